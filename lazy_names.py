@@ -1,6 +1,8 @@
-"""Front doors of packages: a name brings its module along when it is first used, so importing the package stays light.
+"""Front doors of packages: a name brings its module along when it is first used,
+so importing the package stays light.
 
-A package lists its names once, where type checkers and editors look for them, and `lazy_names` reads that list::
+A package lists its names once, where type checkers and editors look for them, and `lazy_names`
+reads that list::
 
     if TYPE_CHECKING:
         from package.module import Name as Name
@@ -21,7 +23,8 @@ from pathlib import Path
 
 
 def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package (PEP 562) for the names that it imports for type checkers.
+    """Return `__getattr__` and `__dir__` of a package (PEP 562)
+    for the names that it imports for type checkers.
 
     Args:
         package: name of the package, `__name__` in its `__init__.py`.
@@ -35,7 +38,9 @@ def lazy_names(package: str) -> tuple[Callable[[str], object], Callable[[], list
         if name == "__all__":
             return list(homes())
         if name not in homes():
-            raise AttributeError(f"module {package!r} has no attribute {name!r}; it exports {', '.join(homes())}")
+            raise AttributeError(
+                f"module {package!r} has no attribute {name!r}; it exports {', '.join(homes())}"
+            )
         try:
             module = import_module(homes()[name])
         except ImportError as error:
@@ -57,9 +62,11 @@ PACKAGES = ("daq", "drivers", "ident")
 
 
 def shadowed_package() -> str:
-    """Describe a file or folder that Python has imported in the place of one of the packages; empty without one.
+    """Describe a file or folder that Python has imported in the place of one of the packages;
+    empty without one.
 
-    The names of the packages are common: a folder `drivers` beside a script comes before an installed package.
+    The names of the packages are common: a folder `drivers` beside a script comes before an
+    installed package.
     """
     home = Path(__file__).resolve().parent
     for name in PACKAGES:
@@ -72,7 +79,8 @@ def shadowed_package() -> str:
             place = place.parent
         if place != home / name:
             return (
-                f"{name!r}: found {place}, which Python imports in the place of drivegain's package; expected "
+                f"{name!r}: found {place}, which Python imports in the place of drivegain's "
+                "package; expected "
                 f"{home / name}; rename {place.name!r}, or start Python in another folder"
             )
     return ""
@@ -85,5 +93,7 @@ def _homes(source: bytes) -> dict[str, str]:
         if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING":
             for statement in block.body:
                 if isinstance(statement, ast.ImportFrom) and statement.module:
-                    homes.update(dict.fromkeys((alias.name for alias in statement.names), statement.module))
+                    homes.update(
+                        dict.fromkeys((alias.name for alias in statement.names), statement.module)
+                    )
     return homes

@@ -3,7 +3,7 @@
 On a terminal one line changes in place; in the log of a continuous integration there is a line every ten seconds.
 
     .venv/bin/python .ci/set_up.py requirements.lock
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ class Progress:
         if found := _LOCAL_ARCHIVE.match(line):
             return replace(self, fetched=(*self.fetched, f"{found[1]} {found[2]}"))
         if found := re.match(r"\s+(?:Downloading|Using cached) .*\(([0-9.]+) ([kM])B\)", line):
-            return replace(self, megabytes=self.megabytes + float(found[1]) / (1000.0 if found[2] == "k" else 1.0))
+            return replace(
+                self,
+                megabytes=self.megabytes + float(found[1]) / (1000.0 if found[2] == "k" else 1.0),
+            )
         if line.startswith("Installing collected packages:"):
             return replace(self, unpacking=line.count(",") + 1)
         return self
@@ -65,7 +68,7 @@ class Progress:
 
 
 def packages_in(lock: str) -> int:
-    """Return the number of requirements in the text of a lock, those for other machines included."""
+    """Return the number of requirements in the text of a lock, those for other machines included."""  # noqa: E501
     return len(re.findall(r"^[^\s#]+==", lock, re.MULTILINE))
 
 
@@ -96,7 +99,8 @@ def install(lock: Path) -> int:
     if code := pip.wait():
         show.end("")
         sys.stderr.write(
-            "".join(line for line in output if line.startswith(("ERROR", "    "))) or "".join(output[-20:])
+            "".join(line for line in output if line.startswith(("ERROR", "    ")))
+            or "".join(output[-20:])
         )
         return code
     show.end(f"{progress.unpacking} packages installed")
@@ -112,7 +116,9 @@ class _Display:
         self._shown_at = time.monotonic()
 
     def __call__(self, words: str) -> None:
-        if words == self._shown or not (self._terminal or time.monotonic() - self._shown_at >= LINE_EVERY_S):
+        if words == self._shown or not (
+            self._terminal or time.monotonic() - self._shown_at >= LINE_EVERY_S
+        ):
             return
         sys.stdout.write(f"\r\033[K  {words}" if self._terminal else f"  {words}\n")
         sys.stdout.flush()

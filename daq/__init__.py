@@ -1,11 +1,13 @@
-"""Calibrate the drive gains of a robot cell: from recorded logs to the current gains of its controller.
+"""Calibrate the drive gains of a robot cell:
+from recorded logs to the current gains of its controller.
 
 Everything that a program needs is here; importing `daq` loads no module before a name is used::
 
     import daq
 
     cell = daq.load_cell(Path("cells/press.yaml"))
-    calibration = daq.fit_logs([Path("bare.mcap"), Path("loaded.mcap")], holdout=[Path("held-out.mcap")])
+    logs = [Path("bare.mcap"), Path("loaded.mcap")]
+    calibration = daq.fit_logs(logs, holdout=[Path("held-out.mcap")])
     for gain in calibration.gains:
         print(f"{gain.axis}: {gain.value:.2f} ± {gain.std:.2f} {gain.unit}")
     daq.save_calibration(calibration, Path("calibration.yaml"))
@@ -24,10 +26,10 @@ write them, and undo it             `Request`, `propose`, `Proposal`, `apply`, `
 errors                              `DaqError` and its subclasses (daq/errors.py)
 ==================================  ==============================================================================
 
-Logs carry the description of their cell, so a fit needs no other file. Nothing is written unless every check of a
-proposal passes. The science behind is in `ident`, the bus in `drivers`; their errors (`ident.IdentificationError`,
-`drivers.DriverError`) pass through.
-"""
+Logs carry the description of their cell, so a fit needs no other file. Nothing is written unless
+every check of a proposal passes. The science behind is in `ident`, the bus in `drivers`; their
+errors (`ident.IdentificationError`, `drivers.DriverError`) pass through.
+"""  # noqa: E501
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Verbs and options of the command line, for the messages of `ident` and `drivers`.
 
-These libraries know no command line: their messages name functions and arguments, in backticks. The user of the command
-line reads the verb or option that does the same.
+These libraries know no command line: their messages name functions and arguments, in backticks. The
+user of the command line reads the verb or option that does the same.
 """
 
 from __future__ import annotations

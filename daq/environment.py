@@ -57,7 +57,8 @@ def software() -> str:
 def login() -> str:
     """Return the name of the user of this process, or the number of a user without a name.
 
-    LOGNAME and USER, which `getpass.getuser` prefers, are ignored: with them one person could pass for two.
+    LOGNAME and USER, which `getpass.getuser` prefers, are ignored: with them one person could pass
+    for two.
     """
     number = os.getuid()
     try:

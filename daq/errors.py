@@ -13,18 +13,18 @@ DaqError
 ├── JobHeld               exit 14   NotReleased (exit 11), BusTaken (exit 12), TimeBoundReached (exit 13)
 └── OutputFailed          exit 1    DiskSpaceShort
 
-A kind of failure has a class of its own where a caller catches it, where it has its own exit code, or where its name is
-data: `drivegain fleet` reports the class of every failed cell. Everything else raises the parent, with a message that
-says what was found.
+A kind of failure has a class of its own where a caller catches it, where it has its own exit code,
+or where its name is data: `drivegain fleet` reports the class of every failed cell. Everything else
+raises the parent, with a message that says what was found.
 
 `drivegain recalibrate` exits with 10 when it found a change that an operator has to approve.
 drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4.
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
@@ -52,18 +52,25 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
-LONGEST = 4000  #: Characters of one part of a message; what was found may be a field of a damaged file, of any size
+#: Characters of one part of a message; what was found may be a field of a damaged file, of any size
+LONGEST = 4000
 
 
 def _cut(text: str) -> str:
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}... ({len(text) - LONGEST} more characters)"
+    if len(text) <= LONGEST:
+        return text
+    return f"{text[:LONGEST]}... ({len(text) - LONGEST} more characters)"
 
 
 class DaqError(Exception):
-    """Root of the tree; its message names subject, what was found, what was expected, and what to do."""
+    """Root of the tree; its message names subject, what was found, what was expected,
+    and what to do.
+    """
 
     def __init__(self, subject: str, *, found: str, expected: str, remedy: str) -> None:
-        subject, found, expected = _cut(subject), _cut(found), _cut(expected)
+        subject = _cut(subject)
+        found = _cut(found)
+        expected = _cut(expected)
         super().__init__(f"{subject}: found {found}; expected {expected}; {remedy}")
         self.subject = subject
         self.found = found
@@ -71,7 +78,8 @@ class DaqError(Exception):
         self.remedy = remedy
 
     def __reduce__(self) -> tuple[object, ...]:
-        # `args` holds the message, not the arguments of `__init__`: without this the error could not be pickled.
+        # `args` holds the message, not the arguments of `__init__`: without this the error could
+        # not be pickled.
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
@@ -84,9 +92,29 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}s"
 
 
+def first_few(texts: Sequence[str], count: int, *, separator: str = "; ", note: str = "") -> str:
+    """Join the first of some texts, and say how many more there are: ``a; b; and 3 more``.
+
+    Args:
+        texts: all of them.
+        count: of those that are shown.
+        separator: between two texts, and before the number of the others.
+        note: after the number of the others, such as where all are.
+    """
+    parts = list(texts[:count])
+    more = len(texts) - count
+    if more > 0:
+        parts.append(f"and {more} more{note}")
+    return separator.join(parts)
+
+
 def evidence(error: Exception) -> str:
-    """Return where and what an error found, without its remedy: for a warning about work that is done all the same."""
-    return f"{error.subject}: {error.found}" if isinstance(error, DaqError) else str(error)
+    """Return where and what an error found, without its remedy:
+    for a warning about work that is done all the same.
+    """
+    if isinstance(error, DaqError):
+        return f"{error.subject}: {error.found}"
+    return str(error)
 
 
 class UsageError(DaqError):
@@ -162,7 +190,9 @@ class HistoryUnreadable(DataError):
 
 
 class HistoryInaccessible(HistoryUnreadable):
-    """A history that may be sound: another program keeps it locked, or its rights do not let it be read."""
+    """A history that may be sound: another program keeps it locked,
+    or its rights do not let it be read.
+    """
 
 
 class LogsDiffer(DataError):
@@ -194,7 +224,9 @@ class CurrentImplausible(DataError):
 
 
 class PositionImplausible(DataError):
-    """Positions far outside the joint limits (degrees for radians, a wrong drive train), or a step no motor makes."""
+    """Positions far outside the joint limits (degrees for radians, a wrong drive train),
+    or a step no motor makes.
+    """
 
 
 class EffectsRefuted(DataError):
@@ -246,7 +278,9 @@ class TimeBoundReached(JobHeld):
 
 
 class OwnerNotKept(PermissionError):
-    """A new file cannot have the owner and group of the one that it would replace: nothing is written."""
+    """A new file cannot have the owner and group of the one that it would replace:
+    nothing is written.
+    """
 
     def __init__(self, path: Path, differing: str) -> None:
         """Store what differs.
@@ -255,7 +289,9 @@ class OwnerNotKept(PermissionError):
             path: file that would be replaced.
             differing: its owner and group where a new file of this user has others, in words.
         """
-        super().__init__(errno.EPERM, f"this user may not make a file of its {differing}", str(path))
+        super().__init__(
+            errno.EPERM, f"this user may not make a file of its {differing}", str(path)
+        )
 
 
 class OutputFailed(DaqError):
@@ -268,9 +304,11 @@ class OutputFailed(DaqError):
             return cls(
                 str(path),
                 found=reason_of(error),
-                expected="a user who may keep owner and group of the file, so that who reads it now can read it then",
-                remedy="it is as it was; run the command as its owner and in its group (`sudo -u`, or `usermod -aG` "
-                "and a new login), or give the file to this user (`chown`, `chgrp`) if the controller can read it then",
+                expected="a user who may keep owner and group of the file, so that who reads it "
+                "now can read it then",
+                remedy="it is as it was; run the command as its owner and in its group (`sudo -u`, "
+                "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
+                "`chgrp`) if the controller can read it then",
             )
         return cls(
             str(path),
@@ -299,7 +337,9 @@ def writing(path: Path) -> Iterator[None]:
 
 
 class DiskSpaceShort(OutputFailed):
-    """Too little room for a recording: it does not begin, or the axes were stopped and the log was finished."""
+    """Too little room for a recording: it does not begin,
+    or the axes were stopped and the log was finished.
+    """
 
 
 EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (

@@ -1,4 +1,6 @@
-"""Read, replace, hash and lock files: a file is replaced whole or not at all, and only regular files are read."""
+"""Read, replace, hash and lock files: a file is replaced whole or not at all,
+and only regular files are read.
+"""
 
 from __future__ import annotations
 
@@ -18,29 +20,37 @@ from daq.errors import OwnerNotKept
 
 
 def replace_file(
-    path: Path, content: bytes, *, check: Callable[[bytes], None] | None = None, like: Path | None = None
+    path: Path,
+    content: bytes,
+    *,
+    check: Callable[[bytes], None] | None = None,
+    like: Path | None = None,
 ) -> None:
-    """Put `content` at `path`: temporary file in the same folder → fsync → read back and check → rename → fsync folder.
+    """Put `content` at `path`: temporary file in the same folder → fsync → read back and check →
+    rename → fsync folder.
 
-    Until the rename the old file is untouched, after it the new one is complete: a kill at any point leaves one of the
-    two. Mode, owner and access lists of an existing file are kept. A symbolic link that `judge_target` trusts stays:
-    the file behind it is replaced.
+    Until the rename the old file is untouched, after it the new one is complete: a kill at any
+    point leaves one of the two. Mode, owner and access lists of an existing file are kept. A
+    symbolic link that `judge_target` trusts stays: the file behind it is replaced.
 
     Args:
         path: file to make or replace; its folder must exist.
         content: new content.
-        check: called with the content read back from the disk, before the rename; an exception stops the replacement.
+        check: called with the content read back from the disk, before the rename; an exception
+            stops the replacement.
         like: file whose mode, owner and access lists are used instead.
 
     Raises:
-        OSError: from the file system, also if owner or access lists cannot be kept; as `judge_target`; or a folder is
-            at `path`. Only a failing fsync of the folder leaves the new content in place.
+        OSError: from the file system, also if owner or access lists cannot be kept; as
+            `judge_target`; or a folder is at `path`. Only a failing fsync of the folder leaves the
+            new content in place.
     """
     target = judge_target(path)
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a directory", str(path))
     model = like or (target if target.exists() else None)
-    # For the owner alone until it has the rights of the other file: an open descriptor outlives a later chmod.
+    # For the owner alone until it has the rights of the other file: an open descriptor outlives a
+    # later chmod.
     temporary, descriptor = _new_file(target, 0o666 if model is None else 0o600)
     try:
         with os.fdopen(descriptor, "wb") as stream:
@@ -59,15 +69,20 @@ def replace_file(
 
 
 def judge_target(path: Path) -> Path:
-    """Resolve the name of a file or folder to write to, if no other user can choose what it leads to.
+    """Resolve the name of a file or folder to write to,
+    if no other user can choose what it leads to.
 
     Raises:
-        OSError: as `follow_links`; its links lead into a folder as of `open_folder` (EPERM); or it is neither a file
-            nor a folder (EINVAL). ``strerror`` says so.
+        OSError: as `follow_links`; its links lead into a folder as of `open_folder` (EPERM); or it
+            is neither a file nor a folder (EINVAL). ``strerror`` says so.
     """
     target = follow_links(path)
     if (folder := open_folder(path, target)) is not None:
-        raise OSError(errno.EPERM, f"a symbolic link into {folder}, a folder that everybody may write", str(path))
+        raise OSError(
+            errno.EPERM,
+            f"a symbolic link into {folder}, a folder that everybody may write",
+            str(path),
+        )
     with suppress(FileNotFoundError, NotADirectoryError):
         mode = target.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
@@ -76,7 +91,8 @@ def judge_target(path: Path) -> Path:
 
 
 def open_folder(path: Path, target: Path) -> Path | None:
-    """Folder behind the links of a name in which every user may exchange the target; None where there is none.
+    """Folder behind the links of a name in which every user may exchange the target;
+    None where there is none.
 
     In a folder with the sticky bit, such as /tmp, only its owner may exchange a file or folder.
 
@@ -98,12 +114,15 @@ def open_folder(path: Path, target: Path) -> Path | None:
 
 
 def is_taken(path: Path) -> bool:
-    """Whether a name leads anywhere or is a link: a new file of that name would replace it, or be made elsewhere."""
+    """Whether a name leads anywhere or is a link:
+    a new file of that name would replace it, or be made elsewhere.
+    """
     return path.exists() or path.is_symlink()
 
 
 def follow_links(path: Path) -> Path:
-    """Resolve the symbolic links of a name, those of its folders included, as long as they can be trusted.
+    """Resolve the symbolic links of a name, those of its folders included,
+    as long as they can be trusted.
 
     A file that is gone resolves to where its links still lead.
 
@@ -111,11 +130,14 @@ def follow_links(path: Path) -> Path:
         path: as it was declared. A name that was resolved before has no links left to judge.
 
     Raises:
-        OSError: the links form a circle (ELOOP), or another user, neither root nor the owner of the file, has made one
-            (EPERM); ``strerror`` says so. Where the file is gone, the owner of its folder counts.
+        OSError: the links form a circle (ELOOP), or another user, neither root nor the owner of the
+            file, has made one (EPERM); ``strerror`` says so. Where the file is gone, the owner of
+            its folder counts.
     """
-    links, target = _links(path), Path(os.path.realpath(path))
-    owner, there = None, False
+    links = _links(path)
+    target = Path(os.path.realpath(path))
+    owner = None
+    there = False
     try:
         there = os.path.lexists(target)
         owner = (target if there else target.parent).lstat().st_uid
@@ -128,8 +150,15 @@ def follow_links(path: Path) -> Path:
         made_by = link.lstat().st_uid
         if made_by not in {0, os.geteuid(), owner}:
             named = "" if link == path else f" ({link})"
-            whose = f"to a file of user {owner}" if there else f"to {target}, which is not there"
-            raise OSError(errno.EPERM, f"a symbolic link{named} that user {made_by} has made, {whose}", str(path))
+            if there:
+                whose = f"to a file of user {owner}"
+            else:
+                whose = f"to {target}, which is not there"
+            raise OSError(
+                errno.EPERM,
+                f"a symbolic link{named} that user {made_by} has made, {whose}",
+                str(path),
+            )
     return target
 
 
@@ -151,7 +180,8 @@ def _links(file: Path) -> tuple[Path, ...]:
 
 
 def fsync_folder(folder: Path) -> None:
-    """Flush a folder: without it a new name in it may not survive a power cut (POSIX fsync, open(2)).
+    """Flush a folder: without it a new name in it may not survive a power cut (POSIX fsync,
+    open(2)).
 
     Raises:
         OSError: from the file system.
@@ -167,9 +197,11 @@ def open_regular(path: Path) -> BufferedReader:
     """Open a regular file for reading, without blocking at a pipe.
 
     Raises:
-        OSError: the file does not exist, is not a regular file, or cannot be read; ``strerror`` gives the reason.
+        OSError: the file does not exist, is not a regular file, or cannot be read; ``strerror``
+            gives the reason.
     """
-    # Checked before it is opened: opening may rewind a tape, or wake a process at the other end of a pipe.
+    # Checked before it is opened: opening may rewind a tape, or wake a process at the other end of
+    # a pipe.
     _check(path.stat(), path)
     stream = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
@@ -200,21 +232,24 @@ def sha256(content: bytes) -> str:
 
 
 def sha256_of(path: Path) -> str | None:
-    """Return the SHA-256 of a file, read piece by piece; None if it is not a readable regular file."""
+    """Return the SHA-256 of a file, read piece by piece;
+    None if it is not a readable regular file.
+    """
     with suppress(OSError), open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
     return None
 
 
-_LOCK_MODE = 0o644  #: Every user may read it, and that is enough to lock it (not on NFS, which requires write access)
+#: Every user may read it, and that is enough to lock it (not on NFS, which requires write access)
+_LOCK_MODE = 0o644
 
 
 @contextmanager
 def hold_lock(lock: Path) -> Iterator[None]:
     """Hold a lock file; the system releases it even after a kill.
 
-    The file is removed at the end. Another process may have opened it just before: its lock is then on a file without
-    a name, which it detects by the inode, and it takes the lock anew.
+    The file is removed at the end. Another process may have opened it just before: its lock is then
+    on a file without a name, which it detects by the inode, and it takes the lock anew.
 
     Raises:
         BlockingIOError: another process holds it.
@@ -239,24 +274,30 @@ def hold_lock(lock: Path) -> Iterator[None]:
                         lock.unlink()
                 return
         finally:
-            with suppress(OSError):  # the work under it is done; the descriptor is closed all the same (close(2))
+            # The work under it is done; the descriptor is closed all the same (close(2))
+            with suppress(OSError):
                 os.close(descriptor)
 
 
 def _open_lock(lock: Path) -> int:
-    """Open the lock file, made where there is none; one that another user has left excludes no process."""
-    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO of that name must not keep us waiting
+    """Open the lock file, made where there is none;
+    one that another user has left excludes no process.
+    """
+    # A FIFO of that name must not keep us waiting
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         with suppress(FileExistsError):
             descriptor = os.open(lock, flags | os.O_RDWR | os.O_CREAT | os.O_EXCL, _LOCK_MODE)
             try:
                 os.fchmod(descriptor, _LOCK_MODE)  # whatever the umask
-            except BaseException:  # an interrupt too: a lock that others cannot open must not stay behind
+            # An interrupt too: a lock that others cannot open must not stay behind.
+            except BaseException:
                 os.close(descriptor)
                 lock.unlink(missing_ok=True)
                 raise
             return descriptor
-        # Without O_CREAT: in a folder with the sticky bit the system refuses it for another user's file.
+        # Without O_CREAT: in a folder with the sticky bit the system refuses it for another user's
+        # file.
         with suppress(FileNotFoundError):  # whose owner was done just now
             try:
                 return os.open(lock, flags | os.O_RDWR)
@@ -272,17 +313,23 @@ def _check(found: os.stat_result, path: Path) -> None:
 
 
 def _new_file(target: Path, mode: int) -> tuple[Path, int]:
-    """Create a hidden file under a new name (O_EXCL); the umask of the process applies to its mode."""
+    """Create a hidden file under a new name (O_EXCL);
+    the umask of the process applies to its mode.
+    """
     attempt = 0
     while True:
         temporary = target.parent / f".{target.name}.{os.getpid()}-{attempt}.tmp"
         with suppress(FileExistsError):
-            return temporary, os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+            return temporary, os.open(
+                temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode
+            )
         attempt += 1
 
 
 def _ownership_differences(found: os.stat_result, wanted: os.stat_result) -> str:
-    """Say in what owner and group of a new file differ from those of the file that it would replace."""
+    """Say in what owner and group of a new file differ from those of the file that it would
+    replace.
+    """
     differing = []
     if found.st_uid != wanted.st_uid:
         differing.append(f"owner {_user_name(wanted.st_uid)}, not {_user_name(found.st_uid)}")
@@ -321,13 +368,18 @@ def _copy_rights(descriptor: int, like: Path) -> None:
 
 _ACCESS = "system.posix_acl_"
 _KERNEL = ("security.", "trusted.")
-"""Labels (SELinux), capabilities, checksums (IMA): many of them only the kernel may set, and it sets them itself."""
+"""Labels (SELinux), capabilities, checksums (IMA):
+many of them only the kernel may set, and it sets them itself.
+"""
 
 
 def _copy_attributes(descriptor: int, like: Path) -> None:
-    """Copy access lists and other extended attributes; without its list a file is open to more people, or to fewer."""
+    """Copy access lists and other extended attributes;
+    without its list a file is open to more people, or to fewer.
+    """
     try:
-        wanted, found = os.listxattr(like), os.listxattr(descriptor)
+        wanted = os.listxattr(like)
+        found = os.listxattr(descriptor)
     except OSError as error:
         if error.errno == errno.ENOTSUP:
             return

@@ -76,7 +76,10 @@ def house() -> str:
     for name in ("ident", "drivers"):
         x, size = columns[name]
         parts.append(_package(name, x, lower, size, below))
-        parts += [_room(x + 20, lower + 64 + row * n, room, job) for n, (room, job) in enumerate(rooms[name])]
+        parts += [
+            _room(x + 20, lower + 64 + row * n, room, job)
+            for n, (room, job) in enumerate(rooms[name])
+        ]
         middle = x + size // 2
         parts.append(_arrow(f"M{middle} {20 + daq_height} V{lower - 4}"))
         parts.append(_text(middle + 10, lower - 15, "imports", 12, FAINT))
@@ -143,7 +146,9 @@ def mechanisms() -> str:
 class Mechanism:
     """Points of a closed chain at its assembly pose, seen along one direction [m]; each of shape (2,)."""
 
-    bodies: tuple[tuple[FloatArray, ...], ...]  #: of each link the points where others join it, that of its joint first
+    bodies: tuple[
+        tuple[FloatArray, ...], ...
+    ]  #: of each link the points where others join it, that of its joint first
     mobility: int  #: degrees of freedom
     carrier: int  #: index of the link that carries the payload
     motors: tuple[FloatArray, ...]
@@ -166,11 +171,17 @@ def mechanism(name: str) -> Mechanism:
     view = ABOVE if planar else OBLIQUE
 
     def seen(place: Place) -> FloatArray:
-        return np.asarray(view @ (at[place.joint + 1] + turned[place.joint + 1] @ place.translation_m))
+        return np.asarray(
+            view @ (at[place.joint + 1] + turned[place.joint + 1] @ place.translation_m)
+        )
 
     def points(link: int) -> Iterator[FloatArray]:
         yield view @ at[link + 1]
-        yield from (view @ at[number + 1] for number, joint in enumerate(robot.joints) if joint.parent == link)
+        yield from (
+            view @ at[number + 1]
+            for number, joint in enumerate(robot.joints)
+            if joint.parent == link
+        )
         ends = (end for closure in robot.closures for end in (closure.first, closure.second))
         yield from (seen(end) for end in ends if end.joint == link)
 
@@ -179,7 +190,9 @@ def mechanism(name: str) -> Mechanism:
         if joint.kind is JointKind.PRISMATIC:
             along = view @ turned[number + 1] @ joint.axis
             lower, upper = axis.limits.position
-            rails.append((view @ at[number + 1] + along * lower, view @ at[number + 1] + along * upper))
+            rails.append(
+                (view @ at[number + 1] + along * lower, view @ at[number + 1] + along * upper)
+            )
     return Mechanism(
         bodies=tuple(tuple(points(link)) for link in range(robot.joint_count)),
         mobility=assembly.mobility,
@@ -203,7 +216,9 @@ def _stick_figure(shown: Mechanism, x: float, y: float, width: float, height: fl
         right, up = scale * (point - middle)
         return float(x + width / 2 + right), float(y + height / 2 - up)
 
-    def line(points: tuple[FloatArray, ...], colour: str, stroke: float, *, filled: bool = False) -> str:
+    def line(
+        points: tuple[FloatArray, ...], colour: str, stroke: float, *, filled: bool = False
+    ) -> str:
         spelled = " ".join(f"{a:.1f},{b:.1f}" for a, b in map(on_page, points))
         look = f'fill="{colour if filled else "none"}" fill-opacity="0.18" stroke-linejoin="round"'
         kind = "polygon" if filled else "polyline"
@@ -232,9 +247,7 @@ def _motor(x: float, y: float) -> str:
 
 
 def _passive(x: float, y: float) -> str:
-    return (
-        f'<circle class="passive" cx="{x:.1f}" cy="{y:.1f}" r="3.8" fill="#ffffff" stroke="{INK}" stroke-width="1.6"/>'
-    )
+    return f'<circle class="passive" cx="{x:.1f}" cy="{y:.1f}" r="3.8" fill="#ffffff" stroke="{INK}" stroke-width="1.6"/>'
 
 
 def _closing(x: float, y: float) -> str:
@@ -253,7 +266,9 @@ def _rooms(package: str) -> list[tuple[str, str]]:
     for info in pkgutil.iter_modules(module.__path__):
         if info.ispkg:
             inner = importlib.import_module(f"{package}.{info.name}")
-            job = re.split(r"\.(?=\s+[A-Z]|$)|: |; ", (inner.__doc__ or "").strip())[0].replace("`", "")
+            job = re.split(r"\.(?=\s+[A-Z]|$)|: |; ", (inner.__doc__ or "").strip())[0].replace(
+                "`", ""
+            )
             if len(job) > LONGEST:
                 job = re.sub(r" \(.*?\)", "", job)
             if len(job) > LONGEST:
@@ -276,7 +291,9 @@ def _room(x: int, y: int, name: str, job: str) -> str:
 
 def _box(x: int, y: int, width: int, height: int, colour: str) -> str:
     place = f'x="{x}" y="{y}" width="{width}" height="{height}" rx="9"'
-    return f'<rect {place} fill="{colour}" fill-opacity="0.11" stroke="{colour}" stroke-width="1.5"/>'
+    return (
+        f'<rect {place} fill="{colour}" fill-opacity="0.11" stroke="{colour}" stroke-width="1.5"/>'
+    )
 
 
 def _text(x: float, y: float, text: str, size: float, colour: str, *, bold: bool = False) -> str:
@@ -296,5 +313,7 @@ def _svg(width: float, height: float, parts: list[str]) -> str:
     )
     # White below the drawing: a dark theme shows it too.
     ground = f'<rect width="{width}" height="{height}" rx="12" fill="#ffffff"/>'
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" style="{STYLE}">'
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" style="{STYLE}">'
+    )
     return "\n".join([head, tip, ground, *parts, "</svg>", ""])

@@ -48,7 +48,10 @@ SCHEMAS: dict[str, tuple[str, Any]] = {
     "import": ("Import description", ImportDescription),
     "simulation": ("Simulation file", SimulationModel),
     "error": ("Error of any verb under --json", ErrorReport),
-    **{f"report-{verb}": (f"What {verb} prints under --json", model) for verb, model in REPORTS.items()},
+    **{
+        f"report-{verb}": (f"What {verb} prints under --json", model)
+        for verb, model in REPORTS.items()
+    },
 }
 """Title and model of each schema, by its name."""
 FRONT_DOORS = ("ident", "daq", "drivers")
@@ -73,7 +76,9 @@ NO_DOCSTRING = {
 HERE = Path(__file__).resolve().parent
 SCHEMA_FOLDER = HERE / "reference" / "schemas"
 UNTIL = "<!-- generated until here -->"
-MARK = re.compile(rf"^(<!-- generated: ([a-z ]+) -->)\n.*?^{re.escape(UNTIL)}$", re.MULTILINE | re.DOTALL)
+MARK = re.compile(
+    rf"^(<!-- generated: ([a-z ]+) -->)\n.*?^{re.escape(UNTIL)}$", re.MULTILINE | re.DOTALL
+)
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
@@ -95,7 +100,11 @@ def schema_texts() -> dict[str, str]:
     """The JSON schemas, by the names of their files."""
     texts = {}
     for name, (title, model) in SCHEMAS.items():
-        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **_schema(model), "title": title}
+        schema = {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            **_schema(model),
+            "title": title,
+        }
         texts[f"{name}.json"] = json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
     return texts
 
@@ -105,7 +114,9 @@ def lagging() -> dict[Path, str | None]:
     wanted = {path: filled(path.read_text(encoding="utf-8")) for path in sorted(HERE.rglob("*.md"))}
     schemas = {SCHEMA_FOLDER / name: text for name, text in schema_texts().items()}
     texts = {**wanted, **schemas}
-    found: dict[Path, str | None] = {path: text for path, text in texts.items() if not _is_current(path, text)}
+    found: dict[Path, str | None] = {
+        path: text for path, text in texts.items() if not _is_current(path, text)
+    }
     found.update({path: None for path in SCHEMA_FOLDER.glob("*.json") if path not in schemas})
     return found
 
@@ -116,7 +127,9 @@ def _is_current(path: Path, text: str) -> bool:
 
 def _require_current(_app: Sphinx, name: str, source: list[str]) -> None:
     if filled(source[0]) != source[0]:
-        raise ExtensionError(f"docs/{name}.md: its generated text is not that of the code; run `make reference`")
+        raise ExtensionError(
+            f"docs/{name}.md: its generated text is not that of the code; run `make reference`"
+        )
 
 
 def _publish_schemas(app: Sphinx, error: Exception | None) -> None:
@@ -129,17 +142,28 @@ def _publish_schemas(app: Sphinx, error: Exception | None) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def _escape_docstring(_app: Sphinx, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
+def _escape_docstring(
+    _app: Sphinx, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]
+) -> None:
     """Take `|x|`, `a*b` and `name_` in a docstring for text, not for reStructuredText."""
     for number, line in enumerate(lines):
         parts = re.split(r"(``.+?``|`[^`]+`)", line)
-        parts[::2] = [re.sub(r"(?<!\w)\*(?=\w)|(?<=\w)_(?!\w)|[|]|(?<=\w)\*", r"\\\g<0>", part) for part in parts[::2]]
+        parts[::2] = [
+            re.sub(r"(?<!\w)\*(?=\w)|(?<=\w)_(?!\w)|[|]|(?<=\w)\*", r"\\\g<0>", part)
+            for part in parts[::2]
+        ]
         parts[1::2] = [part if part.startswith("``") else f"`{part}`" for part in parts[1::2]]
         lines[number] = "".join(parts)
 
 
 def _shorten_types(
-    _app: Sphinx, _kind: str, _name: str, _object: Any, _options: Any, signature: str | None, returned: str | None
+    _app: Sphinx,
+    _kind: str,
+    _name: str,
+    _object: Any,
+    _options: Any,
+    signature: str | None,
+    returned: str | None,
 ) -> tuple[str | None, str | None]:
     """Write `FloatArray` and `NDArray[int64]` for the types that they are short for."""
 
@@ -148,7 +172,9 @@ def _shorten_types(
             return None
         text = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
         return re.sub(
-            r"(?:~?numpy\.)?ndarray\[tuple\[.*?\], (?:~?numpy\.)?dtype\[(?:~?numpy\.)?(\w+)\]\]", r"NDArray[\1]", text
+            r"(?:~?numpy\.)?ndarray\[tuple\[.*?\], (?:~?numpy\.)?dtype\[(?:~?numpy\.)?(\w+)\]\]",
+            r"NDArray[\1]",
+            text,
         )
 
     return short(signature), short(returned)
@@ -161,27 +187,46 @@ def command_line() -> str:
     """Every verb with its help, usage, arguments and options."""
     group: Any = typer.main.get_command(build_app())
     context = typer.Context(group, info_name="drivegain")
-    verbs = [(name, group.resolve_command(context, [name])[1]) for name in group.list_commands(context)]
-    return "\n\n".join(_command(verb, f"drivegain {name}", context, level=2) for name, verb in verbs)
+    verbs = [
+        (name, group.resolve_command(context, [name])[1]) for name in group.list_commands(context)
+    ]
+    return "\n\n".join(
+        _command(verb, f"drivegain {name}", context, level=2) for name, verb in verbs
+    )
 
 
 # typer brings a click of its own, whose classes have no public name; hence Any.
 def _command(command: Any, name: str, parent: typer.Context, level: int) -> str:
     context = typer.Context(command, info_name=name.rpartition(" ")[2], parent=parent)
     usage = " ".join(command.collect_usage_pieces(context))
-    parts = [f"{'#' * level} {name}", _paragraphs(command.help or ""), f"```text\n{name} {usage}\n```"]
-    records = [record for record in (help_record(one, context) for one in command.get_params(context)) if record]
-    parts += [f"`{term.strip()}`\n: {_escaped(' '.join(text.split())) or '—'}" for term, text in records]
+    parts = [
+        f"{'#' * level} {name}",
+        _paragraphs(command.help or ""),
+        f"```text\n{name} {usage}\n```",
+    ]
+    records = [
+        record
+        for record in (help_record(one, context) for one in command.get_params(context))
+        if record
+    ]
+    parts += [
+        f"`{term.strip()}`\n: {_escaped(' '.join(text.split())) or '—'}" for term, text in records
+    ]
     if command.epilog and "Example:" in command.epilog:
         example = command.epilog.partition("Example:")[2].strip()
         parts.append(f"Example:\n\n```console\n$ {example}\n```")
     kinds = getattr(command, "commands", {})
-    parts += [_command(kind, f"{name} {kind_name}", context, level + 1) for kind_name, kind in kinds.items()]
+    parts += [
+        _command(kind, f"{name} {kind_name}", context, level + 1)
+        for kind_name, kind in kinds.items()
+    ]
     return "\n\n".join(part for part in parts if part)
 
 
 def _paragraphs(text: str) -> str:
-    return "\n\n".join(_escaped(" ".join(part.split())) for part in inspect.cleandoc(text).split("\n\n"))
+    return "\n\n".join(
+        _escaped(" ".join(part.split())) for part in inspect.cleandoc(text).split("\n\n")
+    )
 
 
 def _escaped(text: str) -> str:
@@ -199,7 +244,10 @@ def cell_file() -> str:
 
 def schema_list() -> str:
     """Links to the JSON schemas."""
-    lines = [f"- [{name}.json](schemas/{name}.json): {title.lower()}" for name, (title, _) in SCHEMAS.items()]
+    lines = [
+        f"- [{name}.json](schemas/{name}.json): {title.lower()}"
+        for name, (title, _) in SCHEMAS.items()
+    ]
     return "\n".join(lines)
 
 
@@ -229,8 +277,13 @@ def _sections(schema: dict[str, Any]) -> str:
     return "\n\n".join(_section(path, node, anchors, definitions) for path, _, node in sections)
 
 
-def _section(path: str, node: dict[str, Any], anchors: dict[str, str], definitions: dict[str, Any]) -> str:
-    lines = [f"## {f'`{path}`' if path else 'The whole file'}", _paragraphs(_first(node.get("description", "")))]
+def _section(
+    path: str, node: dict[str, Any], anchors: dict[str, str], definitions: dict[str, Any]
+) -> str:
+    lines = [
+        f"## {f'`{path}`' if path else 'The whole file'}",
+        _paragraphs(_first(node.get("description", ""))),
+    ]
     rows = ["| key | value | default |", "| --- | --- | --- |"]
     required = set(node.get("required", ()))
     for key, child in node["properties"].items():
@@ -261,23 +314,44 @@ def _value(node: dict[str, Any], anchors: dict[str, str], definitions: dict[str,
     """A schema in words."""
     if "$ref" in node:
         name = node["$ref"].rpartition("/")[2]
-        return f"section `{anchors[name]}`" if name in anchors else _value(definitions[name], anchors, definitions)
+        return (
+            f"section `{anchors[name]}`"
+            if name in anchors
+            else _value(definitions[name], anchors, definitions)
+        )
     for key in ("anyOf", "oneOf", "allOf"):
         if key in node:
-            kinds = [_value(one, anchors, definitions) for one in node[key] if one.get("type") != "null"]
+            kinds = [
+                _value(one, anchors, definitions) for one in node[key] if one.get("type") != "null"
+            ]
             return " or ".join(dict.fromkeys(kinds))
     if "enum" in node or "const" in node:
         return ", ".join(f"`{one}`" for one in node.get("enum", [node.get("const")]))
     if node.get("type") in ("array", "object"):
-        parts = node.get("prefixItems") or [node.get("items") or node.get("additionalProperties") or {}]
+        parts = node.get("prefixItems") or [
+            node.get("items") or node.get("additionalProperties") or {}
+        ]
         inner = ", ".join(dict.fromkeys(_value(one, anchors, definitions) for one in parts))
-        size = f"{len(parts)} ×" if "prefixItems" in node else "list of" if node["type"] == "array" else "mapping to"
+        size = (
+            f"{len(parts)} ×"
+            if "prefixItems" in node
+            else "list of"
+            if node["type"] == "array"
+            else "mapping to"
+        )
         return f"{size} {inner}"
-    words = {"string": "text", "boolean": "`true` or `false`", "number": "number", "integer": "whole number"}
+    words = {
+        "string": "text",
+        "boolean": "`true` or `false`",
+        "number": "number",
+        "integer": "whole number",
+    }
     bounds = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
     limits = [f"{sign} {node[key]}" for key, sign in bounds.items() if key in node]
     kind = node.get("type")
-    return ", ".join([words.get(kind, "anything") if isinstance(kind, str) else "anything", *limits])
+    return ", ".join(
+        [words.get(kind, "anything") if isinstance(kind, str) else "anything", *limits]
+    )
 
 
 def _default(value: Any) -> str:
@@ -299,7 +373,10 @@ def errors() -> str:
             found.setdefault(int(exit_code(one) or 1), []).append(one)
     parts = []
     for code, classes in sorted(found.items()):
-        rows = [f"- `{one.__name__}`: {_escaped(_summary(one))}" for one in sorted(classes, key=lambda c: c.__name__)]
+        rows = [
+            f"- `{one.__name__}`: {_escaped(_summary(one))}"
+            for one in sorted(classes, key=lambda c: c.__name__)
+        ]
         parts.append(f"### Exit code {code}\n\n" + "\n".join(rows))
     return "\n\n".join(parts)
 
@@ -311,7 +388,8 @@ def _subclasses(root: type[BaseException]) -> Iterator[type[BaseException]]:
 
 
 def _summary(thing: Any) -> str:
-    return (inspect.getdoc(thing) or "").partition("\n")[0].rstrip(".")
+    first_paragraph = (inspect.getdoc(thing) or "").partition("\n\n")[0]
+    return " ".join(first_paragraph.split()).rstrip(".")
 
 
 def api_names(page: str) -> tuple[str, ...]:
@@ -330,7 +408,9 @@ def _home(package: str, name: str) -> str:
     exported = getattr(importlib.import_module(package), name)
     module = str(getattr(exported, "__module__", ""))
     known = module.partition(".")[0] in FRONT_DOORS
-    return module if known else f"{package}.arrays" if package == "ident" else f"{package}.constants"
+    return (
+        module if known else f"{package}.arrays" if package == "ident" else f"{package}.constants"
+    )
 
 
 def _page_of(package: str, module: str) -> str:
@@ -390,7 +470,10 @@ def _settings(family: Sequence[Effect]) -> str:
     parts = []
     for name in family[0].settings:
         values = [f"{value:.3g}" for value in sorted({effect.settings[name] for effect in family})]
-        parts.append(f"`{name}` " + (", ".join(values) if len(values) <= 4 else f"{values[0]} to {values[-1]}"))
+        parts.append(
+            f"`{name}` "
+            + (", ".join(values) if len(values) <= 4 else f"{values[0]} to {values[-1]}")
+        )
     return "; ".join(parts)
 
 

@@ -33,13 +33,17 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
 DRIVEGAIN = Path(sys.executable).with_name("drivegain")
 COLUMNS = 100
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 
 
 def main() -> int:
     """Refresh all pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--demo", type=Path, default=ROOT / "out" / "demo", help="what `make demo` left")
+    parser.add_argument(
+        "--demo", type=Path, default=ROOT / "out" / "demo", help="what `make demo` left"
+    )
     demo = parser.parse_args().demo.resolve()
     PICTURES.mkdir(exist_ok=True)
     (PICTURES / "house.svg").write_text(drawings.house(), encoding="utf-8")
@@ -100,7 +104,9 @@ def _history(folder: Path) -> None:
     cell = folder / "press-4" / "cells" / "press-4.yaml"
     text = cell.read_text(encoding="utf-8").replace("name: press-4", "name: demo", 1)
     cell.write_text(text, encoding="utf-8")
-    fill(ledger_of(cell), 20, lambda week: (1.0, 1.0, 1.0, 1.0 - 0.006 * max(0, week - 10), 1.0, 1.0))
+    fill(
+        ledger_of(cell), 20, lambda week: (1.0, 1.0, 1.0, 1.0 - 0.006 * max(0, week - 10), 1.0, 1.0)
+    )
     _run(["history", str(cell), "--axis", "J4", "--plot", "history.png"], folder)
     _webp(folder / "history.png", "history", width=1100)
 
@@ -109,7 +115,9 @@ def _history(folder: Path) -> None:
 def _simulated_cell(folder: Path) -> Iterator[None]:
     """`drivegain simulate` in a process of its own, from its first line on."""
     command = [str(DRIVEGAIN), "simulate", "demo", "--payload-from", "mounted.txt"]
-    with subprocess.Popen(command, cwd=folder, env=_environment(), stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, cwd=folder, env=_environment(), stdout=subprocess.PIPE, text=True
+    ) as process:
         if process.stdout is None or not process.stdout.readline():
             raise RuntimeError("the simulated cell did not start")
         try:
@@ -127,30 +135,51 @@ def _run(arguments: str | list[str], folder: Path) -> str:
     """Standard output of a command that must succeed."""
     words = arguments.split() if isinstance(arguments, str) else arguments
     done = subprocess.run(
-        [DRIVEGAIN, *words], cwd=folder, env=_environment(), capture_output=True, text=True, check=False
+        [DRIVEGAIN, *words],
+        cwd=folder,
+        env=_environment(),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
-        raise RuntimeError(f"drivegain {' '.join(words)} ended with {done.returncode}:\n{done.stderr}")
+        raise RuntimeError(
+            f"drivegain {' '.join(words)} ended with {done.returncode}:\n{done.stderr}"
+        )
     return done.stdout
 
 
-def _terminal(name: str, arguments: str, folder: Path, shorten: Callable[[list[str]], list[str]] = list) -> None:
+def _terminal(
+    name: str, arguments: str, folder: Path, shorten: Callable[[list[str]], list[str]] = list
+) -> None:
     """A picture of a command and its output."""
     lines = shorten(_run(arguments, folder).rstrip("\n").split("\n"))
-    console = Console(record=True, width=COLUMNS, file=io.StringIO(), force_terminal=True, color_system="truecolor")
+    console = Console(
+        record=True,
+        width=COLUMNS,
+        file=io.StringIO(),
+        force_terminal=True,
+        color_system="truecolor",
+    )
     console.print(Text("$ ", "bold green") + Text(f"drivegain {arguments}", "bold"))
     console.print(Text.from_ansi("\n".join(lines)))
     # Rich's template loads its font from the network, and names its maker's site.
-    template = re.sub(r"@font-face \{\{.*?\}\}\s*|<!--.*?-->\s*", "", CONSOLE_SVG_FORMAT, flags=re.DOTALL)
+    template = re.sub(
+        r"@font-face \{\{.*?\}\}\s*|<!--.*?-->\s*", "", CONSOLE_SVG_FORMAT, flags=re.DOTALL
+    )
     svg = console.export_svg(title="drivegain", theme=MONOKAI, code_format=template, unique_id=name)
-    (PICTURES / f"{name}.svg").write_text(svg.replace("Fira Code", "DejaVu Sans Mono"), encoding="utf-8")
+    (PICTURES / f"{name}.svg").write_text(
+        svg.replace("Fira Code", "DejaVu Sans Mono"), encoding="utf-8"
+    )
 
 
 def _webp(source: Path, name: str, width: int) -> None:
     """A plot, scaled down."""
     picture = Image.open(source).convert("RGB")
     height = round(picture.height * width / picture.width)
-    picture.resize((width, height), Image.Resampling.LANCZOS).save(PICTURES / f"{name}.webp", quality=70, method=6)
+    picture.resize((width, height), Image.Resampling.LANCZOS).save(
+        PICTURES / f"{name}.webp", quality=70, method=6
+    )
 
 
 if __name__ == "__main__":

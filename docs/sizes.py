@@ -47,7 +47,10 @@ def closure(names: Iterable[str]) -> frozenset[str]:
 
 
 def _requirements(found: Distribution, extra: str) -> list[Requirement]:
-    environment = {**{name: str(value) for name, value in default_environment().items()}, "extra": extra}
+    environment = {
+        **{name: str(value) for name, value in default_environment().items()},
+        "extra": extra,
+    }
     needed = [Requirement(text) for text in found.requires or ()]
     return [one for one in needed if one.marker is None or one.marker.evaluate(environment)]
 
@@ -108,7 +111,9 @@ def main() -> None:
     """Write the table into the page."""
     text = table(measured())
     page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(PART.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", page), encoding="utf-8")
+    PAGE.write_text(
+        PART.sub(lambda found: f"{found[1]}\n{text}\n\n{found[2]}", page), encoding="utf-8"
+    )
     sys.stdout.write(f"{text}\n")
 
 

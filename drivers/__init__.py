@@ -4,7 +4,8 @@ Everything that a program needs is here; importing `drivers` loads no module bef
 
     axes = [drivers.Axis("J1", node_id=1), drivers.Axis("J2", node_id=2)]
     with drivers.open_cell("socketcan:can0", axes) as cell:
-        for sample in itertools.islice(drivers.SyncStream(cell, drivers.TimedSync(period_ns=1_000_000)), 1000):
+        stream = drivers.SyncStream(cell, drivers.TimedSync(period_ns=1_000_000))
+        for sample in itertools.islice(stream, 1000):
             print(sample.time_ns, sample.position_counts, sample.current_raw)
 
 ======================================  ==========================================================================
@@ -17,8 +18,9 @@ move axes                               `execute`, `Move`, `synchronised_move`, 
 errors                                  `DriverError` and its subclasses (drivers/errors.py)
 ======================================  ==========================================================================
 
-Nothing moves without a `MotionPermission`. A simulated cell for trials runs on the same buses (`drivers.simulation`).
-"""
+Nothing moves without a `MotionPermission`. A simulated cell for trials runs on the same buses
+(`drivers.simulation`).
+"""  # noqa: E501
 
 from __future__ import annotations
 

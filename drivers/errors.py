@@ -1,4 +1,6 @@
-"""Everything that can go wrong between a bus and a sample. Each class has a caller that treats it differently.
+"""Everything that can go wrong between a bus and a sample.
+
+Each class has a caller that treats it differently.
 
 DriverError
 ├── BusError                  the bus cannot be opened, or is lost
@@ -16,8 +18,9 @@ DriverError
 ├── MotionRefused             motion without permission, or outside the limits
 └── MotionTimeout             a move did not end in time
 
-Where an error ends a motion, each part of the stop that could not be confirmed is attached to it as a note.
-"""
+Where an error ends a motion, each part of the stop that could not be confirmed is attached to it as
+a note.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -25,15 +28,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Protocol
 
-WHILE = "while "  #: Prefix of the notes that report what a stop, or the closing of a network, could not confirm
-POWERED = "not confirmed without power: "  #: Prefix of the note that names the axes which had power and may still have
+#: Prefix of the notes that report what a stop, or the closing of a network, could not confirm
+WHILE = "while "
+#: Prefix of the note that names the axes which had power and may still have
+POWERED = "not confirmed without power: "
 
 
 def error_chain(error: BaseException | None) -> tuple[BaseException, ...]:
-    """Return an error and all errors behind it, nearest first: causes, and errors that were being handled.
+    """Return an error and all errors behind it, nearest first:
+    causes, and errors that were being handled.
 
-    Each is there once, whatever cycles they form. They are compared by identity: the `__eq__` of a foreign error may
-    raise, as that of canopen's SdoAbortedError does with any error that has no abort code.
+    Each is there once, whatever cycles they form. They are compared by identity: the `__eq__` of a
+    foreign error may raise, as that of canopen's SdoAbortedError does with any error that has no
+    abort code.
     """
     found: dict[int, BaseException] = {}
     waiting = [error]
@@ -46,7 +53,9 @@ def error_chain(error: BaseException | None) -> tuple[BaseException, ...]:
 
 
 def text_of(error: BaseException) -> str:
-    """Return the text of an error; empty where it has none, or where a foreign error fails to write it."""
+    """Return the text of an error; empty where it has none,
+    or where a foreign error fails to write it.
+    """
     with suppress(Exception):
         return str(error)
     return ""
@@ -55,7 +64,8 @@ def text_of(error: BaseException) -> str:
 def all_notes(error: BaseException | None) -> tuple[str, ...]:
     """Return the notes of an error, and of all errors behind it, each once.
 
-    An error that comes later, such as that of a full disk, does not carry the notes of the one that it hides.
+    An error that comes later, such as that of a full disk, does not carry the notes of the one that
+    it hides.
     """
     notes: dict[str, None] = {}
     for one in error_chain(error):
@@ -65,12 +75,16 @@ def all_notes(error: BaseException | None) -> tuple[str, ...]:
 
 
 def stop_notes(error: BaseException | None) -> tuple[str, ...]:
-    """Return those of `all_notes` that say what a stop, or the closing of a network, could not confirm."""
+    """Return those of `all_notes` that say what a stop, or the closing of a network,
+    could not confirm.
+    """
     return tuple(note for note in all_notes(error) if note.startswith((WHILE, POWERED)))
 
 
 class NamedNode(Protocol):
-    """Anything with a CANopen node id and the name of its axis, such as an Axis; the name may be empty."""
+    """Anything with a CANopen node id and the name of its axis, such as an Axis;
+    the name may be empty.
+    """
 
     @property
     def node_id(self) -> int: ...
@@ -83,8 +97,15 @@ Node = int | NamedNode
 
 
 def node_label(node: Node, names: Mapping[int, str] | None = None) -> str:
-    """Name a node in a message: "J3 (node 3)", or "node 3" where the axis is not known; `names` are by node id."""
-    node_id, name = (node, (names or {}).get(node)) if isinstance(node, int) else (node.node_id, node.name)
+    """Name a node in a message: "J3 (node 3)", or "node 3" where the axis is not known;
+    `names` are by node id.
+    """
+    if isinstance(node, int):
+        node_id = node
+        name = (names or {}).get(node)
+    else:
+        node_id = node.node_id
+        name = node.name
     return f"{name} (node {node_id})" if name else f"node {node_id}"
 
 
@@ -92,7 +113,8 @@ class DriverError(Exception):
     """Root of the tree; carries the evidence as attributes and in its message."""
 
     def __reduce__(self) -> tuple[object, ...]:
-        # `args` holds the message, not the arguments of `__init__`: without this the error cannot leave a process.
+        # `args` holds the message, not the arguments of `__init__`: without this the error cannot
+        # leave a process.
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
@@ -106,7 +128,9 @@ class BusError(DriverError):
 
 
 class BusBusy(DriverError):
-    """Another device commands this bus, or sends the recorder's heartbeat: two masters would move one robot."""
+    """Another device commands this bus, or sends the recorder's heartbeat:
+    two masters would move one robot.
+    """
 
     def __init__(self, address: str, found: str, expected: str, remedy: str) -> None:
         super().__init__(f"bus {address}: found {found}; expected {expected}; {remedy}")
@@ -125,13 +149,17 @@ class BusBusy(DriverError):
 
     @classmethod
     def by_own_id(cls, address: object, identifier: int) -> BusBusy:
-        """Report a device with the recorder's node id: its heartbeat keeps the axes running when the recorder dies."""
+        """Report a device with the recorder's node id:
+        its heartbeat keeps the axes running when the recorder dies.
+        """
         frame = "heartbeat" if identifier >= 0x700 else "frame"
         return cls(
             str(address),
-            f"a {frame} {identifier:03X}h of another device, which has node id {identifier & 0x7F} too",
+            f"a {frame} {identifier:03X}h of another device, which has node id "
+            f"{identifier & 0x7F} too",
             "an id that only the recorder uses",
-            "the axes are stopped; give that device another node id, or record again: the recorder then takes another",
+            "the axes are stopped; give that device another node id, or record again: the recorder "
+            "then takes another",
         )
 
 
@@ -140,9 +168,9 @@ class NodeMissing(DriverError):
 
     def __init__(self, nodes: Sequence[Node], found: tuple[int, ...], waited_s: float) -> None:
         super().__init__(
-            f"{', '.join(map(node_label, nodes))} did not answer within {waited_s:g} s "
-            f"(answered: {', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id; a drive "
-            "that was switched on just now answers once it has booted: try again then"
+            f"{', '.join(map(node_label, nodes))} did not answer within {waited_s:g} s (answered: "
+            f"{', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id; "
+            "a drive that was switched on just now answers once it has booted: try again then"
         )
         self.node_ids = tuple(node if isinstance(node, int) else node.node_id for node in nodes)
         self.found = found
@@ -153,9 +181,10 @@ class NodeMisplaced(DriverError):
 
     def __init__(self, node_id: int, expected: str, found: str, axis: str = "") -> None:
         super().__init__(
-            f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell configuration has it on bus "
-            f"{expected}: it is wired to the other bus, two amplifiers have that node id, or both CAN interfaces are "
-            "on one wire; `drivers.scan` shows the nodes of each bus"
+            f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell "
+            f"configuration has it on bus {expected}: it is wired to the other bus, two amplifiers "
+            "have that node id, or both CAN interfaces are on one wire; `drivers.scan` shows the "
+            "nodes of each bus"
         )
         self.node_id = node_id
         self.expected = expected
@@ -163,7 +192,9 @@ class NodeMisplaced(DriverError):
 
 
 class NodeError(DriverError):
-    """One amplifier is not as expected; the reason has what was found, what was expected and what to do."""
+    """One amplifier is not as expected; the reason has what was found,
+    what was expected and what to do.
+    """
 
     def __init__(self, node: Node, reason: str) -> None:
         super().__init__(f"{node_label(node)}: {reason}")
@@ -201,7 +232,13 @@ class StateRefused(NodeError):
     """An NMT state (no statusword) or a CiA 402 state was not reached in time."""
 
     def __init__(
-        self, node: Node, asked: str, found: str, statusword: int | None = None, *, remedy: str | None = None
+        self,
+        node: Node,
+        asked: str,
+        found: str,
+        statusword: int | None = None,
+        *,
+        remedy: str | None = None,
     ) -> None:
         if statusword is None:
             shown = f"its heartbeat still says {found}"
@@ -224,9 +261,9 @@ class ParametersMixed(DriverError):
 
     def __init__(self, restored: tuple[str, ...], problems: tuple[str, ...]) -> None:
         super().__init__(
-            f"the write failed midway; the previous values are restored in {', '.join(restored) or 'no drive'}, and "
-            f"NOT confirmed where {'; '.join(problems)}; do not enable an axis before every drive has its previous "
-            "value again"
+            "the write failed midway; the previous values are restored in "
+            f"{', '.join(restored) or 'no drive'}, and NOT confirmed where {'; '.join(problems)}; "
+            "do not enable an axis before every drive has its previous value again"
         )
         self.restored = restored
         self.problems = problems
@@ -236,7 +273,12 @@ class DriveFault(NodeError):
     """A drive reported a fault, fell silent or sent unusable data while running."""
 
     def __init__(
-        self, node: Node, reason: str, statusword: int | None = None, emcy_code: int | None = None, remedy: str = ""
+        self,
+        node: Node,
+        reason: str,
+        statusword: int | None = None,
+        emcy_code: int | None = None,
+        remedy: str = "",
     ) -> None:
         advice = f"; {remedy}" if remedy else ""
         super().__init__(node, f"{reason}; stopping all axes, none is enabled again{advice}")
@@ -246,13 +288,19 @@ class DriveFault(NodeError):
 
 
 class SampleLost(DriverError):
-    """A SYNC cycle had no complete answer; `silent_s` is the time since any axis answered, where none does any more."""
+    """A SYNC cycle had no complete answer; `silent_s` is the time since any axis answered,
+    where none does any more.
+    """
 
-    def __init__(self, cycle: int, axes: tuple[int, ...], names: Sequence[str], silent_s: float | None = None) -> None:
+    def __init__(
+        self, cycle: int, axes: tuple[int, ...], names: Sequence[str], silent_s: float | None = None
+    ) -> None:
         if silent_s is None:
             text = f"no answer from {', '.join(names)}"
         else:
-            text = f"no axis answered within {silent_s:.3g} s; check the power of the cell and the bus"
+            text = (
+                f"no axis answered within {silent_s:.3g} s; check the power of the cell and the bus"
+            )
         super().__init__(f"cycle {cycle}: {text}")
         self.cycle = cycle
         self.axes = axes
@@ -274,7 +322,8 @@ class MotionRefused(DriverError):
 class MotionTimeout(DriverError):
     """A move did not end in time.
 
-    `acknowledge` is the value of statusword bit 12 where that did not come, `other_master` the description of one.
+    `acknowledge` is the value of statusword bit 12 where that did not come, `other_master` the
+    description of one.
     """
 
     def __init__(
@@ -292,16 +341,22 @@ class MotionTimeout(DriverError):
             remedy = "check brakes and limits, or use slower moves"
         elif acknowledge:
             found = "did not set statusword bit 12 (set-point acknowledge)"
-            remedy = "check that the drive is in profile position mode (6061h = 1) and accepts set-points by RPDO"
+            remedy = (
+                "check that the drive is in profile position mode (6061h = 1) and accepts "
+                "set-points by RPDO"
+            )
         else:
             found = "did not clear statusword bit 12 (set-point acknowledge)"
             remedy = (
-                "the drive still works on an earlier set-point: check that it is in profile position mode (6061h = 1) "
-                "and that nothing else gives it set-points; switch it off and on"
+                "the drive still works on an earlier set-point: check that it is in profile "
+                "position mode (6061h = 1) and that nothing else gives it set-points; switch it "
+                "off and on"
             )
         if other_master:
             found = f"{found}, and {other_master},"
             remedy = f"end the other program first; else {remedy}"
-        super().__init__(f"move {move}: {names} {found} within {waited_s:g} s; stopping all axes; {remedy}")
+        super().__init__(
+            f"move {move}: {names} {found} within {waited_s:g} s; stopping all axes; {remedy}"
+        )
         self.move = move
         self.axes = axes

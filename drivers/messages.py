@@ -11,18 +11,21 @@ from enum import Enum
 class Sample:
     """Reports of all axes for one SYNC.
 
-    Values are raw counts, converted late: the gain is to be identified, so the data contain no assumed gain.
+    Values are raw counts, converted late: the gain is to be identified, so the data contain no
+    assumed gain.
     """
 
-    cycle: int  #: number of the sampling period since the stream began; a period that had no SYNC leaves a gap
-    #: Time of the SYNC, not of the frames that answered it: wall time at the stream's first SYNC plus the monotonic
-    #: time since [ns since 1970].
+    #: number of the sampling period since the stream began; a period that had no SYNC leaves a gap
+    cycle: int
+    #: Time of the SYNC, not of the frames that answered it: wall time at the stream's first SYNC
+    #: plus the monotonic time since [ns since 1970].
     time_ns: int
     position_counts: tuple[int, ...]  #: motor-side position of each axis [encoder counts]
     #: Signal of the current loop of each axis [unit of the drive profile's current object].
     current_raw: tuple[int, ...]
     statusword: tuple[int, ...]  #: CiA 402 object 6041h of each axis
-    missing: int = 0  #: bit i is set when axis i did not answer this SYNC; its values then repeat the last known ones
+    #: bit i is set when axis i did not answer this SYNC; its values then repeat the last known ones
+    missing: int = 0
 
 
 class EventKind(Enum):
@@ -59,14 +62,17 @@ class CellEvent:
     time_ns: int  #: time of the SYNC before it [ns since 1970]
     axis: int | None  #: index of the axis from 0, or None for the whole cell
     kind: EventKind  #: of the event
-    #: By kind: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, bits
-    #: of the controller's state, number of frames, index of an object that is not logged any more.
+    #: By kind: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or
+    #: of the cycle, bits of the controller's state, number of frames, index of an object that is
+    #: not logged any more.
     code: int
     text: str  #: for the operator
 
 
 EventSink = Callable[[CellEvent], None]
-"""Receives events in the order in which they happen, before the sample of their cycle is returned."""
+"""Receives events in the order in which they happen,
+before the sample of their cycle is returned.
+"""
 
 
 class Quantity(Enum):

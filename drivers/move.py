@@ -16,7 +16,9 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class AxisLimits:
-    """Limits of one motor in its drive's counts: range of its targets, largest velocity and acceleration."""
+    """Limits of one motor in its drive's counts:
+    range of its targets, largest velocity and acceleration.
+    """
 
     position_min_counts: int
     position_max_counts: int
@@ -26,7 +28,9 @@ class AxisLimits:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One synchronised point-to-point move in profile position mode; an axis that does not move gets no profile."""
+    """One synchronised point-to-point move in profile position mode;
+    an axis that does not move gets no profile.
+    """
 
     target_counts: tuple[int, ...]  #: absolute, of each axis
     velocity_counts_s: tuple[int, ...]  #: profile of each axis (6081h)
@@ -63,12 +67,15 @@ class MotionPermission:
 
 
 def synchronised_move(
-    start_counts: Sequence[int], target_counts: Sequence[int], limits: Sequence[AxisLimits], dwell_cycles: int = 0
+    start_counts: Sequence[int],
+    target_counts: Sequence[int],
+    limits: Sequence[AxisLimits],
+    dwell_cycles: int = 0,
 ) -> Move:
     """Return the fastest move within the limits in which all axes start and end together.
 
-    Drives accept whole numbers only. The velocity is rounded up and the acceleration then chosen for the common
-    duration, so that the end times differ only by its rounding, on the ramp alone.
+    Drives accept whole numbers only. The velocity is rounded up and the acceleration then chosen
+    for the common duration, so that the end times differ only by its rounding, on the ramp alone.
 
     Raises:
         ValueError: a limit is not above 2 counts/s or counts/s².
@@ -89,11 +96,16 @@ def synchronised_move(
         ramp_s = path.duration_s - distance / velocity
         velocities.append(velocity)
         accelerations.append(max(1, round(velocity / ramp_s)) if distance > 0 else 1)
-    return Move(tuple(map(int, target_counts)), tuple(velocities), tuple(accelerations), dwell_cycles)
+    return Move(
+        tuple(map(int, target_counts)), tuple(velocities), tuple(accelerations), dwell_cycles
+    )
 
 
 def check_moves(
-    start_counts: Sequence[int], moves: Sequence[Move], permission: MotionPermission, names: Sequence[str]
+    start_counts: Sequence[int],
+    moves: Sequence[Move],
+    permission: MotionPermission,
+    names: Sequence[str],
 ) -> None:
     """Check all moves against the permission before anything moves.
 
@@ -103,7 +115,10 @@ def check_moves(
     if not permission.granted_by.strip():
         raise MotionRefused("the permission names no operator: set granted_by")
     if len(permission.limits) != len(names):
-        raise MotionRefused(f"the permission has limits for {len(permission.limits)} axes, the cell has {len(names)}")
+        raise MotionRefused(
+            f"the permission has limits for {len(permission.limits)} axes, the cell has "
+            f"{len(names)}"
+        )
 
     def check_positions(event: str, positions: Sequence[int]) -> None:
         for name, position, limit in zip(names, positions, permission.limits, strict=True):
@@ -117,7 +132,9 @@ def check_moves(
         where = f"move {number}"
         profiles = (move.target_counts, move.velocity_counts_s, move.acceleration_counts_s2)
         if any(len(column) != len(names) for column in profiles):
-            raise MotionRefused(f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes")
+            raise MotionRefused(
+                f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes"
+            )
         if move.dwell_cycles < 0:
             raise MotionRefused(f"{where}: dwells for {move.dwell_cycles} cycles")
         check_positions(f"{where} goes to", move.target_counts)
@@ -130,7 +147,8 @@ def check_moves(
             ):
                 if not 0 < value <= allowed:
                     raise MotionRefused(
-                        f"{where}: {names[axis]}: {quantity} {value}, allowed is above 0 up to {allowed:g}"
+                        f"{where}: {names[axis]}: {quantity} {value}, allowed is above 0 up to "
+                        f"{allowed:g}"
                     )
         here = move.target_counts
 
@@ -139,8 +157,9 @@ def check_moves(
 class Trapezoid:
     """One move of n axes with a trapezoidal velocity profile.
 
-    Every axis accelerates for ``ramp_s``, cruises, and decelerates for ``ramp_s``; because the ramps are shared, any
-    linear combination of axes (a coupled motor) moves on a trapezoid of the same times.
+    Every axis accelerates for ``ramp_s``, cruises, and decelerates for ``ramp_s``; because the
+    ramps are shared, any linear combination of axes (a coupled motor) moves on a trapezoid of the
+    same times.
     """
 
     start: FloatArray  #: first position [any unit], shape (n,)
@@ -152,25 +171,43 @@ class Trapezoid:
     def velocity(self) -> FloatArray:
         """Signed cruise velocity of each axis [unit/s], shape (n,)."""
         cruise_s = self.duration_s - self.ramp_s
-        return (self.end - self.start) / cruise_s if cruise_s > 0 else np.zeros_like(self.start)
+        if cruise_s > 0:
+            return (self.end - self.start) / cruise_s
+        return np.zeros_like(self.start)
 
     @property
     def acceleration(self) -> FloatArray:
         """Signed acceleration of the first ramp of each axis [unit/s²], shape (n,)."""
-        return self.velocity / self.ramp_s if self.ramp_s > 0 else np.zeros_like(self.start)
+        if self.ramp_s > 0:
+            return self.velocity / self.ramp_s
+        return np.zeros_like(self.start)
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Position, velocity and acceleration at the given times, each of shape (len(time_s), n)."""
+        """Position, velocity and acceleration at the given times, each of shape (len(time_s),
+        n).
+        """
         t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)[:, None]
         rising = np.minimum(t, self.ramp_s)
         falling = np.maximum(t - (self.duration_s - self.ramp_s), 0.0)
         acceleration = self.acceleration
         velocity = self.velocity
-        distance = 0.5 * acceleration * rising**2 + velocity * (t - rising) - 0.5 * acceleration * falling**2
+        distance = (
+            0.5 * acceleration * rising**2
+            + velocity * (t - rising)
+            - 0.5 * acceleration * falling**2
+        )
         speed = acceleration * (rising - falling)
-        inside = (np.asarray(time_s)[:, None] >= 0.0) & (np.asarray(time_s)[:, None] < self.duration_s)
-        phase = np.where(t < self.ramp_s, 1.0, 0.0) - np.where(t > self.duration_s - self.ramp_s, 1.0, 0.0)
-        return self.start + distance, np.where(inside, speed, 0.0), np.where(inside, acceleration * phase, 0.0)
+        inside = (np.asarray(time_s)[:, None] >= 0.0) & (
+            np.asarray(time_s)[:, None] < self.duration_s
+        )
+        phase = np.where(t < self.ramp_s, 1.0, 0.0) - np.where(
+            t > self.duration_s - self.ramp_s, 1.0, 0.0
+        )
+        return (
+            self.start + distance,
+            np.where(inside, speed, 0.0),
+            np.where(inside, acceleration * phase, 0.0),
+        )
 
 
 def synchronised(
@@ -180,14 +217,17 @@ def synchronised(
 
     Args:
         start, end: positions, shape (n,).
-        velocity_limit, acceleration_limit: positive limits in the same unit per s and s², shape (n,).
+        velocity_limit, acceleration_limit: positive limits in the same unit per s and s², shape
+            (n,).
 
     Raises:
         ValueError: a limit is not positive.
     """
     limits = np.array([velocity_limit, acceleration_limit], dtype=np.float64)
     if np.any(limits <= 0):
-        raise ValueError(f"limits must be positive, found {velocity_limit!r} and {acceleration_limit!r}")
+        raise ValueError(
+            f"limits must be positive, found {velocity_limit!r} and {acceleration_limit!r}"
+        )
     start = np.asarray(start, dtype=np.float64)
     end = np.asarray(end, dtype=np.float64)
     distance = np.abs(end - start)

@@ -19,7 +19,8 @@ def main() -> None:
     found = identify_gains()
     calibration = ident.calibration_of(found, ("J1", "J2", "J3"), NAMEPLATE_NM_A)
 
-    # A swing of 60 degrees and back in two seconds: q, dq/dt and d²q/dt², shape (n_samples, n_axes).
+    # A swing of 60 degrees and back in two seconds: q, dq/dt and d²q/dt², shape (n_samples,
+    # n_axes).
     time_s = np.arange(0.0, 2.0, 1.0 / RATE_HZ)[:, None]
     swing_rad, rate = np.radians([60.0, 60.0, 60.0]), np.pi
     motion = ident.Motion(
@@ -27,7 +28,8 @@ def main() -> None:
         swing_rad * rate * np.sin(rate * time_s) / 2.0,
         swing_rad * rate**2 * np.cos(rate * time_s) / 2.0,
     )
-    # The mass is known from the scale, and with the rest of the payload's inertia part of the calibration by now.
+    # The mass is known from the scale, and with the rest of the payload's inertia part of the
+    # calibration by now.
     for payload in (None, DISC):
         planned = ident.planned(motion, RATE_HZ, payload)
         current_a = ident.predict_current(calibration, found.model, planned)

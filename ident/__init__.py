@@ -12,14 +12,16 @@ From recordings to gains::
     found = ident.identify(model, [bare, loaded])
     print(found.estimate.gains, found.estimate.gains_std)
 
-Arrays over time have the shape (n_samples, n_axes) everywhere: in `Run`, `Motion` and `Dataset`, and in what
-`predict_torque` and `predict_current` return. Columns of the equations (`Model.regressor`, `Observation`) put the joint
-first and time last. Units are SI and in the names; a prismatic axis has m for rad and N for Nm.
+Arrays over time have the shape (n_samples, n_axes) everywhere: in `Run`, `Motion` and `Dataset`,
+and in what `predict_torque` and `predict_current` return. Columns of the equations
+(`Model.regressor`, `Observation`) put the joint first and time last. Units are SI and in the names;
+a prismatic axis has m for rad and N for Nm.
 
-`GrowingFit` follows a recording while it goes on: gains ± σ after each move, or why nothing fixes them yet.
-`find_effects` looks for torques that the declared model lacks, in the rows that `gather` collects; an `Effect` of your
-own is one class. `calibration_of` makes the `Calibration` with which `predict_torque`, `predict_current`, `weigh` and
-`external_torque` work. Errors are `IdentificationError` and its kinds in `ident.errors`.
+`GrowingFit` follows a recording while it goes on: gains ± σ after each move, or why nothing fixes
+them yet. `find_effects` looks for torques that the declared model lacks, in the rows that `gather`
+collects; an `Effect` of your own is one class. `calibration_of` makes the `Calibration` with which
+`predict_torque`, `predict_current`, `weigh` and `external_torque` work. Errors are
+`IdentificationError` and its kinds in `ident.errors`.
 """
 
 from __future__ import annotations
@@ -148,6 +150,7 @@ if TYPE_CHECKING:  # the names of a module stand together
     from ident.model.robot import (
         Closure as Closure,
         Joint as Joint,
+        JointCoupling as JointCoupling,
         JointKind as JointKind,
         Motion as Motion,
         Pivot as Pivot,

@@ -23,50 +23,75 @@ Result = TypeVar("Result")
 
 
 def as_array(
-    label: str, values: object, shape: tuple[int, ...] = (), meaning: str = "", refuse: Refusal = ModelError
+    label: str,
+    values: object,
+    shape: tuple[int, ...] = (),
+    meaning: str = "",
+    refuse: Refusal = ModelError,
 ) -> FloatArray:
-    """Convert an argument to finite numbers of a shape, any if empty; otherwise raise what ``refuse`` makes."""
+    """Convert an argument to finite numbers of a shape, any if empty;
+    otherwise raise what ``refuse`` makes.
+    """
     if values is not None:
         require_real(label, values, refuse, str(shape or "real numbers"))
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise refuse(f"{label} is no array of numbers: {error}; expected {shape or 'numbers'}") from error
+        raise refuse(
+            f"{label} is no array of numbers: {error}; expected {shape or 'numbers'}"
+        ) from error
     if shape and array.shape != shape:
-        turned = "; transpose it?" if array.shape == shape[::-1] else ""
+        if array.shape == shape[::-1]:
+            turned = "; transpose it?"
+        else:
+            turned = ""
         raise refuse(f"{label} has shape {array.shape}; expected {shape}, {meaning}{turned}")
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         if array.ndim == 0:
             raise refuse(f"{label} is {values!r}; expected an array of numbers")
         first = f"sample {bad[0][0]}" + (f", axis {bad[0][1] + 1}" if array.ndim > 1 else "")
-        raise refuse(f"{label} holds {len(bad)} non-finite values, the first in {first}; give numbers")
+        raise refuse(
+            f"{label} holds {len(bad)} non-finite values, the first in {first}; give numbers"
+        )
     return array
 
 
-def require_real(label: str, values: object, refuse: Refusal, expected: str = "real numbers") -> None:
-    """Refuse what numpy would convert to real numbers with a loss, or without a word: complex, masked, text."""
+def require_real(
+    label: str, values: object, refuse: Refusal, expected: str = "real numbers"
+) -> None:
+    """Refuse what numpy would convert to real numbers with a loss, or without a word:
+    complex, masked, text.
+    """
     if np.ma.isMaskedArray(values):
         masked = int(np.count_nonzero(np.ma.getmaskarray(values)))
         if masked:
             remedy = "fill them, or mark them in `Run.valid`: `array.filled(...)`"
-            raise refuse(f"{label} is a masked array with {masked} masked values; expected numbers; {remedy}")
+            raise refuse(
+                f"{label} is a masked array with {masked} masked values; expected numbers; {remedy}"
+            )
     try:
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
         raise refuse(
-            f"{label} is no array of numbers: {error}; expected {expected}; give each row one length"
+            f"{label} is no array of numbers: {error}; expected {expected}; give each row "
+            "one length"
         ) from error
     if array.dtype.kind == "c":
         raise refuse(
-            f"{label} is of complex numbers ({array.dtype}); expected real ones; give their real part: `.real`"
+            f"{label} is of complex numbers ({array.dtype}); expected real ones; give their real "
+            "part: `.real`"
         )
     if array.dtype.kind in "SUmM":
         remedy = "convert it first: `.astype(float)`"
-        raise refuse(f"{label} is no array of numbers: its type is {array.dtype}; expected {expected}; {remedy}")
+        raise refuse(
+            f"{label} is no array of numbers: its type is {array.dtype}; expected "
+            f"{expected}; {remedy}"
+        )
     if array.dtype.kind != "O":
         return
-    # Data frames with columns of several types give such arrays; numbers in them are as good as any.
+    # Data frames with columns of several types give such arrays; numbers in them are as good as
+    # any.
     for value in array.ravel():
         if not isinstance(value, Real):
             found = f"it holds {value!r:.60} of type {type(value).__name__}"
@@ -77,7 +102,9 @@ def require_real(label: str, values: object, refuse: Refusal, expected: str = "r
 def require_kind(label: str, value: object, kind: type, remedy: str) -> None:
     """Refuse an argument of another type, as a `ModelError`."""
     if not isinstance(value, kind):
-        raise ModelError(f"{label} is of type {type(value).__name__}; expected {kind.__name__}; {remedy}")
+        raise ModelError(
+            f"{label} is of type {type(value).__name__}; expected {kind.__name__}; {remedy}"
+        )
 
 
 def require_names(label: str, names: object, count: int | None = None) -> None:
@@ -86,29 +113,44 @@ def require_names(label: str, names: object, count: int | None = None) -> None:
     A single text would count as one name a letter.
     """
     if isinstance(names, str):
-        raise ModelError(f"{label} is the text {names!r:.60}; expected a list of names; write [{names!r:.60}]")
+        raise ModelError(
+            f"{label} is the text {names!r:.60}; expected a list of names; write [{names!r:.60}]"
+        )
     require_entries(label, names, str, "give a list of names: ['J1', 'J2']")
     given = list(names)  # type: ignore[call-overload]
     if count is not None and len(given) != count:
-        raise ModelError(f"{label} has {len(given)} names; expected {count}, one for each axis; found {given}")
+        raise ModelError(
+            f"{label} has {len(given)} names; expected {count}, one for each axis; found {given}"
+        )
     if label == "axes" and len(set(given)) < len(given):
         raise ModelError(f"axes are {', '.join(given)}; expected another name for each; rename one")
 
 
 def require_entries(label: str, values: object, kind: type, remedy: str) -> None:
-    """Refuse a list whose entries are of another type, as a `ModelError`; an iterator is not looked into."""
+    """Refuse a list whose entries are of another type, as a `ModelError`;
+    an iterator is not looked into.
+    """
     require_kind(label, values, Iterable, remedy)
     if isinstance(values, (Sequence, np.ndarray)):
         for value in values:
             require_kind(f"an entry of {label}", value, kind, remedy)
 
 
-def require_number(label: str, value: object, *, above: float = -np.inf, remedy: str = "give a number") -> float:
-    """Return an argument that is one finite number above a bound, as a float; refuse others, as a `ModelError`."""
+def require_number(
+    label: str, value: object, *, above: float = -np.inf, remedy: str = "give a number"
+) -> float:
+    """Return an argument that is one finite number above a bound, as a float;
+    refuse others, as a `ModelError`.
+    """
     is_number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
-    bound = "a finite number" if above == -np.inf else f"a finite number above {above:g}"
+    if above == -np.inf:
+        bound = "a finite number"
+    else:
+        bound = f"a finite number above {above:g}"
     if not is_number:
-        raise ModelError(f"{label} is {value!r:.60} of type {type(value).__name__}; expected {bound}; {remedy}")
+        raise ModelError(
+            f"{label} is {value!r:.60} of type {type(value).__name__}; expected {bound}; {remedy}"
+        )
     number = float(value)  # type: ignore[arg-type]  # isinstance does not narrow through the name above
     if not above < number < np.inf:
         raise ModelError(f"{label} is {number:g}; expected {bound}; {remedy}")
@@ -116,18 +158,25 @@ def require_number(label: str, value: object, *, above: float = -np.inf, remedy:
 
 
 def require_count(label: str, value: object, *, remedy: str = "give a number such as 0") -> int:
-    """Return an argument that is a whole number, zero or above; refuse others, as a `ModelError`."""
+    """Return an argument that is a whole number, zero or above;
+    refuse others, as a `ModelError`.
+    """
     is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not is_whole or value < 0:  # type: ignore[operator]
-        raise ModelError(f"{label} is {value!r:.60}; expected a whole number, zero or above; {remedy}")
+        raise ModelError(
+            f"{label} is {value!r:.60}; expected a whole number, zero or above; {remedy}"
+        )
     return int(value)  # type: ignore[call-overload, no-any-return]
 
 
-def takes(**kinds: type | UnionType) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+def takes(
+    **kinds: type | UnionType,
+) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
     """Make a function refuse arguments of another type by name, as a `ModelError`, before it runs.
 
     Args:
-        kinds: of the arguments by their names; others are not looked at. An argument that is left out is not, either.
+        kinds: of the arguments by their names; others are not looked at. An argument that is left
+            out is not, either.
     """
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -137,7 +186,9 @@ def takes(**kinds: type | UnionType) -> Callable[[Callable[Arguments, Result]], 
         def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             for name, value in signature.bind(*args, **kwargs).arguments.items():
                 if name in kinds and not isinstance(value, kinds[name]):
-                    raise ModelError(_of_another_kind(function.__name__, name, value, kinds[name], signature))
+                    raise ModelError(
+                        _of_another_kind(function.__name__, name, value, kinds[name], signature)
+                    )
             return function(*args, **kwargs)
 
         return checked
@@ -150,7 +201,9 @@ def _of_another_kind(
 ) -> str:
     expected = kind.__name__ if isinstance(kind, type) else str(kind)
     found = f"{name} of {function} is of type {type(value).__name__}"
-    return f"{found}; expected {_short(expected)}; call {function}({', '.join(signature.parameters)})"
+    return (
+        f"{found}; expected {_short(expected)}; call {function}({', '.join(signature.parameters)})"
+    )
 
 
 def _short(kind: str) -> str:

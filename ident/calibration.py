@@ -1,4 +1,6 @@
-"""The calibration: drive gains with their uncertainty, parameters, effects and where all of it came from."""
+"""The calibration: drive gains with their uncertainty, parameters,
+effects and where all of it came from.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,10 @@ if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.estimators.estimate import Identification
 
 EXTRAPOLATED = 1.5
-"""Times the largest torque of an effect in the fit that it may have in a prediction: a power of the speed or of the
-current grows without end where nothing was recorded. Samples differ from the filtered rows of a fit by less."""
+"""Times the largest torque of an effect in the fit that it may have in a prediction: a power of the
+speed or of the current grows without end where nothing was recorded. Samples differ from the
+filtered rows of a fit by less.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +65,18 @@ class Parameter:
 
     @property
     def is_payload_friction(self) -> bool:
-        """Whether it is, or leads with, what a payload adds to friction (`Model.friction_by_payload`)."""
+        """Whether it is, or leads with, what a payload adds to friction
+        (`Model.friction_by_payload`).
+        """
         is_of_robot = ":" not in self.name  # behind a colon is the mounting of a payload
         return is_of_robot and self.name.split(" ", 1)[0].endswith(LOADED)
 
     @property
     def std_percent(self) -> float:
         """Relative standard deviation (eq. 11) [%]; inf for a value of zero."""
-        return 100.0 * self.std / abs(self.value) if self.value else float("inf")
+        if self.value:
+            return 100.0 * self.std / abs(self.value)
+        return float("inf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,27 +87,32 @@ class AcceptedEffect:
     axis: str  #: name of the axis, of a joint without a motor, or of all axes together
     settings: dict[str, float]  #: the searched (non-linear) parameters by name, units in the names
     coefficients: tuple[Parameter, ...]  #: the linear parameters, identified
-    #: Error without the effect on data that the fit did not use [%]: of the axis's joint torque on held-out runs (in
-    #: total for an effect on all motors, for a correction of the description, or on a joint without a motor); without
-    #: such runs, of the most affected motor's current on left-out moves.
+    #: Error without the effect on data that the fit did not use [%]: of the axis's joint torque on
+    #: held-out runs (in total for an effect on all motors, for a correction of the description, or
+    #: on a joint without a motor); without such runs, of the most affected motor's current on
+    #: left-out moves.
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
-    ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
-    #: Largest torque of the effect on the rows of the fit, at each axis [Nm; N]: no more was ever seen of it, and a
-    #: prediction takes no more than EXTRAPOLATED times as much. None of an effect whose torque is a rate, which is far
-    #: larger in a sample than in a filtered row, and in calibrations of earlier versions.
+    #: families whose held-out score does not differ from this one's
+    ambiguity: tuple[str, ...] = ()
+    #: Largest torque of the effect on the rows of the fit, at each axis [Nm; N]: no more was ever
+    #: seen of it, and a prediction takes no more than EXTRAPOLATED times as much. None of an effect
+    #: whose torque is a rate, which is far larger in a sample than in a filtered row, and in
+    #: calibrations of earlier versions.
     largest_torque: tuple[float, ...] | None = None
-    #: Of a correction of the robot's description: the number that it corrects, as the fit found it described (the zero
-    #: offset of the axis [rad; m], or gravity [m/s²]). None of other effects, where nothing in the description is
-    #: corrected, and in calibrations of earlier versions.
+    #: Of a correction of the robot's description: the number that it corrects, as the fit found it
+    #: described (the zero offset of the axis [rad; m], or gravity [m/s²]). None of other effects,
+    #: where nothing in the description is corrected, and in calibrations of earlier versions.
     described: tuple[float, ...] | None = None
-    #: Name and version of the package that has the effect, or its module where no package has it: `module my_effects`.
-    #: None of an effect that drivegain ships.
+    #: Name and version of the package that has the effect, or its module where no package has it:
+    #: `module my_effects`. None of an effect that drivegain ships.
     package: str | None = None
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether it does not raise the error on data that the fit did not use, by more than SAME_ERROR of it."""
+        """Whether it does not raise the error on data that the fit did not use,
+        by more than SAME_ERROR of it.
+        """
         return self.error_after_percent <= (1.0 + SAME_ERROR) * self.error_before_percent
 
 
@@ -109,8 +122,10 @@ class MassInfluence:
 
     axis: str  #: name of the axis
     per_kg: float  #: dg/dm [unit of the gain per kg]
-    percent_per_percent: float  #: d ln g/d ln m: change of the gain [%] with a mass that is wrong by 1 %
-    tolerance_std: float  #: |dg/dm| times the tolerance of the mass [unit of the gain]; it is not in the gain's σ
+    #: d ln g/d ln m: change of the gain [%] with a mass that is wrong by 1 %
+    percent_per_percent: float
+    #: |dg/dm| times the tolerance of the mass [unit of the gain]; it is not in the gain's σ
+    tolerance_std: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +136,8 @@ class PayloadMass:
     mass_kg: float  #: as the fit took it for known
     tolerance_kg: float  #: declared tolerance of the weighing, 0 where none is declared
     gains: tuple[MassInfluence, ...]  #: one an axis
-    #: Derivative of each of the calibration's parameters to the mass [its unit per kg], in their order; empty in
-    #: calibrations of earlier versions.
+    #: Derivative of each of the calibration's parameters to the mass [its unit per kg], in their
+    #: order; empty in calibrations of earlier versions.
     parameters_per_kg: tuple[float, ...] = ()
 
     @classmethod
@@ -144,7 +159,9 @@ class PayloadMass:
 
     def weighed_to(self, tolerance_kg: float) -> PayloadMass:
         """Return the same with the tolerance of the weighing."""
-        influences = tuple(replace(one, tolerance_std=abs(one.per_kg) * tolerance_kg) for one in self.gains)
+        influences = tuple(
+            replace(one, tolerance_std=abs(one.per_kg) * tolerance_kg) for one in self.gains
+        )
         return replace(self, tolerance_kg=tolerance_kg, gains=influences)
 
 
@@ -154,9 +171,11 @@ class GeometryCorrection:
 
     kind: str  #: `zero` of a joint, `length` of a link, or `place` of a joint on the base
     joint: str  #: name of the joint with the zero, on the base, or of the one that moves the link
-    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x, y or z.
+    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x,
+    #: y or z.
     end: str
-    described: float  #: as the fit found it described: the zero offset, the length, or the coordinate [unit]
+    #: as the fit found it described: the zero offset, the length, or the coordinate [unit]
+    described: float
     change: float  #: what has to be added to it [unit]
     std: float  #: σ of the change [unit]
     unit: str  #: rad or m
@@ -164,18 +183,25 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, slots=True)
 class EncoderMisfit:
-    """How well the encoders of a robot with more of them than degrees of freedom fit its loops, and why not better."""
+    """How well the encoders of a robot with more of them than degrees of freedom fit its loops,
+    and why not better.
+    """
 
     described: float  #: root mean square of the misfit with the described geometry [unit]
-    left: float  #: the same with the explanation; without any, with all zeros and lengths that fit best [unit]
+    #: the same with the explanation; without any, with all zeros and lengths that fit best [unit]
+    left: float
     unit: str  #: rad; with prismatic axes `rad or robot size`
     significant: bool  #: the described one is more than noise makes
-    #: The fewest numbers that explain it; empty without an explanation, and where late encoders explain it.
+    #: The fewest numbers that explain it; empty without an explanation, and where late encoders
+    #: explain it.
     corrections: tuple[GeometryCorrection, ...]
-    applied: bool  #: the gains and parameters of the calibration are those of the corrected geometry
-    alternatives: tuple[str, ...] = ()  #: other explanations that these positions cannot distinguish from it
+    #: the gains and parameters of the calibration are those of the corrected geometry
+    applied: bool
+    #: other explanations that these positions cannot distinguish from it
+    alternatives: tuple[str, ...] = ()
     unobservable: tuple[str, ...] = ()  #: directions of zeros and lengths that no position shows
-    noise: float | None = None  #: of the encoders, likewise [unit]; None in calibrations of earlier versions
+    #: of the encoders, likewise [unit]; None in calibrations of earlier versions
+    noise: float | None = None
     late_encoders: str = ""  #: the explanation, in words, where an encoder is late; empty elsewhere
 
 
@@ -186,12 +212,14 @@ class Source:
     name: str  #: of the log
     sha256: str  #: its digest
     role: str  #: use of the log, `fit` or `holdout`; not whether a payload was mounted
-    #: It is what was saved of a recording that was never finished, or one with losses; nothing of it may reach a
-    #: controller.
+    #: It is what was saved of a recording that was never finished, or one with losses; nothing of
+    #: it may reach a controller.
     partial: bool = False
-    payload: str | None = None  #: name of what was mounted; None without load, and in calibrations of earlier versions
+    #: name of what was mounted; None without load, and in calibrations of earlier versions
+    payload: str | None = None
     mass_kg: float | None = None  #: of it, as fitted; None where it was not declared
-    recording: Recording | None = None  #: how the log was made; None in calibrations of earlier versions
+    #: how the log was made; None in calibrations of earlier versions
+    recording: Recording | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +233,9 @@ class CalibratedJoint:
 
 @dataclass(frozen=True, slots=True)
 class CalibratedDrive:
-    """A drive of the robot that a calibration is of; None for a number that its description leaves open."""
+    """A drive of the robot that a calibration is of;
+    None for a number that its description leaves open.
+    """
 
     axis: str  #: name of the axis
     node_id: int | None
@@ -215,9 +245,12 @@ class CalibratedDrive:
 
 @dataclass(frozen=True, slots=True)
 class CalibratedRobot:
-    """The robot that a calibration is of: what tells it from another one of the same name and axes."""
+    """The robot that a calibration is of:
+    what tells it from another one of the same name and axes.
+    """
 
-    kinematics_sha256: str  #: of joints, their kinds and order, and the motors of a closed chain, hex; as in a plan
+    #: of joints, their kinds and order, and the motors of a closed chain, hex; as in a plan
+    kinematics_sha256: str
     drives_sha256: str  #: of node id, vendor and product code of each axis, hex; as in a plan
     joints: tuple[CalibratedJoint, ...]  #: that move, in the order of the description
     drives: tuple[CalibratedDrive, ...]  #: one an axis
@@ -235,43 +268,54 @@ class Calibration:
     parameters: tuple[Parameter, ...]
     effects: tuple[AcceptedEffect, ...]  #: accepted effects
     relative_error_percent: RelativeError  #: on the data of the fit
-    #: On a run that no fit has seen, None where there was none; NaN for an axis that did not move in it. It has judged
-    #: the effects that a search found.
+    #: On a run that no fit has seen, None where there was none; NaN for an axis that did not move
+    #: in it. It has judged the effects that a search found.
     holdout_error_percent: RelativeError | None
     condition: float  #: of the weighted observation matrix
     rows: int  #: of the observation after masks and decimation
-    filter: dict[str, float | list[float]]  #: cut-offs, orders, decimation and standstill speeds, by name
+    #: cut-offs, orders, decimation and standstill speeds, by name
+    filter: dict[str, float | list[float]]
     sources: tuple[Source, ...]  #: logs, with digests and roles
     configuration_sha256: str  #: of the cell configuration that the logs carry
     created: str  #: ISO 8601 time, given by the caller
     software: str  #: name and version that made it
-    #: When the first run of the fit began, by the clock of `Run.started_s`; None where a run has no clock.
+    #: When the first run of the fit began, by the clock of `Run.started_s`; None where a run has no
+    #: clock.
     session_began_s: float | None = None
-    #: On the held-out run, of the same model, effects included, fitted with the nameplate gains; the total weighs the
-    #: axes by the torques under the identified gains. None where there is none to compare.
+    #: On the held-out run, of the same model, effects included, fitted with the nameplate gains;
+    #: the total weighs the axes by the torques under the identified gains. None where there is none
+    #: to compare.
     nameplate_holdout_error_percent: RelativeError | None = None
-    #: Digest of the part of the configuration that a recording depends on; None in calibrations of earlier versions.
+    #: Digest of the part of the configuration that a recording depends on; None in calibrations of
+    #: earlier versions.
     recording_configuration_sha256: str | None = None
-    #: Lower triangle L of the covariance L Lᵀ of (gains, parameters), a row each; None in calibrations of earlier
-    #: versions, and of an estimate without σ.
+    #: Lower triangle L of the covariance L Lᵀ of (gains, parameters), a row each; None in
+    #: calibrations of earlier versions, and of an estimate without σ.
     covariance_factor: tuple[tuple[float, ...], ...] | None = None
-    diagnoses: tuple[Diagnosis, ...] = ()  #: what was wrong with the recordings or the fit, by run and axis
-    #: Root mean square of what is left of each motor's current on the held-out run, filtered as in the fit [A, or the
-    #: unit of the gains' current]; of the fit for a motor that did not move there. None in earlier versions.
+    #: what was wrong with the recordings or the fit, by run and axis
+    diagnoses: tuple[Diagnosis, ...] = ()
+    #: Root mean square of what is left of each motor's current on the held-out run, filtered as in
+    #: the fit [A, or the unit of the gains' current]; of the fit for a motor that did not move
+    #: there. None in earlier versions.
     current_residual: tuple[float, ...] | None = None
-    #: Joints of a closed chain without a motor, then the pivots that its loops are cut at: effects can act there, too.
+    #: Joints of a closed chain without a motor, then the pivots that its loops are cut at: effects
+    #: can act there, too.
     passive_joints: tuple[str, ...] = ()
-    #: How the gains depend on the mass of each payload whose mass is known; empty for fixed gains, and in calibrations
-    #: of earlier versions.
+    #: How the gains depend on the mass of each payload whose mass is known; empty for fixed gains,
+    #: and in calibrations of earlier versions.
     payload_mass: tuple[PayloadMass, ...] = ()
-    #: Of a robot with more encoders than degrees of freedom; None for others, and in calibrations of earlier versions.
+    #: Of a robot with more encoders than degrees of freedom; None for others, and in calibrations
+    #: of earlier versions.
     encoder_misfit: EncoderMisfit | None = None
-    #: All standard parameters under a prior; None where none was asked for, and in calibrations of earlier versions.
+    #: All standard parameters under a prior; None where none was asked for, and in calibrations of
+    #: earlier versions.
     full_parameters: FullSet | None = None
-    #: The robot that it is of; None of arrays, where nothing describes it, and in calibrations of earlier versions.
+    #: The robot that it is of; None of arrays, where nothing describes it, and in calibrations of
+    #: earlier versions.
     robot: CalibratedRobot | None = None
-    #: Effects of one's own that were given as an argument, one of each name or more: predictions find them here. No
-    #: file has them; give them again to `daq.load_calibration`. An installed package needs no argument.
+    #: Effects of one's own that were given as an argument, one of each name or more: predictions
+    #: find them here. No file has them; give them again to `daq.load_calibration`. An installed
+    #: package needs no argument.
     own_effects: tuple[Effect, ...] = field(default=(), compare=False, repr=False)
 
     @property
@@ -300,7 +344,8 @@ class Calibration:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Covariance of (gains, parameters), shape (m + p, m + p); None where the calibration has none.
+        """Covariance of (gains, parameters), shape (m + p, m + p);
+        None where the calibration has none.
 
         Raises:
             ModelError: its factor has another shape.
@@ -310,9 +355,10 @@ class Calibration:
         size = len(self.gains) + len(self.parameters)
         if [len(row) for row in self.covariance_factor] != list(range(1, size + 1)):
             raise ModelError(
-                f"covariance_factor of the calibration of cell {self.cell!r} has {len(self.covariance_factor)} rows; "
-                f"expected {size} of one to {size} entries, for {len(self.gains)} gains and {len(self.parameters)} "
-                "parameters: fit the logs again"
+                f"covariance_factor of the calibration of cell {self.cell!r} has "
+                f"{len(self.covariance_factor)} rows; expected {size} of one to {size} entries, "
+                f"for {len(self.gains)} gains and {len(self.parameters)} parameters: fit the logs "
+                "again"
             )
         lower = np.zeros((size, size))
         lower[np.tril_indices(size)] = np.concatenate(self.covariance_factor)
@@ -338,10 +384,12 @@ def calibration_of(
         nameplate: gains by the data sheet, one an axis.
         units: of each gain; Nm/A where it is left out.
         robot: name of the robot or cell.
-        steps: by `ident.find_effects`: the calibration is that of the last one, with the effects that it holds.
+        steps: by `ident.find_effects`: the calibration is that of the last one, with the effects
+            that it holds.
 
     Raises:
-        ModelError: there is not one name, nameplate gain and unit for each axis, or the effects come without steps.
+        ModelError: there is not one name, nameplate gain and unit for each axis, or the effects
+            come without steps.
     """
     # Reading a calibration needs no effects and no estimator.
     from ident.effects.signals import session_began_s  # noqa: PLC0415
@@ -355,33 +403,43 @@ def calibration_of(
     require_kind("steps", steps, Sequence, "give the result of ident.find_effects")
 
     last = steps[-1].after if steps else None
-    start, found = found, found if last is None else last.identification
+    start = found
+    found = found if last is None else last.identification
     if last is None and len(found.system.columns) > len(found.system.base.names):
-        effect = f"the identification holds {found.system.columns[-1].name!r}, a parameter of an effect"
+        effect = (
+            f"the identification holds {found.system.columns[-1].name!r}, a parameter of an effect"
+        )
         raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
     nameplate_gains = np.atleast_1d(as_array("nameplate", nameplate))
     if nameplate_gains.ndim != 1 or not nameplate_gains.all():
         raise ModelError(
-            f"nameplate is {nameplate_gains.tolist()}; expected one gain per axis, none of them zero: take them from "
-            "the data sheet, or the identified ones"
+            f"nameplate is {nameplate_gains.tolist()}; expected one gain per axis, none of them "
+            "zero: take them from the data sheet, or the identified ones"
         )
     units = units or ("Nm/A",) * len(axes)
     if not len(axes) == len(nameplate_gains) == len(units) == len(estimate.gains):
         raise ModelError(
-            f"{len(axes)} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} units for "
-            f"{len(estimate.gains)} identified gains; expected one of each for each axis"
+            f"{len(axes)} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} "
+            f"units for {len(estimate.gains)} identified gains; expected one of each for each axis"
         )
     parameters = tuple(
         Parameter(column.name, float(value + column.about), float(std), column.unit)
-        for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+        for column, value, std in zip(
+            estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True
+        )
     )
     identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate_gains, strict=True)
-    gains = tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in identified)
+    gains = tuple(
+        Gain(axis, float(g), float(std), unit, float(entered))
+        for axis, g, std, unit, entered in identified
+    )
     responses = mass_responses(found.system, estimate)
     tolerance_kg: dict[str, float] = {}
     for payload in found.system.payloads:
-        tolerance_kg[payload.name] = max(payload.mass_tolerance_kg, tolerance_kg.get(payload.name, 0.0))
+        tolerance_kg[payload.name] = max(
+            payload.mass_tolerance_kg, tolerance_kg.get(payload.name, 0.0)
+        )
     undriven = found.model.robot.undriven_names
     places = (*axes, *undriven)
     return Calibration(
@@ -389,14 +447,22 @@ def calibration_of(
         method=estimate.method.value,
         gains=gains,
         parameters=parameters,
-        effects=() if last is None else tuple(_accepted(start, steps, one, places, parameters) for one in last.effects),
+        effects=()
+        if last is None
+        else tuple(_accepted(start, steps, one, places, parameters) for one in last.effects),
         relative_error_percent=found.training_error,
         holdout_error_percent=found.holdout_error,
         condition=estimate.condition,
         rows=estimate.rows,
         filter=found.conditioning.document(),
         sources=tuple(
-            Source(", ".join(found.system.runs), "", "fit", payload=payload.name, mass_kg=payload.known.get("m"))
+            Source(
+                ", ".join(found.system.runs),
+                "",
+                "fit",
+                payload=payload.name,
+                mass_kg=payload.known.get("m"),
+            )
             for payload in found.system.payloads
         ),
         configuration_sha256="",
@@ -409,7 +475,11 @@ def calibration_of(
         own_effects=() if last is None else _own_effects(last),
         payload_mass=tuple(
             PayloadMass.of(
-                one.payload, one.mass_kg, one.gain_per_kg.tolist(), gains, one.parameters_per_kg.tolist()
+                one.payload,
+                one.mass_kg,
+                one.gain_per_kg.tolist(),
+                gains,
+                one.parameters_per_kg.tolist(),
             ).weighed_to(tolerance_kg[one.payload])
             for one in responses
         ),
@@ -428,7 +498,10 @@ def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
     upper = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"))
     lower = upper.T * unit[:, None]
-    return tuple(tuple(float(f"{value:.6g}") for value in row[: index + 1]) for index, row in enumerate(lower))
+    return tuple(
+        tuple(float(f"{value:.6g}") for value in row[: index + 1])
+        for index, row in enumerate(lower)
+    )
 
 
 def _own_effects(last: Evidence) -> tuple[Effect, ...]:
@@ -454,7 +527,11 @@ def _accepted(
     for number, step in reversed(list(enumerate(steps))):
         before = steps[number - 1].after if number else None
         finding = step.accepted
-        if finding is not None and placed in step.after.effects and not (before and placed in before.effects):
+        if (
+            finding is not None
+            and placed in step.after.effects
+            and not (before and placed in before.effects)
+        ):
             break
     else:
         raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
@@ -491,7 +568,9 @@ def _accepted(
 
 
 def _largest_torque(evidence: Evidence, placed: PlacedEffect) -> tuple[float, ...] | None:
-    """Largest torque of an effect at each axis, over the rows of the fit [Nm; N]; None where it is a rate."""
+    """Largest torque of an effect at each axis, over the rows of the fit [Nm; N];
+    None where it is a rate.
+    """
     if placed.effect.is_rate:
         return None
     rows = evidence.training
@@ -499,7 +578,9 @@ def _largest_torque(evidence: Evidence, placed: PlacedEffect) -> tuple[float, ..
     names = {column.name for column in placed.columns}
     first = len(rows.columns) - rows.effects.shape[1]
     own = [index for index, column in enumerate(rows.columns[first:]) if column.name in names]
-    of_parameters = [index for index, column in enumerate(estimate.unknowns) if column.name in names]
+    of_parameters = [
+        index for index, column in enumerate(estimate.unknowns) if column.name in names
+    ]
     torque = np.einsum("p,mpr->mr", estimate.parameters[of_parameters], rows.effects[:, own])
     largest = np.max(np.abs(torque), axis=1, where=rows.use, initial=0.0)
     return tuple(float(f"{value:.4g}") for value in largest)

@@ -1,31 +1,36 @@
-"""External torque of the joints: what the motors supply beyond the prediction, its band, and a threshold for alarms.
+"""External torque of the joints: what the motors supply beyond the prediction, its band,
+and a threshold for alarms.
 
     τ_ext = V g − (W χ + W_L χ_L + E c)
 
-of every row (the filters of the calibration's fit), so some 0.05 s late; a robot that pushes against its surroundings
-has τ_ext in the direction of its push. Rows at standstill do not count: stiction hides any torque below it.
+of every row (the filters of the calibration's fit), so some 0.05 s late; a robot that pushes
+against its surroundings has τ_ext in the direction of its push. Rows at standstill do not count:
+stiction hides any torque below it.
 
-*Band.* The residual grows with what drives it: errors of gains with the torque, of friction with the speed, of inertia
-and of time with the acceleration. The scale of joint j is
+*Band.* The residual grows with what drives it: errors of gains with the torque, of friction with
+the speed, of inertia and of time with the acceleration. The scale of joint j is
 
     s_j = a_j + b_j |τ_j| + c_j |q̇_j| + d_j |q̈_j|,        a, b, c, d ≥ 0,
 
-the mean of |τ_ext| by least squares over quiet motion, rows weighted by 1/s. Half the band is the 95 % quantile of
-z = |τ_ext|/s times s.
+the mean of |τ_ext| by least squares over quiet motion, rows weighted by 1/s. Half the band is the
+95 % quantile of z = |τ_ext|/s times s.
 
-*Threshold.* False alarms are rarer than recordings are long, so the tail of z is extrapolated by its peaks over a
-threshold u, the highest quantile with enough of them (Davison & Smith 1990). Exceedances closer than twice the
-correlation time are one peak, as they would be one alarm. Peaks beyond u follow a generalised Pareto distribution, its
-shape ξ by probability-weighted moments. Minutes of quiet motion show a heavy tail badly: the level is that of the upper
-95 % bound of ξ, but of ξ = 0, an exponential, at least, because a tail that seems to end is not believed; and of the
-upper 90 % bound of the scale. So more quiet motion lowers the level. It is SCALE_MARGIN times higher again: the scale
-of the residual differs from day to day. What remains to assume: the motion to be watched is like the quiet motion
-(other loads, temperatures or speeds need their own), its residual has a scale at most SCALE_MARGIN times as large, and
-no heavier tail begins beyond the largest peak seen.
+*Threshold.* False alarms are rarer than recordings are long, so the tail of z is extrapolated by
+its peaks over a threshold u, the highest quantile with enough of them (Davison & Smith 1990).
+Exceedances closer than twice the correlation time are one peak, as they would be one alarm. Peaks
+beyond u follow a generalised Pareto distribution, its shape ξ by probability-weighted moments.
+Minutes of quiet motion show a heavy tail badly: the level is that of the upper 95 % bound of ξ, but
+of ξ = 0, an exponential, at least, because a tail that seems to end is not believed; and of the
+upper 90 % bound of the scale. So more quiet motion lowers the level. It is SCALE_MARGIN times
+higher again: the scale of the residual differs from day to day. What remains to assume: the motion
+to be watched is like the quiet motion (other loads, temperatures or speeds need their own), its
+residual has a scale at most SCALE_MARGIN times as large, and no heavier tail begins beyond the
+largest peak seen.
 
-The allowed rate is one on average over bands, from five minutes of quiet motion on. Single bands of a heavy tail
-(Student's with five degrees of freedom) exceed it: the worst of 40 by 3.5 times after five minutes, by 1.3 times after
-thirty, at a scale SCALE_MARGIN times as large; after two minutes the average can, too (docs/evidence/contact.md).
+The allowed rate is one on average over bands, from five minutes of quiet motion on. Single bands of
+a heavy tail (Student's with five degrees of freedom) exceed it: the worst of 40 by 3.5 times after
+five minutes, by 1.3 times after thirty, at a scale SCALE_MARGIN times as large; after two minutes
+the average can, too (docs/evidence/contact.md).
 """
 
 from __future__ import annotations
@@ -50,7 +55,8 @@ from ident.prediction import measured_torque, predict_torque
 DRIVERS = ("constant", "torque", "speed", "acceleration")  #: Of the residual's scale
 PREDICTED_SHARE = 0.95  #: Share of quiet rows inside the band
 PEAK_QUANTILES = (0.99, 0.98, 0.97, 0.95, 0.9)  #: u, the first with enough peaks
-ENOUGH_PEAKS = 100  #: With fewer, the shape of a tail like Student's with five degrees of freedom is not seen
+#: With fewer, the shape of a tail like Student's with five degrees of freedom is not seen
+ENOUGH_PEAKS = 100
 MIN_PEAKS = 10  #: With fewer at the last of them, nothing can be said about the tail
 TAIL_CONFIDENCE = 0.90  #: Of the tail's scale
 SHAPE_SIGMAS = 1.645  #: By which the tail's shape is raised: its upper 95 % bound
@@ -66,10 +72,12 @@ class Band:
 
     scale: FloatArray  #: (a, b, c, d) of each joint in the order of DRIVERS, shape (m, 4)
     factor: FloatArray  #: half the band over s, shape (m,)
-    threshold: FloatArray  #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (m,)
+    #: threshold over s; NaN where the quiet motion has fewer than MIN_PEAKS, shape (m,)
+    threshold: FloatArray
     correlation_s: FloatArray  #: correlation time of the residual [s], shape (m,)
     quiet_s: FloatArray  #: time that each joint moved in the quiet motion [s], shape (m,)
-    alarms_per_hour: float  #: false alarms of all joints together that are allowed in an hour of motion, on average
+    #: false alarms of all joints together that are allowed in an hour of motion, on average
+    alarms_per_hour: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +119,20 @@ class ExternalTorque:
         found = []
         over = np.abs(self.torque_nm) / self.threshold_nm
         for axis, beyond in enumerate(self.use & (over > 1.0)):
-            for rows in _stretches(np.flatnonzero(beyond), self.time_s, 2.0 * self.band.correlation_s[axis]):
+            for rows in _stretches(
+                np.flatnonzero(beyond), self.time_s, 2.0 * self.band.correlation_s[axis]
+            ):
                 peak = rows[np.argmax(over[axis, rows])]
                 start_s, end_s = (float(self.time_s[row]) for row in (rows[0], rows[-1]))
-                found.append(Contact(axis, start_s, end_s, float(self.torque_nm[axis, peak]), float(over[axis, peak])))
+                found.append(
+                    Contact(
+                        axis,
+                        start_s,
+                        end_s,
+                        float(self.torque_nm[axis, peak]),
+                        float(over[axis, peak]),
+                    )
+                )
         return tuple(sorted(found, key=lambda contact: contact.start_s))
 
 
@@ -129,7 +147,13 @@ class _Residual:
     move: IntArray  #: shape (r,)
 
 
-@takes(calibration=Calibration, model=Model, run=Run, conditioning=Conditioning | None, band=Band | None)
+@takes(
+    calibration=Calibration,
+    model=Model,
+    run=Run,
+    conditioning=Conditioning | None,
+    band=Band | None,
+)
 def external_torque(
     calibration: Calibration,
     model: Model,
@@ -144,15 +168,17 @@ def external_torque(
         model: the declared model that it was fitted with.
         run: any motion.
         conditioning: the filters; those of the fit when None.
-        band: from `prediction_band`. Without one, it is learned from the run itself, less the stretches of at most two
-            seconds in which some joint is far out; this works while contacts fill less than a quarter of the run.
+        band: from `prediction_band`. Without one, it is learned from the run itself, less the
+            stretches of at most two seconds in which some joint is far out; this works while
+            contacts fill less than a quarter of the run.
 
     Raises:
         DataUnfit: the run is unfit, or no row of it counts.
         ModelError, EffectRefused: see `ident.predict_torque`.
     """
     rows = _residual(calibration, model, run, conditioning or calibration.conditioning)
-    itself, left_out = band is None, 0
+    itself = band is None
+    left_out = 0
     if band is None:
         quiet, left_out = _quiet(rows)
         band = _band([quiet], ALARMS_PER_HOUR)
@@ -173,42 +199,65 @@ def prediction_band(
 
     Args:
         calibration, model, conditioning: as for `external_torque`.
-        quiet: the runs, with the motion that is to be watched; five minutes or more for a heavy tail, and more
-            minutes give lower thresholds.
-        alarms_per_hour: false alarms of all joints together, in an hour of motion: fewer on average; see the top.
+        quiet: the runs, with the motion that is to be watched; five minutes or more for a heavy
+            tail, and more minutes give lower thresholds.
+        alarms_per_hour: false alarms of all joints together, in an hour of motion: fewer on
+            average; see the top.
 
     Raises:
         DataUnfit, ModelError, EffectRefused: as from `external_torque`.
     """
-    alarms_per_hour = require_number("alarms_per_hour", alarms_per_hour, above=0.0, remedy="give a rate such as 1")
+    alarms_per_hour = require_number(
+        "alarms_per_hour", alarms_per_hour, above=0.0, remedy="give a rate such as 1"
+    )
     filters = conditioning or calibration.conditioning
     return _band([_residual(calibration, model, run, filters) for run in quiet], alarms_per_hour)
 
 
-def _residual(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> _Residual:
-    require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
+def _residual(
+    calibration: Calibration, model: Model, run: Run, conditioning: Conditioning
+) -> _Residual:
+    require_kind(
+        "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
+    )
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model, data, conditioning)
     if not use.any():
-        raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
+        raise DataUnfit(
+            data.name, "no row is left after the standstill and validity masks; did the robot move?"
+        )
     predicted = predict_torque(calibration, model, data).T
     measured = measured_torque(calibration, model, data.current_a, data.motion()).T
     torque, needed, speed, acceleration = (
-        filter_(one) for one in (measured - predicted, predicted, data.velocity_rad_s.T, data.acceleration_rad_s2.T)
+        filter_(one)
+        for one in (
+            measured - predicted,
+            predicted,
+            data.velocity_rad_s.T,
+            data.acceleration_rad_s2.T,
+        )
     )
-    drivers = np.stack((np.ones_like(torque), np.abs(needed), np.abs(speed), np.abs(acceleration)), axis=1)
+    drivers = np.stack(
+        (np.ones_like(torque), np.abs(needed), np.abs(speed), np.abs(acceleration)), axis=1
+    )
     centres = filter_.centres(len(data.time_s))
-    return _Residual(data.time_s[centres] - data.time_s[0], torque, drivers, use, data.move[centres])
+    return _Residual(
+        data.time_s[centres] - data.time_s[0], torque, drivers, use, data.move[centres]
+    )
 
 
 def _quiet(rows: _Residual) -> tuple[_Residual, int]:
     """The rows without the stretches that are far out on any joint, and the number of these."""
     scale = _scales([rows], robust=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(rows.use, np.abs(rows.torque_nm) / np.einsum("jd,jdr->jr", scale, rows.drivers), 0.0)
+        ratio = np.where(
+            rows.use, np.abs(rows.torque_nm) / np.einsum("jd,jdr->jr", scale, rows.drivers), 0.0
+        )
     moves, of_move = np.unique(rows.move, return_inverse=True)
-    largest = np.stack([ratio[:, of_move == move].max(axis=1) for move in range(len(moves))], axis=1)
+    largest = np.stack(
+        [ratio[:, of_move == move].max(axis=1) for move in range(len(moves))], axis=1
+    )
     lower, upper = np.quantile(largest, (0.25, 0.75), axis=1)
     loud = np.any(largest > (upper + FAR_OUT * (upper - lower))[:, None], axis=0)
     use = rows.use & ~loud[of_move]
@@ -216,11 +265,15 @@ def _quiet(rows: _Residual) -> tuple[_Residual, int]:
 
 
 def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
-    """(a, b, c, d) of each joint, shape (m, 4); robust: rows beyond four times the scale are left out."""
+    """(a, b, c, d) of each joint, shape (m, 4); robust:
+    rows beyond four times the scale are left out.
+    """
     out = np.zeros((len(parts[0].use), len(DRIVERS)))
     for joint in range(len(out)):
         size = np.concatenate([np.abs(part.torque_nm[joint, part.use[joint]]) for part in parts])
-        drivers = np.concatenate([part.drivers[joint][:, part.use[joint]] for part in parts], axis=1)
+        drivers = np.concatenate(
+            [part.drivers[joint][:, part.use[joint]] for part in parts], axis=1
+        )
         if not size.size or not size.any():
             continue
         scale = np.full(len(size), np.median(size) or size.mean())
@@ -257,7 +310,13 @@ def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
         correlation_s[joint] = row_s * _correlation(runs)
         factor[joint] = np.nanquantile(np.abs(signed), PREDICTED_SHARE)
         times = np.concatenate([part.time_s + 1e6 * index for index, part in enumerate(parts)])
-        level = alarm_level(np.abs(signed), times, 2.0 * correlation_s[joint], alarms_per_hour / count, quiet_s[joint])
+        level = alarm_level(
+            np.abs(signed),
+            times,
+            2.0 * correlation_s[joint],
+            alarms_per_hour / count,
+            quiet_s[joint],
+        )
         threshold[joint] = np.nan if level is None else level
     return Band(scale, factor, threshold, correlation_s, quiet_s, alarms_per_hour)
 
@@ -265,7 +324,8 @@ def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
 def alarm_level(
     ratio: FloatArray, time_s: FloatArray, gap_s: float, alarms_per_hour: float, observed_s: float
 ) -> float | None:
-    """Level that a signal exceeds, on average, less often an hour than given, extrapolated from its peaks; see the top.
+    """Level that a signal exceeds, on average, less often an hour than given,
+    extrapolated from its peaks; see the top.
 
     The signal may grow by SCALE_MARGIN.
 
@@ -293,15 +353,18 @@ def alarm_level(
     scale = (1.0 - shape) * mean * count / float(gammaincinv(count, 1.0 - TAIL_CONFIDENCE))
     # An hour of signal has so many times more peaks than alarms are allowed.
     factor = max(1.0, count * 3600.0 / observed_s / alarms_per_hour)
-    beyond_start = np.log(factor) if shape < 1e-9 else (factor**shape - 1.0) / shape
+    if shape < 1e-9:
+        beyond_start = np.log(factor)
+    else:
+        beyond_start = (factor**shape - 1.0) / shape
     return float(SCALE_MARGIN * (start + scale * beyond_start))
 
 
 def tail_shape_bound(peaks: FloatArray) -> float:
     """Upper bound of the shape ξ of a generalised Pareto distribution, from 0 to LARGEST_SHAPE.
 
-    ξ is estimated by probability-weighted moments, which a single largest peak moves less than a variance; its
-    standard error is the asymptotic one (Hosking & Wallis 1987, eqs. for k = −ξ).
+    ξ is estimated by probability-weighted moments, which a single largest peak moves less than a
+    variance; its standard error is the asymptotic one (Hosking & Wallis 1987, eqs. for k = −ξ).
 
     Args:
         peaks: above the threshold, not negative, shape (n,).
@@ -316,12 +379,20 @@ def tail_shape_bound(peaks: FloatArray) -> float:
         return 0.0  # equal peaks: no tail
     shape = 2.0 - mean / (mean - 2.0 * weighted)
     k = -float(np.clip(shape, -0.4, 0.4))  # where the asymptotic variance holds
-    variance = (1.0 + k) * (2.0 + k) ** 2 * (1.0 + k + 2.0 * k**2) / ((1.0 + 2.0 * k) * (3.0 + 2.0 * k)) / count
+    variance = (
+        (1.0 + k)
+        * (2.0 + k) ** 2
+        * (1.0 + k + 2.0 * k**2)
+        / ((1.0 + 2.0 * k) * (3.0 + 2.0 * k))
+        / count
+    )
     return float(np.clip(shape + SHAPE_SIGMAS * np.sqrt(variance), 0.0, LARGEST_SHAPE))
 
 
 def _correlation(runs: Sequence[FloatArray]) -> float:
-    """Rows until the autocorrelation of a signal with gaps (NaN) falls below 1/e, interpolated; at least 1."""
+    """Rows until the autocorrelation of a signal with gaps (NaN) falls below 1/e, interpolated;
+    at least 1.
+    """
     before = 1.0
     for lag in range(1, 200):
         first = np.concatenate([run[:-lag] for run in runs])
@@ -329,7 +400,9 @@ def _correlation(runs: Sequence[FloatArray]) -> float:
         both = np.isfinite(first) & np.isfinite(second)
         if both.sum() < 10:
             return float(lag)
-        value = float(first[both] @ second[both]) / float(np.sqrt((first[both] ** 2).sum() * (second[both] ** 2).sum()))
+        value = float(first[both] @ second[both]) / float(
+            np.sqrt((first[both] ** 2).sum() * (second[both] ** 2).sum())
+        )
         if value < np.exp(-1.0):
             return float(max(1.0, lag - 1 + (before - np.exp(-1.0)) / (before - value)))
         before = value

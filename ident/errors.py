@@ -23,7 +23,7 @@ IdentificationError
     └── EffectNotInstalled a calibration has an effect of a package that is not installed
 
 What leaves usable numbers is no error but a `Diagnosis`.
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class IdentificationError(Exception):
     """Root of the tree; carries the evidence as attributes and in its message."""
 
     def __reduce__(self) -> tuple[object, ...]:
-        # The arguments of `__init__` are not the message that `args` holds: without this, no process can hand one of
-        # these to another.
+        # The arguments of `__init__` are not the message that `args` holds: without this, no
+        # process can hand one of these to another.
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
@@ -49,7 +49,9 @@ class DataUnfit(IdentificationError):
     """The recording cannot be used; several runs are named with commas."""
 
     def __init__(self, run: str, reason: str) -> None:
-        super().__init__(f"runs {run}: {reason}" if ", " in run else f"run {run!r}: {reason}" if run else reason)
+        super().__init__(
+            f"runs {run}: {reason}" if ", " in run else f"run {run!r}: {reason}" if run else reason
+        )
         self.run = run
         self.reason = reason
 
@@ -62,7 +64,9 @@ class PayloadMissing(DataUnfit):
         self.found = "no run with a payload of known mass"
         self.expected = "at least one; without it all gains could be scaled at will"
         self.remedy = "record one (`Run.payload`), or hold the gains (`fixed_gains`)"
-        super().__init__(", ".join(runs), f"found {self.found}; expected {self.expected}; {self.remedy}")
+        super().__init__(
+            ", ".join(runs), f"found {self.found}; expected {self.expected}; {self.remedy}"
+        )
 
 
 class CurrentUnsigned(DataUnfit):
@@ -72,19 +76,25 @@ class CurrentUnsigned(DataUnfit):
         names = ", ".join(axes)
         self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
         self.found = (
-            f"currents that are never {missing_sign} while the axes move both ways, and that no load which is always "
-            "carried explains"
+            f"currents that are never {missing_sign} while the axes move both ways, and that no "
+            "load which is always carried explains"
         )
         self.expected = "a current with its sign: that of the torque"
-        self.remedy = "the drive, or the export, gives the size of the current only; take its signed value"
-        super().__init__(run, f"axis {names}: found {self.found}; expected {self.expected}; {self.remedy}")
+        self.remedy = (
+            "the drive, or the export, gives the size of the current only; take its signed value"
+        )
+        super().__init__(
+            run, f"axis {names}: found {self.found}; expected {self.expected}; {self.remedy}"
+        )
         self.axes = axes
 
 
 class ChannelUnfit(DataUnfit):
     """A channel of a recording shows by itself that it cannot be used."""
 
-    def __init__(self, run: str, axes: tuple[str, ...], *, found: str, expected: str, remedy: str) -> None:
+    def __init__(
+        self, run: str, axes: tuple[str, ...], *, found: str, expected: str, remedy: str
+    ) -> None:
         names = ", ".join(axes)
         self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
         self.found = found
@@ -103,8 +113,8 @@ class JointStill(ChannelUnfit):
             axes,
             found=found,
             expected="a joint that moves in runs without load and in runs with each payload",
-            remedy="if it stood still, record this run again with moves of every joint; if it moved, check its encoder "
-            "or the column of its position",
+            remedy="if it stood still, record this run again with moves of every joint; if it "
+            "moved, check its encoder or the column of its position",
         )
 
 
@@ -115,14 +125,19 @@ class CurrentConstant(ChannelUnfit):
         super().__init__(
             run,
             axes,
-            found="a current that is zero throughout" if size == 0.0 else f"a current of {size:.4g} throughout",
+            found="a current that is zero throughout"
+            if size == 0.0
+            else f"a current of {size:.4g} throughout",
             expected="the changing current of a motor that moves",
-            remedy="is its channel connected, and the object or column the right one? record this run again",
+            remedy="is its channel connected, and the object or column the right one? record this "
+            "run again",
         )
 
 
 class ReadingsDamaged(ChannelUnfit):
-    """Readings of a channel are none, and nothing says what is right, or too many are (`ident.data.channel_faults`)."""
+    """Readings of a channel are none, and nothing says what is right,
+    or too many are (`ident.data.channel_faults`).
+    """
 
 
 class ModelContradicted(IdentificationError):
@@ -169,8 +184,8 @@ class TooFewMoves(IdentificationError):
 
     def __init__(self, found: int, expected: int) -> None:
         super().__init__(
-            f"the runs hold {found} separate moves (or stretches of two seconds), expected at least {expected} "
-            "and better 30 a run; record longer"
+            f"the runs hold {found} separate moves (or stretches of two seconds), expected at "
+            f"least {expected} and better 30 a run; record longer"
         )
         self.found = found
         self.expected = expected
@@ -188,12 +203,14 @@ class RankDeficient(IdentificationError):
 class PayloadUnseen(IdentificationError):
     """The runs declared loaded do not differ from the others by the weight of the payload."""
 
-    def __init__(self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = "") -> None:
+    def __init__(
+        self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = ""
+    ) -> None:
         super().__init__(
-            f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, expected some 1 %, "
-            f"and on one at most {100.0 * LARGEST_GAIN_STD:g} %: "
-            "the runs declared loaded and those declared unloaded do not differ by the weight of the payload, or are "
-            "positions not in rad, or columns in another order than the joints? "
+            f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, "
+            f"expected some 1 %, and on one at most {100.0 * LARGEST_GAIN_STD:g} %: the runs "
+            "declared loaded and those declared unloaded do not differ by the weight of the "
+            "payload, or are positions not in rad, or columns in another order than the joints? "
             + (hint or "was it mounted in every loaded run, and in no other? is its mass right?")
         )
         self.std_percent = std_percent
@@ -215,18 +232,24 @@ class NotConverged(IdentificationError):
     """The iteration did not reach its optimum."""
 
     def __init__(
-        self, method: str, iterations: int, cost: tuple[float, ...], step: float, likely_cause: str = ""
+        self,
+        method: str,
+        iterations: int,
+        cost: tuple[float, ...],
+        step: float,
+        likely_cause: str = "",
     ) -> None:
         question = likely_cause or "are roles, payload mass, drive train, rad and axis order ok?"
         super().__init__(
-            f"{method} did not converge in {iterations} iterations: the cost went from {cost[0]:.6g} to {cost[-1]:.6g} "
-            f"and the last relative step was {step:.2g}; {question}"
+            f"{method} did not converge in {iterations} iterations: the cost went from "
+            f"{cost[0]:.6g} to {cost[-1]:.6g} and the last relative step was {step:.2g}; {question}"
         )
         self.method = method
         self.iterations = iterations
         self.cost = cost
         self.step = step
-        self.likely_cause = likely_cause  #: found in the recordings; empty where nothing in them is odd
+        #: found in the recordings; empty where nothing in them is odd
+        self.likely_cause = likely_cause
 
 
 class EffectRefused(IdentificationError):
@@ -240,25 +263,56 @@ class EffectImpossible(EffectRefused):
 class EffectNotInstalled(EffectRefused):
     """A calibration has an effect of a package that is not installed."""
 
-    def __init__(self, effect: str, axis: str, package: str) -> None:
+    def __init__(
+        self, effect: str, axis: str, package: str, *, installed: str = "", other: str = ""
+    ) -> None:
+        """Name what is missing.
+
+        Args:
+            effect: name of the effect.
+            axis: name of its axis.
+            package: name and version of the package that the calibration names, or its module.
+            installed: version of this package that is installed and does not register the effect.
+            other: name and version of another package that has an effect of this name.
+        """
         self.effect = effect
         self.axis = axis
         self.package = package
         self.subject = f"effect {effect!r} on {axis}"
-        self.found = "no installed package that has it"
         self.expected = f"{package}, which had it when the calibration was made"
-        if package.startswith("module "):
+        if other:
+            self.found = f"an effect of this name of {other}, which may be another one"
+        elif installed:
+            self.found = f"version {installed} of its package, which does not register it"
+        else:
+            self.found = "no installed package that has it"
+        if other:
             self.remedy = (
-                "give it as an argument (`own_effects`), or install it in a package with an entry point of the group "
-                "drivegain.effects"
+                "install the one in place of the other, give the effect as an argument "
+                "(`own_effects`), or fit the logs again"
+            )
+        elif installed:
+            self.remedy = (
+                "add it to the entry points of the group drivegain.effects in the package's "
+                "pyproject.toml and install the package again, or give it as an argument "
+                "(`own_effects`)"
+            )
+        elif package.startswith("module "):
+            self.remedy = (
+                "give it as an argument (`own_effects`), or install it in a package with an entry "
+                "point of the group drivegain.effects"
             )
         else:
             self.remedy = "install this package, or fit the logs again without it"
-        super().__init__(f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy}")
+        super().__init__(
+            f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy}"
+        )
 
 
 CORRECTION_UNCLEAR = "correction-unclear"
-"""Diagnosis of a description that is wrong, where the moves do not tell which of several corrections is right."""
+"""Diagnosis of a description that is wrong, where the moves do not tell which of several
+corrections is right.
+"""
 GAIN_UNSEEN = "gain-unseen"  #: Diagnosis of a gain that the moves hardly show
 
 
@@ -266,10 +320,11 @@ GAIN_UNSEEN = "gain-unseen"  #: Diagnosis of a gain that the moves hardly show
 class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
-    #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-clipped, current-late,
-    #: current-limited, current-off-scale, current-reversed, estimators-disagree, gain-off-nameplate, gain-unseen,
-    #: geometry-off, gravity-tilted, gravity-turned, ill-conditioned, joint-still, length-off, masses-contradict,
-    #: payload-differs, place-off, position-late, position-reversed, readings-damaged, readings-frozen, readings-held,
+    #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-clipped,
+    #: current-late, current-limited, current-off-scale, current-reversed, estimators-disagree,
+    #: gain-off-nameplate, gain-unseen, geometry-off, gravity-tilted, gravity-turned,
+    #: ill-conditioned, joint-still, length-off, masses-contradict, payload-differs, place-off,
+    #: position-late, position-reversed, readings-damaged, readings-frozen, readings-held,
     #: time-skew, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
@@ -286,4 +341,7 @@ class Diagnosis:
     @property
     def text(self) -> str:
         """The diagnosis in one line."""
-        return f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy} ({self.name})"
+        return (
+            f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy} "
+            f"({self.name})"
+        )

@@ -1,9 +1,11 @@
-"""Whether the geometry of a robot has changed since its calibration, by one run that the fit has not seen.
+"""Whether the geometry of a robot has changed since its calibration,
+by one run that the fit has not seen.
 
-An encoder that lost its zero, or a base that was moved, leaves a part of the prediction's error that is the derivative
-of the whole arm's torque (`ident.effects.geometry_corrections`). Friction and gains change with temperature and wear,
-so what they explain is left out of the comparison: on each axis the predicted torque, its speed, the direction of
-motion and a constant. So is what another payload, or another way of mounting it, explains.
+An encoder that lost its zero, or a base that was moved, leaves a part of the prediction's error
+that is the derivative of the whole arm's torque (`ident.effects.geometry_corrections`). Friction
+and gains change with temperature and wear, so what they explain is left out of the comparison: on
+each axis the predicted torque, its speed, the direction of motion and a constant. So is what
+another payload, or another way of mounting it, explains.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from ident.equations.rows import at_rows
 from ident.model.model import Model
 from ident.prediction import corrections_of, fitted_model, payload_of, standard_parameters
 
-LEAST_SHARE = 0.5  #: Of the squared error beyond that of the fit, friction and gains, that it must explain
+#: Of the squared error beyond that of the fit, friction and gains, that it must explain
+LEAST_SHARE = 0.5
 SMALLEST_SHARE = 0.03  #: Of the whole squared error that it must explain: less is not worth a word
 CERTAIN_SIGMAS = 6.0  #: By which it must differ from zero: several are tried
 FEWEST_MOVES = 8  #: Of the scatter that σ comes from
@@ -38,7 +41,9 @@ class GeometryDrift:
     placed: PlacedEffect  #: the correction, on its axis
     values: FloatArray  #: of its coefficients, shape (p,)
     deviations: FloatArray  #: their σ by the scatter of moves, shape (p,)
-    share: float  #: of the squared error that it explains, beyond what the fit leaves and friction and gains explain
+    #: of the squared error that it explains, beyond what the fit leaves and friction and gains
+    #: explain
+    share: float
     explained: float  #: squared error that it explains, each axis weighted by its own error
 
 
@@ -51,7 +56,8 @@ def geometry_drift(
     use: BoolArray,
     suspected: Collection[PlacedEffect] = (),
 ) -> GeometryDrift | None:
-    """Name the change of the geometry that explains the error of a prediction; None where none does.
+    """Name the change of the geometry that explains the error of a prediction;
+    None where none does.
 
     Of several, it is the one that explains most.
 
@@ -62,8 +68,9 @@ def geometry_drift(
         conditioning: the filters of the rows.
         left_nm: measured less predicted torque at the rows [Nm or N], shape (m, r).
         use: rows of each axis that count, shape (m, r).
-        suspected: corrections of numbers that are known to differ from those of the run's own description. They need
-            not explain most of the error: they are few, and named beforehand.
+        suspected: corrections of numbers that are known to differ from those of the run's own
+            description. They need not explain most of the error: they are few, and named
+            beforehand.
     """
     if model.is_redundant:
         return None  # internal preload hides a part of the torque
@@ -73,9 +80,13 @@ def geometry_drift(
     model = replace(corrected, robot=replace(corrected.robot, declared_gravity_m_s2=None))
     slow = at_rows(corrected_dataset(data, corrections), conditioning)
     move = data.move[np.searchsorted(data.time_s, slow.time_s).clip(0, len(data.move) - 1)]
-    standard = model.with_payload(standard_parameters(calibration, model), payload_of(calibration, data))
+    standard = model.with_payload(
+        standard_parameters(calibration, model), payload_of(calibration, data)
+    )
     gains = np.array([gain.value for gain in calibration.gains])
-    signals = declared_signals(model, slow, standard, gains, calibration.session_began_s, inertia=False)
+    signals = declared_signals(
+        model, slow, standard, gains, calibration.session_began_s, inertia=False
+    )
     scale = np.array([_rms(row[used]) for row, used in zip(left_nm, use, strict=True)])
     weight = np.where(use, 1.0 / np.maximum(scale, np.finfo(np.float64).tiny)[:, None], 0.0)
     payload_nm = np.empty((0, *left_nm.shape))
@@ -95,7 +106,10 @@ def geometry_drift(
         if not is_suspected and not excess > 0.0:
             continue  # the run is predicted as well as what was fitted
         columns = _beyond(nuisance, placed.effect.columns(signals, placed.axis), weight)
-        least = 0.0 if is_suspected else max(LEAST_SHARE * excess, SMALLEST_SHARE * float(np.sum(left**2)))
+        if is_suspected:
+            least = 0.0
+        else:
+            least = max(LEAST_SHARE * excess, SMALLEST_SHARE * float(np.sum(left**2)))
         found = _fitted(placed, columns, left, move, excess, least)
         if found is not None and (best is None or found.explained > best.explained):
             best = found
@@ -118,7 +132,10 @@ def _nuisance(torque_nm: FloatArray, velocity: FloatArray, payload_nm: FloatArra
         payload_nm: columns of the mounted payload, shape (p, m, r); none without load.
     """
     own = np.stack((torque_nm, velocity, np.sign(velocity), np.ones_like(velocity)))
-    each = [np.eye(len(velocity))[axis][:, None] * shape for axis in range(len(velocity)) for shape in own]
+    each = []
+    for axis in range(len(velocity)):
+        for shape in own:
+            each.append(np.eye(len(velocity))[axis][:, None] * shape)
     return np.concatenate((np.stack(each), payload_nm))
 
 
@@ -134,7 +151,8 @@ def _beyond(nuisance: FloatArray, columns: FloatArray, weight: FloatArray) -> Fl
 
 
 def _usual_error_nm(calibration: Calibration, torque_nm: FloatArray, use: BoolArray) -> FloatArray:
-    """Error that a calibration leaves of such torques if nothing has changed, by the error of its fit, shape (m,).
+    """Error that a calibration leaves of such torques if nothing has changed,
+    by the error of its fit, shape (m,).
 
     Not by the held-out run's: that may be the run that is judged.
     """
@@ -144,7 +162,12 @@ def _usual_error_nm(calibration: Calibration, torque_nm: FloatArray, use: BoolAr
 
 
 def _fitted(
-    placed: PlacedEffect, columns: FloatArray, left: FloatArray, move: IntArray, excess: float, least: float
+    placed: PlacedEffect,
+    columns: FloatArray,
+    left: FloatArray,
+    move: IntArray,
+    excess: float,
+    least: float,
 ) -> GeometryDrift | None:
     """Least squares of one correction, with σ by moves; None where it is not certain enough.
 

@@ -1,19 +1,22 @@
-"""Weigh the body on the flange with a calibration: mass, centre of mass and inertia, each with its σ.
+"""Weigh the body on the flange with a calibration:
+mass, centre of mass and inertia, each with its σ.
 
-With the gains g held, the ten parameters p of the body (paper §2.4) are the least-squares solution of the motors'
-equations, rows divided by the deviation σ_i of motor i's residual,
+With the gains g held, the ten parameters p of the body (paper §2.4) are the least-squares solution
+of the motors' equations, rows divided by the deviation σ_i of motor i's residual,
 
     g_i v_i = (T W χ + T E(p) c + T W_L p)_i,
 
-with the effects E c of the calibration in the model. Load friction, elasticity and saturation depend on the body: E is
-built from the torques that the last p predicts, until p stays. Beside runs without load, χ and c are found again,
-together with p: only the gains are taken from the calibration. Without such runs, χ and c are the calibration's, except
-the friction of the joints, which is found again because it changes with the temperature.
+with the effects E c of the calibration in the model. Load friction, elasticity and saturation
+depend on the body: E is built from the torques that the last p predicts, until p stays. Beside runs
+without load, χ and c are found again, together with p: only the gains are taken from the
+calibration. Without such runs, χ and c are the calibration's, except the friction of the joints,
+which is found again because it changes with the temperature.
 
-σ has three parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`). Another, S C Sᵀ, is what
-the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ, c). The last is the tolerance u_k of the mass
-m_k of each payload that gave the calibration its scale, which C lacks: p moves by the vector S ∂(g, χ, c)/∂m_k u_k, and
-its outer product with itself is added. Where that mass was all that was known, the vector is p u_k/m_k.
+σ has three parts. One leaves out a move at a time, as that of a gain (`jackknife_covariance`).
+Another, S C Sᵀ, is what the errors of the calibration do to p: C is its covariance, S = ∂p/∂(g, χ,
+c). The last is the tolerance u_k of the mass m_k of each payload that gave the calibration its
+scale, which C lacks: p moves by the vector S ∂(g, χ, c)/∂m_k u_k, and its outer product with itself
+is added. Where that mass was all that was known, the vector is p u_k/m_k.
 """
 
 from __future__ import annotations
@@ -48,7 +51,9 @@ from ident.planning.gain_verdict import ExtraMoves
 from ident.prediction import corrections_of, left_of, placed_effect, standard_parameters
 
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three
-STAYS = 1e-3  #: Largest change of the body in the last pass, as a share of its size; each is some 3 % of the one before
+#: Largest change of the body in the last pass, as a share of its size; each is some 3 % of the one
+#: before
+STAYS = 1e-3
 WORTH = 0.7  #: Share of its σ to which moves must bring a parameter in order to be named
 KNOWN = 0.1  #: Largest σ of a parameter that counts as identified, as a share of its value
 FRICTION = ("fv", "fs")  #: First letters of friction's columns, of joints and of coupled motors
@@ -56,7 +61,9 @@ FRICTION = ("fv", "fs")  #: First letters of friction's columns, of joints and o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowsToWeigh:
-    """Rows of runs without load, then of runs with the body; they serve any calibration of the robot."""
+    """Rows of runs without load, then of runs with the body;
+    they serve any calibration of the robot.
+    """
 
     model: Model  #: the declared model
     datasets: tuple[Dataset, ...]  #: the runs, without load first
@@ -77,7 +84,8 @@ class Scale:
     """
 
     model: Model  #: the declared model
-    unknowns: IntArray  #: which columns belong to unknowns, whether the motion shows them or not, shape (u,)
+    #: which columns belong to unknowns, whether the motion shows them or not, shape (u,)
+    unknowns: IntArray
     weight: FloatArray  #: 1/(g_i σ_i) of each motor, shape (m,)
     information: FloatArray  #: AᵀA of the unknowns, shape (u, u)
     beside_bare_runs: bool  #: the robot was found together with the body
@@ -85,21 +93,25 @@ class Scale:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeighedBody:
-    """A body on the flange; parameters are in its joint's frame and in the order of LINK_PARAMETERS."""
+    """A body on the flange; parameters are in its joint's frame and in the order of
+    LINK_PARAMETERS.
+    """
 
     values: FloatArray  #: NaN for a parameter that the motion does not show, shape (10,) [SI]
     #: From leaving out moves, the calibration taken as exact; NaN likewise, shape (10, 10).
     moves_covariance: FloatArray
-    #: With the errors of the calibration and the tolerance of its reference masses; NaN likewise, shape (10, 10).
+    #: With the errors of the calibration and the tolerance of its reference masses; NaN likewise,
+    #: shape (10, 10).
     covariance: FloatArray
-    #: The calibration has its covariance. Otherwise σ adds the errors of the gains by size, because one weight sets
-    #: their common scale, and lacks those of the robot's parameters and of the effects.
+    #: The calibration has its covariance. Otherwise σ adds the errors of the gains by size, because
+    #: one weight sets their common scale, and lacks those of the robot's parameters and of the
+    #: effects.
     complete: bool
     moves: int  #: separate moves behind σ
     error: RelativeError  #: ‖ρ‖/‖Y‖ with the body in the model, on the runs that carried it [%]
     scale: Scale  #: the equations
-    #: The part of `covariance` that is the tolerance of the masses that the calibration was made with; NaN likewise,
-    #: shape (10, 10).
+    #: The part of `covariance` that is the tolerance of the masses that the calibration was made
+    #: with; NaN likewise, shape (10, 10).
     reference_covariance: FloatArray = field(default_factory=lambda: np.zeros((10, 10)))
 
     @property
@@ -119,12 +131,16 @@ class WeighedBody:
 
     @property
     def mass_reference_std_kg(self) -> float:
-        """Share of σ of m that is the tolerance of the reference masses [kg]; 0 where none is declared."""
+        """Share of σ of m that is the tolerance of the reference masses [kg];
+        0 where none is declared.
+        """
         return float(np.sqrt(self.reference_covariance[-1, -1]))
 
     @property
     def centre_m(self) -> tuple[FloatArray, FloatArray]:
-        """Centre of mass in the frame of the joint that carries it, and its σ [m], shape (3,) each."""
+        """Centre of mass in the frame of the joint that carries it, and its σ [m], shape (3,)
+        each.
+        """
         return self._derived(_centre)
 
     def centre_in(self, frame: Place) -> tuple[FloatArray, FloatArray]:
@@ -133,19 +149,24 @@ class WeighedBody:
         # A coordinate that is not shown spoils those of the frame that depend on it, and no others.
         used = np.abs(turned) > 1e-12
         return self._derived(
-            lambda body: np.where(used, turned * (_centre(body) - frame.translation_m), 0.0).sum(axis=1)
+            lambda body: np.where(used, turned * (_centre(body) - frame.translation_m), 0.0).sum(
+                axis=1
+            )
         )
 
     @property
     def inertia_kg_m2(self) -> tuple[FloatArray, FloatArray]:
-        """Inertia about the centre of mass (Ixx, Ixy, Ixz, Iyy, Iyz, Izz) and its σ [kg m²], shape (6,) each."""
+        """Inertia about the centre of mass (Ixx, Ixy, Ixz, Iyy, Iyz, Izz) and its σ [kg m²],
+        shape (6,) each.
+        """
         return self._derived(_about_centre)
 
     @property
     def size(self) -> FloatArray:
         """m a², m a and m of a steel cube of side a: compact, hence small, shape (10,).
 
-        Its mass is the least one that these moves allow, m − 2 σ; 1 kg where they do not show the mass.
+        Its mass is the least one that these moves allow, m − 2 σ; 1 kg where they do not show the
+        mass.
         """
         mass = 1.0
         if np.isfinite(self.mass_kg):
@@ -155,10 +176,11 @@ class WeighedBody:
 
     @property
     def identifiable(self) -> BoolArray:
-        """Parameters known to KNOWN of their value, or to less than what a compact body of this mass has, shape (10,).
+        """Parameters known to KNOWN of their value, or to less than what a compact body of this
+        mass has, shape (10,).
 
-        The second counts for a parameter near zero, the first for one with a long lever, such as Izz about a far joint.
-        The mass itself has the first alone.
+        The second counts for a parameter near zero, the first for one with a long lever, such as
+        Izz about a far joint. The mass itself has the first alone.
         """
         std = np.nan_to_num(self.std, nan=np.inf)
         is_known = std <= KNOWN * np.abs(np.nan_to_num(self.values))
@@ -166,11 +188,15 @@ class WeighedBody:
         is_small[-1] = False
         return np.asarray(is_known | is_small)
 
-    def _derived(self, quantity: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+    def _derived(
+        self, quantity: Callable[[FloatArray], FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
         with np.errstate(invalid="ignore"):  # NaN is what depends on a parameter that is not shown
             value = quantity(self.values)
             # Complex steps differentiate polynomials and quotients exactly.
-            slope = np.stack([quantity(self.values + step).imag / 1e-20 for step in 1e-20j * np.eye(10)], axis=1)
+            slope = np.stack(
+                [quantity(self.values + step).imag / 1e-20 for step in 1e-20j * np.eye(10)], axis=1
+            )
         shown = np.isfinite(self.values)
         used = slope[:, shown]
         std = np.sqrt(np.einsum("ij,jk,ik->i", used, self.covariance[np.ix_(shown, shown)], used))
@@ -187,7 +213,13 @@ def _about_centre(body: FloatArray) -> FloatArray:
     return np.asarray(body[:6] - steiner / body[9])
 
 
-@takes(calibration=Calibration, model=Model, loaded=Iterable, conditioning=Conditioning | None, bare=Iterable)
+@takes(
+    calibration=Calibration,
+    model=Model,
+    loaded=Iterable,
+    conditioning=Conditioning | None,
+    bare=Iterable,
+)
 def weigh(
     calibration: Calibration,
     model: Model,
@@ -203,7 +235,8 @@ def weigh(
         model: the declared model that the calibration was fitted with.
         loaded: runs with the same body, mounted the same way.
         conditioning: the filters; those of the calibration's fit when None.
-        bare: runs of the same robot without load. With them, σ does not depend on the calibration's parameters.
+        bare: runs of the same robot without load. With them, σ does not depend on the calibration's
+            parameters.
 
     Raises:
         DataUnfit: a run is unfit, or no row of the runs counts.
@@ -226,7 +259,9 @@ def rows_to_weigh(
     def prepared(runs: Iterable[Run]) -> list[Dataset]:
         made: list[Dataset] = []
         for run in runs:
-            require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
+            require_kind(
+                "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
+            )
             made.append(differentiate(replace(run, payload=None), model.drive_train, conditioning))
         return made
 
@@ -237,16 +272,22 @@ def rows_to_weigh(
     return _rows_of(model, (*without, *mounted), len(without), conditioning)
 
 
-def _rows_of(model: Model, datasets: tuple[Dataset, ...], bare: int, conditioning: Conditioning) -> RowsToWeigh:
+def _rows_of(
+    model: Model, datasets: tuple[Dataset, ...], bare: int, conditioning: Conditioning
+) -> RowsToWeigh:
     """Build the rows of runs, those without the body first."""
     rows = observe(model, datasets, conditioning, standard_equations(model))
     is_mounted = rows.run >= bare
     if model.friction_by_payload:
         # What the runs say of their payload is ignored, but their friction is that of a loaded arm.
         regressor = rows.regressor.copy()
-        regressor[:, model.loaded_friction_columns] = regressor[:, model.friction_columns] * is_mounted
+        regressor[:, model.loaded_friction_columns] = (
+            regressor[:, model.friction_columns] * is_mounted
+        )
         rows = replace(rows, regressor=regressor)
-    body = tuple(Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True))
+    body = tuple(
+        Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)
+    )
     rows = rows.extended(body, rows.flange * is_mounted)
     return RowsToWeigh(model, datasets, bare, rows)
 
@@ -262,12 +303,15 @@ def _corrected(given: RowsToWeigh, corrections: tuple[PlacedEffect, ...]) -> Row
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CalibratedRobot:
-    """What a calibration says of the robot, in the order of the columns that a body is weighed with."""
+    """What a calibration says of the robot, in the order of the columns that a body is weighed
+    with.
+    """
 
     model: Model  #: with the calibration's corrections of the geometry
     gains: FloatArray  #: shape (m,)
     standard: FloatArray  #: χ, shape (p,)
-    effects: tuple[PlacedEffect, ...]  #: those that correct the geometry are in `model`, and zero here
+    #: those that correct the geometry are in `model`, and zero here
+    effects: tuple[PlacedEffect, ...]
     coefficients: tuple[FloatArray, ...]  #: c of each effect
     session_began_s: float | None
 
@@ -294,13 +338,15 @@ class _CalibratedRobot:
         parameters = self.model.with_payload(self.standard, body)
         made = []
         for data in datasets:
-            of_robot = declared_signals(self.model, data, parameters, self.gains, self.session_began_s)
+            of_robot = declared_signals(
+                self.model, data, parameters, self.gains, self.session_began_s
+            )
             made.append(beside_rotors(of_robot, list(self.effects)))
         return made
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Solution:
+class _WeighingSolution:
     """Least-squares solution of the motors' equations, for one set of effect columns."""
 
     rows: Observation  #: with the columns of the effects
@@ -391,7 +437,7 @@ def _robot_of(calibration: Calibration, model: Model) -> _CalibratedRobot:
     )
 
 
-def _solved(robot: _CalibratedRobot, given: RowsToWeigh) -> _Solution:
+def _solved(robot: _CalibratedRobot, given: RowsToWeigh) -> _WeighingSolution:
     """Solve for the body, again and again while its torques change the columns of the effects."""
     without_body = given.datasets[: given.bare]
     with_body = given.datasets[given.bare :]
@@ -409,20 +455,26 @@ def _solved(robot: _CalibratedRobot, given: RowsToWeigh) -> _Solution:
     return solution
 
 
-def _solved_with(robot: _CalibratedRobot, given: RowsToWeigh, signals: Sequence[Signals]) -> _Solution:
+def _solved_with(
+    robot: _CalibratedRobot, given: RowsToWeigh, signals: Sequence[Signals]
+) -> _WeighingSolution:
     """Solve for the body, with the columns of the effects from these signals."""
     rows = given.rows
     for placed in robot.effects:
-        torque = effect_torque(placed.effect, placed.axis, signals, given.datasets, rows.conditioning, robot.model)
+        torque = effect_torque(
+            placed.effect, placed.axis, signals, given.datasets, rows.conditioning, robot.model
+        )
         rows = rows.extended(placed.columns, torque)
     system = rows.system()
     values = robot.values
-    unknowns, free, blurred = _unknowns(system, robot.body_columns, robot.model, beside_bare_runs=given.bare > 0)
+    unknowns, free, blurred = _unknowns(
+        system, robot.body_columns, robot.model, beside_bare_runs=given.bare > 0
+    )
     fixed = tuple(index for index in range(len(values)) if index not in free)
     free_system = system.holding({index: float(values[index]) for index in fixed})
     parameters, noise = free_system.currents.settled(robot.gains, len(free))
     values[list(free)] = parameters
-    return _Solution(
+    return _WeighingSolution(
         rows=rows,
         system=system,
         free_system=free_system,
@@ -436,7 +488,9 @@ def _solved_with(robot: _CalibratedRobot, given: RowsToWeigh, signals: Sequence[
     )
 
 
-def _error_with_body(solution: _Solution, is_loaded: BoolArray, gains: FloatArray) -> RelativeError:
+def _error_with_body(
+    solution: _WeighingSolution, is_loaded: BoolArray, gains: FloatArray
+) -> RelativeError:
     """Relative error of the torques on the rows that carried the body."""
     rows = solution.rows
     regressor = np.concatenate((rows.regressor, rows.effects), axis=1)
@@ -449,13 +503,19 @@ def _error_with_body(solution: _Solution, is_loaded: BoolArray, gains: FloatArra
 def _unknowns(
     system: System, ten: IntArray, model: Model, *, beside_bare_runs: bool
 ) -> tuple[IntArray, tuple[int, ...], tuple[int, ...]]:
-    """Columns of the unknowns; those that are independent; those of the body that gather others of its parameters."""
+    """Columns of the unknowns; those that are independent;
+    those of the body that gather others of its parameters.
+    """
     names = [column.name for column in system.columns]
     robot = [index for index in range(len(names)) if index not in ten]
     if not beside_bare_runs:
-        robot = [index for index in robot[: len(model.columns)] if names[index].startswith(FRICTION)]
+        robot = [
+            index for index in robot[: len(model.columns)] if names[index].startswith(FRICTION)
+        ]
     order = np.array([*robot, *ten])
-    columns = np.concatenate([factor[:, system.axis_count : -1] for factor in system.joints.factors])[:, order]
+    columns = np.concatenate(
+        [factor[:, system.axis_count : -1] for factor in system.joints.factors]
+    )[:, order]
     base = base_parameters(columns, tuple(names[index] for index in order))
     free = order[list(base.independent)]
     regrouped = np.setdiff1d(np.arange(len(order)), base.independent)
@@ -463,7 +523,9 @@ def _unknowns(
     return order, tuple(sorted(free.tolist())), tuple(free[blurred & np.isin(free, ten)].tolist())
 
 
-def _of_calibration(calibration: Calibration, gains: FloatArray, slope: FloatArray, held: Sequence[str]) -> FloatArray:
+def _of_calibration(
+    calibration: Calibration, gains: FloatArray, slope: FloatArray, held: Sequence[str]
+) -> FloatArray:
     """Covariance of the ten that comes from the calibration's errors, shape (10, 10).
 
     Args:
@@ -482,8 +544,12 @@ def _of_calibration(calibration: Calibration, gains: FloatArray, slope: FloatArr
     return np.asarray(used @ covariance @ used.T)
 
 
-def _slope_to_calibration(calibration: Calibration, slope: FloatArray, held: Sequence[str]) -> FloatArray:
-    """∂p/∂(gains, parameters of the calibration), shape (10, n + p), from that to gains and held columns."""
+def _slope_to_calibration(
+    calibration: Calibration, slope: FloatArray, held: Sequence[str]
+) -> FloatArray:
+    """∂p/∂(gains, parameters of the calibration), shape (10, n + p),
+    from that to gains and held columns.
+    """
     count = len(calibration.gains)
     place = {name: count + index for index, name in enumerate(held)}
     used = np.zeros((len(slope), count + len(calibration.parameters)))
@@ -498,11 +564,13 @@ def _slope_to_calibration(calibration: Calibration, slope: FloatArray, held: Seq
 def _of_reference_mass(
     calibration: Calibration, body: FloatArray, slope: FloatArray, held: Sequence[str]
 ) -> FloatArray:
-    """Covariance of the ten that comes from the tolerance of the calibration's reference masses, shape (10, 10).
+    """Covariance of the ten that comes from the tolerance of the calibration's reference masses,
+    shape (10, 10).
 
     Args:
-        calibration: with the derivatives of its gains and parameters to these masses. Without those of the parameters,
-            the body is taken in proportion to the mass, as it is where nothing else is known of that payload.
+        calibration: with the derivatives of its gains and parameters to these masses. Without those
+            of the parameters, the body is taken in proportion to the mass, as it is where nothing
+            else is known of that payload.
         body: the ten, shape (10,).
         slope: ∂p/∂(g, held parameters), shape (10, n + h).
         held: names of the columns held.
@@ -537,7 +605,8 @@ def moves_that_help(weighed: WeighedBody, extras: Sequence[ExtraMoves]) -> tuple
 
     Args:
         weighed: the body.
-        extras: moves that could be made with it, and without load too where it was weighed beside bare runs.
+        extras: moves that could be made with it, and without load too where it was weighed beside
+            bare runs.
 
     Returns:
         an entry for each parameter that some of them bring to WORTH of its σ or less.
@@ -548,13 +617,23 @@ def moves_that_help(weighed: WeighedBody, extras: Sequence[ExtraMoves]) -> tuple
     alone = _std(scale.information, place)
     # Rows are correlated, and moves scatter more than rows say: the prediction is of the ratio.
     usable = np.isfinite(shown) & np.isfinite(alone)
-    factor = float(np.median((shown / alone)[usable])) if usable.any() else 1.0
-    after = [(extra, factor * _std(scale.information + _information(scale, extra), place)) for extra in extras]
+    if usable.any():
+        factor = float(np.median((shown / alone)[usable]))
+    else:
+        factor = 1.0
+    after = [
+        (extra, factor * _std(scale.information + _information(scale, extra), place))
+        for extra in extras
+    ]
     found = []
     for index in np.flatnonzero(~weighed.identifiable):
         extra, std = min(after, key=lambda one: float(one[1][index]), default=(None, shown))
-        if extra is not None and std[index] <= WORTH * np.nan_to_num(shown[index], nan=np.finfo(np.float64).max):
-            found.append(Help(LINK_PARAMETERS[index], extra.words, extra.seconds, float(std[index])))
+        if extra is not None and std[index] <= WORTH * np.nan_to_num(
+            shown[index], nan=np.finfo(np.float64).max
+        ):
+            found.append(
+                Help(LINK_PARAMETERS[index], extra.words, extra.seconds, float(std[index]))
+            )
     return tuple(found)
 
 
@@ -570,7 +649,9 @@ def _information(scale: Scale, extra: ExtraMoves) -> FloatArray:
     rows[:, inside] = motors[:, scale.unknowns[inside]].transpose(0, 2, 1).reshape(len(rows), -1)
     information = rows.T @ rows
     if scale.beside_bare_runs:
-        of_body = (scale.unknowns >= count) | np.isin(scale.unknowns, scale.model.loaded_friction_columns)
+        of_body = (scale.unknowns >= count) | np.isin(
+            scale.unknowns, scale.model.loaded_friction_columns
+        )
         rows[:, of_body] = 0.0
         information += rows.T @ rows
     return information
@@ -579,7 +660,8 @@ def _information(scale: Scale, extra: ExtraMoves) -> FloatArray:
 def _std(information: FloatArray, wanted: IntArray) -> FloatArray:
     """σ of some unknowns; inf for one that the information does not fix."""
     unit = np.sqrt(np.diag(information))
-    unit[unit <= UNSEEN * unit.max()] = np.inf  # rounding, which scaled up would look like information
+    # Rounding, which scaled up would look like information
+    unit[unit <= UNSEEN * unit.max()] = np.inf
     values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
     seen = values > UNSEEN * values[-1]
     std = np.sqrt((vectors[wanted][:, seen] ** 2) @ (1.0 / values[seen])) / unit[wanted]

@@ -16,24 +16,36 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadFileScheduling
 
-# A busy machine is no reason to fail: no test asserts on a clock. And what passed once passes again.
+# A busy machine is no reason to fail: no test asserts on a clock. And what passed once passes
+# again.
 settings.register_profile("drivegain", deadline=None, derandomize=True)
 settings.load_profile("drivegain")
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 
-LONG = ("test_main_job.py", "test_same_diagnoses.py", "test_plan_effort.py", "test_guided.py", "test_any_robot.py")
-"""Files that take a minute and more: begun last, they would keep one processor busy after the other has ended."""
+LONG = (
+    "test_main_job.py",
+    "test_same_diagnoses.py",
+    "test_plan_effort.py",
+    "test_guided.py",
+    "test_any_robot.py",
+)
+"""Files that take a minute and more: begun last, they would keep one processor busy after the other
+has ended.
+"""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register what `make test` leaves to a target of its own."""
     config.addinivalue_line(
-        "markers", "processes: a whole job: on several processes or buses, or a real recording (make test-processes)"
+        "markers",
+        "processes: a whole job: on several processes or buses, or a real recording "
+        "(make test-processes)",
     )
     config.addinivalue_line(
-        "markers", "slow: searches, plans and sessions on whole simulated recordings (make test-slow)"
+        "markers",
+        "slow: searches, plans and sessions on whole simulated recordings (make test-slow)",
     )
     config.addinivalue_line(
         "markers", "browser: drives Chromium, where DRIVEGAIN_CHROMIUM names it (make test-console)"
@@ -41,7 +53,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_sessionstart() -> None:
-    """Leave garbage alone while modules are imported: a third of that time would go into looking for it."""
+    """Leave garbage alone while modules are imported:
+    a third of that time would go into looking for it.
+    """
     gc.disable()
 
 
@@ -71,13 +85,17 @@ class _FolderTogether(LoadFileScheduling):  # type: ignore[misc]  # xdist has no
     """As `--dist loadfile`, with the files of one folder in one worker."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return TOGETHER if nodeid.startswith(TOGETHER) else nodeid.split("::", 1)[0]
+        if nodeid.startswith(TOGETHER):
+            return TOGETHER
+        return nodeid.split("::", 1)[0]
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
     """Replace the scheduler of `--dist loadfile`."""
-    return _FolderTogether(config, log) if config.getvalue("dist") == "loadfile" else None
+    if config.getvalue("dist") == "loadfile":
+        return _FolderTogether(config, log)
+    return None
 
 
 @pytest.fixture(scope="session")
@@ -91,12 +109,16 @@ def shared_data() -> Path:
     """The folder with recordings and EDS files that are not part of the repository."""
     folder = Path(os.environ.get("DRIVEGAIN_DATA", CHECKOUT.parent / "shared" / "data"))
     if not (folder / "tx40").is_dir():
-        pytest.skip(f"no real recordings at {folder}: set DRIVEGAIN_DATA to the folder that holds tx40/")
+        pytest.skip(
+            f"no real recordings at {folder}: set DRIVEGAIN_DATA to the folder that holds tx40/"
+        )
     return folder
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the processor time of the whole run: this process, its workers and the programs that they started."""
+    """Print the processor time of the whole run:
+    this process, its workers and the programs that they started.
+    """
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     seconds = sum(one.ru_utime + one.ru_stime for one in used)
     terminalreporter.write_line(f"processor time: {seconds:.0f} s")

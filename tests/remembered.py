@@ -1,4 +1,6 @@
-"""Pure functions that compute each result once, for tests that ask for the same one along several ways."""
+"""Pure functions that compute each result once, for tests that ask for the same one along several
+ways.
+"""
 
 from __future__ import annotations
 

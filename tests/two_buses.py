@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 
-LEFT, RIGHT = (1, 2, 3), (4, 5, 6)
+LEFT = (1, 2, 3)
+RIGHT = (4, 5, 6)
 
 
 def on_two_buses(text: str, interface: str, left: str, right: str) -> str:
-    """A cell file of one bus and nodes 1 to 6 with two: axes 1 to 3 on the left one, 4 to 6 on the right one.
+    """A cell file of one bus and nodes 1 to 6 with two:
+    axes 1 to 3 on the left one, 4 to 6 on the right one.
 
     Args:
         text: of the cell file.

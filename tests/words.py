@@ -1,14 +1,16 @@
-"""`make words`: count the words of the old house language that are still in code, tests and documentation.
+"""`make words`: count the words of the old house language that are still in code,
+tests and documentation.
 
-The phrases are the left column of the project's language table, each with the plain English to write instead. Files
-are read as text: comments, messages, docstrings, identifiers (`told_of` and `TellingTime` are split into words), file
-names and documentation. Phrases broken over lines are joined first. Docstrings are found with `ast`.
+The phrases are the left column of the project's language table, each with the plain English to
+write instead. Files are read as text: comments, messages, docstrings, identifiers (`told_of` and
+`TellingTime` are split into words), file names and documentation. Phrases broken over lines are
+joined first. Docstrings are found with `ast`.
 
     python -m tests.words                          the working tree beside the baseline; exit code 1 above the limit
     python -m tests.words --at REV                 the same for a git revision
     python -m tests.words --show "stand"           where a phrase occurs (part of its name is enough)
-    python -m tests.words --at ad5bfbc --baseline  prints BASELINE, the table at the end of this file
-"""
+    python -m tests.words --at ad5bfbc --baseline  prints BASELINE, the table at the end
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -47,8 +49,8 @@ class Phrase:
     Attributes:
         name: as the table prints it.
         instead: the plain English.
-        pattern: regular expression. It is matched against the joined words in lower case, or against the text itself
-            when `raw` is set.
+        pattern: regular expression. It is matched against the joined words in lower case, or
+            against the text itself when `raw` is set.
         raw: whether the pattern is for identifiers as they are written.
     """
 
@@ -67,24 +69,52 @@ class Phrase:
 PHRASES = (
     Phrase("told", "reported, shown, identified", r"\btold\b"),
     Phrase("tell, tells, telling", "reports, shows, distinguishes", r"\btell(?:s|ing|ings)?\b"),
-    # Not: standstill, standard, standalone (other words), stand-alone, "stands still" of a joint at rest.
+    # Not: standstill, standard, standalone (other words), stand-alone, "stands still" of a joint at
+    # rest.
     Phrase(
         "stand, stands, stood, standing",
         "is in, is, holds; approves",
         r"\b(?<!self-)(?:stands?|stood|standing)\b(?!-alone|-by| still| alone)",
     ),
     Phrase("whoever, whomever", "operator, caller, client", r"\bwho(?:m?ever|soever)\b"),
-    Phrase("somebody, anybody, who asks", "operator, caller, another program", r"\b(?:somebody|anybody|who asks?)\b"),
+    Phrase(
+        "somebody, anybody, who asks",
+        "operator, caller, another program",
+        r"\b(?:somebody|anybody|who asks?)\b",
+    ),
     Phrase("nobody", "no one is needed: name the thing that is missing", r"\bnobody\b"),
     Phrase("way back", "rollback", r"\bways? back\b"),
-    Phrase("fails while … is told", "reporting failures are attached as notes", r"\bwhat fails? while\b"),
-    Phrase("take … back", "undo, roll back", r"\b(?:take|takes|took|taken|taking)(?: [\w`{}.']+){0,6} back\b"),
-    Phrase("closed gate", "failed check", r"\bclosed gates?\b|\bgates? (?:is|are|was|were|stays?|stayed) closed\b"),
+    Phrase(
+        "fails while … is told",
+        "reporting failures are attached as notes",
+        r"\bwhat fails? while\b",
+    ),
+    Phrase(
+        "take … back",
+        "undo, roll back",
+        r"\b(?:take|takes|took|taken|taking)(?: "
+        r"[\w`{}.']+){0,6} back\b",
+    ),
+    Phrase(
+        "closed gate",
+        "failed check",
+        r"\bclosed gates?\b|\bgates? "
+        r"(?:is|are|was|were|stays?|stayed) closed\b",
+    ),
     Phrase("inertia only", "identifiable only through inertia", r"\binertia only\b"),
     Phrase("as fit; then find", "fit, then detect and add missing effects", r"\bas fit; then\b"),
-    Phrase("what the model lacks", "missing effects", r"\bwhat (?:the|a|their) model (?:may )?lack(?:s|ed)?\b"),
+    Phrase(
+        "what the model lacks",
+        "missing effects",
+        r"\bwhat (?:the|a|their) model (?:may "
+        r")?lack(?:s|ed)?\b",
+    ),
     Phrase("make a log of", "convert CSV files to a log", r"\bmake a log of\b"),
-    Phrase("unused, not used (runs)", "held-out", r"\bunused\b|\bruns? that (?:was|were|is|are) not used\b"),
+    Phrase(
+        "unused, not used (runs)",
+        "held-out",
+        r"\bunused\b|\bruns? that (?:was|were|is|are) not used\b",
+    ),
     Phrase("short_searches", "defer_full_gc", r"\bshort_searches\b", raw=True),
     Phrase("deed, doer", "WriteAction, actor", r"\bdeeds?\b|\bdoers?\b"),
     Phrase("Cellside", "JobContext", r"\bcell ?side\b"),
@@ -114,9 +144,13 @@ class Source:
     @staticmethod
     def of(path: str, text: str) -> Source:
         """Prepare a file for the search."""
-        shown = re.sub(r'`[^`\n]*`|"[^"\n]*"|“[^”\n]*”', "", text) if path == "CHANGELOG.md" else text
+        if path == "CHANGELOG.md":
+            shown = re.sub(r'`[^`\n]*`|"[^"\n]*"|“[^”\n]*”', "", text)
+        else:
+            shown = text
         raw = f"{path}\n{shown}"
-        joined = re.sub(r'(?<!")"[ \t]*\n[ \t]*[fr]{0,2}"(?!")', "", raw)  # a message in several pieces
+        # A message in several pieces
+        joined = re.sub(r'(?<!")"[ \t]*\n[ \t]*[fr]{0,2}"(?!")', "", raw)
         joined = re.sub(r"\s*\n[ \t]*(?:#+(?!\w)|>|\*|//)?[ \t]*", " ", joined)
         split = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", joined).replace("_", " ")
         return Source(path, raw, re.sub(r"[ \t]+", " ", split).lower())
@@ -126,7 +160,9 @@ class Source:
         """Index into AREAS."""
         if self.path.startswith("tests/"):
             return 1
-        return 2 if self.path.startswith("docs/") or self.path.endswith(DOCUMENTS) else 0
+        if self.path.startswith("docs/") or self.path.endswith(DOCUMENTS):
+            return 2
+        return 0
 
     def odd_docstrings(self) -> Iterator[str]:
         """Yield the docstrings that begin with "Of" or "What"."""
@@ -152,7 +188,10 @@ def revision(name: str) -> Iterator[Source]:
     """Yield the files of a git revision."""
     with tarfile.open(fileobj=io.BytesIO(_git("archive", "--format=tar", name))) as archive:
         for member in archive:
-            content = archive.extractfile(member) if member.isfile() else None
+            if member.isfile():
+                content = archive.extractfile(member)
+            else:
+                content = None
             if content is not None and member.name not in EXEMPT:
                 yield from _decoded(member.name, content.read())
 
@@ -168,7 +207,9 @@ def occurrences(source: Source) -> Iterator[tuple[str, str]]:
 
 def count(sources: Iterator[Source]) -> Counts:
     """Count every phrase in each of AREAS."""
-    counts: Counts = {name: [0] * len(AREAS) for name in (*(phrase.name for phrase in PHRASES), DOCSTRING)}
+    counts: Counts = {
+        name: [0] * len(AREAS) for name in (*(phrase.name for phrase in PHRASES), DOCSTRING)
+    }
     for source in sources:
         for name, _ in occurrences(source):
             counts[name][source.area] += 1
@@ -180,19 +221,30 @@ def table(counts: Counts) -> str:
     rows = [(name, *found, sum(found), sum(BASELINE[name])) for name, found in counts.items()]
     totals = [sum(column) for column in zip(*(figures for _, *figures in rows), strict=True)]
     lines = [f"{'phrase':34}" + "".join(f"{head:>10}" for head in (*AREAS, "total", "baseline"))]
-    lines += [f"{name:34}" + "".join(f"{figure:10d}" for figure in figures) for name, *figures in rows]
+    lines += [
+        f"{name:34}" + "".join(f"{figure:10d}" for figure in figures) for name, *figures in rows
+    ]
     lines.append(f"{'total':34}" + "".join(f"{figure:10d}" for figure in totals))
     return "\n".join(lines)
 
 
 def main() -> int:
     """Print the table, or the places of a phrase; return the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--at", metavar="REV", help="count a git revision in place of the working tree")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--at", metavar="REV", help="count a git revision in place of the working tree"
+    )
     parser.add_argument("--show", metavar="PHRASE", help="list where the phrase occurs")
-    parser.add_argument("--baseline", action="store_true", help="print the counts as the table BASELINE")
+    parser.add_argument(
+        "--baseline", action="store_true", help="print the counts as the table BASELINE"
+    )
     arguments = parser.parse_args()
-    sources = revision(arguments.at) if arguments.at else working_tree()
+    if arguments.at:
+        sources = revision(arguments.at)
+    else:
+        sources = working_tree()
     if arguments.show is not None:
         for source in sources:
             for name, context in occurrences(source):
@@ -201,10 +253,16 @@ def main() -> int:
         return 0
     counts = count(sources)
     if arguments.baseline:
-        sys.stdout.write("".join(f'    "{name}": {tuple(found)},\n' for name, found in counts.items()))
+        sys.stdout.write(
+            "".join(f'    "{name}": {tuple(found)},\n' for name, found in counts.items())
+        )
         return 0
-    total, allowed = _total(counts), LIMIT * _total(BASELINE)
-    sys.stdout.write(f"{table(counts)}\n{total} found, at most {allowed:.0f} allowed: {LIMIT:.0%} of the baseline\n")
+    total = _total(counts)
+    allowed = LIMIT * _total(BASELINE)
+    sys.stdout.write(
+        f"{table(counts)}\n{total} found, at most {allowed:.0f} allowed: {LIMIT:.0%} "
+        "of the baseline\n"
+    )
     return int(total > allowed)
 
 

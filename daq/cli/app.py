@@ -20,7 +20,14 @@ from typer.core import TyperGroup
 
 from daq.cli.failure import ErrorParts, show_failure
 from daq.cli.output import QueuedOutput
-from daq.cli.terminal import STARTED, WRITTEN, interruptible, remove_empty_folders, say_last
+from daq.cli.terminal import (
+    CHANGED,
+    STARTED,
+    WRITTEN,
+    interruptible,
+    remove_empty_folders,
+    say_last,
+)
 from daq.cli.verb import HELP_NAMES, Job, Verb
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed
@@ -28,8 +35,12 @@ from daq.report.text import printable
 from drivers.errors import DriverError, all_notes
 from ident.errors import IdentificationError
 
-CLICK_ERROR: type[Exception] = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
-"""What typer raises of a command line that cannot be parsed: it brings a click of its own, without public names."""
+CLICK_ERROR: type[Exception] = next(
+    kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"
+)
+"""What typer raises of a command line that cannot be parsed:
+it brings a click of its own, without public names.
+"""
 BY_JOB = {
     Job.COMMISSION: (
         Verb(
@@ -51,7 +62,10 @@ BY_JOB = {
             "One session: check, record, identify, write, accept.",
         ),
         Verb(
-            "scan", "daq.cli.scan:scan_verb", "drivegain scan CELL", "Compare the nodes on the bus with the cell file."
+            "scan",
+            "daq.cli.scan:scan_verb",
+            "drivegain scan CELL",
+            "Compare the nodes on the bus with the cell file.",
         ),
         Verb(
             "plan",
@@ -62,20 +76,22 @@ BY_JOB = {
         Verb(
             "record",
             "daq.cli.record:record_verb",
-            "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
+            "drivegain record CELL plan.yaml --out loaded.mcap --payload disc --mass 4.59 "
+            "--enable-motion",
             "Execute a plan and log it; this moves the robot.",
         ),
         Verb(
             "fit",
             "daq.cli.fit:fit_verb",
-            "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml",
+            "drivegain fit unloaded.mcap loaded.mcap --holdout held-out.mcap --out "
+            "calibration.yaml",
             "Identify all drive gains and dynamic parameters.",
         ),
         Verb(
             "residual",
             "daq.cli.fit:residual_verb",
-            "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml "
-            "--report report",
+            "drivegain residual unloaded.mcap loaded.mcap --holdout held-out.mcap --out "
+            "calibration.yaml --report report",
             "Fit, then detect and add missing effects.",
         ),
         Verb(
@@ -149,13 +165,21 @@ BY_JOB = {
             "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna",
             "Sign a calibration as its second approver.",
             (
-                Verb("key", "daq.cli.sign:sign_key_verb", "drivegain sign key --name anna --folder keys"),
+                Verb(
+                    "key",
+                    "daq.cli.sign:sign_key_verb",
+                    "drivegain sign key --name anna --folder keys",
+                ),
                 Verb(
                     "calibration",
                     "daq.cli.sign:sign_calibration_verb",
                     "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna",
                 ),
-                Verb("check", "daq.cli.sign:sign_check_verb", "drivegain sign check CELL calibration.yaml"),
+                Verb(
+                    "check",
+                    "daq.cli.sign:sign_check_verb",
+                    "drivegain sign check CELL calibration.yaml",
+                ),
             ),
         ),
         Verb(
@@ -194,13 +218,21 @@ BY_JOB = {
                     "daq.cli.models:export_mjcf_verb",
                     "drivegain export mjcf CELL calibration.yaml --out robot.xml",
                 ),
-                Verb("log", "daq.cli.logs:export_log_verb", "drivegain export log loaded.mcap --csv --out loaded.csv"),
+                Verb(
+                    "log",
+                    "daq.cli.logs:export_log_verb",
+                    "drivegain export log loaded.mcap --csv --out loaded.csv",
+                ),
                 Verb(
                     "csv",
                     "daq.cli.logs:export_csv_verb",
                     "drivegain export csv calibration.yaml held-out.mcap --out residual.csv",
                 ),
-                Verb("bag", "daq.cli.logs:export_bag_verb", "drivegain export bag loaded.mcap --out loaded-bag"),
+                Verb(
+                    "bag",
+                    "daq.cli.logs:export_bag_verb",
+                    "drivegain export bag loaded.mcap --out loaded-bag",
+                ),
             ),
         ),
         Verb(
@@ -231,10 +263,14 @@ ALIASES = {"report": "certificate", "install-units": "schedule"}
 
 
 class _Verbs(TyperGroup):
-    """Group that lists the verbs by job without importing them, and imports the one that is called."""
+    """Group that lists the verbs by job without importing them,
+    and imports the one that is called.
+    """
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Return name, command and remaining arguments, with the verb itself in place of its placeholder."""
+        """Return name, command and remaining arguments,
+        with the verb itself in place of its placeholder.
+        """
         first, *others = args
         named = ALIASES.get(first, first)
         name, command, rest = super().resolve_command(ctx, [named, *others])
@@ -255,7 +291,10 @@ class _Verbs(TyperGroup):
                 return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
             writes = ctx.invoked_subcommand in {"apply", "rollback"}
-            nothing = "nothing was changed" if writes else "no file was written"
+            if writes:
+                nothing = "nothing was changed"
+            else:
+                nothing = "no file was written"
             said = _kept() or "; ".join(all_notes(interrupt)) or nothing
             if ctx.invoked_subcommand == "demo" and any(path.exists() for path in STARTED):
                 said += "; the next `drivegain demo` into this folder starts anew and replaces it"
@@ -265,7 +304,9 @@ class _Verbs(TyperGroup):
 
 def _ending_signals() -> tuple[signal.Signals, ...]:
     """Signals that end this process at once; those that are ignored stay so: nohup."""
-    return tuple(one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is signal.SIG_DFL)
+    return tuple(
+        one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is signal.SIG_DFL
+    )
 
 
 def build_app() -> typer.Typer:
@@ -273,15 +314,17 @@ def build_app() -> typer.Typer:
     app = typer.Typer(
         cls=_Verbs,
         name="drivegain",
-        help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the calibration back.",
-        epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 calibration refused, "
-        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate "
-        "(11: the interlock refuses, 12: the bus is taken), "
-        "130 interrupted.",
+        help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the "
+        "calibration back.",
+        epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 "
+        "calibration refused, 4 data unfit, 5 device fault, 6 configuration, 10 to 14 see "
+        "recalibrate (11: the interlock refuses, 12: the bus is taken), 15 new moves contradict "
+        "the gains that were written, see calibrate; 130 interrupted.",
         no_args_is_help=True,
         context_settings={"help_option_names": HELP_NAMES},
         pretty_exceptions_enable=False,
-        rich_markup_mode=None,  # rich would read the units in brackets, [s], as markup and drop them
+        # Rich would read the units in brackets, [s], as markup and drop them
+        rich_markup_mode=None,
     )
     app.callback()(_options)
     for verb in VERBS:
@@ -292,10 +335,12 @@ def build_app() -> typer.Typer:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line, by default that of this process, and return its exit code."""
     if arguments is None:
-        # A process of one command: almost all that it makes at its start stays, and searching it for garbage again and
-        # again is a sixth of the time of `info`. A recording sets limits of its own (daq/workflow/safeguards.py).
+        # A process of one command: almost all that it makes at its start stays, and searching it
+        # for garbage again and again is a sixth of the time of `info`. A recording sets limits of
+        # its own (daq/workflow/safeguards.py).
         gc.set_threshold(20_000, 50, 100)
     WRITTEN.clear()
+    CHANGED.clear()
     STARTED.clear()
     words = sys.argv[1:] if arguments is None else list(arguments)
     json_wanted = "--json" in words[: words.index("--") if "--" in words else None]
@@ -317,7 +362,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _handed_over(output: QueuedOutput, code: int, json_wanted: bool) -> int:
-    """Wait for the reader of what was printed, unless an interrupt ends that; return the exit code."""
+    """Wait for the reader of what was printed, unless an interrupt ends that;
+    return the exit code.
+    """
     if code == ExitCode.INTERRUPTED:
         return code
     try:
@@ -327,33 +374,45 @@ def _handed_over(output: QueuedOutput, code: int, json_wanted: bool) -> int:
         return code or _output_failed(error, json_wanted)
     except KeyboardInterrupt:
         kept = _kept()
-        say_last(printable("interrupted: the output was not read to its end" + (f"; {kept}" if kept else "")))
+        say_last(
+            printable(
+                "interrupted: the output was not read to its end" + (f"; {kept}" if kept else "")
+            )
+        )
         return ExitCode.INTERRUPTED
     return code
 
 
 def _spelled(error: Any) -> tuple[str, int]:
-    """Spell characters that the output's encoding lacks as \\u00b1, which is right in a JSON document too."""
+    """Spell characters that the output's encoding lacks as \\u00b1,
+    which is right in a JSON document too.
+    """
     return json.dumps(error.object[error.start : error.end])[1:-1], error.end
 
 
 def _run(words: list[str], json_wanted: bool) -> int:
     try:
-        ended = typer.main.get_command(build_app()).main(words, prog_name="drivegain", standalone_mode=False)
+        ended = typer.main.get_command(build_app()).main(
+            words, prog_name="drivegain", standalone_mode=False
+        )
     except (DaqError, DriverError, IdentificationError) as error:
-        if isinstance(error, OutputFailed) and _kept():
+        is_told = isinstance(error, OutputFailed) or bool(CHANGED)
+        if is_told and _kept():
             error.add_note(f"kept: {_kept()}")
         failure = ErrorParts.of(error, _verb_of(words))
         show_failure(failure, json_wanted=json_wanted)
         return failure.exit_code
     except OSError as error:
         return _output_failed(error, json_wanted)
-    except SystemExit as stop:  # typer ends so after an option such as --show-completion, rich at a closed pipe
+    # Typer ends so after an option such as --show-completion, rich at a closed pipe.
+    except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):
             return _output_failed(stop.__context__, json_wanted)
         ended = stop.code
     except typer.Abort:
-        say_last("interrupted: no file was written")  # Ctrl-C or Ctrl-D at a prompt
+        # Ctrl-C or Ctrl-D at a prompt
+        said = _kept() or "no file was written"
+        say_last(printable(f"interrupted: {said}"))
         ended = ExitCode.INTERRUPTED
     except CLICK_ERROR as error:
         ended = _usage_failed(error, words, json_wanted)
@@ -375,12 +434,16 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
     if error.ctx is not None:
         command = error.ctx.command_path
         usage = error.ctx.get_usage()
-    elif verb := _verb_of(words):  # the parser knows no verb where an option ends the line without its value
+    elif verb := _verb_of(words):
+        # The parser knows no verb where an option ends the line without its value.
         command = f"drivegain {verb}"
     found = str(error.format_message())
     param = getattr(error, "param", None)
     if param is not None:
-        shown = param.name.upper() if param.param_type_name == "argument" else max(param.opts, key=len)
+        if param.param_type_name == "argument":
+            shown = param.name.upper()
+        else:
+            shown = max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
     remedy = f"`{command} --help` explains it"
     # A value of the wrong type: the message of typer's validation does not repeat it.
@@ -396,20 +459,31 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
 
 def _output_failed(error: OSError, json_wanted: bool) -> int:
     # A reader that closed the pipe needs no message where nothing was written; a full disk does.
-    if WRITTEN or not isinstance(error, BrokenPipeError):
+    has_changed = bool(WRITTEN or CHANGED)
+    if has_changed or not isinstance(error, BrokenPipeError):
         failed = OutputFailed.of(Path(str(error.filename or "standard output")), error)
         if not error.filename:
             failed.expected = "an output that takes what is printed"
-            failed.remedy = f"only the printed output is lost: {_kept()}" if WRITTEN else "send it elsewhere"
+            if has_changed:
+                failed.remedy = f"only the printed output is lost: {_kept()}"
+            else:
+                failed.remedy = "send it elsewhere"
         show_failure(ErrorParts.of(failed), json_wanted=json_wanted)
     return ExitCode.UNEXPECTED
 
 
 def _kept() -> str:
-    """Say what this command has written: files that are complete, and folders that it was still filling."""
+    """Say what this command has written: files that are complete, folders that it was still
+    filling, and changes of other files.
+    """
     unfinished = [str(path) for path in STARTED if path.exists()]
-    parts = [f"{', '.join(map(str, WRITTEN))} was written before that, completely"] if WRITTEN else []
-    parts += [f"{', '.join(unfinished)} has what was finished until then"] if unfinished else []
+    if WRITTEN:
+        parts = [f"{', '.join(map(str, WRITTEN))} was written before that, completely"]
+    else:
+        parts = []
+    if unfinished:
+        parts += [f"{', '.join(unfinished)} has what was finished until then"]
+    parts += CHANGED
     return "; ".join(parts)
 
 
@@ -421,7 +495,10 @@ def _show_version(wanted: bool) -> None:
 
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     """Options before the verb."""

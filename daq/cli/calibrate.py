@@ -1,4 +1,6 @@
-"""`drivegain calibrate`: one session with a person, from a wired cell to an accepted calibration."""
+"""`drivegain calibrate`: one session with a person,
+from a wired cell to an accepted calibration.
+"""
 
 from __future__ import annotations
 
@@ -51,36 +53,57 @@ class CalibrateOptions:
 
     cell: CellArgument
     enable_motion: Annotated[
-        bool, typer.Option("--enable-motion", help="Allow motion; each block still asks before power comes on.")
+        bool,
+        typer.Option(
+            "--enable-motion", help="Allow motion; each block still asks before power comes on."
+        ),
     ] = False
-    check: Annotated[bool, typer.Option("--check", help="Only check what a session needs; nothing moves.")] = False
-    payload: Annotated[str | None, typer.Option(help="Body for the loaded blocks, if the cell has several.")] = None
+    check: Annotated[
+        bool, typer.Option("--check", help="Only check what a session needs; nothing moves.")
+    ] = False
+    payload: Annotated[
+        str | None, typer.Option(help="Body for the loaded blocks, if the cell has several.")
+    ] = None
     target: Annotated[
         float | None,
         typer.Option(
-            help="σ of every gain at which the recording ends [%]; target_sigma_percent of the cell file by default.",
+            help="σ of every gain at which the recording ends [%]; target_sigma_percent of the "
+            "cell file by default.",
             min=0.05,
             max=10.0,
         ),
     ] = None
-    block: Annotated[float, typer.Option(help="Duration of a block [s].", min=5.0, max=600.0)] = 20.0
+    block: Annotated[float, typer.Option(help="Duration of a block [s].", min=5.0, max=600.0)] = (
+        20.0
+    )
     rehearse: Annotated[
-        bool, typer.Option("--rehearse", help="First make the moves of three blocks at 25 % of their speed.")
+        bool,
+        typer.Option(
+            "--rehearse", help="First make the moves of three blocks at 25 % of their speed."
+        ),
     ] = False
-    time_limit: Annotated[float, typer.Option(help="Motion after which the recording ends [min].", min=1.0)] = 30.0
+    time_limit: Annotated[
+        float, typer.Option(help="Motion after which the recording ends [min].", min=1.0)
+    ] = 30.0
     sessions: Annotated[
-        Path | None, output_option("--sessions", "Folder of the sessions, by default beside the cell file.")
+        Path | None,
+        output_option("--sessions", "Folder of the sessions, by default beside the cell file."),
     ] = None
-    by: Annotated[str | None, typer.Option("--by", help="Operator, for logs and audit; you, by default.")] = None
+    by: Annotated[
+        str | None, typer.Option("--by", help="Operator, for logs and audit; you, by default.")
+    ] = None
     yes_move: Annotated[
-        bool, typer.Option("--yes-move", help="Do not ask before each block: on simulated cells alone.")
+        bool,
+        typer.Option("--yes-move", help="Do not ask before each block: on simulated cells alone."),
     ] = False
     json: JsonOption = False
 
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """An operator at the terminal, who mounts, weighs, permits each motion and types `yes` to write."""
+    """An operator at the terminal, who mounts, weighs,
+    permits each motion and types `yes` to write.
+    """
 
     cell: Cell
     who: str
@@ -102,13 +125,18 @@ class Person:
             ask("Check the flange, leave the cell, press Enter")
 
     def weigh(self, payload: str) -> float:
-        """Ask for the mass from the scale, twice, until both are the same and that of the cell file."""
+        """Ask for the mass from the scale, twice, until both are the same and that of the cell
+        file.
+        """
         declared = next(one for one in self.cell.payloads if one.name == payload)
         while True:
             first_kg = _number(ask(f"Mass of {payload} read from the scale [kg]"))
             second_kg = _number(ask("The same once more"))
             if first_kg is None or first_kg != second_kg:
-                tell("Found two different numbers, or none; type the mass in kg, such as 4.59, twice.")
+                tell(
+                    "Found two different numbers, or none; type the mass in kg, such as "
+                    "4.59, twice."
+                )
                 continue
             refusal = _refused_mass(declared, first_kg)
             if not refusal:
@@ -118,15 +146,23 @@ class Person:
     def permit_motion(self, run: PlannedRun) -> str:
         """Ask once more before power comes on."""
         if not self.may_move:
-            raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
+            raise MotionRefused(
+                "motion is disabled", expected="permission", remedy="pass --enable-motion"
+            )
         if self.asks_before_motion:
             ask("The robot moves now: Enter starts it, Ctrl-C stops")
         return self.who
 
     def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
         """Ask whether blocks with a mistake are recorded again; `keep` keeps them."""
-        them = "it" if len(blocks) == 1 else f"these {len(blocks)} blocks"
-        return ask(f"Press Enter to record {them} again, or type {KEEP} to keep {run.name} as it is") != KEEP
+        if len(blocks) == 1:
+            them = "it"
+        else:
+            them = f"these {len(blocks)} blocks"
+        is_kept = ask_word(
+            f"Press Enter to record {them} again, or type {KEEP} to keep {run.name} as it is", KEEP
+        )
+        return not is_kept
 
     def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
         """Show the change, and ask for `yes`."""
@@ -135,7 +171,7 @@ class Person:
         show_proposal(proposal, output_console())
         if touched:
             tell("! The controller's file was written or rolled back since the session began.")
-        return ask(f"Type {YES} to write to {proposal.edit.subject}, else Enter") == YES
+        return ask_word(f"Type {YES} to write to {proposal.edit.subject}, else Enter", YES)
 
 
 def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
@@ -149,8 +185,8 @@ def _refused_mass(declared: WeighedPayload, mass_kg: float) -> str:
     if agree(mass_kg / 1000.0, declared.mass_kg, tolerance_kg):
         return f"Found {mass_kg:g}, which is the mass in grams; {expected}. Type it in kg."
     return (
-        f"Found {mass_kg:g} kg; {expected}. Weigh it again. If the cell file is wrong, press Ctrl-C and correct it: "
-        "all gains are in proportion to this mass."
+        f"Found {mass_kg:g} kg; {expected}. Weigh it again. If the cell file is wrong, press "
+        "Ctrl-C and correct it: all gains are in proportion to this mass."
     )
 
 
@@ -159,11 +195,29 @@ def tell(text: str, *, bold: bool = False) -> None:
     typer.secho(printable(text), err=True, bold=bold)
 
 
+def ask_word(question: str, word: str) -> bool:
+    """Ask the operator for one word; return whether it was typed, in letters of either case.
+
+    Enter alone, or `no`, means that it was not. Any other answer may be the word with a slip, so
+    the question is asked again.
+
+    Raises:
+        JobHeld: the input has ended.
+    """
+    while True:
+        answer = ask(question)
+        if answer.casefold() == word:
+            return True
+        if answer.casefold() in {"", "no"}:
+            return False
+        tell(f"Found {answer!r}, expected {word}, or Enter alone.")
+
+
 def ask(question: str) -> str:
     """Ask the operator; return the answer without spaces.
 
-    Only what is typed at a terminal behind the question answers it: a key that was pressed too often before
-    must not start the robot.
+    Only what is typed at a terminal behind the question answers it: a key that was pressed too
+    often before must not start the robot.
 
     Raises:
         JobHeld: the input has ended.
@@ -261,7 +315,8 @@ class Looks:
     remark: str = MOVES  #: beside the progress bar of a block
 
     def show(self, look: QuickLook) -> None:
-        """Publish a look, put its worst gain beside the bar, and print it if it is new; in the thread that receives it.
+        """Publish a look, put its worst gain beside the bar, and print it if it is new;
+        in the thread that receives it.
 
         One that comes after the end of its block is not printed: the operator types then.
         """
@@ -271,7 +326,10 @@ class Looks:
         self.feed.look(look)
         if look.gains:
             worst = look.gains[0]
-            self.remark = f"{MOVES}, {worst.axis} ± {worst.std_percent:.2f} % (target {worst.target_percent:g} %)"
+            self.remark = (
+                f"{MOVES}, {worst.axis} ± {worst.std_percent:.2f} % (target "
+                f"{worst.target_percent:g} %)"
+            )
         is_late = look.block not in ("", self.block)
         if is_late or not tells_something_new(look, self.last):
             return
@@ -314,10 +372,12 @@ def _tools(cell_file: Path, cell: Cell, looks: Looks) -> Tools:
 
 @taking(CalibrateOptions)
 def calibrate_verb(options: CalibrateOptions) -> None:
-    """Calibrate a cell in one session: check, record until every gain is precise, identify, write, accept.
+    """Calibrate a cell in one session: check, record until every gain is precise, identify, write,
+    accept.
 
-    Nothing moves without --enable-motion, and each block asks before power comes on. Ctrl-C stops the axes; the same
-    command goes on where the session is. Nothing is written to the controller before you have typed `yes`.
+    Nothing moves without --enable-motion, and each block asks before power comes on. Ctrl-C stops
+    the axes; the same command goes on where the session is. Nothing is written to the controller
+    before you have typed `yes`.
     """
     from daq.jobs.calibrate import calibrate, check_readiness, context_of, payload_for_blocks
     from daq.jobs.guided import GuidedSettings
@@ -353,9 +413,19 @@ def calibrate_verb(options: CalibrateOptions) -> None:
                 show_check(check_readiness(context, options.payload, options.block))
                 return
             if not options.enable_motion:
-                raise MotionRefused("motion is disabled", expected="permission", remedy="pass --enable-motion")
+                raise MotionRefused(
+                    "motion is disabled", expected="permission", remedy="pass --enable-motion"
+                )
             with LiveGains(options.cell, payload_name, settings.target_percent, looks.show):
-                ended = calibrate(options.cell, declared, settings, person, tools, journal, block_signals=block_signals)
+                ended = calibrate(
+                    options.cell,
+                    declared,
+                    settings,
+                    person,
+                    tools,
+                    journal,
+                    block_signals=block_signals,
+                )
     except KeyboardInterrupt as interrupt:
         axes = "; ".join(stop_notes(interrupt)) or "no axis moves"
         say_last(f"interrupted: {axes}; the same command goes on where the session is")

@@ -28,16 +28,20 @@ def certificate_verb(
         output_option("--out", "Page to write; by default beside the calibration, as .html."),
     ] = None,
     cell: Annotated[
-        Path | None, typer.Option("--cell", help="Cell file: compare with the gains in its controller.")
+        Path | None,
+        typer.Option("--cell", help="Cell file: compare with the gains in its controller."),
     ] = None,
-    beside: Annotated[Path | None, typer.Option("--beside", help="Earlier calibration to compare with.")] = None,
+    beside: Annotated[
+        Path | None, typer.Option("--beside", help="Earlier calibration to compare with.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write the certificate of a calibration: one page for screen, phone and paper, without network or script.
+    """Write the certificate of a calibration:
+    one page for screen, phone and paper, without network or script.
 
-    It shows one verdict, each gain with the current gain and the limits, the error on held-out runs, the effects, what
-    would be written or was written where, and a line to sign. Nothing is written to the controller. The earlier name
-    of this verb, `report`, goes on working.
+    It shows one verdict, each gain with the current gain and the limits, the error on held-out
+    runs, the effects, what would be written or was written where, and a line to sign. Nothing is
+    written to the controller. The earlier name of this verb, `report`, goes on working.
     """
 
     from daq.documents.calibration_file import decode_calibration, read_calibration_bytes
@@ -59,12 +63,17 @@ def certificate_verb(
     request = Request(fitted, datetime.now(UTC), file=calibration, content=content)
     digest = sha256(content)
     if cell is None:
-        unread = "The controller was not read; add --cell CELL to compare with its gains and the limits of the cell."
+        unread = (
+            "The controller was not read; add --cell CELL to compare with its gains and the "
+            "limits of the cell."
+        )
         comparison = without_controller(fitted, unread, request.now)
     else:
         command = f"drivegain apply {shlex.quote(str(cell))} {shlex.quote(str(calibration))}"
         comparison = compare(read_cell(cell), request, command)
-    certificate = certify(fitted, comparison, earlier, Origin(digest, session_of(calibration, digest)))
+    certificate = certify(
+        fitted, comparison, earlier, Origin(digest, session_of(calibration, digest))
+    )
     write_file(page, certificate_page(certificate))
     if json:
         print_json(certificate_report(certificate))

@@ -1,8 +1,9 @@
-"""An error for the user: subject, found, expected and remedy, a line each, or one line of JSON under `--json`.
+"""An error for the user: subject, found, expected and remedy, a line each,
+or one line of JSON under `--json`.
 
-The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found; `ADVICE` adds what the
-command line expects there, and a remedy, and `daq.advice` puts verbs in the place of functions. Errors of the operating
-system on a bus are explained by their number.
+The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found;
+`ADVICE` adds what the command line expects there, and a remedy, and `daq.advice` puts verbs in the
+place of functions. Errors of the operating system on a bus are explained by their number.
 """
 
 from __future__ import annotations
@@ -26,14 +27,15 @@ from ident import errors as identification
 if TYPE_CHECKING:
     from daq.report.document import ErrorReport
 
+#: Errors of the identification that have found, expected and remedy.
 WITH_EVIDENCE = (
     identification.ModelContradicted
     | identification.PayloadMissing
     | identification.CurrentUnsigned
     | identification.ChannelUnfit
-)  #: Errors of the identification that have found, expected and remedy
+)
 NOTES = ("kept", "hint")
-"""Labels of the notes that are shown; a verb adds them to an error with ``error.add_note("hint: …")``."""
+"""Labels of the notes that are shown. A verb adds one by ``error.add_note("hint: …")``."""
 NOT_STOPPED = "{} NOT CONFIRMED WITHOUT POWER: use the emergency stop"
 
 _VCAN = "`sudo modprobe vcan`, `sudo ip link add dev vcan0 type vcan`, `sudo ip link set vcan0 up`"
@@ -42,9 +44,13 @@ _SIMULATE = "at a desk `drivegain simulate demo` in a second terminal is a cell"
 ADVICE: dict[type[Exception], tuple[str, str]] = {
     driver.BusError: (
         "a bus that is up, with the amplifiers on it",
-        "check `bus` in the cell file, the adapter (`ip -details link show`) and the power of the cell",
+        "check `bus` in the cell file, the adapter (`ip -details link show`) and the power "
+        "of the cell",
     ),
-    driver.BusBusy: ("no other master on the bus", "end the other program; `drivegain monitor CELL` only listens"),
+    driver.BusBusy: (
+        "no other master on the bus",
+        "end the other program; `drivegain monitor CELL` only listens",
+    ),
     driver.NodeMissing: (
         "an answer from every axis of the cell file",
         "`drivegain scan CELL` lists the nodes that answer",
@@ -55,15 +61,18 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     ),
     driver.ObjectAccessError: (
         "an object that this drive has and answers for",
-        "check that the drive profile (`drive` in the cell file) is that of this drive, then its wiring",
+        "check that the drive profile (`drive` in the cell file) is that of this drive, then "
+        "its wiring",
     ),
     driver.SetupRefused: (
         "the drive that the cell file describes",
-        "compare the drive with `drivegain scan CELL`, and correct `identity` or `drive` in the cell file",
+        "compare the drive with `drivegain scan CELL`, and correct `identity` or `drive` in the "
+        "cell file",
     ),
     driver.StateRefused: (
         "a drive that follows the commands of CiA 301 and CiA 402",
-        "check the power stage and the safety chain; `drivegain scan CELL --reset-faults` names and resets a fault",
+        "check the power stage and the safety chain; `drivegain scan CELL --reset-faults` names "
+        "and resets a fault",
     ),
     driver.ParameterRefused: (
         "a parameter that reads back as written",
@@ -71,9 +80,13 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     ),
     driver.DriveFault: (
         "no fault while the axes move",
-        "remove the cause (`drivegain explain-emcy CODE` explains a code), then `drivegain scan CELL --reset-faults`",
+        "remove the cause (`drivegain explain-emcy CODE` explains a code), then `drivegain scan "
+        "CELL --reset-faults`",
     ),
-    driver.NodeError: ("an amplifier as the cell file describes it", "compare it with `drivegain scan CELL`"),
+    driver.NodeError: (
+        "an amplifier as the cell file describes it",
+        "compare it with `drivegain scan CELL`",
+    ),
     driver.ParametersMixed: (
         "all drives with their previous values, or all with the new ones",
         "`drivegain rollback CELL --drives` before an axis is enabled",
@@ -86,8 +99,14 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "a person who permits motion, and moves within the limits",
         "pass --enable-motion when the cell is clear; plan again where a limit is named",
     ),
-    driver.MotionTimeout: ("every move within its time", "check brakes and limits, or record with --speed 0.5"),
-    driver.DriverError: ("an undisturbed bus", "read the message above; `drivegain monitor CELL` shows the bus"),
+    driver.MotionTimeout: (
+        "every move within its time",
+        "check brakes and limits, or record with --speed 0.5",
+    ),
+    driver.DriverError: (
+        "an undisturbed bus",
+        "read the message above; `drivegain monitor CELL` shows the bus",
+    ),
     identification.DataUnfit: ("runs that can be used", "leave the run out, or record it again"),
     identification.TooFewMoves: (
         "enough moves to judge the scatter",
@@ -98,11 +117,16 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "record runs without load and with the payload, with a plan of `drivegain plan`",
     ),
     identification.PayloadUnseen: (
-        "the payload in every run that declares it, in no other, and heavy enough for the moves to show it",
-        "check what was mounted in each run (`drivegain info LOG` shows what it declares) and record the wrong one "
-        "again; if all are right, use a heavier payload or a plan of `drivegain plan`",
+        "the payload in every run that declares it, in no other, and heavy enough for the moves "
+        "to show it",
+        "check what was mounted in each run (`drivegain info LOG` shows what it declares) and "
+        "record the wrong one again; if all are right, use a heavier payload or a plan of "
+        "`drivegain plan`",
     ),
-    identification.NotConverged: ("a fit that settles", "check the cell file, or try `fit --method wls`"),
+    identification.NotConverged: (
+        "a fit that settles",
+        "check the cell file, or try `fit --method wls`",
+    ),
     identification.EffectImpossible: (
         "coefficients that physics allows",
         "check this effect, `zero_offset_deg` and `gravity_m_s2` in the cell file",
@@ -116,15 +140,20 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "check the cell file and the logs (`drivegain info LOG`)",
     ),
 }
-"""Expected and remedy by class of error, the nearest class first, where the error has none of its own."""
+"""Expected and remedy by class of error, the nearest class first,
+where the error has none of its own.
+"""
 
-_CHECK_NODE = "check the drive's supply, its wiring, and `node_id` and `drive` of the axis in the cell file"
+_CHECK_NODE = (
+    "check the drive's supply, its wiring, and `node_id` and `drive` of the axis in the cell file"
+)
 ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
     "scan": {
         driver.NodeMissing: (
             "an answer from every axis of the cell file",
-            "check, in this order, the supply of the drives, wiring and termination (60 Ω between CAN_H and CAN_L "
-            "without power), the bit rate, and the node ids; `--wait 2` waits longer",
+            "check, in this order, the supply of the drives, wiring and termination (60 Ω between "
+            "CAN_H and CAN_L without power), the bit rate, and the node ids; `--wait 2` waits "
+            "longer",
         ),
         driver.NodeMisplaced: (
             "every axis on the bus that the cell file names",
@@ -146,15 +175,18 @@ ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
             "an answer from every axis to every SYNC",
             "check the power of the cell and the load of bus and computer",
         ),
-        driver.DriverError: ("an undisturbed bus", "read the message above; `drivegain scan CELL` lists the nodes"),
+        driver.DriverError: (
+            "an undisturbed bus",
+            "read the message above; `drivegain scan CELL` lists the nodes",
+        ),
         driver.BusBusy: ("no other master on the bus", "end the other program"),
     },
     # Its cell is simulated and has no file: no other verb can look at it.
     "demo": {
         driver.DriverError: (
             "a simulated cell that answers in time",
-            "close other programs, because a busy computer answers late, and run `drivegain demo` again; with the same "
-            "error on an idle one, choose another --seed",
+            "close other programs, because a busy computer answers late, and run `drivegain demo` "
+            "again; with the same error on an idle one, choose another --seed",
         ),
         identification.IdentificationError: (
             "five runs that identify every gain",
@@ -164,7 +196,8 @@ ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
 }
 """The same within a verb that `ADVICE` would propose to run: its user has just done so."""
 
-RESET = "; then reset the fault with `CanopenNetwork.reset_faults`"  #: How a message about a fault may end
+#: How a message about a fault may end
+RESET = "; then reset the fault with `CanopenNetwork.reset_faults`"
 
 _BY_NUMBER: dict[int, tuple[str, str, str]] = {
     errno.ECONNREFUSED: (
@@ -181,17 +214,20 @@ _BY_NUMBER: dict[int, tuple[str, str, str]] = {
     errno.ENODEV: (
         "no such CAN interface",
         "an interface of that name (`ip link` lists them)",
-        f"connect the adapter, or correct `bus.channel` in the cell file; for a virtual bus {_VCAN}",
+        "connect the adapter, or correct `bus.channel` in the cell file; for a virtual "
+        f"bus {_VCAN}",
     ),
     errno.ENETDOWN: (
         "an interface that is down",
         "one that is up",
-        "bring it up: `sudo ip link set can0 up type can bitrate 1000000`, with the cell's channel and bit rate",
+        "bring it up: `sudo ip link set can0 up type can bitrate 1000000`, with the cell's channel "
+        "and bit rate",
     ),
     errno.EPERM: (
         "no permission to use it",
         "a user who may open CAN sockets",
-        "run it as such a user; in a container, share the host's network and the capability NET_RAW",
+        "run it as such a user; in a container, share the host's network and the "
+        "capability NET_RAW",
     ),
     errno.ENOSPC: ("no space left", "room for frames and files", "free space on the disk"),
     errno.ETIMEDOUT: (
@@ -219,14 +255,19 @@ class ErrorParts:
     do: str
     exit_code: int
     notes: dict[str, str] = field(default_factory=dict)  #: by label: kept, hint
-    unconfirmed: tuple[str, ...] = ()  #: parts of the stop and of the restoring that could not be confirmed
+    #: parts of the stop and of the restoring that could not be confirmed
+    unconfirmed: tuple[str, ...] = ()
     powered: str = ""  #: axes that had power and are not confirmed without it
 
     @classmethod
     def of(cls, error: Exception, verb: str = "") -> ErrorParts:
         """Take an error of `daq`, `drivers` or `ident` apart; `verb` is the one that raised it."""
         notes = getattr(error, "__notes__", ())
-        labelled = {label: text for label, _, text in (note.partition(": ") for note in notes) if label in NOTES}
+        labelled = {
+            label: text
+            for label, _, text in (note.partition(": ") for note in notes)
+            if label in NOTES
+        }
         subject, found, expected, remedy = map(for_command_line, _parts(error, verb))
         return cls(
             type(error).__name__,
@@ -243,7 +284,8 @@ class ErrorParts:
     def document(self) -> ErrorReport:
         """Return the object of `--json`.
 
-        It is made unchecked: an error is reported whatever is in it, and bytes of file names that are not UTF-8 stay.
+        It is made unchecked: an error is reported whatever is in it, and bytes of file names that
+        are not UTF-8 stay.
         """
         from daq.report.document import ErrorReport
 
@@ -277,7 +319,9 @@ class ErrorParts:
 def may_have_power(error: BaseException | None) -> str:
     """Name the axes that had power and are not confirmed without it; empty where there are none."""
     notes = driver.stop_notes(error)
-    return ", ".join(note.removeprefix(driver.POWERED) for note in notes if note.startswith(driver.POWERED))
+    return ", ".join(
+        note.removeprefix(driver.POWERED) for note in notes if note.startswith(driver.POWERED)
+    )
 
 
 def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
@@ -293,8 +337,13 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
     if isinstance(error, driver.SetupRefused) and error.remedy and verb != "demo":
         # What the drive itself showed says more than the kind of the error.
         return error.found, error.found, error.expected, error.remedy
-    known_advice = ADVICE_WITHIN["demo"] if verb == "demo" else ADVICE | ADVICE_WITHIN.get(verb, {})
-    advice = next((known_advice[kind] for kind in type(error).__mro__ if kind in known_advice), ("", ""))
+    if verb == "demo":
+        known_advice = ADVICE_WITHIN["demo"]
+    else:
+        known_advice = ADVICE | ADVICE_WITHIN.get(verb, {})
+    advice = next(
+        (known_advice[kind] for kind in type(error).__mro__ if kind in known_advice), ("", "")
+    )
     said = str(error)
     if verb == "demo":
         said = said.replace(RESET, "")

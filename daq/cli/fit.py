@@ -1,4 +1,6 @@
-"""`drivegain fit` and `residual`: all gains and all parameters from logs, and the effects that the model lacks."""
+"""`drivegain fit` and `residual`: all gains and all parameters from logs,
+and the effects that the model lacks.
+"""
 
 from __future__ import annotations
 
@@ -62,22 +64,36 @@ class Gains(Enum):
 class LogsRequest:
     """Logs to fit and places for the result, as the command line asks for them."""
 
-    logs: Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
-    gains: Annotated[Gains, typer.Option(help="fixed: hold the gains at the nameplate (classical IDIM).")] = Gains.FREE
+    logs: Annotated[
+        list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")
+    ]
+    gains: Annotated[
+        Gains, typer.Option(help="fixed: hold the gains at the nameplate (classical IDIM).")
+    ] = Gains.FREE
     holdout: Annotated[
-        list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
+        list[Path] | None,
+        typer.Option("--holdout", help="Held-out log, for the final error; repeatable."),
     ] = None
-    out: Annotated[Path | None, output_option("--out", "Calibration file to write (calibration.yaml).")] = None
-    pictures: Annotated[Path | None, output_option("--pictures", "Folder for pictures; it is created.")] = None
+    out: Annotated[
+        Path | None, output_option("--out", "Calibration file to write (calibration.yaml).")
+    ] = None
+    pictures: Annotated[
+        Path | None, output_option("--pictures", "Folder for pictures; it is created.")
+    ] = None
     cell: CellOption = None
     accept_losses: Annotated[
         bool,
         typer.Option(
-            "--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."
+            "--accept-losses",
+            help="Use logs with lost frames, less those samples; `apply` refuses the result.",
         ),
     ] = False
     channels_as_wired: Annotated[
-        bool, typer.Option("--channels-as-wired", help="Do not look for exchanged currents: they are each axis' own.")
+        bool,
+        typer.Option(
+            "--channels-as-wired",
+            help="Do not look for exchanged currents: they are each axis' own.",
+        ),
     ] = False
     json: JsonOption = False
 
@@ -91,7 +107,9 @@ class LogsRequest:
         """Whether logs with lost frames are used."""
         from daq.log.reader import LossyLogs
 
-        return LossyLogs.ACCEPTED if self.accept_losses else LossyLogs.REFUSED
+        if self.accept_losses:
+            return LossyLogs.ACCEPTED
+        return LossyLogs.REFUSED
 
     def options(self) -> list[object]:
         """Return the options of the same logs as words of another command."""
@@ -121,30 +139,43 @@ class FitRequest(LogsRequest):
     method: Annotated[
         Method | None,
         typer.Option(
-            help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments of the demand."
+            help="ls, wls, tls of the paper; ml (default; wls with fixed gains); iv: instruments "
+            "of the demand."
         ),
     ] = None
-    known: Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")] = Known.MASS
+    known: Annotated[
+        Known, typer.Option(help="What is known of the payload; cad: its drawing too.")
+    ] = Known.MASS
     essential: Annotated[
         float | None,
         typer.Option(
-            min=1.5, help="Keep only essential parameters, whose relative σ are within this factor (10 to 30)."
+            min=1.5,
+            help="Keep only essential parameters, whose relative σ are within this factor "
+            "(10 to 30).",
         ),
     ] = None
     cases: Annotated[
         Path | None,
-        output_option("--cases", "Folder for the paper's cases 1 to 4, the nameplate gains and ml."),
+        output_option(
+            "--cases", "Folder for the paper's cases 1 to 4, the nameplate gains and ml."
+        ),
     ] = None
     compare: Annotated[
         bool,
         typer.Option(
-            "--compare", help="Also run every estimator, at the cell's cut-offs, their half and their double."
+            "--compare",
+            help="Also run every estimator, at the cell's cut-offs, their half and their double.",
         ),
     ] = False
-    report: Annotated[Path | None, output_option("--report", "Folder for report.html, the certificate.")] = None
+    report: Annotated[
+        Path | None, output_option("--report", "Folder for report.html, the certificate.")
+    ] = None
     prior: Annotated[
         Path | None,
-        typer.Option("--prior", help="URDF with the inertias of the CAD model: also find every single parameter."),
+        typer.Option(
+            "--prior",
+            help="URDF with the inertias of the CAD model: also find every single parameter.",
+        ),
     ] = None
     prior_tolerance: Annotated[
         float | None,
@@ -152,7 +183,8 @@ class FitRequest(LogsRequest):
             "--prior-tolerance",
             min=LEAST_TOLERANCE,
             max=LARGEST_TOLERANCE,
-            help="How far its masses and inertias may be off, one relative σ (0.1); alone: of the cell's URDF.",
+            help="How far its masses and inertias may be off, one relative σ (0.1); alone: of the "
+            "cell's URDF.",
         ),
     ] = None
 
@@ -164,7 +196,9 @@ class FitRequest(LogsRequest):
 
 @taking(FitRequest)
 def fit_verb(request: FitRequest) -> None:
-    """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
+    """Identify all drive gains and dynamic parameters from runs without load and with a weighed
+    payload.
+    """
 
     from daq.report.fit import fit_report, fit_view
     from daq.workflow.cases import calibration_of_case
@@ -177,7 +211,9 @@ def fit_verb(request: FitRequest) -> None:
     at_most_one(essential=request.essential, prior=request.prior or request.prior_tolerance)
     request.check_places(request.report)
     if request.wants_full:
-        require_packages("full parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
+        require_packages(
+            "full parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+        )
     with status("identifying"):
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
@@ -198,12 +234,16 @@ def fit_verb(request: FitRequest) -> None:
     if request.json:
         print_json(fit_report(found, calibration, comparison))
         return
-    print_view(fit_view(found, calibration, comparison), request.out, request.report, request.pictures)
+    print_view(
+        fit_view(found, calibration, comparison), request.out, request.report, request.pictures
+    )
     say_after_fit(calibration, [*request.logs, *request.options()], request.out)
 
 
 def _fit(request: FitRequest) -> CaseFit:
-    """Fit the logs with what is known of the payload, and keep the essential parameters alone if that is wanted."""
+    """Fit the logs with what is known of the payload, and keep the essential parameters alone if
+    that is wanted.
+    """
 
     from daq.workflow.cases import CaseFit, essential_fit, fit_case, reduce_logs
     from daq.workflow.fit import fit
@@ -249,7 +289,9 @@ def _full_set(request: FitRequest, fitted: Fit) -> FullSet:
 
 
 def _fit_cases(request: FitRequest, folder: Path) -> None:
-    """Fit the paper's cases and ours, write a calibration of each, and tabulate them as Tables 1 to 4."""
+    """Fit the paper's cases and ours, write a calibration of each,
+    and tabulate them as Tables 1 to 4.
+    """
 
     from daq.documents.calibration_file import save_calibration
     from daq.report.fit import cases_report, cases_view
@@ -281,7 +323,11 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         for case in CASES:
             report_step(case.title)
             fits[case.name] = fit_case(
-                reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=request.essential
+                reduced,
+                case.method,
+                case.known,
+                gains_fixed=case.gains_fixed,
+                ratio=request.essential,
             )
         calibrations = {name: calibration_of_case(found, created) for name, found in fits.items()}
     tables = case_tables(calibrations)
@@ -289,7 +335,10 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in files.items():
             save_calibration(calibrations[name], file)
-        replace_file(page_file, paper_page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
+        replace_file(
+            page_file,
+            paper_page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode(),
+        )
     if request.json:
         print_json(cases_report(fits, calibrations))
     else:
@@ -300,10 +349,17 @@ def _fit_cases(request: FitRequest, folder: Path) -> None:
 class ResidualRequest(LogsRequest):
     """A search for what the model lacks, as the command line asks for it."""
 
-    seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0
-    report: Annotated[Path | None, output_option("--report", "Folder for report.html and residual.json.")] = None
+    seed: Annotated[
+        int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)
+    ] = 0
+    report: Annotated[
+        Path | None, output_option("--report", "Folder for report.html and residual.json.")
+    ] = None
     leave_out_runs: Annotated[
-        bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")
+        bool,
+        typer.Option(
+            "--leave-out-runs", help="Also predict each run from a fit of the others: slow."
+        ),
     ] = False
     accept_worse_holdout: Annotated[
         bool,
@@ -321,13 +377,17 @@ class ResidualRequest(LogsRequest):
     ] = False
     verbose: Annotated[
         bool,
-        typer.Option("--verbose", help="Also print the search, all errors and what these data cannot show."),
+        typer.Option(
+            "--verbose", help="Also print the search, all errors and what these data cannot show."
+        ),
     ] = False
 
 
 @taking(ResidualRequest)
 def residual_verb(request: ResidualRequest) -> None:
-    """Fit, then detect the effect that explains the residual, add it, refit everything, and repeat."""
+    """Fit, then detect the effect that explains the residual, add it, refit everything,
+    and repeat.
+    """
 
     from daq.report.fit import start_of
     from daq.report.residual import residual_view
@@ -344,13 +404,20 @@ def residual_verb(request: ResidualRequest) -> None:
         closed = replace(closed, uncertain=needed_verdicts(closed))
         calibration = calibration_of(closed, datetime.now(UTC))
         report_step("computing the errors before and after")
-        changed = account(start_of(closed), closed.steps, leave_out_runs=request.leave_out_runs, progress=report_step)
+        changed = account(
+            start_of(closed),
+            closed.steps,
+            leave_out_runs=request.leave_out_runs,
+            progress=report_step,
+        )
 
     def show(*written: Path | None) -> None:
         if request.json:
             print_json(residual_report(closed, changed, calibration))
         else:
-            print_view(residual_view(closed, changed, calibration, verbose=request.verbose), *written)
+            print_view(
+                residual_view(closed, changed, calibration, verbose=request.verbose), *written
+            )
 
     try:
         if request.report is not None:
@@ -386,20 +453,25 @@ def _search(request: ResidualRequest, report_step: Callable[[str], None]) -> Fit
         channels_as_wired=request.channels_as_wired,
         judge_holdout=False,
     )
-    undecided = Undecided.of(write=request.write_undecided, ignore_holdout=request.accept_worse_holdout)
+    undecided = Undecided.of(
+        write=request.write_undecided, ignore_holdout=request.accept_worse_holdout
+    )
     found = close_loop(fitted, request.seed, report_step, undecided)
     return replace(found, accept_worse_holdout=request.accept_worse_holdout)
 
 
 def _say_after_search(request: ResidualRequest, calibration: Calibration, described: Cell) -> None:
-    """Print the next step: what would be written to the controller, or the same search with a calibration to write.
+    """Print the next step: what would be written to the controller,
+    or the same search with a calibration to write.
 
     Args:
         request: what the search was asked for.
         calibration: that it has found.
         described: the cell as its logs describe it.
     """
-    named = say_after_calibration(calibration, request.out, request.logs, request.cell, described=described)
+    named = say_after_calibration(
+        calibration, request.out, request.logs, request.cell, described=described
+    )
     if named or request.out is not None:
         return
     same = request.options()
@@ -417,7 +489,8 @@ def _say_after_search(request: ResidualRequest, calibration: Calibration, descri
 
 
 def check_report(folder: Path | None, out: Path | None = None) -> None:
-    """Create the folder of a report before any long work, and refuse one with other files of the same names.
+    """Create the folder of a report before any long work,
+    and refuse one with other files of the same names.
 
     A folder in which nothing is written in the end is removed again.
     """

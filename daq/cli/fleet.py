@@ -14,22 +14,35 @@ from daq.errors import ExitCode, OutputFailed
 
 
 def fleet_verb(
-    logs: Annotated[str, typer.Argument(help="Folder with the logs of many cells, or an address (s3://BUCKET/PATH).")],
+    logs: Annotated[
+        str,
+        typer.Argument(
+            help="Folder with the logs of many cells, or an address (s3://BUCKET/PATH)."
+        ),
+    ],
     scheduler: Annotated[
         str,
         typer.Option(
-            help="threads of this process, processes of this machine, or the address of a dask scheduler "
-            "(tcp://127.0.0.1:8786). The last two need pip install 'drivegain[fleet]'."
+            help="threads of this process, processes of this machine, or the address of a dask "
+            "scheduler (tcp://127.0.0.1:8786). The last two need pip install 'drivegain[fleet]'."
         ),
     ] = "threads",
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="Cells fitted at a time; by default one per processor or thread of the scheduler."),
+        typer.Option(
+            min=1,
+            help="Cells fitted at a time; by default one per processor or thread of the scheduler.",
+        ),
     ] = None,
-    residual: Annotated[bool, typer.Option("--residual", help="Also detect missing effects: slow.")] = False,
+    residual: Annotated[
+        bool, typer.Option("--residual", help="Also detect missing effects: slow.")
+    ] = False,
     out: Annotated[
         Path | None,
-        output_option("--out", "Folder for a calibration of each cell; a cell is not fitted again from the same logs."),
+        output_option(
+            "--out",
+            "Folder for a calibration of each cell; a cell is not fitted again from the same logs.",
+        ),
     ] = None,
     csv: Annotated[
         Path | None,
@@ -37,14 +50,22 @@ def fleet_verb(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Fit the logs of many cells, one task per cell; a cell that cannot be fitted is a line with its error.
+    """Fit the logs of many cells, one task per cell;
+    a cell that cannot be fitted is a line with its error.
 
-    Cell and payload are read from the logs. Where a cell has a second run with the same payload, the newest is held
-    out. The exit code is 4 if any cell could not be fitted.
+    Cell and payload are read from the logs. Where a cell has a second run with the same payload,
+    the newest is held out. The exit code is 4 if any cell could not be fitted.
     """
 
     from daq.jobs.cell_fit import Loop, open_cache
-    from daq.jobs.fleet import FIRST_COLUMNS, fit_fleet, fleet_csv, fleet_report, fleet_view, worker_pool
+    from daq.jobs.fleet import (
+        FIRST_COLUMNS,
+        fit_fleet,
+        fleet_csv,
+        fleet_report,
+        fleet_view,
+        worker_pool,
+    )
     from daq.jobs.fleet_survey import list_logs
 
     loop = Loop.CLOSED if residual else Loop.OPEN

@@ -29,7 +29,9 @@ def make_cell_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ..
     """Copy the templates into a new or empty folder, all of them or none; return the files."""
     import yaml
 
-    texts = yaml.safe_load((shipped_configurations() / "templates" / "new-cell.yaml").read_text(encoding="utf-8"))
+    texts = yaml.safe_load(
+        (shipped_configurations() / "templates" / "new-cell.yaml").read_text(encoding="utf-8")
+    )
     name = folder.resolve().name
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise UsageError(
@@ -39,7 +41,10 @@ def make_cell_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ..
             remedy="rename it",
         )
     with write_new_folder(folder) as whole:
-        written = tuple(_copy(source, whole / target.format(name=name), name, texts) for source, target in TEMPLATES)
+        written = tuple(
+            _copy(source, whole / target.format(name=name), name, texts)
+            for source, target in TEMPLATES
+        )
         if simulated:
             cell = whole / "cells" / f"{name}.yaml"
             text = cell.read_text(encoding="utf-8")
@@ -50,9 +55,14 @@ def make_cell_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ..
 
 def init(
     folder: Annotated[
-        Path, typer.Argument(help="Folder to create; its name becomes the cell's.", callback=judged_output)
+        Path,
+        typer.Argument(
+            help="Folder to create; its name becomes the cell's.", callback=judged_output
+        ),
     ],
-    simulated: Annotated[bool, typer.Option("--simulated", help="Use the bus of `drivegain simulate demo`.")] = False,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="Use the bus of `drivegain simulate demo`.")
+    ] = False,
 ) -> None:
     """Create a folder for a new cell, with commented templates to fill in."""
     for path in make_cell_folder(folder, simulated=simulated):
@@ -61,7 +71,11 @@ def init(
     if simulated:
         say("The cell is that of the demonstration: a six-axis arm on a simulated bus.", err=True)
     else:
-        say(f"Edit {cell} first: its numbers are an example's, and its comments say what replaces them.", err=True)
+        say(
+            f"Edit {cell} first: its numbers are an example's, and its comments say what "
+            "replaces them.",
+            err=True,
+        )
     say_next("drivegain", "scan", cell)
 
 
@@ -71,12 +85,20 @@ def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:
     if path.suffix == ".yaml":
         text = path.read_text(encoding="utf-8")
         text = re.sub(r"^(name|controller): (demo|tx40)$", rf"\1: {name}", text, flags=re.MULTILINE)
-        text = re.sub(r"\A(#.*\n)+", texts["heads"].get(Path(source).parent.name, r"\g<0>").format(name=name), text)
+        text = re.sub(
+            r"\A(#.*\n)+",
+            texts["heads"].get(Path(source).parent.name, r"\g<0>").format(name=name),
+            text,
+        )
         for key in ("bus", "axes", "payloads"):
             text = text.replace(f"\n{key}:\n", f"\n{texts[key]}")
         text = text.replace("../controllers/demo.yaml", f"../controllers/{name}.yaml")
         text = text.replace("../cells/tx40.yaml", f"../cells/{name}.yaml")
-        text = text.replace("interface: virtual  ", "interface: socketcan").replace("channel: demo", "channel: can0")
-        text = text.replace("pacing: lockstep", "pacing: timed   ").replace("unit: Nm(motor, a priori)", "unit: A")
+        text = text.replace("interface: virtual  ", "interface: socketcan").replace(
+            "channel: demo", "channel: can0"
+        )
+        text = text.replace("pacing: lockstep", "pacing: timed   ").replace(
+            "unit: Nm(motor, a priori)", "unit: A"
+        )
         path.write_text(text, encoding="utf-8")
     return path

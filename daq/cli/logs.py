@@ -38,13 +38,17 @@ def info(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
     extract_cell: Annotated[
         Path | None,
-        output_option("--extract-cell", "New folder for the cell description in the log: cell file, URDF, drives."),
+        output_option(
+            "--extract-cell",
+            "New folder for the cell description in the log: cell file, URDF, drives.",
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity.
 
-    With --extract-cell also write the description of the cell as files that every verb takes as --cell.
+    With --extract-cell also write the description of the cell as files that every verb takes as
+    --cell.
     """
     from daq.report.document import json_tree
     from daq.report.log import info_report, log_lines
@@ -57,7 +61,10 @@ def info(
             error.found = "a calibration"
             error.remedy = f"`drivegain certificate {log}` reads it"
         raise
-    written = None if extract_cell is None else _extract_cell(log, extract_cell)
+    if extract_cell is None:
+        written = None
+    else:
+        written = _extract_cell(log, extract_cell)
     if json:
         print_json(report)
     else:
@@ -65,7 +72,8 @@ def info(
 
 
 def _extract_cell(log: Path, folder: Path) -> Path:
-    """Write the cell description of a log into a new or empty folder, all files or none; return the cell file.
+    """Write the cell description of a log into a new or empty folder, all files or none;
+    return the cell file.
 
     Raises:
         UsageError: the folder has something in it.
@@ -95,21 +103,31 @@ def _extract_cell(log: Path, folder: Path) -> Path:
 
 
 def import_files(
-    description: Annotated[Path, typer.Argument(help="Import description (YAML): columns, units, rate.")],
+    description: Annotated[
+        Path, typer.Argument(help="Import description (YAML): columns, units, rate.")
+    ],
     data: Annotated[Path, typer.Option("--data", help="Folder of the files.")],
     out: NewLogOption,
-    cell: Annotated[Path | None, typer.Option("--cell", help="Another cell file than the description's.")] = None,
+    cell: Annotated[
+        Path | None, typer.Option("--cell", help="Another cell file than the description's.")
+    ] = None,
     holdout: Annotated[
         Path | None,
-        output_option("--holdout", "Log to write of the part that `holdout` of the description names (.mcap)."),
+        output_option(
+            "--holdout", "Log to write of the part that `holdout` of the description names (.mcap)."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Convert CSV files, MATLAB files or ROS bags of another controller to a log, or to two, one held out."""
+    """Convert CSV files, MATLAB files or ROS bags of another controller to a log, or to two,
+    one held out.
+    """
     from daq.log.importing import import_recording
     from daq.report.log import import_report, timing_text
 
-    imported = import_recording(description, data, out, software=software(), cell_path=cell, holdout=holdout)
+    imported = import_recording(
+        description, data, out, software=software(), cell_path=cell, holdout=holdout
+    )
     WRITTEN.append(out)
     statistics = imported.statistics
     timing = imported.timing
@@ -125,7 +143,10 @@ def import_files(
 
 
 def salvage_verb(
-    log: Annotated[Path, typer.Argument(help="Unfinished (.mcap.part), cut off or damaged log; it is only read.")],
+    log: Annotated[
+        Path,
+        typer.Argument(help="Unfinished (.mcap.part), cut off or damaged log; it is only read."),
+    ],
     out: NewLogOption,
     json: JsonOption = False,
 ) -> None:
@@ -143,8 +164,13 @@ def salvage_verb(
     if json:
         print_json(salvage_report(out, saved))
         return
-    use = ": `fit` accepts it and says so; `apply` refuses the result" if statistics.valid else ""
-    say(f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}")
+    if statistics.valid:
+        use = ": `fit` accepts it and says so; `apply` refuses the result"
+    else:
+        use = ""
+    say(
+        f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL{use}"
+    )
     if saved.left_out_bytes:
         say(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")
     if not statistics.valid:
@@ -159,10 +185,13 @@ def export_log_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
     out: Annotated[Path, output_option("--out", "Table to write; must not exist.")],
     csv: Annotated[bool, typer.Option("--csv", help="Comma-separated text.")] = False,
-    parquet: Annotated[bool, typer.Option("--parquet", help="Apache Parquet, needs drivegain[parquet].")] = False,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Apache Parquet, needs drivegain[parquet].")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Write the samples of a log into a table: a row per SYNC, joint positions and currents in SI beside raw numbers.
+    """Write the samples of a log into a table:
+    a row per SYNC, joint positions and currents in SI beside raw numbers.
 
     The log itself opens in Foxglove and PlotJuggler (configs/viewers).
     """
@@ -188,10 +217,11 @@ def export_csv_verb(
     cell: CellOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Write what a calibration predicts of a log, what was measured, and the residual, for a spreadsheet.
+    """Write what a calibration predicts of a log, what was measured, and the residual,
+    for a spreadsheet.
 
-    A row per equation of the fit: filtered and decimated as it was. Torque of each joint, current reference of each
-    motor, and whether the row counts in the relative errors.
+    A row per equation of the fit: filtered and decimated as it was. Torque of each joint, current
+    reference of each motor, and whether the row counts in the relative errors.
     """
     from daq.log.export import TableFormat, require_new_table, write_table
     from daq.report.validation import residual_table_report
@@ -207,7 +237,10 @@ def export_csv_verb(
     else:
         rows = counted(report.rows, "row")
         total = report.relative_error_percent.total
-        print_view([f"{rows} of {counted(len(report.columns), 'column')}; relative error {total:.3g} %"], out)
+        print_view(
+            [f"{rows} of {counted(len(report.columns), 'column')}; relative error {total:.3g} %"],
+            out,
+        )
 
 
 def _warn(log: Path, partial: bool, valid: bool, reason: str) -> None:
@@ -222,22 +255,31 @@ def export_bag_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
     out: Annotated[Path, output_option("--out", "Folder to write (rosbag2); must not exist.")],
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration of the cell; its gains give the effort of the joint states.")
+        Path | None,
+        typer.Option(
+            help="Calibration of the cell; its gains give the effort of the joint states."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
     """Write a log as a ROS 2 bag: /joint_states, currents in A, events and /robot_description.
 
-    Joint states are at the full rate, with the names of the URDF's joints; effort only with --calibration.
+    Joint states are at the full rate, with the names of the URDF's joints; effort only with
+    --calibration.
     """
     from daq.log.bag_writer import export_bag
     from daq.report.log import bag_report
 
-    known = None if calibration is None else read_calibration(calibration)
+    if calibration is None:
+        known = None
+    else:
+        known = read_calibration(calibration)
     with status("writing the bag"):
         done = export_bag(log, out, known)
     _warn(log, done.partial, done.valid, done.reason)
     if json:
         print_json(bag_report(log, out, done, effort=known is not None))
     else:
-        print_view([f"{topic}: {counted(count, 'message')}" for topic, count in done.messages.items()], out)
+        print_view(
+            [f"{topic}: {counted(count, 'message')}" for topic, count in done.messages.items()], out
+        )

@@ -26,36 +26,57 @@ if TYPE_CHECKING:
 
 
 def export_urdf_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
+    cell: Annotated[
+        Path,
+        typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf."),
+    ],
     out: Annotated[Path, output_option("--out", "URDF to write.")],
-    calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
+    calibration: Annotated[
+        Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")
+    ] = None,
     urdf: Annotated[
         Path | None,
-        typer.Option("--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."),
+        typer.Option(
+            "--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
     """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
 
-    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme finds the nearest
-    physical bodies (pip install 'drivegain[physical]'); the change of torque is reported. A URDF holds no loops: of a
-    closed chain it has the tree, and the closures are named.
+    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme
+    finds the nearest physical bodies (pip install 'drivegain[physical]'); the change of torque is
+    reported. A URDF holds no loops: of a closed chain it has the tree, and the closures are named.
     """
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
     from daq.report.text import origin_text
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.mjcf_effects import split_installed
-    from daq.workflow.urdf_export import FORMAT, cell_limits, parse_markup, physical_robot, update_urdf
+    from daq.workflow.urdf_export import (
+        FORMAT,
+        cell_limits,
+        parse_markup,
+        physical_robot,
+        update_urdf,
+    )
     from daq.workflow.validate import on_cell
 
     given, calibration = _described_by("export urdf", cell, calibration, urdf)
     check_output(out, (calibration, given), FORMAT)
     known = read_calibration(calibration)
     _require_explained(known, calibration)
-    content = bundle(given)[URDF] if urdf is None else read_yaml_bytes(given)
+    if urdf is None:
+        content = bundle(given)[URDF]
+    else:
+        content = read_yaml_bytes(given)
     if out.exists() and out.read_bytes() == content:
-        raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
+        raise UsageError(
+            str(out),
+            found="the input URDF",
+            expected="a file of its own",
+            remedy="choose another name",
+        )
     parse_markup(content, str(given))  # before any other reader sees it
     declared = None if urdf is not None else _declared(known, given)
     known, _ = split_installed(known)  # a URDF holds no effects
@@ -65,8 +86,11 @@ def export_urdf_verb(
         same = _is_same(known, declared)
         content = declared.urdf.encode()  # held joints are fixed in it
     else:
-        model, limits, same = *_plain(content.decode("utf-8")), None
-    require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
+        model, limits = _plain(content.decode("utf-8"))
+        same = None
+    require_packages(
+        "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+    )
     text = content.decode("utf-8")
     with status("finding the nearest physical robot"):
         robot = physical_robot(known, model, limits, text)
@@ -81,21 +105,28 @@ def export_urdf_verb(
 
 
 def export_mjcf_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf.")],
+    cell: Annotated[
+        Path,
+        typer.Argument(help="Cell file: URDF, gravity, drive train, limits; none with --urdf."),
+    ],
     out: Annotated[Path, output_option("--out", "MJCF model to write (.xml).")],
-    calibration: Annotated[Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")] = None,
+    calibration: Annotated[
+        Path | None, typer.Argument(help="calibration.yaml written by `drivegain fit`.")
+    ] = None,
     urdf: Annotated[
         Path | None,
-        typer.Option("--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."),
+        typer.Option(
+            "--urdf", help="Instead of CELL, for a robot with a motor for each joint, base upright."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
     """Write the calibrated robot as an MJCF model for MuJoCo 3.3.1 or later.
 
-    Masses, inertias, rotors, friction, and a motor for each axis: its gear is the drive gain, its input the current
-    reference. Names, frames, shapes and meshes are those of the URDF. Bodies are the full parameters of `fit --prior`;
-    without them, the nearest physical bodies to the URDF (pip install 'drivegain[physical]'). What the model cannot
-    hold is listed in it and under --json.
+    Masses, inertias, rotors, friction, and a motor for each axis: its gear is the drive gain, its
+    input the current reference. Names, frames, shapes and meshes are those of the URDF. Bodies are
+    the full parameters of `fit --prior`; without them, the nearest physical bodies to the URDF (pip
+    install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
     """
     from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
     from daq.workflow.full_choice import full_choice
@@ -108,10 +139,15 @@ def export_mjcf_verb(
     check_output(out, (calibration, given), FORMAT)
     known = read_calibration(calibration)
     _require_explained(known, calibration)
-    described = _of_cell(known, given) if urdf is None else _of_urdf(known, given)
+    if urdf is None:
+        described = _of_cell(known, given)
+    else:
+        described = _of_urdf(known, given)
     known = described.calibration
     if known.full_parameters is None:
-        require_packages("physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel")
+        require_packages(
+            "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+        )
     with status("choosing the bodies"):
         choice = full_choice(known, described.model, described.limits, described.urdf)
     followed = choice.model.follow(random_states(choice.model, described.limits))
@@ -144,7 +180,8 @@ def export_mjcf_verb(
 class _Described:
     """A robot that a model is written of."""
 
-    calibration: Calibration  #: without effects that are not installed, with the corrections that the cell still needs
+    #: without effects that are not installed, with the corrections that the cell still needs
+    calibration: Calibration
     missing: tuple[str, ...]  #: effects that are not installed
     model: Model
     limits: FloatArray  #: ranges in which torques are compared, shape (4, m)
@@ -200,7 +237,8 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
             str(path),
             found=f"{len(joints)} moving joints: {', '.join(joints)}",
             expected=f"{len(calibration.gains)}, one for each axis of the calibration",
-            remedy="give the URDF of the robot that was calibrated, or its cell file, which says what moves its joints",
+            remedy="give the URDF of the robot that was calibrated, or its cell file, which says "
+            "what moves its joints",
         )
     installed, missing = split_installed(calibration)
     ranges = joint_ranges(urdf)
@@ -218,8 +256,12 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
     )
 
 
-def _described_by(verb: str, cell: Path, calibration: Path | None, urdf: Path | None) -> tuple[Path, Path]:
-    """Return the file that describes the robot, and the calibration: of CELL CALIBRATION or CALIBRATION --urdf FILE."""
+def _described_by(
+    verb: str, cell: Path, calibration: Path | None, urdf: Path | None
+) -> tuple[Path, Path]:
+    """Return the file that describes the robot, and the calibration:
+    of CELL CALIBRATION or CALIBRATION --urdf FILE.
+    """
     if (calibration is None) == (urdf is None):
         raise UsageError(
             verb,
@@ -234,24 +276,28 @@ def _described_by(verb: str, cell: Path, calibration: Path | None, urdf: Path | 
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
-    """Return body and friction of each moving joint; a negative friction, part of its axis' friction, counts as 0."""
+    """Return body and friction of each moving joint;
+    a negative friction, part of its axis' friction, counts as 0.
+    """
     from daq.workflow.urdf_export import JointUpdate
     from ident.model.bodies import body_of
 
     parameters = robot.parameters
-    values = dict(zip((column.name for column in parameters.model.columns), parameters.standard, strict=True))
-    return {
-        joint.name: JointUpdate(
-            body_of(link), max(0.0, float(values[f"fv{number}"])), max(0.0, float(values[f"fs{number}"]))
-        )
-        for number, (joint, link) in enumerate(
-            zip(parameters.model.robot.joints, parameters.links, strict=True), start=1
-        )
-    }
+    names = [column.name for column in parameters.model.columns]
+    values = dict(zip(names, parameters.standard, strict=True))
+    joints_and_links = zip(parameters.model.robot.joints, parameters.links, strict=True)
+    updates = {}
+    for number, (joint, link) in enumerate(joints_and_links, start=1):
+        viscous = float(values[f"fv{number}"])
+        coulomb = float(values[f"fs{number}"])
+        updates[joint.name] = JointUpdate(body_of(link), max(0.0, viscous), max(0.0, coulomb))
+    return updates
 
 
 def _is_same(calibration: Calibration, cell: Cell) -> bool | None:
-    """Whether a cell file is that of the fit; None where the calibration does not name one, as of a library."""
+    """Whether a cell file is that of the fit;
+    None where the calibration does not name one, as of a library.
+    """
     if not calibration.configuration_sha256:
         return None
     return cell.digest == calibration.configuration_sha256
@@ -278,7 +324,10 @@ def _declared(calibration: Calibration, path: Path) -> Cell:
     found = mismatch_of_calibration(calibration, cell)
     if found is not None:
         raise ConfigurationInconsistent(
-            str(path), found=found.found, expected=found.expected, remedy="give the cell that was calibrated"
+            str(path),
+            found=found.found,
+            expected=found.expected,
+            remedy="give the cell that was calibrated",
         )
     return cell
 
@@ -292,7 +341,10 @@ def _plain(urdf: str) -> tuple[Model, FloatArray]:
 
     robot = robot_from_urdf(urdf)
     count = robot.joint_count
-    return Model(robot, DriveTrain(np.eye(count))), np.repeat(np.array([[0.0], [np.pi], [3.0], [10.0]]), count, axis=1)
+    model = Model(robot, DriveTrain(np.eye(count)))
+    limits_of_a_joint = np.array([[0.0], [np.pi], [3.0], [10.0]])
+    limits = np.repeat(limits_of_a_joint, count, axis=1)
+    return model, limits
 
 
 def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
@@ -302,7 +354,8 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
     from ident.physical.physical import urdf_links
 
     def check(content: bytes) -> None:
-        if not np.allclose(urdf_links(content.decode("utf-8")), robot.parameters.links, rtol=1e-9, atol=1e-12):
+        links = urdf_links(content.decode("utf-8"))
+        if not np.allclose(links, robot.parameters.links, rtol=1e-9, atol=1e-12):
             raise OutputFailed(
                 str(out),
                 found="other inertias on reading back",

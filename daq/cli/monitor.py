@@ -1,4 +1,6 @@
-"""`drivegain monitor` and `console`: the axes live in the terminal, and on a page beside a recording."""
+"""`drivegain monitor` and `console`: the axes live in the terminal,
+and on a page beside a recording.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +21,25 @@ from daq.errors import UsageError
 def monitor_verb(
     cell: CellArgument,
     once: Annotated[bool, typer.Option("--once", help="Show one reading and end.")] = False,
-    interval: Annotated[float, typer.Option(help="Time between two readings [s].", min=0.1, max=60.0)] = 0.5,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration that predicts the currents.")] = None,
-    payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
+    interval: Annotated[
+        float, typer.Option(help="Time between two readings [s].", min=0.1, max=60.0)
+    ] = 0.5,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration that predicts the currents.")
+    ] = None,
+    payload: Annotated[
+        str | None, typer.Option(help="Mounted payload, by its name in the cell file.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Show position, current, state, rate and losses of every axis, and the load of the bus, until Ctrl-C.
+    """Show position, current, state, rate and losses of every axis, and the load of the bus,
+    until Ctrl-C.
 
-    The first two seconds only listen. While another master is on the bus, nothing is sent, and the axes' answers to
-    that master are shown; otherwise the axes are queried. Nothing is written, enabled or moved. `drivegain console`
-    shows the same as curves. Currents are predicted while a master sends SYNC: a queried axis is not sampled fast
-    enough for an acceleration. --json implies --once.
+    The first two seconds only listen. While another master is on the bus, nothing is sent, and the
+    axes' answers to that master are shown; otherwise the axes are queried. Nothing is written,
+    enabled or moved. `drivegain console` shows the same as curves. Currents are predicted while a
+    master sends SYNC: a queried axis is not sampled fast enough for an acceleration. --json implies
+    --once.
     """
     from rich.console import Console
 
@@ -45,7 +55,10 @@ def monitor_verb(
 
     declared = read_cell(cell)
     carried = mounted(declared, payload)
-    known = None if calibration is None else read_calibration(calibration)
+    if calibration is None:
+        known = None
+    else:
+        known = read_calibration(calibration)
     if known is not None:
         check_cell(known, cell, declared)
     console = Console(highlight=False)
@@ -56,7 +69,9 @@ def monitor_verb(
         Feed(cell, stop=None) as feed,
         CanopenNetwork(cell_address(declared), drive_axes(declared), policy=policy) as network,
     ):
-        watch = CellWatch(cell, declared, network, feed, known, None if carried is None else carried.name)
+        watch = CellWatch(
+            cell, declared, network, feed, known, None if carried is None else carried.name
+        )
         watch.listen(QUIET_S)
         if once or json or not console.is_terminal:
             report = monitor_report(declared, watch.read(interval))
@@ -66,7 +81,9 @@ def monitor_verb(
                 print_json(report)
             else:
                 console.print(monitor_view(report))
-            silent = [axis for axis, shown in zip(network.axes, report.axes, strict=True) if shown.silent]
+            silent = [
+                axis for axis, shown in zip(network.axes, report.axes, strict=True) if shown.silent
+            ]
             heard = tuple(axis.node_id for axis in report.axes if not axis.silent)
             if silent:
                 raise no_answer(declared, silent, heard, QUIET_S + interval + ABANDONED_S)
@@ -75,29 +92,41 @@ def monitor_verb(
             console.print(feed.remark)
         with PatientLive(console=console, auto_refresh=False, screen=False) as live:
             while True:
-                live.update(monitor_view(monitor_report(declared, watch.read(interval))), refresh=True)
+                live.update(
+                    monitor_view(monitor_report(declared, watch.read(interval))), refresh=True
+                )
 
 
 def console_verb(
     cell: CellArgument,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration that predicts the currents; that of the last session by default.")
+        Path | None,
+        typer.Option(
+            help="Calibration that predicts the currents; that of the last session by default."
+        ),
     ] = None,
     report: Annotated[
         Path | None, typer.Option(help="Folder of a report; that of the last session by default.")
     ] = None,
-    port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 takes a free one.", min=0, max=65535)] = 0,
+    port: Annotated[
+        int, typer.Option(help="Port on 127.0.0.1; 0 takes a free one.", min=0, max=65535)
+    ] = 0,
     foxglove: Annotated[
         int | None,
         typer.Option(
-            metavar="PORT", help="Also stream to Foxglove; all programs of this computer can read it.", min=0, max=65535
+            metavar="PORT",
+            help="Also stream to Foxglove; all programs of this computer can read it.",
+            min=0,
+            max=65535,
         ),
     ] = None,
 ) -> None:
-    """Serve a page that shows the cell while `record`, `recalibrate` or `monitor` runs; open the printed address.
+    """Serve a page that shows the cell while `record`, `recalibrate` or `monitor` runs;
+    open the printed address.
 
-    The page reads only, but for a stop button, which does what Ctrl-C does to `record` and `recalibrate` and is no
-    safety function. It never opens the bus, and cannot delay a recording. Ctrl-C ends the page alone.
+    The page reads only, but for a stop button, which does what Ctrl-C does to `record` and
+    `recalibrate` and is no safety function. It never opens the bus, and cannot delay a recording.
+    Ctrl-C ends the page alone.
     """
     require_packages("the console", "the web server", "console", "starlette", "uvicorn")
     if foxglove is not None:
@@ -116,7 +145,10 @@ def console_verb(
             remedy="check the name, or leave --report out",
         )
     results = Results(cell, declared, calibration, report)
-    known = results.calibration() if calibration is None else (calibration, read_calibration(calibration))
+    if calibration is None:
+        known = results.calibration()
+    else:
+        known = (calibration, read_calibration(calibration))
     if calibration is not None and known is not None:
         check_cell(known[1], cell, declared)
     live = Live(cell, declared)
@@ -140,5 +172,8 @@ def console_verb(
             ) from error
         port = listener.getsockname()[1]
         token = new_token()
-        typer.echo(f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C ends the page.")
+        typer.echo(
+            f"Open http://127.0.0.1:{port}/{token}/ in a browser on this computer; Ctrl-C "
+            "ends the page."
+        )
         server_of(Page(declared, live, results, *beside), token, port).run(sockets=[listener])

@@ -1,7 +1,8 @@
 """The next command of a commissioning, chosen from what is in the folder.
 
-The steps are a plan, a run without load, one with the payload, a second plan with a held-out run, `residual`, and
-`apply`. A command is named only where the folder leaves no doubt which files it takes.
+The steps are a plan, a run without load, one with the payload, a second plan with a held-out run,
+`residual`, and `apply`. A command is named only where the folder leaves no doubt which files it
+takes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
     from ident.errors import Diagnosis
 
 LARGEST_FOLDER_BYTES = 100_000_000
-"""Size of all logs of a folder up to which they are read for a hint [bytes]: that takes about a second."""
+"""Size of all logs of a folder up to which they are read for a hint [bytes]:
+that takes about a second.
+"""
 
 
 def say_next(*words: object) -> None:
@@ -45,11 +48,16 @@ def say_correct_first() -> None:
 
 def _say_record_more() -> None:
     """Print on stderr that other moves come before every other step."""
-    typer.echo("Next: record the moves that CHECK asks for, then fit them together with these logs.", err=True)
+    typer.echo(
+        "Next: record the moves that CHECK asks for, then fit them together with these logs.",
+        err=True,
+    )
 
 
 def _needs_other_moves(calibration: Calibration) -> bool:
-    """Whether the moves of a fit hardly show a gain, or do not tell what is wrong with the description."""
+    """Whether the moves of a fit hardly show a gain,
+    or do not tell what is wrong with the description.
+    """
     from ident.errors import CORRECTION_UNCLEAR, GAIN_UNSEEN
 
     return any(one.name in (CORRECTION_UNCLEAR, GAIN_UNSEEN) for one in calibration.diagnoses)
@@ -69,7 +77,9 @@ class FolderRuns:
 
 
 def runs_in(folder: Path, cell: str) -> FolderRuns | None:
-    """Find the valid runs of a cell in a folder; None where its logs are too large to be read for a hint."""
+    """Find the valid runs of a cell in a folder;
+    None where its logs are too large to be read for a hint.
+    """
     from daq.report.log import info_report
 
     logs = sorted(folder.glob("*.mcap"), key=lambda log: log.stat().st_mtime)
@@ -92,7 +102,9 @@ def runs_in(folder: Path, cell: str) -> FolderRuns | None:
 
 
 def free_name(wanted: Path) -> Path:
-    """Return a name of a file that is not there yet: `loaded.mcap`, else `loaded-2.mcap` and so on."""
+    """Return a name of a file that is not there yet:
+    `loaded.mcap`, else `loaded-2.mcap` and so on.
+    """
     others = (wanted.with_name(f"{wanted.stem}-{number}{wanted.suffix}") for number in count(2))
     return next(name for name in chain((wanted,), others) if not name.exists())
 
@@ -114,7 +126,9 @@ def say_after_plan(cell: Path, declared: Cell, plan: Path, made: Plan) -> None:
 
 
 def _good_plan_beside(plan: Path, made: Plan) -> Path | None:
-    """Return the oldest plan of this cell in the folder of a plan that is good and of another seed."""
+    """Return the oldest plan of this cell in the folder of a plan that is good and of another
+    seed.
+    """
     from daq.workflow.plan import plan_head
     from ident.planning.gain_verdict import GOOD_PERCENT
 
@@ -133,11 +147,14 @@ def _say_record(cell: Path, declared: Cell, plan: Path, log: Path, *, loaded: bo
     mounted: list[object] = []
     if loaded:
         mounted = ["--payload", declared.payloads[0].payload.name, "--mass", "KG"]
-    say_next("drivegain", "record", cell, plan, "--out", free_name(log), *mounted, "--enable-motion")
+    say_next(
+        "drivegain", "record", cell, plan, "--out", free_name(log), *mounted, "--enable-motion"
+    )
 
 
 def say_after_record(cell: Path, declared: Cell, plan: Path, log: Path, *, loaded: bool) -> None:
-    """Name the run that is still missing, else the fit of one run without load, one with, and a held-out one.
+    """Name the run that is still missing, else the fit of one run without load, one with,
+    and a held-out one.
 
     Args:
         cell: file of the cell.
@@ -165,11 +182,16 @@ def say_after_record(cell: Path, declared: Cell, plan: Path, log: Path, *, loade
         say_next("drivegain", "fit", *runs.unloaded, *runs.loaded, "--out", calibration)
     if len(runs.loaded) == 2 and log == runs.loaded[1]:
         used = (*runs.unloaded, runs.loaded[0], "--holdout", log)
-        say_next("drivegain", "residual", *used, "--out", free_name(calibration), "--report", "report")
+        say_next(
+            "drivegain", "residual", *used, "--out", free_name(calibration), "--report", "report"
+        )
 
 
-def say_after_fit(calibration: Calibration, arguments: Sequence[object], written: Path | None) -> None:
-    """Name the search for what the model lacks, unless the robot is described wrongly or other moves are needed.
+def say_after_fit(
+    calibration: Calibration, arguments: Sequence[object], written: Path | None
+) -> None:
+    """Name the search for what the model lacks, unless the robot is described wrongly or other
+    moves are needed.
 
     Args:
         calibration: of the fit.
@@ -196,7 +218,8 @@ def say_after_calibration(
     diagnoses: Sequence[Diagnosis] | None = None,
     described: Cell | None = None,
 ) -> bool:
-    """Name the dry run that shows what would be written, unless `apply` would refuse it or a cause must be found first.
+    """Name the dry run that shows what would be written, unless `apply` would refuse it or a cause
+    must be found first.
 
     Args:
         calibration: that could be written.
@@ -204,7 +227,8 @@ def say_after_calibration(
         logs: of the command.
         cell: its file; None where the command was given none.
         diagnoses: that the command has printed; those of the calibration when None.
-        described: the cell as the logs describe it, where no file of it is found; None where it is not known.
+        described: the cell as the logs describe it, where no file of it is found; None where it is
+            not known.
 
     Returns:
         whether a step was named.
@@ -218,7 +242,10 @@ def say_after_calibration(
     refusal = first_refusal(calibration, file, place, described)
     if refusal is not None:
         reason = f"{refusal.subject}: {refusal.found}"
-        typer.echo(f"Next: {refusal.remedy}. `drivegain apply` refuses this calibration: {reason}.", err=True)
+        typer.echo(
+            f"Next: {refusal.remedy}. `drivegain apply` refuses this calibration: {reason}.",
+            err=True,
+        )
         return True
     if file is None:
         return False
@@ -227,7 +254,9 @@ def say_after_calibration(
 
 
 def _say_cause_first(calibration: Calibration, printed: Sequence[Diagnosis]) -> bool:
-    """Print what has to be done about diagnoses before anything is written; return whether there is something."""
+    """Print what has to be done about diagnoses before anything is written;
+    return whether there is something.
+    """
     from daq.writeback.gates.fit import OF_DESCRIPTION
 
     if _needs_other_moves(calibration):
@@ -245,7 +274,8 @@ def _say_cause_first(calibration: Calibration, printed: Sequence[Diagnosis]) -> 
 def first_refusal(
     calibration: Calibration, file: Path | None, place: Path, described: Cell | None = None
 ) -> Refusal | None:
-    """Return the first reason for which `drivegain apply` refuses a calibration now; None where it does not.
+    """Return the first reason for which `drivegain apply` refuses a calibration now;
+    None where it does not.
 
     Args:
         calibration: that could be written.
@@ -264,7 +294,10 @@ def first_refusal(
     cell = _read_cell(place) or described
     if cell is not None:
         with suppress(DaqError):  # a controller that cannot be read refuses nothing yet
-            content = None if file is None else read_calibration_bytes(file)
+            if file is None:
+                content = None
+            else:
+                content = read_calibration_bytes(file)
             request = Request(calibration, now, file=file, content=content)
             refusals = propose(FileTarget.of(cell), request).refusals
             # The dry run prints the --base that opens this one.
@@ -283,10 +316,11 @@ def _read_cell(place: Path) -> Cell | None:
 
 
 def cell_of(calibration: Calibration, logs: Sequence[Path]) -> Path:
-    """Find the cell file of a calibration, here or beside its logs; CELL, to be filled in, where it is not certain.
+    """Find the cell file of a calibration, here or beside its logs;
+    CELL, to be filled in, where it is not certain.
 
-    Several files may describe a cell of that name, as the shipped one and a copy of it. The one with the content that
-    the logs of the fit carry is meant.
+    Several files may describe a cell of that name, as the shipped one and a copy of it. The one
+    with the content that the logs of the fit carry is meant.
     """
     from daq.config.cell_file import load_cell
 

@@ -1,10 +1,11 @@
 """Standard output and error that never block whoever prints.
 
-A terminal whose output is stopped (Ctrl-S), a pipe that nobody reads, and an SSH connection that is gone block a write
-for as long as they like. Here a thread of its own writes, in order, what the verbs print, and they go on: the axes are
-stopped, the log is finished and the bus is free, also when the screen is gone. Where nobody reads, progress is left
-out first (`is_behind`), then remarks, and their number is printed as soon as somebody reads again. Results are never
-left out: the end of the command waits for their reader.
+A terminal whose output is stopped (Ctrl-S), a pipe that nobody reads, and an SSH connection that is
+gone block a write for as long as they like. Here a thread of its own writes, in order, what the
+verbs print, and they go on: the axes are stopped, the log is finished and the bus is free, also
+when the screen is gone. Where nobody reads, progress is left out first (`is_behind`), then remarks,
+and their number is printed as soon as somebody reads again. Results are never left out: the end of
+the command waits for their reader.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from typing import IO, TextIO
 REMARKS_BYTES = 1 << 20  #: Remarks that may wait for a reader
 PROGRESS_BYTES = 4096  #: With more than this waiting, no progress is drawn
 CHUNK_BYTES = 4096  #: Of one write: what a pipe takes as a whole
-PATIENCE_S = 2.0  #: Remarks, and what an interrupt has left, wait so long for a reader that takes nothing
+#: Remarks, and what an interrupt has left, wait so long for a reader that takes nothing
+PATIENCE_S = 2.0
 POLL_S = 0.002  #: Between two looks whether the reader has taken everything
 
 
@@ -80,7 +82,8 @@ class OutputWriter:
         self._write = write
         self._clock = clock
         self._pieces: SimpleQueue[Piece] = SimpleQueue()
-        self._lock = threading.Lock()  # of the numbers below; never held for longer than it takes to change them
+        # Guards the numbers below; it is never held for longer than it takes to change them.
+        self._lock = threading.Lock()
         self._waiting_bytes = 0
         self._waiting_results = 0  # pieces
         self._lost_lines = 0  # not yet said
@@ -107,9 +110,12 @@ class OutputWriter:
         size_bytes = len(piece.content)
         with self._lock:
             if piece.kind is OutputKind.REMARK:
-                # Until the losses are said, what comes later stays out as well: lines keep their order.
+                # Until the losses are said, what comes later stays out as well: lines keep their
+                # order.
                 is_first = self._lost_lines == 0
-                is_full = self._waiting_bytes > 0 and self._waiting_bytes + size_bytes > REMARKS_BYTES
+                is_full = (
+                    self._waiting_bytes > 0 and self._waiting_bytes + size_bytes > REMARKS_BYTES
+                )
                 if is_full or not is_first:
                     if is_first:
                         self._pieces.put(Piece(OutputKind.LOSSES))
@@ -124,6 +130,14 @@ class OutputWriter:
     def is_behind(self) -> bool:
         """Whether the reader does not keep up, so that progress would only wait."""
         return self._waiting_bytes > PROGRESS_BYTES
+
+    @property
+    def has_reader(self) -> bool:
+        """Whether the other end of a pipe, a socket or a terminal is open; true of a file."""
+        poll = select.poll()
+        poll.register(self._descriptor, 0)
+        closed = select.POLLERR | select.POLLHUP
+        return not any(events & closed for _, events in poll.poll(0))
 
     @property
     def _is_empty(self) -> bool:
@@ -149,7 +163,9 @@ class OutputWriter:
         self._require_results()
 
     def close(self, patience_s: float = PATIENCE_S) -> None:
-        """Wait for the reader, but for `patience_s` after the last byte that it took; then end the thread."""
+        """Wait for the reader, but for `patience_s` after the last byte that it took;
+        then end the thread.
+        """
         try:
             self._wait(lambda: self._is_empty, patience_s)
         finally:
@@ -175,7 +191,8 @@ class OutputWriter:
             raise self.error
 
     def _run(self) -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # the main thread handles them
+        # The main thread handles them
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         while True:
             piece = self._pieces.get()
             if piece.kind is OutputKind.END:
@@ -186,13 +203,16 @@ class OutputWriter:
             is_complete = self._write_out(content)
             is_result = piece.kind is OutputKind.RESULT
             if is_result and not is_complete:
-                self._has_lost_result = True  # before it is no longer counted: one of both tells of it at any time
+                # Before it is no longer counted: one of both tells of it at any time
+                self._has_lost_result = True
             with self._lock:
                 self._waiting_bytes -= len(content)
                 self._waiting_results -= is_result
 
     def _taken_losses(self) -> bytes:
-        """Return the sentence about lines that were left out, which counts as waiting from now on."""
+        """Return the sentence about lines that were left out,
+        which counts as waiting from now on.
+        """
         with self._lock:
             content = self.losses_line(self._lost_lines).encode()
             self._lost_lines = 0
@@ -246,7 +266,8 @@ class _QueuedFile(io.RawIOBase):
 
 
 class QueuedOutput:
-    """Context manager within which `sys.stdout` and `sys.stderr` never block; a stream without a file stays.
+    """Context manager within which `sys.stdout` and `sys.stderr` never block;
+    a stream without a file stays.
 
     Where both are one file, such as a terminal, one writer keeps the order of what is printed.
     """
@@ -261,7 +282,9 @@ class QueuedOutput:
         sys.stderr = self._queued(sys.stderr, OutputKind.REMARK)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
         try:
             for _status, writer in self._writers:
                 writer.close()
@@ -288,7 +311,9 @@ class QueuedOutput:
         file = _QueuedFile(writer, kind, descriptor, stream.name)
         # RawIOBase is what `python -u` has there, too.
         raw: IO[bytes] = file  # type: ignore[assignment]
-        return io.TextIOWrapper(raw, encoding=stream.encoding, errors=stream.errors, write_through=True)
+        return io.TextIOWrapper(
+            raw, encoding=stream.encoding, errors=stream.errors, write_through=True
+        )
 
     def _writer_of(self, status: os.stat_result, descriptor: int) -> OutputWriter:
         for known, writer in self._writers:
@@ -301,7 +326,10 @@ class QueuedOutput:
 
 
 def writer_of(stream: object) -> OutputWriter | None:
-    """Return the writer of a stream; None where it is written directly. A stream that rich has replaced counts."""
+    """Return the writer of a stream; None where it is written directly.
+
+    A stream that rich has replaced counts.
+    """
     file = getattr(stream, "buffer", None)
     writer = getattr(file, "writer", None)
     return writer if isinstance(writer, OutputWriter) else None
@@ -314,7 +342,8 @@ def is_behind(stream: object) -> bool:
 
 
 def wait_until_shown(*streams: object) -> None:
-    """Wait until all that was printed is on its way to a reader, before a question or a write that it announces.
+    """Wait until all that was printed is on its way to a reader,
+    before a question or a write that it announces.
 
     Raises:
         OSError: a result cannot be written.
@@ -325,6 +354,15 @@ def wait_until_shown(*streams: object) -> None:
             writer.wait()
 
 
+def has_reader(stream: object) -> bool:
+    """Whether a stream that is written by a writer still has one that may read it.
+
+    Of a file, of a stream in memory and of a closed one it is true.
+    """
+    writer = writer_of(stream)
+    return writer is None or writer.has_reader
+
+
 def release_results() -> None:
     """Let the command end without a reader of its results: an interrupt has ended it."""
     writer = writer_of(sys.stdout)
@@ -333,7 +371,9 @@ def release_results() -> None:
 
 
 def say_losses_as(line: Callable[[int], str]) -> None:
-    """Choose the line on stderr that says how many were left out, for a stream that a program reads."""
+    """Choose the line on stderr that says how many were left out,
+    for a stream that a program reads.
+    """
     writer = writer_of(sys.stderr)
     if writer is not None:
         writer.losses_line = line

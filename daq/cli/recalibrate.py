@@ -1,4 +1,6 @@
-"""`drivegain recalibrate` and `schedule`: the job, which moves the robot, and the timer that runs it."""
+"""`drivegain recalibrate` and `schedule`:
+the job, which moves the robot, and the timer that runs it.
+"""
 
 from __future__ import annotations
 
@@ -29,23 +31,36 @@ if TYPE_CHECKING:
 
 
 def recalibrate_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file; `recalibration` and `policy` configure the job.")],
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the next steps; move and write nothing.")] = False,
-    now: Annotated[bool, typer.Option("--now", help="Run even if the last good calibration is recent.")] = False,
+    cell: Annotated[
+        Path, typer.Argument(help="Cell file; `recalibration` and `policy` configure the job.")
+    ],
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show the next steps; move and write nothing.")
+    ] = False,
+    now: Annotated[
+        bool, typer.Option("--now", help="Run even if the last good calibration is recent.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Record, fit, decide, and propose or apply, unattended, for a timer. Events go to stderr, a line each.
+    """Record, fit, decide, and propose or apply, unattended, for a timer.
 
-    Nothing moves unless the cell file has `policy: {motion: allowed}` and its interlock releases the robot, which is
-    checked before every motion. An interrupted job is resumed by the next one. Exit codes: 0 applied, unchanged or not
-    due; 10 a change waits for approval; 11 the interlock does not release the robot; 12 the bus is taken; 13 out of
-    time; 14 held for another reason; others as for every verb.
+    Events go to stderr, a line each.
+
+    Nothing moves unless the cell file has `policy: {motion: allowed}` and its interlock releases
+    the robot, which is checked before every motion. An interrupted job is resumed by the next one.
+    Exit codes: 0 applied, unchanged or not due; 10 a change waits for approval; 11 the interlock
+    does not release the robot; 12 the bus is taken; 13 out of time; 14 held for another reason;
+    others as for every verb.
     """
 
     from daq.jobs.journal import Form, Journal, Level, form_of
 
     journal = Journal(sys.stderr, form_of(sys.stderr, os.environ), lambda: datetime.now(UTC))
-    say_losses_as(lambda lines: journal.line(Level.WARNING, "lines left out: nothing read the output", lines=lines))
+    say_losses_as(
+        lambda lines: journal.line(
+            Level.WARNING, "lines left out: nothing read the output", lines=lines
+        )
+    )
     try:
         _run(cell, dry_run, now, json, journal)
     except KeyboardInterrupt as interrupt:
@@ -80,7 +95,9 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     with interruptible() as block_signals, Feed(cell) as feed:
-        tools = Tools(save_report=partial(save_certificate, cell, declared), record=partial(record, feed=feed))
+        tools = Tools(
+            save_report=partial(save_certificate, cell, declared), record=partial(record, feed=feed)
+        )
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:
@@ -107,15 +124,22 @@ def schedule_verb(
         Path | None,
         output_option("--to", "Folder of the units, by default that of systemd."),
     ] = None,
-    user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
-    schedule: Annotated[str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")] = "weekly",
+    user: Annotated[
+        bool, typer.Option("--user", help="Install units of this user, not of the system.")
+    ] = False,
+    schedule: Annotated[
+        str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")
+    ] = "weekly",
     cron: Annotated[bool, typer.Option("--cron", help="Print a line for crontab instead.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Write the units; without it they are only shown.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Write the units; without it they are only shown.")
+    ] = False,
 ) -> None:
-    """Create a service and a timer for `drivegain recalibrate`; the last lines printed show how to enable them.
+    """Create a service and a timer for `drivegain recalibrate`;
+    the last lines printed show how to enable them.
 
-    The timer does not catch up on a missed date, and the job checks the interlock before every motion. The earlier
-    name of this verb, `install-units`, goes on working.
+    The timer does not catch up on a missed date, and the job checks the interlock before every
+    motion. The earlier name of this verb, `install-units`, goes on working.
     """
     from daq.jobs.context import section_of
     from daq.jobs.gain_target import file_of
@@ -139,15 +163,23 @@ def schedule_verb(
     folder = to or (Path.home() / _OF_USER if user else _SYSTEM)
     units = units_of(declared, section, wanted)
     for unit in units:
-        require_own_unit(folder / unit.name, cell_option(wanted) if unit.name.endswith(".service") else "")
+        require_own_unit(
+            folder / unit.name, cell_option(wanted) if unit.name.endswith(".service") else ""
+        )
     if yes:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             for unit in units:
                 replace_file(folder / unit.name, unit.text.encode())
     for unit in units:
-        typer.echo(f"Written: {folder / unit.name}" if yes else f"# {folder / unit.name}\n{unit.text}")
-    typer.echo("Then:" if yes else "Dry run, nothing was written. To write this, repeat the command with --yes; then:")
+        typer.echo(
+            f"Written: {folder / unit.name}" if yes else f"# {folder / unit.name}\n{unit.text}"
+        )
+    typer.echo(
+        "Then:"
+        if yes
+        else "Dry run, nothing was written. To write this, repeat the command with --yes; then:"
+    )
     for command in next_commands(wanted, units[1], folder):
         typer.echo(f"  {command}")
 
@@ -171,29 +203,45 @@ def check_schedule(schedule: str) -> None:
     """Check a calendar expression with systemd, where this computer has it."""
     import subprocess
 
-    found = "" if schedule.strip() and schedule.isprintable() else "an empty or unprintable text"
+    if schedule.strip() and schedule.isprintable():
+        found = ""
+    else:
+        found = "an empty or unprintable text"
     analyze = shutil.which("systemd-analyze")
     if not found and analyze is not None:
         done = subprocess.run(
-            [analyze, "calendar", "--", schedule], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+            [analyze, "calendar", "--", schedule],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
         )
-        found = "" if done.returncode == 0 else " ".join(done.stderr.split()) or "no calendar expression"
+        if done.returncode == 0:
+            found = ""
+        else:
+            found = " ".join(done.stderr.split()) or "no calendar expression"
     if found:
         raise UsageError(
             f"--schedule {schedule!r}",
             found=found,
-            expected="a calendar expression of systemd.time(7): weekly, 'Sun 03:00', 'Mon..Fri 22:30'",
+            expected="a calendar expression of systemd.time(7): weekly, 'Sun 03:00', "
+            "'Mon..Fri 22:30'",
             remedy="correct it; `systemd-analyze calendar EXPRESSION` shows its next date",
         )
 
 
 def require_own_unit(path: Path, option: str = "") -> None:
-    """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
+    """Refuse to replace a file that this verb did not write,
+    or a unit without the option of this cell.
+    """
     from daq.jobs.units import MARKS
 
     with writing(path):
         # Reading a pipe would block; only a regular file can be a unit of ours.
-        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
+        if path.is_file():
+            text = path.read_text(encoding="utf-8", errors="replace")
+        else:
+            text = None
     if text is None and not path.exists():
         return
     found = ""
@@ -205,5 +253,9 @@ def require_own_unit(path: Path, option: str = "") -> None:
         found = "the unit of another cell file"
         expected = f"one with {option}"
     if found:
-        remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
-        raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
+        remedy = (
+            "name another folder with --to, or move it away; remove it if the cell file has moved"
+        )
+        raise UsageError(
+            str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy
+        )

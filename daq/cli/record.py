@@ -38,13 +38,24 @@ class RecordOptions:
             help="Allow motion. Without it nothing moves, whatever the cell file says.",
         ),
     ] = False
-    payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None
-    mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None
-    operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None
-    speed: Annotated[float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)] = 1.0
+    payload: Annotated[
+        str | None, typer.Option(help="Mounted payload, by its name in the cell file.")
+    ] = None
+    mass: Annotated[
+        float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)
+    ] = None
+    operator: Annotated[
+        str | None, typer.Option(help="Operator of this recording; you, by default.")
+    ] = None
+    speed: Annotated[
+        float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)
+    ] = 1.0
     unguarded: Annotated[
         bool,
-        typer.Option("--unguarded", help="Move axes that do not stop by themselves when this program is killed."),
+        typer.Option(
+            "--unguarded",
+            help="Move axes that do not stop by themselves when this program is killed.",
+        ),
     ] = False
     json: JsonOption = False
 
@@ -114,8 +125,14 @@ def record_verb(options: RecordOptions) -> None:
     if options.json:
         print_json(record_report(out, done, declared))
     else:
-        verdict = "complete" if done.log.valid else f"INVALID: {done.log.reason}; a fit will refuse it"
-        say(f"{out}: {done.log.samples} samples, {counted(done.log.lost_cycles, 'cycle')} lost, {verdict}")
+        if done.log.valid:
+            verdict = "complete"
+        else:
+            verdict = f"INVALID: {done.log.reason}; a fit will refuse it"
+        say(
+            f"{out}: {done.log.samples} samples, {counted(done.log.lost_cycles, 'cycle')} lost, "
+            f"{verdict}"
+        )
     if not done.log.valid:
         # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
@@ -124,20 +141,27 @@ def record_verb(options: RecordOptions) -> None:
 
 
 def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
-    """Say in notes of an error what became of the samples, and what helps a cell that is too slow for its clock."""
+    """Say in notes of an error what became of the samples,
+    and what helps a cell that is too slow for its clock.
+    """
     from daq.config.cell import PacingMode
 
     if part.exists():
         error.add_note(
-            f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
+            f"kept: the samples recorded until then are in {part}, which `fit` does not read; "
+            f"{_next_command(part)}"
         )
-    if isinstance(error, SampleLost) and cell.sync is not None and cell.sync.pacing is PacingMode.TIMED:
+    if (
+        isinstance(error, SampleLost)
+        and cell.sync is not None
+        and cell.sync.pacing is PacingMode.TIMED
+    ):
         real = not all(bus.kind.is_simulated for bus in cell.buses)
         error.add_note(
             "hint: check the load of bus and computer, or use a longer `sync.period_us`"
             if real
-            else "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
-            "lockstep` in the cell file"
+            else "hint: a cell of `drivegain simulate` answers as fast as its computer can and "
+            "needs `sync.pacing: lockstep` in the cell file"
         )
 
 
@@ -147,16 +171,23 @@ def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:
     from daq.report.plan_preview import find_preview
 
     if not_weighed:
-        yield "the payload's mass was not entered from the scale (--mass KG); `drivegain apply` will ask for it"
+        yield (
+            "the payload's mass was not entered from the scale (--mass KG); `drivegain apply` "
+            "will ask for it"
+        )
     if (page := find_preview(plan)) is not None:
         yield f"preview of these moves: {page}"
     yield from load_lines(cell)
 
 
 def _free(out: Path) -> Path:
-    """Return the file in which the log grows until it is finished, before the bus is used; neither may exist."""
+    """Return the file in which the log grows until it is finished, before the bus is used;
+    neither may exist.
+    """
     part = out.with_name(out.name + ".part")
-    unfinished = "the rest of a recording of that name that failed, was interrupted, or is still running"
+    unfinished = (
+        "the rest of a recording of that name that failed, was interrupted, or is still running"
+    )
     for path, found, remedy in (
         (out, "a file of that name", "choose another --out, or move it away"),
         (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
@@ -172,23 +203,29 @@ def _next_command(part: Path) -> str:
     other = shlex.quote(str(aside))
     saved = shlex.quote(str(part.with_name(part.name.replace(".mcap.part", "") + "-partial.mcap")))
     return (
-        f"`drivegain salvage {one} --out {saved}` saves what is in it; to record under this name, remove it "
-        f"(`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
+        f"`drivegain salvage {one} --out {saved}` saves what is in it; to record under this name, "
+        f"remove it (`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
     )
 
 
 def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> str:
     """Describe in one line what became of the axes and of the recording."""
-    # A stop that could not be confirmed is noted on the interrupt; an interrupt during a stop for another reason cut
-    # that stop short.
+    # A stop that could not be confirmed is noted on the interrupt; an interrupt during a stop for
+    # another reason cut that stop short.
     behind = error_chain(interrupt)[1:]
     causes = (DriverError, OutputFailed, DiskSpaceShort, KeyboardInterrupt)
     first = next((error for error in behind if isinstance(error, causes)), None)
-    notes = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
+    if first is None:
+        notes = []
+    else:
+        notes = [f"it came while they were stopped after {type(first).__name__}: {first}"]
     notes += all_notes(interrupt)
     problems = "; ".join(note for note in notes if not note.startswith(POWERED))
     powered = ", ".join(note.removeprefix(POWERED) for note in notes if note.startswith(POWERED))
-    axes = f"{powered} NOT CONFIRMED WITHOUT POWER, use the emergency stop" if powered else "axes stopped"
+    if powered:
+        axes = f"{powered} NOT CONFIRMED WITHOUT POWER, use the emergency stop"
+    else:
+        axes = "axes stopped"
     axes += f" ({problems})" if problems else ""
     if made is None:
         return f"interrupted: {axes}; nothing was recorded"

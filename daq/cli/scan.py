@@ -27,22 +27,28 @@ if TYPE_CHECKING:
 
 def scan_verb(
     cell: CellArgument,
-    wait: Annotated[float, typer.Option(help="How long to wait for answers [s].", min=0.05, max=60.0)] = 0.5,
+    wait: Annotated[
+        float, typer.Option(help="How long to wait for answers [s].", min=0.05, max=60.0)
+    ] = 0.5,
     reset_faults: Annotated[
         bool,
-        typer.Option("--reset-faults", help="Reset every axis in FAULT (6040h); it stays unpowered, nothing moves."),
+        typer.Option(
+            "--reset-faults",
+            help="Reset every axis in FAULT (6040h); it stays unpowered, nothing moves.",
+        ),
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """List the nodes on the cell's buses with identity, name and state, and compare them with the cell file.
+    """List the nodes on the cell's buses with identity, name and state,
+    and compare them with the cell file.
 
-    Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nameplate gains are compared
-    with the motors' data in the drives and with the current gains. Nothing is changed without
-    --reset-faults; find out why an axis is in fault before you reset it. While a recording or
-    another master uses the bus, nothing is sent: exit code 12 or 5.
-    Of a cell file that other verbs refuse, the buses and node ids are enough; what is missing is said.
-    Exit code 5 also where an axis does not answer; what else is wrong is in the table, as another
-    serial number is, and `record` refuses it.
+    Every node id is tried on every bus, so that an amplifier on the wrong bus is found. Nameplate
+    gains are compared with the motors' data in the drives and with the current gains. Nothing is
+    changed without --reset-faults; find out why an axis is in fault before you reset it. While a
+    recording or another master uses the bus, nothing is sent: exit code 12 or 5. Of a cell file
+    that other verbs refuse, the buses and node ids are enough; what is missing is said. Exit code 5
+    also where an axis does not answer; what else is wrong is in the table, as another serial number
+    is, and `record` refuses it.
     """
     from daq.config.cell_buses import bus_parts
     from daq.config.wiring import read_wiring
@@ -83,8 +89,15 @@ def scan_verb(
     absent = {node.node_id for node in listed if node.verdict == "missing"}
     missing = [_amplifier(axis) for axis in wiring.axes if axis.node_id in absent]
     if missing:
-        raise no_answer(wiring, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
-    if not json and declared is not None and not mistyped and all(node.verdict == "ok" for node in listed):
+        raise no_answer(
+            wiring, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait
+        )
+    if (
+        not json
+        and declared is not None
+        and not mistyped
+        and all(node.verdict == "ok" for node in listed)
+    ):
         say_next("drivegain", "calibrate", cell, "--check")
 
 
@@ -134,8 +147,12 @@ def _scan_bus(
     return ScannedBus(nodes, scales, misfits, causes)
 
 
-def no_answer(cell: Wired, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float) -> Exception:
-    """Error for axes that did not answer: amplifiers without power, or a simulated cell that was not started."""
+def no_answer(
+    cell: Wired, missing: Sequence[Axis], answered: tuple[int, ...], wait_s: float
+) -> Exception:
+    """Error for axes that did not answer: amplifiers without power,
+    or a simulated cell that was not started.
+    """
     from daq.cli.simulate import SHIPPED
 
     if answered or not all(bus.kind.is_of_process for bus in cell.buses):
@@ -143,15 +160,18 @@ def no_answer(cell: Wired, missing: Sequence[Axis], answered: tuple[int, ...], w
     name = cell.name if cell.name in SHIPPED else "FILE"
     return VirtualBusEmpty(
         f"cell {cell.name!r}",
-        found="no node on its bus, which is virtual: no amplifier and no other program is ever on it",
+        found="no node on its bus, which is virtual: no amplifier and no other program is "
+        "ever on it",
         expected="the bus of a simulated cell in a second terminal, or of a robot",
-        remedy=f"start `drivegain simulate {name}`, and put the `bus` and `sync` that it prints into a copy of the "
-        "cell file",
+        remedy=f"start `drivegain simulate {name}`, and put the `bus` and `sync` that it prints "
+        "into a copy of the cell file",
     )
 
 
 def _amplifier(axis: AxisWiring) -> Axis:
-    """Axis for the bus; without a profile it is that of the standard, whose current and position are not read."""
+    """Axis for the bus; without a profile it is that of the standard,
+    whose current and position are not read.
+    """
     from drivers.profiles.profile import CIA402, Axis
 
     return Axis(axis.name, axis.node_id, axis.profile or CIA402, axis.identity)
@@ -168,7 +188,9 @@ def _scale_of(network: CanopenNetwork, axis: Axis) -> ScaleReading | None:
 
 
 def _misfit_of(network: CanopenNetwork, axis: Axis) -> str:
-    """Describe the objects of its profile that a drive lacks; empty where it has them, or does not answer."""
+    """Describe the objects of its profile that a drive lacks;
+    empty where it has them, or does not answer.
+    """
     from daq.config.drive import shipped_profiles
     from drivers.canopen.setup import misfit
 
@@ -184,7 +206,9 @@ def _fault_of(network: CanopenNetwork, axis: Axis) -> str:
     from drivers.canopen.emcy import explain, read_error_code
 
     code = read_error_code(network.link.objects(axis.node_id))
-    return "the drive names no error code (603Fh)" if code == 0 else f"{explain(code).hex}: {explain(code).text}"
+    if code == 0:
+        return "the drive names no error code (603Fh)"
+    return f"{explain(code).hex}: {explain(code).text}"
 
 
 _HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{1,4})[hH]?")

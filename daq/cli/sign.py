@@ -25,17 +25,24 @@ from daq.errors import UsageError
 def sign_verb() -> None:
     """Sign a calibration for a cell whose policy requires a second approver.
 
-    Signatures and keys are minisign files: `minisign -V` checks the signatures, and minisign keys can be used here.
+    Signatures and keys are minisign files: `minisign -V` checks the signatures, and minisign keys
+    can be used here.
     """
 
 
 def sign_key_verb(
     name: Annotated[str, typer.Option("--name", help="Name of the person, as in the cell file.")],
-    folder: Annotated[Path, output_option("--folder", "Folder for NAME.key and NAME.pub.")] = Path(),
-    no_password: Annotated[bool, typer.Option("--no-password", help="Only its file's permissions protect it.")] = False,
+    folder: Annotated[
+        Path, output_option("--folder", "Folder for NAME.key and NAME.pub.")
+    ] = Path(),
+    no_password: Annotated[
+        bool, typer.Option("--no-password", help="Only its file's permissions protect it.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Make a key pair: NAME.key is secret and stays with the person, the public key goes into the cell file."""
+    """Make a key pair: NAME.key is secret and stays with the person,
+    the public key goes into the cell file.
+    """
     from daq.report.job_schemas import KeyReport
     from daq.writeback.signature import generate
 
@@ -48,13 +55,16 @@ def sign_key_verb(
             "password",
             found="two that differ" if password else "none",
             expected="the same twice",
-            remedy="try again, or use --no-password for a key that only its file permissions protect",
+            remedy="try again, or use --no-password for a key that only its file "
+            "permissions protect",
         )
     secret, public = generate(folder, name, password)
     if json:
         print_json(KeyReport(name=name, secret_key=str(secret), public_key=public.line))
         return
-    entry = f"For the cell file, under `policy: {{apply: {{signers: …}}}}`:\n  {name}: {public.line}"
+    entry = (
+        f"For the cell file, under `policy: {{apply: {{signers: …}}}}`:\n  {name}: {public.line}"
+    )
     print_view([entry], secret, secret.with_suffix(".pub"))
     say(f"Keep {secret.name} secret: anyone who has it can sign as {name}.")
 
@@ -65,7 +75,9 @@ def sign_calibration_verb(
     name: Annotated[str, typer.Option("--name", help="Your name, as the cell file spells it.")],
     json: JsonOption = False,
 ) -> None:
-    """Show a calibration and write your signature beside it; changing the file makes the signature invalid."""
+    """Show a calibration and write your signature beside it;
+    changing the file makes the signature invalid.
+    """
 
     from daq.report.gains import gain_table
     from daq.report.job_schemas import SignatureReport
@@ -87,7 +99,9 @@ def sign_check_verb(
     calibration: CalibrationArgument,
     json: JsonOption = False,
 ) -> None:
-    """Show which of the cell's signers have signed a calibration; an invalid signature is exit code 3."""
+    """Show which of the cell's signers have signed a calibration;
+    an invalid signature is exit code 3.
+    """
     from daq.report.job_schemas import SignersReport
     from daq.writeback.signature import signers_of
 
@@ -98,7 +112,10 @@ def sign_check_verb(
         return
     signed = ", ".join(found) or "none of the cell's signers"
     print_view(
-        [f"Signed by: {signed}.", f"Signatures required by the cell: {policy.signatures}, not counting the applier's."]
+        [
+            f"Signed by: {signed}.",
+            f"Signatures required by the cell: {policy.signatures}, not counting the applier's.",
+        ]
     )
 
 

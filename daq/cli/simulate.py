@@ -37,7 +37,17 @@ if TYPE_CHECKING:
     from drivers.canopen.split_bus import BusPart
     from drivers.simulation.spec import CellSpec
 
-SHIPPED = ("demo", "clean", "rx90", "kr270", "seven-axis", "gantry", "five-bar", "orthoglide", "dualv")
+SHIPPED = (
+    "demo",
+    "clean",
+    "rx90",
+    "kr270",
+    "seven-axis",
+    "gantry",
+    "five-bar",
+    "orthoglide",
+    "dualv",
+)
 _SHIPPED_FAULTS = "faults-example"
 LARGEST_NAME_FILE_BYTES = 4096  #: Size of a file that names a body
 
@@ -45,29 +55,52 @@ LARGEST_NAME_FILE_BYTES = 4096  #: Size of a file that names a body
 def simulate(
     simulation: Annotated[
         Path,
-        typer.Argument(help=f"Simulation file, the truth of a cell, or a shipped one: {', '.join(SHIPPED)}."),
+        typer.Argument(
+            help=f"Simulation file, the truth of a cell, or a shipped one: {', '.join(SHIPPED)}."
+        ),
     ],
-    payload: Annotated[str | None, typer.Option(help="Name of the mounted body in the simulation file.")] = None,
-    faults: Annotated[Path | None, typer.Option(help="Scenario file, or the shipped faults-example.")] = None,
-    interface: Annotated[str, typer.Option(help="socketcand, a hub on 127.0.0.1, or socketcan.")] = SOCKETCAND.name,
+    payload: Annotated[
+        str | None, typer.Option(help="Name of the mounted body in the simulation file.")
+    ] = None,
+    faults: Annotated[
+        Path | None, typer.Option(help="Scenario file, or the shipped faults-example.")
+    ] = None,
+    interface: Annotated[
+        str, typer.Option(help="socketcand, a hub on 127.0.0.1, or socketcan.")
+    ] = SOCKETCAND.name,
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "can0",
     bus: Annotated[
         list[str] | None,
-        typer.Option(metavar="CHANNEL=NODE,NODE,...", help="One of several buses, instead of --channel; repeatable."),
+        typer.Option(
+            metavar="CHANNEL=NODE,NODE,...",
+            help="One of several buses, instead of --channel; repeatable.",
+        ),
     ] = None,
-    port: Annotated[int, typer.Option(help="Port of the hub; 0 takes a free one.", min=0, max=65535)] = 29536,
+    port: Annotated[
+        int, typer.Option(help="Port of the hub; 0 takes a free one.", min=0, max=65535)
+    ] = 29536,
     payload_from: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Names the mounted body, or none; read again while no axis has power."),
+        typer.Option(
+            metavar="FILE",
+            help="Names the mounted body, or none; read again while no axis has power.",
+        ),
     ] = None,
 ) -> None:
-    """Run a simulated cell until Ctrl-C or SIGTERM: amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
+    """Run a simulated cell until Ctrl-C or SIGTERM:
+    amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
 
-    It prints the bus settings for the cell file; the other verbs then run in a second terminal. Each shipped one but
-    clean, which is the demo without its hidden effect, has a cell file of its name.
+    It prints the bus settings for the cell file; the other verbs then run in a second terminal.
+    Each shipped one but clean, which is the demo without its hidden effect, has a cell file of its
+    name.
     """
 
-    from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
+    from daq.simulation.simulation_file import (
+        load_scenario,
+        load_simulation,
+        require_simulator,
+        shipped_simulation,
+    )
     from daq.workflow.bus_lock import require_untaken
     from drivers.canopen.bus import BusAddress, bus_errors, open_bus
     from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
@@ -92,11 +125,25 @@ def simulate(
     if faults is not None:
         shipped = faults.name == _SHIPPED_FAULTS and not faults.is_file()
         scenario = shipped_simulation(faults.name) if shipped else faults
-        spec = replace(spec, faults=spec.faults + load_scenario(scenario, len(spec.axes), spec.sync_period_us))
+        spec = replace(
+            spec, faults=spec.faults + load_scenario(scenario, len(spec.axes), spec.sync_period_us)
+        )
     # SIGHUP is left alone, so that nohup works.
-    with until_interrupted(), interruptible(signals=(signal.SIGINT, signal.SIGTERM)), ExitStack() as stack:
-        there = nodes_on_buses(bus, [axis.node_id for axis in spec.axes]) if bus else {channel: frozenset()}
-        hub = stack.enter_context(Hub(tuple(there), port)) if interface_of(interface) is SOCKETCAND else None
+    with (
+        until_interrupted(),
+        interruptible(signals=(signal.SIGINT, signal.SIGTERM)),
+        ExitStack() as stack,
+    ):
+        there = (
+            nodes_on_buses(bus, [axis.node_id for axis in spec.axes])
+            if bus
+            else {channel: frozenset()}
+        )
+        hub = (
+            stack.enter_context(Hub(tuple(there), port))
+            if interface_of(interface) is SOCKETCAND
+            else None
+        )
         parts = tuple(
             BusPart(name, BusAddress(interface, name) if hub is None else hub.address(name), nodes)
             for name, nodes in there.items()
@@ -104,17 +151,26 @@ def simulate(
         if hub is None:  # a hub is a bus of this program, on which nobody is yet
             require_untaken(part.address for part in parts)
         address = SplitAddress(parts) if bus else parts[0].address
-        end = open_cell_bus(address) if isinstance(address, SplitAddress) else open_bus(address, answering=True)
+        end = (
+            open_cell_bus(address)
+            if isinstance(address, SplitAddress)
+            else open_bus(address, answering=True)
+        )
         stack.callback(end.shutdown)
         try:
             cell = SimulatedCell(spec, end, mounted=mounted)
         except SpecInvalid as error:
             expected = "a cell that can be built"
             remedy = "correct it, or the URDF that it names"
-            raise ConfigurationInconsistent(str(truth), found=str(error), expected=expected, remedy=remedy) from error
+            raise ConfigurationInconsistent(
+                str(truth), found=str(error), expected=expected, remedy=remedy
+            ) from error
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
-        say(f"{counted(len(spec.axes), 'amplifier')} on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
+        say(
+            f"{counted(len(spec.axes), 'amplifier')} on {address}, payload {what}, {faulty} "
+            "faults; Ctrl-C ends it"
+        )
         typer.echo(how_to_reach(parts, spec.sync_period_us))
         with bus_errors(address):
             cell.serve_forever()
@@ -130,7 +186,10 @@ class MountedFile:
     """
 
     def __init__(
-        self, path: Path, load: Callable[[str | None], CellSpec], complain: Callable[[UsageError], None]
+        self,
+        path: Path,
+        load: Callable[[str | None], CellSpec],
+        complain: Callable[[UsageError], None],
     ) -> None:
         self._path = path
         self._load = load
@@ -145,7 +204,9 @@ class MountedFile:
         return self._spec
 
     def __call__(self) -> CellSpec | None:
-        """Return the cell with the body that the file names; the same object while the name is the same."""
+        """Return the cell with the body that the file names;
+        the same object while the name is the same.
+        """
         name = self._read()
         if name != self._name:
             self._name = name
@@ -164,7 +225,9 @@ class MountedFile:
 
 
 def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str, frozenset[int]]:
-    """Read the nodes of each channel from CHANNEL=NODE,NODE,...; each node of the cell must be on exactly one bus."""
+    """Read the nodes of each channel from CHANNEL=NODE,NODE,...;
+    each node of the cell must be on exactly one bus.
+    """
     there: dict[str, frozenset[int]] = {}
     for one in options:
         channel, _, nodes = one.partition("=")
@@ -204,7 +267,8 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
         buses += f"  - name: {part.name}\n" if several else ""
         buses += "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
     nodes = "".join(
-        f"axes with node_id {', '.join(map(str, sorted(part.node_ids)))}: add bus: {part.name}\n" for part in parts
+        f"axes with node_id {', '.join(map(str, sorted(part.node_ids)))}: add bus: {part.name}\n"
+        for part in parts
     )
     return (
         "To reach it, replace `bus` and `sync` in the cell file with:\n\n"
@@ -216,12 +280,18 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
 
 def demo(
     out: Annotated[Path, output_option("--out", "Folder to fill.")] = Path("out/demo"),
-    simulation: Annotated[Path | None, typer.Option(help="Another simulation file than the shipped one.")] = None,
+    simulation: Annotated[
+        Path | None, typer.Option(help="Another simulation file than the shipped one.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of plans and noise.", min=0)] = 1,
-    duration: Annotated[float, typer.Option(help="Duration of each of the five runs [s].", min=10.0, max=600.0)] = 40.0,
+    duration: Annotated[
+        float, typer.Option(help="Duration of each of the five runs [s].", min=10.0, max=600.0)
+    ] = 40.0,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate a simulated six-axis cell: scan, plan, record, identify, add effects, write a copy of its file."""
+    """Calibrate a simulated six-axis cell: scan, plan, record, identify, add effects,
+    write a copy of its file.
+    """
 
     from daq.report.document import json_text
     from daq.report.proposal import show_proposal
@@ -232,7 +302,11 @@ def demo(
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
     with replace_output(out):
         with show_steps() as stepper:
-            outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
+            outcome = demonstrate(
+                settings,
+                lambda: datetime.now(UTC),
+                ProgressReporter(stepper.step, stepper.progress),
+            )
         report = demo_report(outcome, seconds=round(time.monotonic() - began, 1))
         replace_file(out / "summary.json", json_text(report).encode())
     if json:
@@ -246,7 +320,9 @@ def demo(
 
 
 def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
-    """Nodes on the bus, turns of the loop, errors before and after, the summary, and the gains beside the truth."""
+    """Nodes on the bus, turns of the loop, errors before and after, the summary,
+    and the gains beside the truth.
+    """
     from daq.report.bus_views import scan_table, scanned_nodes
     from daq.report.gains import gain_table
     from daq.report.residual import before_after_table, summary, turns_view
@@ -263,6 +339,11 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     title = "Drive gains beside the truth of the simulated cell; change % is from the nameplate"
     yield gain_table(outcome.calibration.gains, truth, title=title)
     if fitted.paper is not None:
-        errors = (100.0 * (gain / truth[axis] - 1.0) for axis, gain in zip(truth, fitted.paper.gains, strict=True))
-        yield "Errors of the paper's total least squares on the same rows: " + ", ".join(f"{e:+.2f} %" for e in errors)
+        errors = (
+            100.0 * (gain / truth[axis] - 1.0)
+            for axis, gain in zip(truth, fitted.paper.gains, strict=True)
+        )
+        yield ("Errors of the paper's total least squares on the same rows: ") + ", ".join(
+            f"{e:+.2f} %" for e in errors
+        )
     yield ""

@@ -1,4 +1,6 @@
-"""The terminal of a verb: output files that are not overwritten by accident, progress, views, and Ctrl-C."""
+"""The terminal of a verb: output files that are not overwritten by accident, progress, views,
+and Ctrl-C.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ from rich.text import Text
 
 from daq.cli.output import release_results
 from daq.cli.verb import judged_output
-from daq.errors import OutputFailed, UsageError, writing
+from daq.errors import OutputFailed, UsageError, first_few, writing
 from daq.files import is_taken, replace_file
 from daq.report.text import break_lines, terminal_text
 
@@ -31,11 +33,19 @@ if TYPE_CHECKING:
 
     from drivers.canopen.network import SignalBlocker
 
-ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
+#: Called with the number done, the total, and a remark
+ProgressCallback = Callable[[int, int, str], None]
 
 WRITTEN: list[Path] = []
-"""Files and folders that this command has written, for the message of an error or interrupt that comes later."""
+"""Files and folders that this command has written, for the message of an error or interrupt that
+comes later.
+"""
 
+
+CHANGED: list[str] = []
+"""Changes that this command has made to files that others fill, too, such as the audit log: a
+clause each, for the message of an error or interrupt that comes later.
+"""
 
 STARTED: list[Path] = []
 """Folders that this command was filling when it was interrupted."""
@@ -46,7 +56,9 @@ _MADE: list[Path] = []
 
 @contextmanager
 def write_output(path: Path) -> Iterator[None]:
-    """Write a file or folder within the block, as `writing`, and note in `WRITTEN` that it is there."""
+    """Write a file or folder within the block, as `writing`,
+    and note in `WRITTEN` that it is there.
+    """
     try:
         with writing(path):
             yield
@@ -73,7 +85,10 @@ def write_new_folder(folder: Path) -> Iterator[Path]:
     with write_output(folder):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(
-                str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"
+                str(folder),
+                found="something in it",
+                expected="a new or empty folder",
+                remedy="choose another name",
             )
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as temporary:
@@ -92,7 +107,8 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replace_output(path: Path) -> Iterator[None]:
-    """Write a file or folder within the block, as `write_output`, and say on stderr which files were there before.
+    """Write a file or folder within the block, as `write_output`,
+    and say on stderr which files were there before.
 
     What can be made again, such as a plan or a calibration, may replace an earlier file of its kind
     (`check_replaceable`); a log replaces nothing.
@@ -106,10 +122,9 @@ def replace_output(path: Path) -> Iterator[None]:
         return
     oldest_ns = min(before[file].modified_ns for file in replaced)
     since = datetime.fromtimestamp(oldest_ns / 1e9, UTC)
-    names = [str(file) for file in replaced[:NAMED_FILES]]
-    if len(replaced) > NAMED_FILES:
-        names.append(f"{len(replaced) - NAMED_FILES} more")
-    replaced_text = terminal_text(f"Replaced: {', '.join(names)} (of {since:%Y-%m-%d %H:%M} UTC)")
+    names = [str(file) for file in replaced]
+    named = first_few(names, NAMED_FILES, separator=", ")
+    replaced_text = terminal_text(f"Replaced: {named} (of {since:%Y-%m-%d %H:%M} UTC)")
     say(replaced_text.plain, err=True)
 
 
@@ -137,7 +152,9 @@ def _files_of(path: Path) -> dict[Path, _FileState]:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder, with its parents, before there is anything to put into it; it is removed if it stays empty."""
+    """Create a folder, with its parents, before there is anything to put into it;
+    it is removed if it stays empty.
+    """
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
     _MADE.extend(reversed(missing))
     folder.mkdir(parents=True, exist_ok=True)
@@ -151,12 +168,17 @@ def remove_empty_folders() -> None:
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
-    """Refuse an output file that would overwrite an input, or a file without ``format: …`` in its first lines."""
+    """Refuse an output file that would overwrite an input, or a file without ``format:
+    …`` in its first lines.
+    """
     if out is None or not out.exists():
         return
     if any(given is not None and given.exists() and out.samefile(given) for given in inputs):
         raise UsageError(
-            str(out), found="one of the input files", expected="a file of its own", remedy="choose another name"
+            str(out),
+            found="one of the input files",
+            expected="a file of its own",
+            remedy="choose another name",
         )
     check_replaceable(out, f"format: {format_}", format_)
 
@@ -177,7 +199,10 @@ def check_folder(out: Path | None) -> None:
     """Refuse, before the work is done, an output file in a folder that does not exist."""
     if out is not None and not out.parent.is_dir():
         raise OutputFailed(
-            str(out), found="no such folder", expected="a folder that exists", remedy="create it, or choose another"
+            str(out),
+            found="no such folder",
+            expected="a folder that exists",
+            remedy="create it, or choose another",
         )
 
 
@@ -194,9 +219,11 @@ def check_page(out: Path, option: str) -> None:
 
 
 def check_replaceable(out: Path, mark: str, kind: str) -> None:
-    """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head.
+    """Refuse to overwrite a file of another kind:
+    one that is not empty and lacks the mark of this kind in its head.
 
-    What `judged_output` refuses is refused too: a file in a folder that the command line names was not judged there.
+    What `judged_output` refuses is refused too: a file in a folder that the command line names was
+    not judged there.
     """
     judged_output(out)
     if out.is_file():
@@ -227,12 +254,17 @@ def at_most_one(**options: object) -> None:
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
     if len(given) > 1:
         raise UsageError(
-            given[0], found=f"{', '.join(given[1:])} beside it", expected="one of them", remedy="leave out all but one"
+            given[0],
+            found=f"{', '.join(given[1:])} beside it",
+            expected="one of them",
+            remedy="leave out all but one",
         )
 
 
 class _WholeWords(Console):
-    """Console that breaks long lines of text at spaces, where a terminal would break them within a word."""
+    """Console that breaks long lines of text at spaces,
+    where a terminal would break them within a word.
+    """
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print as rich does, with lines of text that fit a terminal."""
@@ -250,7 +282,9 @@ class _WholeWords(Console):
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print text for a person; a terminal gets lines broken at spaces, a pipe or file gets them as they are."""
+    """Print text for a person; a terminal gets lines broken at spaces,
+    a pipe or file gets them as they are.
+    """
     stream = sys.stderr if err else sys.stdout
     shown = text
     if stream is not None and stream.isatty():
@@ -270,7 +304,9 @@ PIPE_COLUMNS = 1_000  #: Wider than any table
 
 
 def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
-    """Print tables and lines on stdout, then the files written; a terminal breaks lines between words alone."""
+    """Print tables and lines on stdout, then the files written;
+    a terminal breaks lines between words alone.
+    """
     console = output_console()
     for part in parts:
         console.print(part)
@@ -278,7 +314,9 @@ def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
 
 
 def say_written(console: Console, *paths: Path | None) -> None:
-    """Print the files and folders that were written, a line each; None for those that were not asked for."""
+    """Print the files and folders that were written, a line each;
+    None for those that were not asked for.
+    """
     for path in paths:
         if path is not None:
             page = path / "report.html"
@@ -288,13 +326,17 @@ def say_written(console: Console, *paths: Path | None) -> None:
 
 
 def say_last(text: str) -> None:
-    """Print the last line of a command on stderr; the exit code says it where that takes nothing."""
+    """Print the last line of a command on stderr;
+    the exit code says it where that takes nothing.
+    """
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
         say(text, err=True)
 
 
 class Stepper:
-    """Progress of steps that follow each other: a line for each as it ends, whole and at once, for a file or pipe."""
+    """Progress of steps that follow each other:
+    a line for each as it ends, whole and at once, for a file or pipe.
+    """
 
     def __init__(self) -> None:
         self._title = ""
@@ -307,12 +349,16 @@ class Stepper:
         self._began_s = time.monotonic()
 
     def progress(self, done: int, total: int, remark: str) -> None:
-        """Report progress within the step, which a line that cannot be taken back does not; a total of 0 is unknown."""
+        """Report progress within the step, which a line that cannot be taken back does not;
+        a total of 0 is unknown.
+        """
 
     def end(self) -> None:
         """End the current step."""
         if self._title:
-            typer.echo(f"{terminal_text(self._title)} ({time.monotonic() - self._began_s:.0f} s)", err=True)
+            typer.echo(
+                f"{terminal_text(self._title)} ({time.monotonic() - self._began_s:.0f} s)", err=True
+            )
         self._title = ""
 
 
@@ -341,7 +387,9 @@ class _Bars(Stepper):
 
 @contextmanager
 def show_steps() -> Iterator[Stepper]:
-    """Show progress on stderr, in a terminal as bars; the last step is ended unless an error is raised."""
+    """Show progress on stderr, in a terminal as bars;
+    the last step is ended unless an error is raised.
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
         lines = Stepper()
@@ -353,7 +401,12 @@ def show_steps() -> Iterator[Stepper]:
     from daq.cli.patient_live import PatientProgress
 
     remark = TextColumn("{task.fields[remark]}", style="dim")
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(), remark)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TimeElapsedColumn(),
+        remark,
+    )
     with PatientProgress(*columns, console=console, refresh_per_second=5) as bars:
         stepper = _Bars(bars)
         yield stepper
@@ -362,7 +415,9 @@ def show_steps() -> Iterator[Stepper]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
-    """Show one progress bar on stderr from the first progress on: none where the work is refused."""
+    """Show one progress bar on stderr from the first progress on:
+    none where the work is refused.
+    """
     with ExitStack() as stack:
         shown: list[Stepper] = []
 
@@ -377,7 +432,9 @@ def progress_bar(title: str) -> Iterator[ProgressCallback]:
 
 @contextmanager
 def status(title: str) -> Iterator[Callable[[str], None]]:
-    """Show work of unknown length on stderr: in a terminal a spinner with the step, elsewhere a line for each step."""
+    """Show work of unknown length on stderr: in a terminal a spinner with the step,
+    elsewhere a line for each step.
+    """
     from rich.spinner import Spinner
 
     from daq.cli.patient_live import PatientLive
@@ -390,7 +447,8 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
             if console.is_terminal:
                 spinner.update(text=terminal_text(step))
             else:
-                console.print(f"  {step}", style="dim", soft_wrap=True)  # a line of a file, whatever its length
+                # A line of a file, whatever its length
+                console.print(f"  {step}", style="dim", soft_wrap=True)
 
         yield show_step
 
@@ -400,7 +458,9 @@ SPINNER_HZ = 12.5  #: Frames of the spinner a second
 
 @contextmanager
 def until_interrupted() -> Iterator[None]:
-    """End a block that runs until Ctrl-C without an error; what it has printed is not waited for after that."""
+    """End a block that runs until Ctrl-C without an error;
+    what it has printed is not waited for after that.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -411,8 +471,8 @@ def until_interrupted() -> Iterator[None]:
 def delay_signals() -> Iterator[None]:
     """Let a short write and the records of it be completed before a signal is a KeyboardInterrupt.
 
-    Unlike the blocker of `interruptible`, which drops a signal during a stop, this one raises it afterwards. Outside
-    the main thread nothing changes.
+    Unlike the blocker of `interruptible`, which drops a signal during a stop, this one raises it
+    afterwards. Outside the main thread nothing changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -433,15 +493,18 @@ ONE_KEY_S = 0.3  #: Signals that are closer together count as one
 def interruptible(
     clock: Callable[[], float] = time.monotonic, signals: tuple[signal.Signals, ...] = SIGNALS
 ) -> Iterator[SignalBlocker]:
-    """Turn signals within the block into KeyboardInterrupt, and ignore those that follow within `GRACE_S`.
+    """Turn signals within the block into KeyboardInterrupt,
+    and ignore those that follow within `GRACE_S`.
 
-    By default SIGTERM and SIGHUP end a process at once, and the axes would keep moving; a shell starts background jobs
-    (&) with SIGINT ignored, and only a handler of our own makes them interruptible. The first signal starts the stop of
-    the axes, which a second one must not cut short; later signals count again, so that a hanging stop can be left. The
-    yielded context manager protects a stop that a fault has started in the same way; a signal that arrives meanwhile is
-    dropped, because it asks for what is happening already. The context yields a function that returns whether a second
-    signal came, after which the settings of the axes need not be restored any more. Outside the main thread, where
-    Python handles no signals, nothing changes.
+    By default SIGTERM and SIGHUP end a process at once, and the axes would keep moving; a shell
+    starts background jobs (&) with SIGINT ignored, and only a handler of our own makes them
+    interruptible. The first signal starts the stop of the axes, which a second one must not cut
+    short; later signals count again, so that a hanging stop can be left. The yielded context
+    manager protects a stop that a fault has started in the same way; a signal that arrives
+    meanwhile is dropped, because it asks for what is happening already. The context yields a
+    function that returns whether a second signal came, after which the settings of the axes need
+    not be restored any more. Outside the main thread, where Python handles no signals, nothing
+    changes.
     """
     if threading.current_thread() is not threading.main_thread():
         yield nullcontext
@@ -475,7 +538,9 @@ def interruptible(
 
 
 @contextmanager
-def _handled_by(handler: Callable[[int, FrameType | None], None], signals: Iterable[signal.Signals]) -> Iterator[None]:
+def _handled_by(
+    handler: Callable[[int, FrameType | None], None], signals: Iterable[signal.Signals]
+) -> Iterator[None]:
     """Handle signals within the block by a function."""
     before = [(number, signal.signal(number, handler)) for number in signals]
     try:

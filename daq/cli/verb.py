@@ -1,7 +1,7 @@
 """A verb of the command line, its help, and the options that several verbs share.
 
-A verb parses, calls and prints. Its module imports what the help needs; the verb imports what it runs when it runs, so
-that no help waits for numerics or for the bus.
+A verb parses, calls and prints. Its module imports what the help needs; the verb imports what it
+runs when it runs, so that no help waits for numerics or for the bus.
 """
 
 from __future__ import annotations
@@ -29,22 +29,30 @@ if TYPE_CHECKING:
     from daq.report.document import Report
     from ident.calibration import Calibration
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")
+]
 CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
 CellOption = Annotated[
-    Path | None, typer.Option("--cell", help="Corrected file of the same cell, in place of the one in the logs.")
+    Path | None,
+    typer.Option(
+        "--cell", help="Corrected file of the same cell, in place of the one in the logs."
+    ),
 ]
-CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")]
+CalibrationArgument = Annotated[
+    Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")
+]
 
 
 RequestT = TypeVar("RequestT")
 
 
 def judged_output(path: Path | None) -> Path | None:
-    """Refuse, as the command line is parsed, a place to write to that another user has chosen, and a device or pipe.
+    """Refuse, as the command line is parsed, a place to write to that another user has chosen,
+    and a device or pipe.
 
-    The callback of every option (`output_option`) and argument that names a file or folder to write; it returns the
-    path as it was given.
+    The callback of every option (`output_option`) and argument that names a file or folder to
+    write; it returns the path as it was given.
 
     Raises:
         UsageError: as `judge_target`.
@@ -130,11 +138,15 @@ class Verb:
     """One verb. The module of its function is imported when it is called or explained."""
 
     name: str  #: on the command line
-    #: Function, as module:name; it takes its arguments as typer parses them, and its docstring is the help.
+    #: Function, as module:name; it takes its arguments as typer parses them, and its docstring is
+    #: the help.
     place: str
-    example: str  #: a command line that works, shown at the end of the help; CELL is the cell file of the user's folder
+    #: a command line that works, shown at the end of the help; CELL is the cell file of the user's
+    #: folder
+    example: str
     summary: str = ""  #: one line for the list of verbs
-    #: Verbs with arguments of their own, `drivegain export urdf …`; then the function takes none and is the help alone.
+    #: Verbs with arguments of their own, `drivegain export urdf …`; then the function takes none
+    #: and is the help alone.
     kinds: tuple[Verb, ...] = ()
 
     def function(self) -> Callable[..., None]:
@@ -161,7 +173,8 @@ class Verb:
         return typer.main.get_command(app)
 
 
-_HYPHEN = "\u2011"  #: Non-breaking: a line is broken at spaces alone, so that --enable-motion stays whole
+#: Non-breaking: a line is broken at spaces alone, so that --enable-motion stays whole
+_HYPHEN = "\u2011"
 
 
 def _example(command: str) -> str:
@@ -174,25 +187,37 @@ def _example(command: str) -> str:
 class _VerbCommand(TyperCommand):
     """Command whose help names values as a manual does: CELL, SECONDS.
 
-    `--cell CELL` and `--calibration CALIBRATION` are other spellings of a first argument of that name.
+    `--cell CELL` and `--calibration CALIBRATION` are other spellings of a first argument of that
+    name.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        first = next((param.name for param in self.params if param.param_type_name == "argument"), None)
+        first = next(
+            (param.name for param in self.params if param.param_type_name == "argument"), None
+        )
         if first in _SPELLED_AS_OPTIONS:
             args = _in_front(first, args)
         return super().parse_args(ctx, args)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        return [piece.replace("{", "").replace("}", "").upper() for piece in super().collect_usage_pieces(ctx)]
+        return [
+            piece.replace("{", "").replace("}", "").upper()
+            for piece in super().collect_usage_pieces(ctx)
+        ]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         for title in ("argument", "option"):
             params = [param for param in self.get_params(ctx) if param.param_type_name == title]
-            records = [record for record in (help_record(param, ctx) for param in params) if record is not None]
+            records = [
+                record
+                for record in (help_record(param, ctx) for param in params)
+                if record is not None
+            ]
             if records:
                 with formatter.section(f"{title.capitalize()}s"):
-                    formatter.write_dl([(name, text.replace("-", _HYPHEN)) for name, text in records])
+                    formatter.write_dl(
+                        [(name, text.replace("-", _HYPHEN)) for name, text in records]
+                    )
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
         formatter.write_paragraph()
@@ -200,7 +225,8 @@ class _VerbCommand(TyperCommand):
             formatter.write_text(inspect.cleandoc(self.help or "").replace("-", _HYPHEN))
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        # Made when it is asked for: it looks for the cell files of this folder, and no other command waits for them.
+        # Made when it is asked for: it looks for the cell files of this folder, and no other
+        # command waits for them.
         self.epilog = _example(self.epilog or "")
         super().format_epilog(ctx, formatter)
 
@@ -222,7 +248,9 @@ class _Kinds(TyperGroup):
 
 
 def help_record(param: Any, ctx: Any) -> tuple[str, str] | None:
-    """Name of an argument or option with the word for its value, and its help; None for a hidden one."""
+    """Name of an argument or option with the word for its value, and its help;
+    None for a hidden one.
+    """
     # typer brings a click of its own, whose classes have no public name; hence Any.
     record = param.get_help_record(ctx)
     if record is None:
@@ -236,14 +264,22 @@ def help_record(param: Any, ctx: Any) -> tuple[str, str] | None:
 
 _WORDS = {
     **dict.fromkeys(("by", "name", "operator", "payload"), "NAME"),
-    **{"axis": "AXIS", "base": "BEFORE-AFTER", "channel": "CHANNEL", "payload_mass": "NAME=KG", "schedule": "WHEN"},
+    **{
+        "axis": "AXIS",
+        "base": "BEFORE-AFTER",
+        "channel": "CHANNEL",
+        "payload_mass": "NAME=KG",
+        "schedule": "WHEN",
+    },
 }
 """Words for the texts that options take, by the name of the option."""
 _UNITS = {"s": "SECONDS", "kg": "KG", "%": "PERCENT"}
 
 
 def _value_word(param: Any, ctx: Any) -> str:
-    """Word for the value of an option: the declared one, or by its type, its unit or the first word of its help."""
+    """Word for the value of an option: the declared one, or by its type,
+    its unit or the first word of its help.
+    """
     if param.metavar is not None:
         return str(param.metavar)
     described = param.type_descriptor
@@ -277,7 +313,8 @@ _TEMPLATE = Path("press-4/cells/press-4.yaml")  #: What the example of `drivegai
 
 
 def cell_here() -> Path:
-    """The only cell file in or below this folder, for a command to copy; else the one that `drivegain init` would make.
+    """The only cell file in or below this folder, for a command to copy;
+    else the one that `drivegain init` would make.
 
     Of several, one that is copied without a look may be the wrong one.
     """
@@ -302,7 +339,9 @@ def cells_in(folder: Path, name: str | None = None) -> Iterator[Path]:
 
 
 def continued(command: str, width: int, indent: str = "") -> list[str]:
-    r"""Break a command at its spaces into lines that a shell reads as one, each but the last with ` \` at its end."""
+    r"""Break a command at its spaces into lines that a shell reads as one,
+    each but the last with ` \` at its end.
+    """
     lines = []
     line = indent
     # An option stays with its value.

@@ -1,4 +1,6 @@
-"""A cell in SI units: robot, drive train, buses, axes, payloads, filters and the destination of the gains."""
+"""A cell in SI units: robot, drive train, buses, axes, payloads,
+filters and the destination of the gains.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +90,8 @@ class Bus(UnnamedBus):
 
 RECORDER = "recorder"
 KERNEL = "kernel"
-"""SYNC producers other than an axis: the recording program, or this machine's kernel (SocketCAN's BCM).
+"""SYNC producers other than an axis: the recording program,
+or this machine's kernel (SocketCAN's BCM).
 
 On one SocketCAN bus that can do it, the kernel sends SYNC for the recording program too.
 """
@@ -96,7 +99,9 @@ On one SocketCAN bus that can do it, the kernel sends SYNC for the recording pro
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """Sampling period [µs], its pacing, and the producer of SYNC: RECORDER, KERNEL or the name of an axis."""
+    """Sampling period [µs], its pacing, and the producer of SYNC:
+    RECORDER, KERNEL or the name of an axis.
+    """
 
     period_us: Annotated[int, Field(ge=250, le=1_000_000)]
     pacing: PacingMode = PacingMode.TIMED
@@ -117,16 +122,20 @@ class CellAxis:
     """One motor with its amplifier, and the joint of the same number."""
 
     name: str
-    node_id: int | None  #: of the amplifier, as the next four; None in a cell that only imports recordings
+    #: of the amplifier, as the next four; None in a cell that only imports recordings
+    node_id: int | None
     drive: str | None
     profile: DriveProfile | None
     identity: Identity | None
     bus: str | None
-    counts_per_revolution: int | None  #: encoder counts of a motor revolution; None where the import defines its own
+    #: encoder counts of a motor revolution; None where the import defines its own
+    counts_per_revolution: int | None
     unit: JointUnit  #: unit of the joint's positions for people
-    zero_offset_rad: float  #: position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint]
+    #: position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint]
+    zero_offset_rad: float
     nameplate_gain: float  #: drive gain of the data sheet, g = N·Gt·Kt [gain_unit], signed
-    gain_unit: str  #: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference
+    #: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference
+    gain_unit: str
     limits: Limits
 
 
@@ -138,12 +147,15 @@ class WeighedPayload:
     mounting: str  #: the one way in which it is mounted
     mass_kg: float  #: as weighed [kg]
     mass_tolerance_kg: float  #: its tolerance [kg]
-    #: Further inertial parameters, from its drawing, by their names in ident.model.bodies.LINK_PARAMETERS.
+    #: Further inertial parameters, from its drawing, by their names in
+    #: ident.model.bodies.LINK_PARAMETERS.
     known: dict[str, float]
 
     @property
     def payload(self) -> Payload:
-        """The payload with its mass alone, as in a log and by default in the identification (paper, case 4)."""
+        """The payload with its mass alone, as in a log and by default in the identification (paper,
+        case 4).
+        """
         return Payload(self.name, self.mounting, {"m": self.mass_kg})
 
     @property
@@ -154,11 +166,15 @@ class WeighedPayload:
 
 @dataclass(frozen=True, slots=True)
 class DeclaredEffect:
-    """An effect beyond rigid links and friction that the robot is known to have, such as a counterbalance."""
+    """An effect beyond rigid links and friction that the robot is known to have,
+    such as a counterbalance.
+    """
 
     name: str  #: family, as a calibration names it
-    axis: int  #: index among `Cell.place_names` of the axis, or joint without a motor, that it acts on
-    #: Its settings by name, where they are known; a fit of the effect begins with them. Empty: the fit finds them.
+    #: index among `Cell.place_names` of the axis, or joint without a motor, that it acts on
+    axis: int
+    #: Its settings by name, where they are known; a fit of the effect begins with them. Empty: the
+    #: fit finds them.
     settings: dict[str, float]
 
 
@@ -187,7 +203,9 @@ class WiredAxis(Protocol):
 
 
 class Wired(Protocol):
-    """What a bus is found with: a `Cell`, or the `Wiring` of a cell file that is wrong elsewhere."""
+    """What a bus is found with: a `Cell`, or the `Wiring` of a cell file that is wrong
+    elsewhere.
+    """
 
     @property
     def name(self) -> str:
@@ -217,8 +235,10 @@ class Cell:
     name: str
     urdf: str  #: text of the URDF, its held joints fixed
     gravity_m_s2: tuple[float, float, float]  #: in the base frame
-    ratio: FloatArray  #: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m, prismatic joints
-    buses: tuple[Bus, ...]  #: buses of the amplifiers, usually one; empty in a cell that only imports recordings
+    #: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m, prismatic joints
+    ratio: FloatArray
+    #: buses of the amplifiers, usually one; empty in a cell that only imports recordings
+    buses: tuple[Bus, ...]
     sync: Sync | None  #: sampling; None in such a cell
     axes: tuple[CellAxis, ...]  #: n axes
     payloads: tuple[WeighedPayload, ...]  #: bodies that can be mounted
@@ -228,26 +248,32 @@ class Cell:
     effects: tuple[DeclaredEffect, ...]  #: part of every fit, whatever a search finds beside them
     folder: Path | None  #: folder of the cell file; None for a cell from a log
     digest: str  #: sha256 of the cell file and all files it refers to, hex
-    #: sha256 of the content that a recording or its fit depends on, hex: without comments, and without the later use of
-    #: a calibration (`policy`, `history`, `recalibration`) and the end of a session (`target_sigma_percent`).
+    #: sha256 of the content that a recording or its fit depends on, hex: without comments, and
+    #: without the later use of a calibration (`policy`, `history`, `recalibration`) and the end of
+    #: a session (`target_sigma_percent`).
     recording_digest: str
     motion: MotionPolicy = MotionPolicy.ASK  #: permission of a scheduled job to move the axes
     #: Permission of a job to move axes that go on moving when it is killed.
     unguarded: Permission = Permission.REFUSED
-    recovery_motion: Permission = Permission.REFUSED  #: to move axes slowly back within their limits before a recording
+    #: to move axes slowly back within their limits before a recording
+    recovery_motion: Permission = Permission.REFUSED
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
     friction_by_payload: bool = False  #: whether friction with a payload has parameters of its own
-    target_sigma_percent: float = DEFAULT_TARGET_SIGMA_PERCENT  #: σ of every gain at which a guided session ends [%]
+    #: σ of every gain at which a guided session ends [%]
+    target_sigma_percent: float = DEFAULT_TARGET_SIGMA_PERCENT
     history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
-    recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log
-    chain: ClosedChain | None = None  #: how the loops of a closed chain close; None of a serial robot
+    #: the scheduled job; None without one, or for a cell from a log
+    recalibration: Recalibration | None = None
+    #: how the loops of a closed chain close; None of a serial robot
+    chain: ClosedChain | None = None
     platform: str | None = None  #: link that carries the payload; that of the last joint when None
 
     @property
     def controller_path(self) -> Path | None:
         """The controller's file under the name in the cell file, None if it is unknown.
 
-        Symbolic links in that name are not resolved: `daq.writeback.file_access` decides which of them may be followed.
+        Symbolic links in that name are not resolved: `daq.writeback.file_access` decides which of
+        them may be followed.
         """
         if self.controller is None or self.controller.file is None or self.folder is None:
             return None
@@ -261,7 +287,9 @@ class Cell:
     @property
     def wiring(self) -> tuple[tuple[Bus, tuple[CellAxis, ...]], ...]:
         """Each bus with its axes."""
-        return tuple((bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses)
+        return tuple(
+            (bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses
+        )
 
     @property
     def axis_names(self) -> tuple[str, ...]:
@@ -270,7 +298,9 @@ class Cell:
 
     @property
     def place_names(self) -> tuple[str, ...]:
-        """Where an effect can act: the axes, a closed chain's joints without a motor, its pivots (`Robot.places`)."""
+        """Where an effect can act: the axes, a closed chain's joints without a motor,
+        its pivots (`Robot.places`).
+        """
         undriven = () if self.chain is None else self.chain.undriven_names
         return (*self.axis_names, *undriven)
 
@@ -309,4 +339,6 @@ def model_of(cell: Cell) -> Model:
     Raises:
         ModelError: the URDF or the drive train describes no robot.
     """
-    return Model(robot_of(cell), DriveTrain(cell.ratio), friction_by_payload=cell.friction_by_payload)
+    return Model(
+        robot_of(cell), DriveTrain(cell.ratio), friction_by_payload=cell.friction_by_payload
+    )

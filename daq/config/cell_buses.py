@@ -1,4 +1,6 @@
-"""The buses of a cell: their contradictions, their load in a recording, and their addresses for `drivers`."""
+"""The buses of a cell: their contradictions, their load in a recording,
+and their addresses for `drivers`.
+"""
 
 from __future__ import annotations
 
@@ -21,31 +23,40 @@ if TYPE_CHECKING:
     from drivers.canopen.split_bus import CellAddress
     from drivers.stream.monitor import CellReading
 
-# Addresses are made through the lazy front door: reading a cell file checks the load of its buses, and that needs no
-# CAN library.
+# Addresses are made through the lazy front door: reading a cell file checks the load of its buses,
+# and that needs no CAN library.
 
 LARGEST_MEAN = 0.80
-"""Largest mean load, as a share of the bus. The rest is for repeated frames, SDO, EMCY and other nodes; above it frames
-wait for each other so often that answers come after the next SYNC."""
+"""Largest mean load, as a share of the bus.
+
+The rest is for repeated frames, SDO, EMCY and other nodes; above it frames wait for each other so
+often that answers come after the next SYNC.
+"""
 LARGEST_WORST = 1.0
-"""Largest share of a period for SYNC and its answers at maximal bit stuffing: an answer after the next SYNC is late and
-makes a run invalid."""
+"""Largest share of a period for SYNC and its answers at maximal bit stuffing:
+an answer after the next SYNC is late and makes a run invalid.
+"""
 STUFFING = 13
-"""Number of bits for each stuff bit on average: positions and currents have longer runs of equal bits than random data,
-where it is 30. tests/daq/config/test_bus_load.py compares it with real frames."""
+"""Number of bits for each stuff bit on average: positions and currents have longer runs of equal
+bits than random data, where it is 30. tests/daq/config/test_bus_load.py compares it with real
+frames.
+"""
 MOVES_PER_S = 1.0
 SETPOINTS = 4
-"""Controlwords of an axis in a move: new set-point until acknowledged, cleared until confirmed; usually twice each."""
+"""Controlwords of an axis in a move: new set-point until acknowledged, cleared until confirmed;
+usually twice each.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
     """Load of a recording on one bus, as shares of its capacity."""
 
-    mean: float  #: SYNC, answers, heartbeats, and the set-points of one move per second, with usual stuffing
+    #: SYNC, answers, heartbeats, and the set-points of one move per second, with usual stuffing
+    mean: float
     worst: float  #: SYNC and answers alone, with maximal stuffing
-    #: The cycle in which all axes start, with usual stuffing. Above 1 it takes longer than a period, and answers may be
-    #: late.
+    #: The cycle in which all axes start, with usual stuffing. Above 1 it takes longer than a
+    #: period, and answers may be late.
     start: float
 
     @property
@@ -58,9 +69,11 @@ class BusLoad:
 
 
 def frame_bits(data_bytes: int) -> int:
-    """Return the bits of the longest data frame with an 11-bit identifier, with stuff bits and interframe space.
+    """Return the bits of the longest data frame with an 11-bit identifier,
+    with stuff bits and interframe space.
 
-    Source: ISO 11898-1; 34 + 8·d bits are stuffed, with at most one stuff bit for four of them (for the first, five).
+    Source: ISO 11898-1; 34 + 8·d bits are stuffed, with at most one stuff bit for four of them (for
+    the first, five).
     """
     stuffed = 34 + 8 * data_bytes
     return stuffed + 13 + (stuffed - 1) // 4
@@ -96,7 +109,9 @@ def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: in
 
 
 def shortest_period_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> int | None:
-    """Return the shortest allowed period; None if heartbeats and moves alone are too much for the bus."""
+    """Return the shortest allowed period;
+    None if heartbeats and moves alone are too much for the bus.
+    """
     left_bits_s = LARGEST_MEAN * bitrate_bit_s - _steady_bits_s(profiles)
     if left_bits_s <= 0:
         return None
@@ -131,7 +146,9 @@ def _cycle_bits(profiles: Sequence[DriveProfile]) -> float:
 
 
 def _steady_bits_s(profiles: Sequence[DriveProfile]) -> float:
-    """Return the load of heartbeats (also the recorder's) and set-points, independent of the period [bit/s]."""
+    """Return the load of heartbeats (also the recorder's) and set-points,
+    independent of the period [bit/s].
+    """
     heartbeats = (len(profiles) + 1) * usual_bits(1) * 1000.0 / HEARTBEAT_MS
     first, *others = map(usual_bits, _SETPOINT_BYTES)
     return heartbeats + MOVES_PER_S * len(profiles) * (SETPOINTS * first + sum(others))
@@ -150,14 +167,18 @@ def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterat
         return
     if len(model.buses) > 1 and model.sync.producer != RECORDER:
         expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
-        yield Fault(("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected)
+        yield Fault(
+            ("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected
+        )
     for drive in model.drives:
         refresh_us = profiles[drive].update_period_us
         if refresh_us > model.sync.period_us:
             yield Fault(
                 ("sync", "period_us"),
-                f"{model.sync.period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
-                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
+                f"{model.sync.period_us}, while drive {drive} refreshes its objects every "
+                f"{refresh_us} µs",
+                f"{refresh_us} or more: faster than that, samples repeat old values and motion "
+                "becomes a staircase",
             )
     for index, bus in enumerate(model.buses):
         if model.sync.pacing is PacingMode.TIMED:
@@ -166,8 +187,8 @@ def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterat
             yield Fault(
                 ("sync", "pacing"),
                 f"lockstep on a bus of interface {bus.interface}",
-                f"timed: in lockstep the time of the samples is simulated, so only a simulated cell ({SIMULATED}) may "
-                "use it",
+                "timed: in lockstep the time of the samples is simulated, so only a simulated cell "
+                f"({SIMULATED}) may use it",
             )
         for other in model.buses[:index]:
             if _where(bus) == _where(other):
@@ -182,34 +203,63 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
     names = [bus.name for bus in model.buses]
     for index, name in enumerate(names):
         if names.count(name) > 1:
-            yield Fault(("bus", index, "name"), f"{name}, used {names.count(name)} times", "each name once")
-        if names.index(name) == index and not any(model.bus_of(axis) == name for axis in model.axes):
-            yield Fault(_path(model, index), f"bus {name} without an axis", "an axis with this `bus`, or no such bus")
+            yield Fault(
+                ("bus", index, "name"), f"{name}, used {names.count(name)} times", "each name once"
+            )
+        if names.index(name) == index and not any(
+            model.bus_of(axis) == name for axis in model.axes
+        ):
+            yield Fault(
+                _path(model, index),
+                f"bus {name} without an axis",
+                "an axis with this `bus`, or no such bus",
+            )
     used = Counter(axis.node_id for axis in model.axes if axis.node_id is not None)
     for index, axis in enumerate(model.axes):
         if model.buses:
             for key in ("node_id", "drive", "counts_per_revolution"):
                 if getattr(axis, key) is None:
-                    yield Fault(("axes", index, key), "nothing", "a value, because the cell has a bus")
+                    yield Fault(
+                        ("axes", index, key), "nothing", "a value, because the cell has a bus"
+                    )
         where = ("axes", index, "bus")
         known = ", ".join(names)
         if model.bus_of(axis) is None and len(names) > 1:
-            yield Fault(where, "nothing", f"the bus of its amplifier, because the cell has several: {known}")
+            yield Fault(
+                where, "nothing", f"the bus of its amplifier, because the cell has several: {known}"
+            )
         elif axis.bus is not None and axis.bus not in names:
-            yield Fault(where, f"{axis.bus}, which is no bus of this cell", f"one of {known}" if names else "no `bus`")
+            yield Fault(
+                where,
+                f"{axis.bus}, which is no bus of this cell",
+                f"one of {known}" if names else "no `bus`",
+            )
         if axis.node_id is None:
             continue
         if not 1 <= axis.node_id <= 127:
             yield Fault(("axes", index, "node_id"), str(axis.node_id), "1 to 127 (CiA 301)")
         if used[axis.node_id] > 1:
-            several = ", on all buses together: a frame is known by its node id alone" if len(names) > 1 else ""
+            several = (
+                (", on all buses together: a frame is known by its node id alone")
+                if len(names) > 1
+                else ""
+            )
             found = f"{axis.node_id}, used {used[axis.node_id]} times"
             yield Fault(("axes", index, "node_id"), found, f"each node once{several}")
 
 
-def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    """Find buses that cannot carry a recording. In lockstep any can: the next SYNC waits for the answers."""
-    used = [profiles[axis.drive] for axis in model.axes if axis.drive is not None and model.bus_of(axis) == bus.name]
+def _load_faults(
+    model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]
+) -> Iterator[Fault]:
+    """Find buses that cannot carry a recording.
+
+    In lockstep any can: the next SYNC waits for the answers.
+    """
+    used = [
+        profiles[axis.drive]
+        for axis in model.axes
+        if axis.drive is not None and model.bus_of(axis) == bus.name
+    ]
     load = bus_load(used, bus.bitrate_bit_s, period_us)
     if load.allowed:
         return
@@ -219,13 +269,15 @@ def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[s
         ways.append("the axes on more buses (`bus` as a list)")
     wide = sorted({profile.name for profile in used if split_answers(profile)})
     if wide:
-        ways.append(f"position, current and statusword in one frame (drive {', '.join(wide)} needs two)")
+        ways.append(
+            f"position, current and statusword in one frame (drive {', '.join(wide)} needs two)"
+        )
     yield Fault(
         ("sync", "period_us"),
-        f"{period_us}, with which SYNC, the answers of {len(used)} axes, heartbeats and moves load bus {bus.name} "
-        f"by {load} at {bus.bitrate_bit_s} bit/s",
-        f"at most {100 * LARGEST_MEAN:.0f} % on average and answers that fit between two SYNCs at worst: "
-        + ", or ".join(ways),
+        f"{period_us}, with which SYNC, the answers of {len(used)} axes, heartbeats and moves load "
+        f"bus {bus.name} by {load} at {bus.bitrate_bit_s} bit/s",
+        f"at most {100 * LARGEST_MEAN:.0f} % on average and answers that fit between two SYNCs "
+        "at worst: " + ", or ".join(ways),
     )
 
 
@@ -256,7 +308,9 @@ def producer_faults(model: CellModel) -> Iterator[Fault]:
             expected = f"a bus of interface {SOCKETCAN.name}, whose broadcast manager sends it"
             yield Fault(path, f"{KERNEL} on {' + '.join(interfaces) or 'no bus'}", expected)
     elif producer not in model.axis_names:
-        yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(model.axis_names)})")
+        yield Fault(
+            path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(model.axis_names)})"
+        )
 
 
 def cell_address(cell: Wired) -> CellAddress:
@@ -302,32 +356,42 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
     if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
         return ()
     return tuple(
-        f"{bus.name}: when all its axes start, set-points and answers take {100 * load.start:.0f} % of a "
-        "period, and a late answer makes the run invalid; a longer sync.period_us or a second bus has room for them"
+        f"{bus.name}: when all its axes start, set-points and answers take {100 * load.start:.0f} "
+        "% of a period, and a late answer makes the run invalid; a longer sync.period_us or a "
+        "second bus has room for them"
         for bus, load in bus_loads(cell)
         if load.start > 1.0
     )
 
 
 def polling_fits(cell: Cell) -> bool:
-    """Return whether every period has room for an SDO request and its answer beside all answers to the SYNC.
+    """Return whether every period has room for an SDO request and its answer beside all answers to
+    the SYNC.
 
-    Both frames may fall into one period, and an answer after the next SYNC makes a run invalid. In lockstep there is
-    always room.
+    Both frames may fall into one period, and an answer after the next SYNC makes a run invalid. In
+    lockstep there is always room.
     """
     if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
         return True
-    return all(load.worst + _sdo_share(cell.sync, bus) <= LARGEST_WORST for bus, load in bus_loads(cell))
+    return all(
+        load.worst + _sdo_share(cell.sync, bus) <= LARGEST_WORST for bus, load in bus_loads(cell)
+    )
 
 
 def polling_warnings(cell: Cell) -> tuple[str, ...]:
-    """Warn of a cell in which torque and temperature are not logged beside the samples: see `polling_fits`."""
+    """Warn of a cell in which torque and temperature are not logged beside the samples:
+    see `polling_fits`.
+    """
     if cell.sync is None or polling_fits(cell):
         return ()
-    most = max((load.worst + _sdo_share(cell.sync, bus)) * cell.sync.period_us for bus, load in bus_loads(cell))
+    most = max(
+        (load.worst + _sdo_share(cell.sync, bus)) * cell.sync.period_us
+        for bus, load in bus_loads(cell)
+    )
     return (
-        "no room for SDO between two SYNCs: the drives' torque is not logged, and their temperature only before and "
-        f"after the run; a sync.period_us of {100 * ceil(most / 100)} has room",
+        "no room for SDO between two SYNCs: the drives' torque is not logged, and their "
+        f"temperature only before and after the run; a sync.period_us of {100 * ceil(most / 100)} "
+        "has room",
     )
 
 
@@ -377,7 +441,8 @@ def _no_bus(cell: Wired, found: str) -> ConfigurationInconsistent:
         f"cell {cell.name!r}",
         found=found,
         expected="a cell with bus, sync, and node_id and drive of each axis",
-        remedy="this cell only imports recordings; add what is missing, as in configs/cells/demo.yaml",
+        remedy="this cell only imports recordings; add what is missing, as in "
+        "configs/cells/demo.yaml",
     )
 
 

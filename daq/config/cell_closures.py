@@ -1,4 +1,6 @@
-"""Closed chains in a cell file: `closures`, and what `robot` says of motors, platform and assembly."""
+"""Closed chains in a cell file: `closures`, and what `robot` says of motors,
+platform and assembly.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from daq.config.yaml_file import Fault, Name, StrictModel
 from ident.errors import ModelError
 from ident.model.closed_chain import assemble
 from ident.model.robot import Joint, JointKind, Place, Robot
-from ident.model.urdf import LinkPair, UrdfRobot, read_urdf, robot_from_urdf
+from ident.model.urdf import LinkPair, UrdfRobot, mimics_of, read_urdf, robot_from_urdf
 
 Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
 
@@ -28,7 +30,11 @@ class ClosureModel(StrictModel):
     second: Name
     directions: Annotated[
         tuple[Direction, ...],
-        Field(min_length=1, max_length=6, description="Along and about the axes of the first link's frame."),
+        Field(
+            min_length=1,
+            max_length=6,
+            description="Along and about the axes of the first link's frame.",
+        ),
     ]
 
 
@@ -40,28 +46,38 @@ class ChainModel(StrictModel):
     """Keys of a robot with closures, beside its URDF."""
 
     motors: Annotated[
-        tuple[Name, ...], Field(description="Joint of each axis of a closed chain, in the order of the axes.")
+        tuple[Name, ...],
+        Field(description="Joint of each axis of a closed chain, in the order of the axes."),
     ] = ()
     platform: Annotated[Name | None, Field(description="Link that carries the payload.")] = None
-    mobility: Annotated[int | None, Field(ge=1, le=32, description="Degrees of freedom of a closed chain.")] = None
+    mobility: Annotated[
+        int | None, Field(ge=1, le=32, description="Degrees of freedom of a closed chain.")
+    ] = None
     assembly_deg: Annotated[
-        Mapping[str, float], Field(description="Positions of the revolute joints at which the closures nearly hold.")
+        Mapping[str, float],
+        Field(description="Positions of the revolute joints at which the closures nearly hold."),
     ] = Field(default_factory=dict)
-    assembly_mm: Annotated[Mapping[str, float], Field(description="The same of the prismatic joints.")] = Field(
-        default_factory=dict
-    )
+    assembly_mm: Annotated[
+        Mapping[str, float], Field(description="The same of the prismatic joints.")
+    ] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class ClosedChain:
-    """How the loops of a URDF's tree close."""
+    """How the loops of a URDF's tree close, or which of its joints have motors where others follow
+    them.
+    """
 
     closures: tuple[LinkPair, ...]
     motors: tuple[str, ...]  #: joint of each axis, in the order of the axes
     platform: str | None  #: link that carries the payload; that of the last joint when None
-    assembly_rad: dict[str, float]  #: roughly, positions of all joints at which the closures hold [rad or m]
-    passive_joints: tuple[Joint, ...]  #: joints without a motor, in the order of the URDF's tree
-    pivots: tuple[str, ...] = ()  #: names of the joints that the loops are cut at and that turn about one axis
+    #: roughly, positions of all joints at which the closures hold [rad or m]
+    assembly_rad: dict[str, float]
+    #: Joints without a motor, in the order of the URDF's tree; not those that follow another one in
+    #: a fixed ratio.
+    passive_joints: tuple[Joint, ...]
+    #: names of the joints that the loops are cut at and that turn about one axis
+    pivots: tuple[str, ...] = ()
 
     @property
     def undriven_names(self) -> tuple[str, ...]:
@@ -69,14 +85,16 @@ class ClosedChain:
         return (*(joint.name for joint in self.passive_joints), *self.pivots)
 
 
-def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -> ClosedChain | None:
-    """Return the closed chain of a cell file, None of a serial robot.
+def chain_of(
+    robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str
+) -> ClosedChain | None:
+    """Return the closed chain of a cell file, None of a serial robot whose every joint has a motor.
 
     Raises:
         ModelError: the URDF cannot be read.
     """
     if not closures:
-        return None
+        return _followed_chain(robot, urdf)
     revolute = {name: radians(position) for name, position in robot.assembly_deg.items()}
     prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
     pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
@@ -87,8 +105,18 @@ def chain_of(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -
     return replace(chain, pivots=closed.pivot_names)
 
 
+def _followed_chain(robot: ChainModel, urdf: str) -> ClosedChain | None:
+    """Return the chain of a robot without loops in which joints mimic axes; None if none does."""
+    followers = mimics_of(urdf)
+    if not followers:
+        return None
+    motors = tuple(joint.name for joint in read_urdf(urdf).joints if joint.name not in followers)
+    return ClosedChain((), motors, robot.platform, {}, ())
+
+
 def platform_frame(robot: ChainModel, urdf: str) -> Place:
-    """Return the platform's frame, in which payloads are drawn, relative to the joint that carries it.
+    """Return the platform's frame, in which payloads are drawn,
+    relative to the joint that carries it.
 
     Without a `platform`, that joint's own frame.
 
@@ -101,7 +129,10 @@ def platform_frame(robot: ChainModel, urdf: str) -> Place:
 
 
 def robot_with(
-    chain: ClosedChain | None, urdf: str, gravity_m_s2: tuple[float, float, float], platform: str | None = None
+    chain: ClosedChain | None,
+    urdf: str,
+    gravity_m_s2: tuple[float, float, float],
+    platform: str | None = None,
 ) -> Robot:
     """Read a cell's robot.
 
@@ -109,7 +140,8 @@ def robot_with(
         chain: how its loops close, with the link that carries the payload; None of a serial robot.
         urdf: text of the URDF.
         gravity_m_s2: gravity in the base frame.
-        platform: of a serial robot, the link that carries the payload; that of the last joint when None.
+        platform: of a serial robot, the link that carries the payload; that of the last joint when
+            None.
 
     Raises:
         ModelError: see `ident.model.urdf.robot_from_urdf`.
@@ -126,8 +158,11 @@ def robot_with(
     )
 
 
-def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:
-    """Find a closed chain that is described by halves, does not close, or is not moved by its motors.
+def chain_faults(
+    robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: str
+) -> Iterator[Fault]:
+    """Find a closed chain that is described by halves, does not close,
+    or is not moved by its motors.
 
     Raises:
         ModelError: the URDF cannot be read.
@@ -136,7 +171,9 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
     if not closures:
         for key in given:
             if key != "platform":
-                yield Fault(("robot", key), "given without `closures`", "no such key in a serial robot")
+                yield Fault(
+                    ("robot", key), "given without `closures`", "no such key in a serial robot"
+                )
         yield from _carrier_faults(robot, urdf)
         return
     for key, what in (
@@ -156,10 +193,16 @@ def chain_faults(robot: ChainModel, closures: tuple[ClosureModel, ...], urdf: st
                 yield Fault(("robot", key, name), found, f"a {kind.value} joint")
     if {"motors", "mobility"} <= set(given) and not unknown:
         try:
-            assemble(robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility)
+            assemble(
+                robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility
+            )
         except ModelError as error:
             found, _, expected = str(error).partition("; expected ")
-            yield Fault(("closures",), found, expected or "a mechanism that closes, and that its motors move")
+            yield Fault(
+                ("closures",),
+                found,
+                expected or "a mechanism that closes, and that its motors move",
+            )
 
 
 def _carrier_faults(robot: ChainModel, urdf: str) -> Iterator[Fault]:
@@ -169,25 +212,37 @@ def _carrier_faults(robot: ChainModel, urdf: str) -> Iterator[Fault]:
     links = read_urdf(urdf).links
     moving = [name for name, place in links.items() if place.joint >= 0]
     if robot.platform not in moving:
-        found = f"{robot.platform!r}, which does not move" if robot.platform in links else f"{robot.platform!r}"
+        if robot.platform in links:
+            found = f"{robot.platform!r}, which does not move"
+        else:
+            found = f"{robot.platform!r}"
         yield Fault(("robot", "platform"), found, f"a link that moves: {', '.join(moving)}")
 
 
 def mechanism_faults(closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:
-    """Find closures that are there twice, and joints of a closed chain that follow another one by the URDF.
+    """Find closures that are there twice, and joints of a closed chain that follow another one by
+    the URDF.
 
-    The equations of a closed chain do not read `<mimic>`; a second closure of the same frames only costs rank.
+    The equations of a closed chain do not read `<mimic>`; a second closure of the same frames only
+    costs rank.
     """
     yield from _repeated(closures)
     try:
-        joints = ElementTree.fromstring(urdf).findall("{*}joint") if closures else []
+        if closures:
+            joints = ElementTree.fromstring(urdf).findall("{*}joint")
+        else:
+            joints = []
     except ElementTree.ParseError:
         return  # the check of the robot says so
     for joint in joints:
         leader = joint.find("{*}mimic")
         if leader is not None and joint.get("type") != "fixed":
             found = f"joint {joint.get('name')} mimics {leader.get('joint')} in the URDF"
-            yield Fault(("robot", "urdf"), found, "no <mimic>: describe the mechanism that couples them in `closures`")
+            yield Fault(
+                ("robot", "urdf"),
+                found,
+                "no <mimic>: describe the mechanism that couples them in `closures`",
+            )
 
 
 def _repeated(closures: tuple[ClosureModel, ...]) -> Iterator[Fault]:
@@ -201,7 +256,9 @@ def _repeated(closures: tuple[ClosureModel, ...]) -> Iterator[Fault]:
         seen.setdefault(key, one.name)
 
 
-def _unknown_names(robot: ChainModel, closures: tuple[ClosureModel, ...], tree: UrdfRobot) -> Iterator[Fault]:
+def _unknown_names(
+    robot: ChainModel, closures: tuple[ClosureModel, ...], tree: UrdfRobot
+) -> Iterator[Fault]:
     """Find names of joints and links that the URDF lacks."""
     joints = [joint.name for joint in tree.joints]
     a_joint = f"a joint of the URDF that moves: {', '.join(joints)}"

@@ -12,9 +12,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from daq.arguments import A_PATH, checks_arguments
 from daq.config.cell import MILLIMETRE, Cell, CellAxis, DeclaredEffect, Limits, WeighedPayload
 from daq.config.cell_closures import ClosedChain, chain_of, platform_frame
-from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, EffectModel, PayloadModel, ratio_of
+from daq.config.cell_schema import (
+    AxisModel,
+    CellModel,
+    ConditioningModel,
+    EffectModel,
+    PayloadModel,
+    ratio_of,
+)
 from daq.config.checks import check
 from daq.config.drive import drive_from_text
 from daq.config.urdf_text import urdf_text
@@ -43,11 +51,14 @@ URDF = "robot.urdf"
 DRIVES = "drives/"
 
 
+@checks_arguments(path=A_PATH)
 def load_cell(path: Path | str) -> Cell:
     """Read a cell file and all it refers to.
 
     Raises:
-        ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
+        UsageError: the argument is no path.
+        ConfigurationError: a file is missing, is not what its schema says, or the cell is
+            inconsistent.
     """
     path = Path(path)
     sources = _sources(path)
@@ -75,7 +86,8 @@ def cell_from_bundle(
         names: names of the files in messages.
 
     Raises:
-        ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
+        ConfigurationError: a file is missing, is not what its schema says, or the cell is
+            inconsistent.
     """
     names = names or {}
     document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
@@ -87,7 +99,10 @@ def cell_from_bundle(
         profiles[drive] = drive_from_text(_member(files, member, names), names.get(member, member))
     urdf = held_urdf(document, model, urdf)
     check(document, model, urdf, profiles, logged=file is None)
-    controller = None if model.controller is None else model.controller.file
+    if model.controller is None:
+        controller = None
+    else:
+        controller = model.controller.file
     chain = chain_of(model.robot, model.closures, urdf)
     undriven = () if chain is None else chain.undriven_names
     places = [*model.axis_names, *undriven]
@@ -110,7 +125,9 @@ def cell_from_bundle(
         effects=tuple(_effect(effect, places) for effect in model.effects),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
-        recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
+        recording_digest=digest(
+            {name: _canonical(name, files[name], names.get(name, name)) for name in used}
+        ),
         motion=model.policy.motion,
         unguarded=model.policy.unguarded,
         recovery_motion=model.policy.recovery_motion,
@@ -118,23 +135,29 @@ def cell_from_bundle(
         friction_by_payload=model.friction_by_payload,
         target_sigma_percent=model.target_sigma_percent,
         history=None if file is None else model.history.place(file, controller),
-        recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
+        recalibration=None
+        if file is None or model.recalibration is None
+        else model.recalibration.recalibration(file),
     )
 
 
 def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
-    """Return the URDF with the joints of `hold` fixed at their positions, the text itself without `hold`.
+    """Return the URDF with the joints of `hold` fixed at their positions,
+    the text itself without `hold`.
 
     These are joints that are no axes of the cell, such as a gripper's or a mobile base's.
 
     Raises:
-        ConfigurationInconsistent: a held joint does not exist, is an axis too, mimics a joint that moves,
-            or is held where it cannot be.
+        ConfigurationInconsistent: a held joint does not exist, is an axis too, mimics a joint that
+            moves, or is held where it cannot be.
     """
     if not model.hold:
         return urdf
     try:
-        joints = {joint.get("name", ""): joint for joint in ElementTree.fromstring(urdf).findall("{*}joint")}
+        joints = {
+            joint.get("name", ""): joint
+            for joint in ElementTree.fromstring(urdf).findall("{*}joint")
+        }
         prismatic = {name for name, joint in joints.items() if joint.get("type") == "prismatic"}
         held = {name: at if name in prismatic else radians(at) for name, at in model.hold.items()}
         fixed = hold_joints(urdf, held)
@@ -143,17 +166,31 @@ def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
         return urdf  # the check of the robot says so
     except ModelError as error:
         found, _, expected = str(error).partition("; expected ")
-        faults = [Fault(("hold",), found, expected or "joints of the URDF that are no axes, each with its position")]
+        faults = [
+            Fault(
+                ("hold",),
+                found,
+                expected or "joints of the URDF that are no axes, each with its position",
+            )
+        ]
     if faults:
-        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the cell file")
+        raise ConfigurationInconsistent(
+            **fault_texts(document, faults), remedy="correct the cell file"
+        )
     return fixed
 
 
-def _hold_faults(model: CellModel, held: dict[str, float], joints: dict[str, ElementTree.Element]) -> Iterator[Fault]:
+def _hold_faults(
+    model: CellModel, held: dict[str, float], joints: dict[str, ElementTree.Element]
+) -> Iterator[Fault]:
     """Find held joints that are axes, and positions that the URDF excludes."""
     for name, position in held.items():
         if name in model.axis_names:
-            yield Fault(("hold", name), "a joint that is also one of `axes`", "an axis or a held joint, not both")
+            yield Fault(
+                ("hold", name),
+                "a joint that is also one of `axes`",
+                "an axis or a held joint, not both",
+            )
         limit = joints[name].find("{*}limit")
         kind = joints[name].get("type")
         if limit is None or kind == "continuous":
@@ -164,7 +201,12 @@ def _hold_faults(model: CellModel, held: dict[str, float], joints: dict[str, Ele
             continue  # a held joint's limits are needed for this check alone
         margin = 0.01 * (upper - lower)
         if lower < upper and not lower - margin <= position <= upper + margin:
-            unit, spelled = (1.0, "m") if kind == "prismatic" else (radians(1.0), "deg")
+            if kind == "prismatic":
+                unit = 1.0
+                spelled = "m"
+            else:
+                unit = radians(1.0)
+                spelled = "deg"
             expected = f"{lower / unit:.4g} to {upper / unit:.4g} {spelled}, the limits in the URDF"
             yield Fault(("hold", name), f"{model.hold[name]:g} {spelled}", expected)
 
@@ -179,11 +221,15 @@ def digest(files: Mapping[str, bytes]) -> str:
 
 
 _AFTERWARDS = ("policy", "history", "recalibration", "target_sigma_percent")
-"""Keys for the use of a calibration, and for the end of a recording; no recording and no fit depends on them."""
+"""Keys for the use of a calibration, and for the end of a recording;
+no recording and no fit depends on them.
+"""
 _BOUNDS = ("rated_payload_kg",)
 """Keys of `robot` that only bound others; no recording and no fit depends on them."""
 _BESIDE = ("torque", "temperature")
-"""Keys of a drive profile for what is read beside the samples; samples and gains do not depend on them."""
+"""Keys of a drive profile for what is read beside the samples;
+samples and gains do not depend on them.
+"""
 
 
 def _canonical(member: str, content: bytes, name: str) -> bytes:
@@ -221,7 +267,8 @@ def _sources(path: Path) -> dict[str, Path]:
     for drive in model.drives:
         profile = sources[f"{DRIVES}{drive}.yaml"] = drive_path(path.parent, drive)
         tree = parse_yaml(read_yaml_bytes(profile), str(profile)).tree
-        if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:  # the schema is checked later
+        # The schema is checked later
+        if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:
             sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
     return sources
 
@@ -230,8 +277,8 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
     """Read the cell file and what belongs to it.
 
     Raises:
-        ConfigurationMissing: a file cannot be read. Where a cell file was copied alone, the others are missing, so the
-            message says to copy them.
+        ConfigurationMissing: a file cannot be read. Where a cell file was copied alone, the others
+            are missing, so the message says to copy them.
     """
     cell_file = sources[CELL]
     content = {CELL: read_yaml_bytes(cell_file)}
@@ -242,8 +289,8 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
             source,
             ConfigurationMissing,
             expected=f"a file that belongs to {cell_file}, of at most {MAX_BYTES} bytes",
-            remedy=f"copy it to this place, or correct its name in {cell_file.name} or in the drive profile; a name is "
-            "relative to the file that has it",
+            remedy=f"copy it to this place, or correct its name in {cell_file.name} or in the "
+            "drive profile; a name is relative to the file that has it",
         )
     return content
 
@@ -251,7 +298,11 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
 def drive_path(folder: Path, drive: str) -> Path:
     """Find a profile beside the cell (drives/ or ../drives/), else the shipped one."""
     file = f"{drive}.yaml"
-    candidates = (folder / "drives" / file, folder.parent / "drives" / file, shipped_configurations() / "drives" / file)
+    candidates = (
+        folder / "drives" / file,
+        folder.parent / "drives" / file,
+        shipped_configurations() / "drives" / file,
+    )
     for candidate in candidates:
         if candidate.is_file():
             return candidate
@@ -278,11 +329,15 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
 def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> CellAxis:
     limits = model.limits
     unit = limits.unit
-    ((key, gain),) = model.nameplate_gains.items()  # the checks require that it matches the kind of joint
+    # The checks require that it matches the kind of joint
+    ((key, gain),) = model.nameplate_gains.items()
     force = "N" if key == "nameplate_gain_n_per_a" else "Nm"
     profile = None if model.drive is None else profiles[model.drive]
     # A gain by the actual current is another quantity, so its unit must show it.
-    ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
+    if profile is not None and profile.tap is TapPoint.ACTUAL:
+        ampere = "A(actual)"
+    else:
+        ampere = "A"
     return CellAxis(
         name=model.name,
         node_id=model.node_id,
@@ -304,7 +359,9 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
 
 
 def _conditioning(model: ConditioningModel) -> Conditioning:
-    """Merge the two lists of standstill speeds; the checks guarantee that each joint is in the list of its kind."""
+    """Merge the two lists of standstill speeds;
+    the checks guarantee that each joint is in the list of its kind.
+    """
     millimetres = model.standstill_mm_s or (None,) * len(model.standstill_rad_s)
     radians = model.standstill_rad_s or (None,) * len(millimetres)
     rest = model.model_dump(exclude={"standstill_rad_s", "standstill_mm_s"})
@@ -316,12 +373,16 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
 
 
 def _joints(model: CellModel, chain: ClosedChain | None, urdf: str) -> dict[str, int]:
-    """Return the index of the joint behind each axis, and behind each joint of a closed chain without a motor."""
+    """Return the index of the joint behind each axis,
+    and behind each joint of a closed chain without a motor.
+    """
     if chain is None:
         return {name: index for index, name in enumerate(model.axis_names)}
     index = {joint.name: number for number, joint in enumerate(read_urdf(urdf).joints)}
-    passive = {joint.name: index[joint.name] for joint in chain.passive_joints}
-    return passive | {name: index[motor] for name, motor in zip(model.axis_names, chain.motors, strict=True)}
+    passive = {name: number for name, number in index.items() if name not in chain.motors}
+    return passive | {
+        name: index[motor] for name, motor in zip(model.axis_names, chain.motors, strict=True)
+    }
 
 
 def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:
@@ -339,7 +400,9 @@ def _payload(model: PayloadModel, mounted: Place) -> WeighedPayload:
 def _in_joint_frame(
     mounted: Place, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
 ) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Write centre of mass and inertia about it, both in a link's frame, in the frame of the joint that moves it."""
+    """Write centre of mass and inertia about it, both in a link's frame,
+    in the frame of the joint that moves it.
+    """
     turned = mounted.rotation
     centre = mounted.translation_m + turned @ np.array(centre_m)
     if about_centre_kg_m2 is None:
@@ -354,12 +417,14 @@ def _in_joint_frame(
 def drawn_parameters(
     mass_kg: float, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
 ) -> dict[str, float]:
-    """Return first moments and, if given, the inertia about the frame's origin (Steiner), by LINK_PARAMETERS names.
+    """Return first moments and, if given, the inertia about the frame's origin (Steiner),
+    by LINK_PARAMETERS names.
 
     Args:
         mass_kg: mass of the body.
         centre_m: centre of mass, shape (3,).
-        about_centre_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass, in the directions of the frame.
+        about_centre_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass, in the directions of
+            the frame.
     """
     centre = np.array(centre_m)
     known = dict(zip(("mx", "my", "mz"), (mass_kg * centre).tolist(), strict=True))

@@ -1,7 +1,8 @@
 """Schema of a cell file, key by key (configs/cells/demo.yaml shows all of it).
 
-Sections whose fields mean the same in the program are its own classes (`Sync`, `ApplyPolicy`, ...). The classes here
-differ: degrees and mm instead of SI, and optional keys of which the checks accept only some combinations.
+Sections whose fields mean the same in the program are its own classes (`Sync`, `ApplyPolicy`, ...).
+The classes here differ: degrees and mm instead of SI, and optional keys of which the checks accept
+only some combinations.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class DriveTrainModel(StrictModel):
 
 
 def _how_many(value: object) -> str:
-    return SEVERAL_BUSES if isinstance(value, list | tuple) else ONE_BUS
+    if isinstance(value, list | tuple):
+        return SEVERAL_BUSES
+    return ONE_BUS
 
 
 Buses = Annotated[
@@ -92,8 +95,8 @@ class LimitsModel(StrictModel):
         millimetres = (self.position_mm, self.velocity_mm_s, self.acceleration_mm_s2)
         if sorted(part.count(None) for part in (degrees, millimetres)) != [0, 3]:
             raise ValueError(
-                "position_deg, velocity_deg_s and acceleration_deg_s2, or for a prismatic joint position_mm, "
-                "velocity_mm_s and acceleration_mm_s2"
+                "position_deg, velocity_deg_s and acceleration_deg_s2, or for a prismatic joint "
+                "position_mm, velocity_mm_s and acceleration_mm_s2"
             )
         return self
 
@@ -144,8 +147,8 @@ class AxisModel(StrictModel):
     def _check_lead(self) -> AxisModel:
         if self.lead_mm is not None and not within(abs(self.lead_mm), LEAD_MM):
             raise ValueError(
-                "a lead_mm that is not zero: the travel of one turn, negative for a left-handed screw; "
-                f"{LEAD_MM[0]:g} to {LEAD_MM[1]:g} mm in size"
+                "a lead_mm that is not zero: the travel of one turn, negative for a left-handed "
+                f"screw; {LEAD_MM[0]:g} to {LEAD_MM[1]:g} mm in size"
             )
         return self
 
@@ -163,15 +166,20 @@ class AxisModel(StrictModel):
 
     @model_validator(mode="after")
     def _check_gain(self) -> AxisModel:
-        if len(self.nameplate_gains) != 1 or (self.nameplate_gain is None) != (self.gain_unit is None):
+        if len(self.nameplate_gains) != 1 or (self.nameplate_gain is None) != (
+            self.gain_unit is None
+        ):
             raise ValueError(
-                "nameplate_gain_nm_per_a, nameplate_gain_n_per_a (prismatic), or nameplate_gain together with gain_unit"
+                "nameplate_gain_nm_per_a, nameplate_gain_n_per_a (prismatic), or nameplate_gain "
+                "together with gain_unit"
             )
         return self
 
 
 class KnownModel(StrictModel):
-    """Single inertial parameters of a payload beside its mass, about the last joint's frame (paper eq. 5)."""
+    """Single inertial parameters of a payload beside its mass,
+    about the last joint's frame (paper eq. 5).
+    """
 
     Ixx: float | None = None
     Ixy: float | None = None
@@ -187,8 +195,9 @@ class KnownModel(StrictModel):
 class PayloadModel(StrictModel):
     """A weighed body, and the parameters of its drawing.
 
-    The centre of mass is in the last joint's frame, with a `platform` in that of this link; the inertia xx,
-    xy, xz, yy, yz, zz is about the centre of mass, in the directions of that frame, as a URDF has it (xy = −∫xy dm).
+    The centre of mass is in the last joint's frame, with a `platform` in that of this link; the
+    inertia xx, xy, xz, yy, yz, zz is about the centre of mass, in the directions of that frame, as
+    a URDF has it (xy = −∫xy dm).
     """
 
     name: Name
@@ -202,14 +211,20 @@ class PayloadModel(StrictModel):
     @property
     def known_parameters(self) -> dict[str, float]:
         """Stated single parameters, by their names."""
-        return {} if self.known is None else self.known.model_dump(exclude_none=True)
+        if self.known is None:
+            return {}
+        return self.known.model_dump(exclude_none=True)
 
     @model_validator(mode="after")
     def _check_form(self) -> PayloadModel:
         if self.inertia_kg_m2 is not None and self.centre_m is None:
-            raise ValueError("centre_m beside inertia_kg_m2: the inertia is about the centre of mass")
+            raise ValueError(
+                "centre_m beside inertia_kg_m2: the inertia is about the centre of mass"
+            )
         if self.centre_m is not None and self.known is not None:
-            raise ValueError("centre_m and inertia_kg_m2, or single parameters under `known`, not both")
+            raise ValueError(
+                "centre_m and inertia_kg_m2, or single parameters under `known`, not both"
+            )
         return self
 
 
@@ -220,13 +235,15 @@ class EffectModel(StrictModel):
     axis: Annotated[
         Name,
         Field(
-            description="Name of the axis, of a closed chain's joint without a motor, or `pivot` and a closure's name."
+            description="Name of the axis, of a closed chain's joint without a motor, or `pivot` "
+            "and a closure's name."
         ),
     ]
     settings: dict[str, float] = Field(default_factory=dict)
 
 
-CUTOFF_HZ = (0.01, 100_000.0)  #: Least and largest cut-off of a filter; below, its window is minutes long
+#: Least and largest cut-off of a filter; below, its window is minutes long
+CUTOFF_HZ = (0.01, 100_000.0)
 FILTER_ORDER = (1, 10)  #: Least and largest order
 _CutOff = Annotated[float, Field(ge=CUTOFF_HZ[0], le=CUTOFF_HZ[1])]
 
@@ -248,19 +265,23 @@ class PolicyModel(StrictModel):
     motion: Annotated[
         MotionPolicy,
         Field(
-            description="allowed: the scheduled job `recalibrate` may move the axes where the interlock releases them. "
-            "`record` needs --enable-motion all the same."
+            description="allowed: the scheduled job `recalibrate` may move the axes where the "
+            "interlock releases them. `record` needs --enable-motion all the same."
         ),
     ] = MotionPolicy.ASK
     unguarded: Annotated[
         Permission,
         Field(
-            description="allowed: the scheduled job may move axes that do not stop by themselves when it is killed. "
-            "`record` needs --unguarded all the same."
+            description="allowed: the scheduled job may move axes that do not stop by themselves "
+            "when it is killed. `record` needs --unguarded all the same."
         ),
     ] = Permission.REFUSED
     recovery_motion: Annotated[
-        Permission, Field(description="Before a recording, move axes slowly back that are a little beyond a limit.")
+        Permission,
+        Field(
+            description="Before a recording, move axes slowly back that are a little "
+            "beyond a limit."
+        ),
     ] = Permission.REFUSED
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY
 
@@ -275,12 +296,14 @@ class CellModel(StrictModel):
     robot: RobotModel
     drive_train: DriveTrainModel
     hold: Annotated[
-        dict[str, float], Field(description="Positions of joints that are no axes [deg; m if prismatic].")
+        dict[str, float],
+        Field(description="Positions of joints that are no axes [deg; m if prismatic]."),
     ] = Field(default_factory=dict)
     bus: Buses | None = None
     sync: Sync | None = None
     closures: Annotated[
-        tuple[ClosureModel, ...], Field(description="Where the loops of a closed chain close; none of a serial robot.")
+        tuple[ClosureModel, ...],
+        Field(description="Where the loops of a closed chain close; none of a serial robot."),
     ] = ()
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
@@ -288,8 +311,8 @@ class CellModel(StrictModel):
     friction_by_payload: Annotated[
         bool,
         Field(
-            description="Whether friction with a payload has parameters of its own, so that friction that changes "
-            "between bare and loaded runs does not become gain."
+            description="Whether friction with a payload has parameters of its own, so that "
+            "friction that changes between bare and loaded runs does not become gain."
         ),
     ] = False
     conditioning: ConditioningModel = ConditioningModel()
@@ -297,7 +320,12 @@ class CellModel(StrictModel):
     workspace: WorkspaceSection | None = None
     clearance: ClearanceSection | None = None
     target_sigma_percent: Annotated[
-        float, Field(description="σ of every gain at which `calibrate` ends its recording [%].", ge=0.05, le=10.0)
+        float,
+        Field(
+            description="σ of every gain at which `calibrate` ends its recording [%].",
+            ge=0.05,
+            le=10.0,
+        ),
     ] = DEFAULT_TARGET_SIGMA_PERCENT
     policy: PolicyModel = PolicyModel()
     history: HistorySection = HistorySection()
@@ -324,20 +352,28 @@ class CellModel(StrictModel):
 
 
 def ratio_of(model: CellModel) -> FloatArray:
-    """Return R of q_motor = R q_joint (paper eq. 24), rad/rad, or rad/m for a prismatic joint, shape (n, n).
+    """Return R of q_motor = R q_joint (paper eq.
+    24), rad/rad, or rad/m for a prismatic joint, shape (n, n).
 
-    Where a prismatic axis has a `lead_mm`, its column is written in turns: one turn of screw or pinion moves the joint
-    by the lead, so R = ratio · 2π / lead.
+    Where a prismatic axis has a `lead_mm`, its column is written in turns: one turn of screw or
+    pinion moves the joint by the lead, so R = ratio · 2π / lead.
 
     Raises:
         ValueError: the rows are not n of n numbers.
     """
     lead_mm = [axis.lead_mm for axis in model.axes]
     per_turn = np.array([1.0 if lead is None else 2.0 * pi / (1e-3 * lead) for lead in lead_mm])
-    return np.asarray(np.array(model.drive_train.ratio, dtype=np.float64) * per_turn, dtype=np.float64)
+    return np.asarray(
+        np.array(model.drive_train.ratio, dtype=np.float64) * per_turn, dtype=np.float64
+    )
 
 
 def gain_joints(ratio: FloatArray) -> tuple[int, ...]:
-    """Return the index of the joint that the gain of each motor refers to: that of its reduction N."""
+    """Return the index of the joint that the gain of each motor refers to:
+    that of its reduction N.
+    """
     # The rule of ident.model.model.DriveTrain.reduction.
-    return tuple(motor if row[motor] != 0.0 else int(np.argmax(np.abs(row))) for motor, row in enumerate(ratio))
+    return tuple(
+        motor if row[motor] != 0.0 else int(np.argmax(np.abs(row)))
+        for motor, row in enumerate(ratio)
+    )

@@ -1,4 +1,6 @@
-"""Find contradictions in a cell file of well-formed values: robot, drive train, axes, buses, SYNC, payloads."""
+"""Find contradictions in a cell file of well-formed values:
+robot, drive train, axes, buses, SYNC, payloads.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ import numpy as np
 
 from daq.config.cell import DEGREE, MILLIMETRE, joint_unit
 from daq.config.cell_buses import bus_faults, producer_faults
-from daq.config.cell_closures import chain_faults, chain_of, mechanism_faults, platform_frame, robot_with
+from daq.config.cell_closures import (
+    chain_faults,
+    chain_of,
+    mechanism_faults,
+    platform_frame,
+    robot_with,
+)
 from daq.config.cell_schema import AxisModel, CellModel, gain_joints, ratio_of
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults, signer_faults
@@ -22,7 +30,7 @@ from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
-from ident.model.urdf import LINKAGE, Mimic, mimics_of
+from ident.model.urdf import first_leader, mimics_of, read_urdf
 from ident.plausible import (
     ACCELERATION,
     FARTHEST_CENTRE_M,
@@ -47,11 +55,17 @@ from ident.plausible import (
 )
 
 OTHER_JOINT = "is of type"  #: Of the reader's message about a joint that can be no axis
-LARGEST_CONDITION = 1e8  #: Largest condition number of R; above it, joint positions do not follow from motor positions
+#: Largest condition number of R; above it, joint positions do not follow from motor positions
+LARGEST_CONDITION = 1e8
 
 
 def check(
-    document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile], *, logged: bool = False
+    document: Document,
+    model: CellModel,
+    urdf: str,
+    profiles: Mapping[str, DriveProfile],
+    *,
+    logged: bool = False,
 ) -> None:
     """Refuse a cell that contradicts itself.
 
@@ -60,13 +74,17 @@ def check(
         model: its content.
         urdf: text of its robot.
         profiles: drive profiles, by name.
-        logged: the file is a log's copy, which cannot be corrected: typing mistakes are left to the diagnoses of a fit.
+        logged: the file is a log's copy, which cannot be corrected: typing mistakes are left to the
+            diagnoses of a fit.
 
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
     robot = None
-    faults = [] if logged else [*mechanism_faults(model.closures, urdf)]
+    if logged:
+        faults = []
+    else:
+        faults = [*mechanism_faults(model.closures, urdf)]
     if not faults:
         robot, faults = _robot(model, urdf)
     joints = () if robot is None else robot.axes
@@ -84,7 +102,12 @@ def check(
         *max_change_faults(model.policy.apply, names),
     ]
     if not logged:
-        faults += [*_mass_faults(model), *_size_faults(model), *_range_faults(model), *_si_faults(model, urdf)]
+        faults += [
+            *_mass_faults(model),
+            *_size_faults(model),
+            *_range_faults(model),
+            *_si_faults(model, urdf),
+        ]
         faults += _order_faults(model, joints)
     if robot is not None:
         faults += _frame_faults(model, urdf)
@@ -95,12 +118,20 @@ def check(
 
 
 def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
-    """Return the robot, None if it cannot be read or its loops do not close, and the faults of it as a whole."""
+    """Return the robot, None if it cannot be read or its loops do not close,
+    and the faults of it as a whole.
+    """
     faults = []
     gravity = hypot(*model.robot.gravity_m_s2)
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
-        faults.append(Fault(("robot", "gravity_m_s2"), found, f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth"))
+        faults.append(
+            Fault(
+                ("robot", "gravity_m_s2"),
+                found,
+                f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth",
+            )
+        )
     axes = model.axis_names
     try:
         of_urdf = _urdf_faults(model, urdf)
@@ -110,84 +141,112 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         robot = robot_with(chain, urdf, model.robot.gravity_m_s2, model.robot.platform)
     except ModelError as error:
         found, _, expected = str(error).partition("; expected ")
-        found = f"{model.robot.urdf}: {found}"  # the place is that of the cell file, which only names it
-        expected = f"a URDF of an arm: {expected}" if expected else "a URDF of an arm"
+        # The place is that of the cell file, which only names it
+        found = f"{model.robot.urdf}: {found}"
+        if expected:
+            expected = f"a URDF of an arm: {expected}"
+        else:
+            expected = "a URDF of an arm"
         if OTHER_JOINT in found:
             expected += "; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
         return None, [*faults, Fault(("robot", "urdf"), found, expected)]
     names = [joint.name for joint in robot.axes]
     more = len(names) - len(axes)
-    if more and chain is not None:
+    if more and model.closures:
         found = f"{len(names)} joints for {len(axes)} axes"
-        faults.append(Fault(("robot", "motors"), found, f"the joint of each axis, in their order ({', '.join(axes)})"))
+        faults.append(
+            Fault(
+                ("robot", "motors"),
+                found,
+                f"the joint of each axis, in their order ({', '.join(axes)})",
+            )
+        )
     elif more:
         expected = f"one for each moving joint of the URDF ({', '.join(names)})"
         if more > 0:
             others = [name for name in names if name not in axes]
             held = ", ".join(f"{name}: 0.0" for name in others[-more:])
-            expected += f"; joints that are no axes are held at a position [deg; m if prismatic]: `hold: {{{held}}}`"
+            expected += (
+                "; joints that are no axes are held at a position [deg; m if prismatic]: "
+                f"`hold: {{{held}}}`"
+            )
         faults.append(Fault(("axes",), f"{len(axes)} axes", expected))
     for index, name in enumerate(axes[: len(model.robot.motors)]):
-        # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an effect may name either.
+        # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an
+        # effect may name either.
         if name in robot.passive_names:
-            found = f"{model.robot.motors[index]} as the joint of axis {name}, and joint {name} without a motor"
+            found = (
+                f"{model.robot.motors[index]} as the joint of axis {name}, and joint {name} "
+                "without a motor"
+            )
             expected = f"{name}, or another name of that axis (`axes[{index}].name`)"
             faults.append(Fault(("robot", "motors", index), found, expected))
     return robot, faults
 
 
 def _urdf_faults(model: CellModel, urdf: str) -> list[Fault]:
-    """Find what keeps a URDF from being read as the robot of the axes; the first kind of fault alone."""
+    """Find what keeps a URDF from being read as the robot of the axes;
+    the first kind of fault alone.
+    """
     if not urdf.strip():
         return [Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
-    return [*mimic_faults(model.axis_names, urdf)] or [*chain_faults(model.robot, model.closures, urdf)]
+    return [*mimic_faults(model.axis_names, urdf)] or [
+        *chain_faults(model.robot, model.closures, urdf)
+    ]
 
 
 def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
-    """Find joints that mimic another one and still move: the equations give each joint a motion of its own.
+    """Find joints that mimic another one and follow no axis:
+    such a joint stays, or its leader has to be held.
 
     Args:
         axes: names of the axes.
-        urdf: text of the URDF, its held joints fixed; a joint that follows a held one is fixed with it.
+        urdf: text of the URDF, its held joints fixed; a joint that follows a held one is fixed with
+            it.
 
     Raises:
-        ModelError: the URDF cannot be read.
+        ModelError: the URDF cannot be read, or joints mimic each other.
     """
     mimics = mimics_of(urdf)
+    if not mimics:
+        return
+    leaders = [joint.name for joint in read_urdf(urdf).joints if joint.name not in mimics]
     for name, mimic in mimics.items():
         found = f"joint {name} mimics {mimic.leader} (multiplier {mimic.multiplier:g})"
         if mimic.at_rest:
-            expected = f"`hold` of {name} at its offset, {mimic.offset:g} rad or m: by that multiplier it never moves"
+            expected = (
+                f"`hold` of {name} at its offset, {mimic.offset:g} rad or m: by that "
+                "multiplier it never moves"
+            )
             yield Fault(("robot", "urdf"), found, expected)
             continue
-        first = _first_leader(name, mimics)
-        if first in axes:
-            yield Fault(("robot", "urdf"), found, LINKAGE)
-        else:
-            expected = f"`hold` of {first} if that is no axis, and {name} follows it; else {LINKAGE}"
+        first = first_leader(name, mimics).leader
+        # Axes may have other names than their joints, so names count only where there are joints
+        # without an axis.
+        if first not in leaders or (len(leaders) > len(axes) and first not in axes):
+            expected = (
+                f"`hold` of {first} if that is no axis, and {name} follows it; else an axis of "
+                f"{first}"
+            )
             yield Fault(("robot", "urdf"), found, expected)
-
-
-def _first_leader(name: str, mimics: Mapping[str, Mimic]) -> str:
-    """Return the joint at the head of a chain of followers; one of them where they follow each other in a circle."""
-    seen = {name}
-    leader = mimics[name].leader
-    while leader in mimics and leader not in seen:
-        seen.add(leader)
-        leader = mimics[leader].leader
-    return leader
 
 
 def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
-    """Find axes with the name of another axis's joint: they are in another order than their joints."""
+    """Find axes with the name of another axis's joint:
+    they are in another order than their joints.
+    """
     driven = [joint.name for joint in joints]
     if len(driven) != len(model.axes):
         return
     for index, (axis, joint) in enumerate(zip(model.axes, driven, strict=True)):
         if axis.name != joint and axis.name in driven:
             path = ("robot", "motors", index) if model.robot.motors else ("axes", index, "name")
-            found = f"{joint} as the joint of axis {axis.name}, and {axis.name} as that of another axis"
-            yield Fault(path, found, f"{axis.name}, or another name of that axis (`axes[{index}].name`)")
+            found = (
+                f"{joint} as the joint of axis {axis.name}, and {axis.name} as that of another axis"
+            )
+            yield Fault(
+                path, found, f"{axis.name}, or another name of that axis (`axes[{index}].name`)"
+            )
 
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
@@ -195,27 +254,39 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     ratio = model.drive_train.ratio
     n = len(model.axes)
     if len(ratio) != n or any(len(row) != n for row in ratio):
-        shape = f"{len(ratio)} rows of {', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
+        shape = (
+            f"{len(ratio)} rows of "
+            f"{', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
+        )
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
         return
     implausible = False
     for motor, row in enumerate(np.abs(ratio_of(model)).tolist()):
-        if any(0.0 < one < SMALLEST_COUPLING for one in row) or (any(row) and not within(max(row), RATIO)):
+        if any(0.0 < one < SMALLEST_COUPLING for one in row) or (
+            any(row) and not within(max(row), RATIO)
+        ):
             implausible = True
             found = ", ".join(f"{number:g}" for number in ratio[motor])
-            expected = f"a reduction of {RATIO[0]:g} to {RATIO[1]:g} rad/rad (rad/m), and no smaller coupling than "
+            expected = (
+                f"a reduction of {RATIO[0]:g} to {RATIO[1]:g} rad/rad (rad/m), and no "
+                "smaller coupling than "
+            )
             yield Fault((*path, motor), found, f"{expected}{SMALLEST_COUPLING:g}")
     if implausible:
         return
     condition = float(np.linalg.cond(ratio_of(model)))
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
-        yield Fault(path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted")
+        yield Fault(
+            path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted"
+        )
     free = model.robot.mobility
     motors = len(model.robot.motors)
     if free is None or motors <= free:
         return
     for motor, row in enumerate(ratio):
-        others = [model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0]
+        others = [
+            model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0
+        ]
         if others:  # the rule of ident.model.model.Model
             found = f"the motor of {model.axes[motor].name} also turns with {', '.join(others)}"
             expected = f"zeros off the diagonal: {motors} motors for {free} degrees of freedom"
@@ -227,14 +298,22 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
     names = Counter(model.axis_names)
     for index, axis in enumerate(model.axes):
         if names[axis.name] > 1:
-            yield Fault(("axes", index, "name"), f"{axis.name}, used {names[axis.name]} times", "each name once")
+            yield Fault(
+                ("axes", index, "name"),
+                f"{axis.name}, used {names[axis.name]} times",
+                "each name once",
+            )
     if model.controller is not None:
-        on_a_bus = bool(model.buses) and all(axis.node_id is not None and axis.drive for axis in model.axes)
+        on_a_bus = bool(model.buses) and all(
+            axis.node_id is not None and axis.drive for axis in model.axes
+        )
         yield from controller_faults(model.controller, n, on_a_bus=on_a_bus)
     mountings = Counter(payload.mounting for payload in model.payloads)
     for index, payload in enumerate(model.payloads):
         if payload.mass_kg <= 0:
-            yield Fault(("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]")
+            yield Fault(
+                ("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]"
+            )
         elif payload.mass_tolerance_kg > TOLERANCE_SHARE * payload.mass_kg:
             found = f"{payload.mass_tolerance_kg:g} kg for {payload.mass_kg:g} kg"
             expected = "at most a tenth of the mass: it is in every gain"
@@ -250,7 +329,8 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
 
 
 def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> Iterator[Fault]:
-    """Find effects that are nowhere or twice in one place; in a file, also those that cannot be there.
+    """Find effects that are nowhere or twice in one place;
+    in a file, also those that cannot be there.
 
     A log is read whatever its effects are: the fit refuses those that cannot be.
     """
@@ -265,7 +345,11 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
         if effect.axis not in names and not (model.closures and not undriven):
             yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
         elif placed.index((effect.name, effect.axis)) < index:
-            yield Fault(("effects", index), f"{effect.name} on {effect.axis} twice", "each effect once on an axis")
+            yield Fault(
+                ("effects", index),
+                f"{effect.name} on {effect.axis} twice",
+                "each effect once on an axis",
+            )
         elif not logged and robot is not None and len(names) == len(robot.places):
             found = place_effect(effect.name, names.index(effect.axis), effect.settings, robot)
             if isinstance(found, Fault):
@@ -273,13 +357,18 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
 
 
 def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
-    """Find single parameters of a payload in the frame of a platform's link, where only all of them can be turned."""
+    """Find single parameters of a payload in the frame of a platform's link,
+    where only all of them can be turned.
+    """
     mounted = platform_frame(model.robot, urdf)
     if np.allclose(mounted.rotation, np.eye(3)) and not mounted.translation_m.any():
         return
     for index, payload in enumerate(model.payloads):
         if payload.known is not None:
-            found = f"single parameters, and the link {model.robot.platform} is not at the origin of its joint"
+            found = (
+                f"single parameters, and the link {model.robot.platform} is not at the origin "
+                "of its joint"
+            )
             expected = "`centre_m` and `inertia_kg_m2`, in the frame of that link"
             yield Fault(("payloads", index, "known"), found, expected)
 
@@ -287,14 +376,18 @@ def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
 def _mass_faults(model: CellModel) -> Iterator[Fault]:
     """Find payloads that this robot cannot carry, and g beside kg."""
     rated_kg = model.robot.rated_payload_kg
-    lightest_kg = min((payload.mass_kg for payload in model.payloads if payload.mass_kg > 0), default=0.0)
+    lightest_kg = min(
+        (payload.mass_kg for payload in model.payloads if payload.mass_kg > 0), default=0.0
+    )
     for index, payload in enumerate(model.payloads):
         path = ("payloads", index, "mass_kg")
         found = f"{payload.mass_kg:g} kg"
         if rated_kg is not None and payload.mass_kg > rated_kg:
             yield Fault(path, found, f"at most the {rated_kg:g} kg of `robot.rated_payload_kg`")
         elif rated_kg is None and payload.mass_kg > HEAVIEST_PAYLOAD_KG:
-            expected = f"at most {HEAVIEST_PAYLOAD_KG:g} kg, or a `robot.rated_payload_kg`; is this in g?"
+            expected = (
+                f"at most {HEAVIEST_PAYLOAD_KG:g} kg, or a `robot.rated_payload_kg`; is this in g?"
+            )
             yield Fault(path, found, expected)
         elif 0.0 < payload.mass_kg < LIGHTEST_PAYLOAD_KG:
             yield Fault(path, found, f"at least {LIGHTEST_PAYLOAD_KG:g} kg; is this in t?")
@@ -330,7 +423,9 @@ def centre_faults(path: Location, centre_m: Sequence[float]) -> Iterator[Fault]:
         yield Fault(path, found, f"at most {FARTHEST_CENTRE_M:g} m; is this in mm?")
 
 
-def gyration_faults(path: Location, inertia_kg_m2: Sequence[float], mass_kg: float) -> Iterator[Fault]:
+def gyration_faults(
+    path: Location, inertia_kg_m2: Sequence[float], mass_kg: float
+) -> Iterator[Fault]:
     """Find an inertia in kg mm², by its radius of gyration √(I/m)."""
     radius_m = sqrt(max(map(abs, inertia_kg_m2)) / mass_kg)
     if not within(radius_m, (0.0, LARGEST_GYRATION_M)):
@@ -348,13 +443,16 @@ def moment_faults(path: Location, inertia_kg_m2: Sequence[float]) -> Iterator[Fa
     if not max(map(abs, inertia_kg_m2)) < _OVERFLOWS:
         return  # `gyration_faults` refuses it
     xx, xy, xz, yy, yz, zz = inertia_kg_m2
-    least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    least, middle, largest = np.linalg.eigvalsh(
+        np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    )
     margin = 1e-9 * abs(largest)
     if least < -margin or largest > least + middle + margin:
         yield Fault(
             path,
             f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
-            "those of a body about its centre of mass: none below 0, none above the sum of the other two",
+            "those of a body about its centre of mass: none below 0, none above the sum of the "
+            "other two",
         )
 
 
@@ -378,7 +476,8 @@ _PLAUSIBLE = {
 class _UrdfLimits:
     """Limits of a joint by the URDF, in SI."""
 
-    position: tuple[float, float] | None  #: lower and upper end [rad or m]; None for a continuous joint
+    #: lower and upper end [rad or m]; None for a continuous joint
+    position: tuple[float, float] | None
     velocity: float  #: largest speed [rad/s or m/s]; 0 if it is not given
 
 
@@ -392,7 +491,11 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         for unit, offset in axis.zero_offsets.items():
             farthest = _PLAUSIBLE[unit].farthest
             if abs(offset) > farthest:
-                yield Fault((*path, f"zero_offset_{unit.name}"), f"{offset:g}", f"at most ±{farthest:g} {unit.name}")
+                yield Fault(
+                    (*path, f"zero_offset_{unit.name}"),
+                    f"{offset:g}",
+                    f"at most ±{farthest:g} {unit.name}",
+                )
     yield from _gain_faults(model, joints)
     yield from _standstill_faults(model, joints)
 
@@ -411,9 +514,15 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
         )
     for other in axis.zero_offsets:
         if other is not unit:
-            yield Fault((*path, f"zero_offset_{other.name}"), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
+            yield Fault(
+                (*path, f"zero_offset_{other.name}"),
+                f"{other.name}, and {what}",
+                f"zero_offset_{unit.name}",
+            )
     if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
-        yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead")
+        yield Fault(
+            (*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead"
+        )
 
 
 def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -424,7 +533,9 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         ((key, gain),) = axis.nameplate_gains.items()
         if not gain:
-            yield Fault(("axes", index, key), "0", "the nameplate gain of the data sheet, signed, not zero")
+            yield Fault(
+                ("axes", index, key), "0", "the nameplate gain of the data sheet, signed, not zero"
+            )
         if index >= len(gained) or gained[index] >= len(joints):
             continue
         joint = joints[gained[index]]
@@ -436,7 +547,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         if written in {"Nm", "N"} and written != force:
             yield Fault(
                 ("axes", index, key),
-                f"a gain in {written}, and it acts on joint {joint.name}, which is {joint.kind.value}",
+                f"a gain in {written}, and it acts on joint {joint.name}, which is "
+                f"{joint.kind.value}",
                 f"{force} per unit of the current reference",
             )
 
@@ -449,10 +561,17 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
     if lower >= upper:
         yield Fault(path, found, "the lower limit first")
     elif max(abs(lower), abs(upper)) > plausible.farthest:
-        yield Fault(path, found, f"at most ±{plausible.farthest:g} {unit.name}; are these {plausible.too_far}?")
+        yield Fault(
+            path,
+            found,
+            f"at most ±{plausible.farthest:g} {unit.name}; are these {plausible.too_far}?",
+        )
     elif upper - lower < plausible.shortest:
         yield Fault(
-            path, found, f"a range of at least {plausible.shortest:g} {unit.name}; are these {plausible.too_short}?"
+            path,
+            found,
+            f"a range of at least {plausible.shortest:g} {unit.name}; are these "
+            f"{plausible.too_short}?",
         )
 
 
@@ -463,16 +582,25 @@ def _range_faults(model: CellModel) -> Iterator[Fault]:
         ((key, gain),) = axis.nameplate_gains.items()
         for where, value, bounds, shown in (
             (("limits", f"velocity_{unit}_s"), axis.limits.velocity, SPEED, f" {unit}/s"),
-            (("limits", f"acceleration_{unit}_s2"), axis.limits.acceleration, ACCELERATION, f" {unit}/s²"),
+            (
+                ("limits", f"acceleration_{unit}_s2"),
+                axis.limits.acceleration,
+                ACCELERATION,
+                f" {unit}/s²",
+            ),
             ((key,), abs(gain), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
         ):
             if value != 0.0 and not within(value, bounds):
                 found = f"{value:g}{shown}"
-                yield Fault(("axes", index, *where), found, f"{bounds[0]:g} to {bounds[1]:g}{shown}")
+                yield Fault(
+                    ("axes", index, *where), found, f"{bounds[0]:g} to {bounds[1]:g}{shown}"
+                )
 
 
 def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
-    """Find limits in rad or m: the numbers of the URDF, or no revolute axis with a range of some degrees."""
+    """Find limits in rad or m: the numbers of the URDF,
+    or no revolute axis with a range of some degrees.
+    """
     limits = _urdf_limits(urdf)
     of_urdf = dict(enumerate(limits.get(name) for name in model.robot.motors or limits))
     ranges = [axis.limits.position for axis in model.axes if axis.limits.unit is DEGREE]
@@ -486,18 +614,26 @@ def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
         remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
         where = (*path, f"position_{unit.name}")
         found = f"[{lower:g}, {upper:g}] {unit.name}"
-        if in_si is not None and _within_urdf((lower, upper), in_si.position, _PLAUSIBLE[unit].farthest * unit.si):
+        if in_si is not None and _within_urdf(
+            (lower, upper), in_si.position, _PLAUSIBLE[unit].farthest * unit.si
+        ):
             yield Fault(where, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
         elif narrow and unit is DEGREE:
             found += f", and on no axis a range of {SHORTEST_OF_ALL_DEG:g} deg"
-            yield Fault(where, found, f"limits in deg; are these in rad? multiply by {1.0 / unit.si:.3g}")
+            yield Fault(
+                where, found, f"limits in deg; are these in rad? multiply by {1.0 / unit.si:.3g}"
+            )
         if in_si is not None and abs(velocity - in_si.velocity) < 0.1 * in_si.velocity:
             found = f"{velocity:g} {unit.name}/s, the number of the URDF in {unit.si_name}/s"
             yield Fault((*path, f"velocity_{unit.name}_s"), found, remedy)
 
 
-def _within_urdf(written: tuple[float, float], in_si: tuple[float, float] | None, farthest: float) -> bool:
-    """Whether limits lie within those of the URDF as numbers, and fill most of them: their unit is then SI too."""
+def _within_urdf(
+    written: tuple[float, float], in_si: tuple[float, float] | None, farthest: float
+) -> bool:
+    """Whether limits lie within those of the URDF as numbers, and fill most of them:
+    their unit is then SI too.
+    """
     if in_si is None or not in_si[0] < in_si[1] or max(map(abs, in_si)) > farthest:
         return False
     span = in_si[1] - in_si[0]
@@ -506,13 +642,17 @@ def _within_urdf(written: tuple[float, float], in_si: tuple[float, float] | None
 
 
 def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
-    """Check for one speed for each axis, in the list of its unit, or for none at all: they are then derived."""
+    """Check for one speed for each axis, in the list of its unit, or for none at all:
+    they are then derived.
+    """
     n = len(model.axes)
     lists = {
         "standstill_rad_s": model.conditioning.standstill_rad_s,
         "standstill_mm_s": model.conditioning.standstill_mm_s,
     }
-    units = [joint_unit(joint.kind) for joint in joints] or [axis.limits.unit for axis in model.axes]
+    units = [joint_unit(joint.kind) for joint in joints] or [
+        axis.limits.unit for axis in model.axes
+    ]
     if not any(lists.values()):
         return
     keys = ["standstill_mm_s" if unit is MILLIMETRE else "standstill_rad_s" for unit in units]
@@ -523,16 +663,24 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
     if short:
         return
     for index, own in enumerate(keys[:n]):
-        kind = JointKind.PRISMATIC if own == "standstill_mm_s" else JointKind.REVOLUTE
+        if own == "standstill_mm_s":
+            kind = JointKind.PRISMATIC
+        else:
+            kind = JointKind.REVOLUTE
         for key, speeds in lists.items():
             if speeds and (speeds[index] is None) == (key == own):
                 found = f"{speeds[index]} for {model.axes[index].name}, which is {kind.value}"
-                expected = "a speed" if key == own else "null, it is in the other list"
+                if key == own:
+                    expected = "a speed"
+                else:
+                    expected = "null, it is in the other list"
                 yield Fault(("conditioning", key, index), found, expected)
 
 
 def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
-    """Read the limits of the moving joints from the URDF by name, in document order; {} if it cannot be read."""
+    """Read the limits of the moving joints from the URDF by name, in document order;
+    {} if it cannot be read.
+    """
     try:
         joints = ElementTree.fromstring(urdf).iter("joint")
         limits: dict[str, _UrdfLimits | None] = {}
@@ -546,7 +694,9 @@ def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
                 continue
             position = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
             unlimited = joint.get("type") == "continuous"
-            limits[name] = _UrdfLimits(None if unlimited else position, float(limit.get("velocity", "0")))
+            limits[name] = _UrdfLimits(
+                None if unlimited else position, float(limit.get("velocity", "0"))
+            )
     except (ElementTree.ParseError, ValueError):
         return {}
     return limits

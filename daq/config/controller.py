@@ -1,4 +1,6 @@
-"""`controller` of a cell file: the controller file, the objects of the drives, or both, that receive the gains."""
+"""`controller` of a cell file: the controller file, the objects of the drives, or both,
+that receive the gains.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +55,15 @@ _KEY_AND_FACTOR = not_in_file("key and factor")
 
 
 def _entry_kind(value: object) -> str:
-    return _KEY_AND_FACTOR if isinstance(value, dict | GainKey) else _KEY
+    if isinstance(value, dict | GainKey):
+        return _KEY_AND_FACTOR
+    return _KEY
 
 
-_Gain = Annotated[Annotated[FileName, Tag(_KEY)] | Annotated[GainKey, Tag(_KEY_AND_FACTOR)], Discriminator(_entry_kind)]
+_Gain = Annotated[
+    Annotated[FileName, Tag(_KEY)] | Annotated[GainKey, Tag(_KEY_AND_FACTOR)],
+    Discriminator(_entry_kind),
+]
 """A key alone, or {key: ..., factor: ...}."""
 
 
@@ -64,16 +71,20 @@ _Gain = Annotated[Annotated[FileName, Tag(_KEY)] | Annotated[GainKey, Tag(_KEY_A
 class Controller:
     """Destination of the gains."""
 
-    file: FileName | None = None  #: the controller file, relative to the cell file; None if only the drives are written
+    #: the controller file, relative to the cell file; None if only the drives are written
+    file: FileName | None = None
     format: ControllerFormat | None = None  #: format of the file; None to derive it from the suffix
-    gains: tuple[_Gain, ...] = ()  #: key of each axis's current gain in the file; empty without a file
+    #: key of each axis's current gain in the file; empty without a file
+    gains: tuple[_Gain, ...] = ()
     #: Objects of the drives, one for each axis; empty if the drives are not written.
     objects: tuple[GainObject, ...] = ()
 
     @model_validator(mode="after")
     def _check_targets(self) -> Controller:
         if (self.file is None) != (not self.gains) or (self.file is None and not self.objects):
-            raise ValueError("file and gains of the controller, objects of the drives, or all three")
+            raise ValueError(
+                "file and gains of the controller, objects of the drives, or all three"
+            )
         if self.file is None and self.format is not None:
             raise ValueError("format only beside file")
         return self
@@ -98,14 +109,27 @@ def controller_faults(section: Controller, axes: int, *, on_a_bus: bool) -> Iter
         on_a_bus: whether every axis has a node id and a drive profile.
     """
     if section.gains and len(section.gains) != axes:
-        yield Fault(("controller", "gains"), f"{len(section.gains)} keys", f"{axes}, one for each axis")
+        yield Fault(
+            ("controller", "gains"), f"{len(section.gains)} keys", f"{axes}, one for each axis"
+        )
     if section.objects and len(section.objects) != axes:
-        yield Fault(("controller", "objects"), f"{len(section.objects)} objects", f"{axes}, one for each axis")
+        yield Fault(
+            ("controller", "objects"),
+            f"{len(section.objects)} objects",
+            f"{axes}, one for each axis",
+        )
     if section.objects and not on_a_bus:
         expected = "bus, and node_id and drive of each axis"
         yield Fault(("controller", "objects"), "objects of drives that no bus leads to", expected)
-    factors = {"gains": section.factors, "objects": tuple(entry.factor for entry in section.objects)}
+    factors = {
+        "gains": section.factors,
+        "objects": tuple(entry.factor for entry in section.objects),
+    }
     for kind, values in factors.items():
         for index, factor in enumerate(values):
             if factor == 0.0 or not math.isfinite(factor):
-                yield Fault(("controller", kind, index, "factor"), f"{factor:g}", "a factor that is not zero")
+                yield Fault(
+                    ("controller", kind, index, "factor"),
+                    f"{factor:g}",
+                    "a factor that is not zero",
+                )

@@ -1,7 +1,8 @@
-"""A drive profile file: the objects of an amplifier with position and current, their units, and the evidence for each.
+"""A drive profile file: the objects of an amplifier with position and current, their units,
+and the evidence for each.
 
-The classes here differ from those of `drivers.profiles`: an object's type is one word (`i32`), and the keys of a scale
-depend on its form.
+The classes here differ from those of `drivers.profiles`: an object's type is one word (`i32`), and
+the keys of a scale depend on its form.
 """
 
 from __future__ import annotations
@@ -13,7 +14,15 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import DocumentKind, Fault, Positive, StrictModel, fault_texts, parse_yaml, read_model
+from daq.config.yaml_file import (
+    DocumentKind,
+    Fault,
+    Positive,
+    StrictModel,
+    fault_texts,
+    parse_yaml,
+    read_model,
+)
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import (
@@ -45,10 +54,15 @@ class SectionModel(StrictModel, ABC):
 
 
 def _parts(model: StrictModel) -> dict[str, Any]:
-    """Return the values of a section by their keys, with every section in it as the class of `drivers`."""
+    """Return the values of a section by their keys,
+    with every section in it as the class of `drivers`.
+    """
     parts: dict[str, Any] = {}
     for key, value in model:
-        parts[key] = value.built() if isinstance(value, SectionModel) else value
+        if isinstance(value, SectionModel):
+            parts[key] = value.built()
+        else:
+            parts[key] = value
     return parts
 
 
@@ -61,11 +75,15 @@ class EntryModel(SectionModel):
 
     def built(self) -> Any:
         """Convert to `ObjectEntry`; a temperature is a `Thermometer`."""
-        return ObjectEntry(self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i")
+        return ObjectEntry(
+            self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i"
+        )
 
 
 class SignalModel(EntryModel):
-    """A signal of at most 32 bits: logs hold int32 of what a TPDO carries, and slow readings come in one SDO frame."""
+    """A signal of at most 32 bits: logs hold int32 of what a TPDO carries,
+    and slow readings come in one SDO frame.
+    """
 
     type: Literal["i8", "i16", "i32", "u8", "u16"]
 
@@ -103,7 +121,10 @@ class ScaleModel(SectionModel):
         wanted = SCALE_KEYS[self.form]
         empty = {key for key in given if getattr(self, key) is None and key != "peak_current_a"}
         if empty or given - wanted or wanted - given - {"objects"}:
-            raise ValueError(f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing else")
+            raise ValueError(
+                f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing "
+                "else"
+            )
         return self
 
     def built(self) -> CurrentScale | None:
@@ -161,7 +182,9 @@ class SaveModel(SectionModel):
 
     def built(self) -> Save:
         """Convert to the class of `drivers`."""
-        return Save(ObjectEntry(self.index, self.subindex, 32, signed=False), self.signature, self.mapping)
+        return Save(
+            ObjectEntry(self.index, self.subindex, 32, signed=False), self.signature, self.mapping
+        )
 
 
 class FactModel(StrictModel):
@@ -206,11 +229,15 @@ class DriveModel(StrictModel):
     tap: TapPoint
     saturation_bit: Annotated[int, Field(ge=0, le=15)] | None = None
     toggle_bit: Literal[8, 14, 15] | None = None
-    """CiA 402 leaves these bits to the maker; the others have a meaning in profile position mode."""
+    """CiA 402 leaves these bits to the maker;
+    the others have a meaning in profile position mode.
+    """
     update_period_us: Annotated[int, Field(gt=0)]
     rated: RatedModel | None = None
     torque: SignalModel | None = None
-    """Torque actual value, in thousandths of the rated torque, which the drive must report (`rated.torque`)."""
+    """Torque actual value, in thousandths of the rated torque,
+    which the drive must report (`rated.torque`).
+    """
     temperature: TemperatureModel | None = None
     save: SaveModel | None = None
     save_semantics: str
@@ -222,7 +249,9 @@ class DriveModel(StrictModel):
     @model_validator(mode="after")
     def _options_and_sources(self) -> DriveModel:
         for key in ("toggle_bit", "torque", "temperature"):
-            if self.facts is not None and (getattr(self, key) is None) != (getattr(self.facts, key) is None):
+            if self.facts is not None and (getattr(self, key) is None) != (
+                getattr(self.facts, key) is None
+            ):
                 raise ValueError(f"{key} and facts.{key}, both or neither")
         if self.torque is not None and (self.rated is None or self.rated.torque is None):
             raise ValueError("torque with rated.torque, of which it is given in thousandths")
@@ -255,7 +284,8 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         expected = "the peak current of this size of drive [A]; no object of the drive reports it"
         raise ConfigurationInconsistent(
             **fault_texts(document, [Fault(place, "nothing", expected)]),
-            remedy="copy the profile to drives/ beside your cell file and enter it from the drive's data sheet",
+            remedy="copy the profile to drives/ beside your cell file and enter it from the "
+            "drive's data sheet",
         )
     del parts["eds"]  # a log carries it for people; no reader of a profile needs it
     parts["facts"] = parts["facts"] or ()

@@ -1,4 +1,6 @@
-"""Place the effects that a cell file declares: names, settings and places as the dictionary of effects has them."""
+"""Place the effects that a cell file declares:
+names, settings and places as the dictionary of effects has them.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,17 @@ from ident.errors import EffectRefused
 from ident.model.robot import Robot
 
 
-def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Robot) -> PlacedEffect | Fault:
-    """Return a declared effect, or what is wrong with it; the path of a fault is relative to the effect.
+def place_effect(
+    name: str, place: int, settings: Mapping[str, float], robot: Robot
+) -> PlacedEffect | Fault:
+    """Return a declared effect, or what is wrong with it;
+    the path of a fault is relative to the effect.
 
     Args:
         name: of its family.
         place: index of its joint among `Robot.places`.
-        settings: those that are given; the others are those of the dictionary's first member, or 0 if a later version
-            added them.
+        settings: those that are given; the others are those of the dictionary's first member, or 0
+            if a later version added them.
         robot: that has it.
     """
     known = _family_member(name)
@@ -27,8 +32,13 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
         return known
     unknown = sorted(set(settings) - set(known.settings))
     if unknown:
-        return Fault(("settings",), f"settings {', '.join(unknown)}", ", ".join(known.settings) or "no settings")
-    added = dict.fromkeys(known.added_settings, 0)  # a file of an earlier version does not have them
+        return Fault(
+            ("settings",),
+            f"settings {', '.join(unknown)}",
+            ", ".join(known.settings) or "no settings",
+        )
+    # A file of an earlier version does not have them
+    added = dict.fromkeys(known.added_settings, 0)
     full = {**known.settings, **added, **settings}
     for setting, value in full.items():
         # A file has one kind of number; an order is whole.
@@ -38,9 +48,13 @@ def place_effect(name: str, place: int, settings: Mapping[str, float], robot: Ro
         check_settings(known, full, place, robot.axis_count)
     except EffectRefused as error:
         return Fault(("settings",), str(error), "settings in their range")
-    effect = known.with_settings({setting: type(known.settings[setting])(value) for setting, value in full.items()})
+    effect = known.with_settings(
+        {setting: type(known.settings[setting])(value) for setting, value in full.items()}
+    )
     if not is_placeable(effect, place, robot):
-        return Fault(("axis",), "a place that this effect cannot have", _places(effect, place, robot))
+        return Fault(
+            ("axis",), "a place that this effect cannot have", _places(effect, place, robot)
+        )
     return PlacedEffect(effect, place)
 
 
@@ -62,9 +76,13 @@ def _family_member(name: str) -> Effect | Fault:
 def _places(effect: Effect, place: int, robot: Robot) -> str:
     """Describe where an effect that is elsewhere can be."""
     if effect.with_motor != (place < robot.axis_count):
-        return "an axis: it acts on a motor" if effect.with_motor else "a joint of a closed chain without a motor"
+        if effect.with_motor:
+            return "an axis: it acts on a motor"
+        return "a joint of a closed chain without a motor"
     if not effect.has_axis:
         return "the first axis: it acts on all motors alike"
     if effect.side is GearSide.TWO_JOINTS:
-        return "the pair the other way: on the axis of the lower number, with `other_axis` the higher"
+        return (
+            "the pair the other way: on the axis of the lower number, with `other_axis` the higher"
+        )
     return "an axis that is revolute"

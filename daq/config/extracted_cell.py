@@ -1,7 +1,8 @@
 """The description of a cell out of a log, as files that `load_cell` reads.
 
-A log has the files of its cell under fixed names (`daq.config.cell_file.bundle`), and the cell file names others:
-`../robots/tx40.urdf`. Laid out as the cell file names them, its text stays as it is, and so does its digest.
+A log has the files of its cell under fixed names (`daq.config.cell_file.bundle`), and the cell file
+names others: `../robots/tx40.urdf`. Laid out as the cell file names them, its text stays as it is,
+and so does its digest.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ def extracted_cell(files: Mapping[str, bytes]) -> tuple[PurePosixPath, dict[Pure
         files: of a log, or as returned by `bundle`; other entries are ignored.
 
     Returns:
-        the place of the cell file, and the content of each file by its place; all relative to one folder.
+        the place of the cell file, and the content of each file by its place; all relative to one
+        folder.
 
     Raises:
         ConfigurationInconsistent: a file would be outside of that folder.

@@ -1,4 +1,6 @@
-"""An import description: the layout of the files of another controller (configs/imports/tx40.yaml)."""
+"""An import description: the layout of the files of another controller
+(configs/imports/tx40.yaml).
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
 
 
 class PositionUnit(Enum):
-    """Unit of the position columns; `rad` and `deg` are m and mm for the prismatic axes of a robot that has both."""
+    """Unit of the position columns; `rad` and `deg` are m and mm for the prismatic axes of a robot
+    that has both.
+    """
 
     RAD = "rad"
     DEG = "deg"
@@ -82,11 +86,13 @@ class TimeUnit(Enum):
 class CsvLayout:
     """Layout of CSV files."""
 
-    delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","  #: between fields; " " means any white space
+    #: between fields; " " means any white space
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
     decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."  #: point or comma
     skip_rows: Annotated[int, Field(ge=0)] = 0  #: lines before the header
     header: bool = True  #: whether a line of names precedes the numbers
-    #: Begin of lines among the rows that are left out; before and after the rows, #, % and // are known.
+    #: Begin of lines among the rows that are left out; before and after the rows, #, % and // are
+    #: known.
     comment: Annotated[str, Field(min_length=1, max_length=4)] | None = None
 
     @model_validator(mode="after")
@@ -123,12 +129,23 @@ class Section:
     @model_validator(mode="after")
     def _check_files(self) -> Self:
         if isinstance(self.file, tuple) and len(self.columns) not in {1, len(self.file)}:
-            raise ValueError("as many files as columns, or one column of the same name in each file")
+            raise ValueError(
+                "as many files as columns, or one column of the same name in each file"
+            )
         return self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PositionColumns(Section):
+class PublishedColumns(Section):
+    """Columns of a quantity that a bag has, too."""
+
+    topic: str | None = None  #: topic of these columns in a bag; that of the description by default
+    #: their publisher; that of the description by default
+    publisher: Annotated[int, Field(ge=1)] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionColumns(PublishedColumns):
     """Position columns, one for each axis."""
 
     unit: PositionUnit
@@ -137,7 +154,7 @@ class PositionColumns(Section):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScaledColumns(Section):
+class ScaledColumns(PublishedColumns):
     """Columns of a quantity, one for each axis, and the factor to its unit."""
 
     #: One for all axes, a list in their order, or a mapping from their names.
@@ -155,7 +172,11 @@ class ScaledColumns(Section):
         if isinstance(self.factor, float):
             return (self.factor,) * len(axes)
         if isinstance(self.factor, dict):
-            return tuple(self.factor[axis] for axis in axes) if self.factor.keys() == set(axes) else None
+            return (
+                tuple(self.factor[axis] for axis in axes)
+                if self.factor.keys() == set(axes)
+                else None
+            )
         return self.factor if len(self.factor) == len(axes) else None
 
 
@@ -171,13 +192,17 @@ class CurrentColumns(ScaledColumns):
         if isinstance(self.unit, str):
             return (self.unit,) * len(axes)
         if isinstance(self.unit, dict):
-            return tuple(self.unit[axis] for axis in axes) if self.unit.keys() == set(axes) else None
+            return (
+                tuple(self.unit[axis] for axis in axes) if self.unit.keys() == set(axes) else None
+            )
         return self.unit if len(self.unit) == len(axes) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TorqueColumns(ScaledColumns):
-    """Columns of the controller's own torque, for a comparison with the gains; numbers × factor are Nm (or N)."""
+    """Columns of the controller's own torque, for a comparison with the gains;
+    numbers × factor are Nm (or N).
+    """
 
     side: Side
 
@@ -197,13 +222,14 @@ class VelocityUnit(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VelocityColumns(Section):
+class VelocityColumns(PublishedColumns):
     """Velocity columns, one for each axis: a check of the positions and the time; not imported."""
 
     unit: VelocityUnit
     side: Side
     reversed: tuple[Name, ...] = ()  #: as of the positions
-    #: Largest difference between the way by the velocities and by the positions, as a share of the latter.
+    #: Largest difference between the way by the velocities and by the positions, as a share of the
+    #: latter.
     tolerance: Annotated[float, Field(gt=0.0, le=1.0)] = 0.2
 
 
@@ -221,7 +247,9 @@ class TimeColumn:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeptPart:
-    """Part of a recording that is imported: rows of numbers, counted from 1, or seconds since the first of them."""
+    """Part of a recording that is imported: rows of numbers, counted from 1,
+    or seconds since the first of them.
+    """
 
     from_row: Annotated[int, Field(ge=1)] | None = None  #: first row
     to_row: Annotated[int, Field(ge=1)] | None = None  #: last row
@@ -258,7 +286,8 @@ class KeptPart:
 class HoldoutPart:
     """End of a recording that becomes a log of its own, for the final error of a fit."""
 
-    from_s: Annotated[float, Field(gt=0.0, le=1e9)]  #: its begin, since the first sample that is imported [s]
+    #: its begin, since the first sample that is imported [s]
+    from_s: Annotated[float, Field(gt=0.0, le=1e9)]
 
 
 class ImportDescription(StrictModel):
@@ -273,23 +302,35 @@ class ImportDescription(StrictModel):
     position: PositionColumns  #: column of the position
     current: CurrentColumns  #: column of the current
     velocity: VelocityColumns | None = None  #: columns of the velocity, for a check alone
-    torque: TorqueColumns | None = None  #: columns of the controller's own torque, for a comparison alone
+    #: columns of the controller's own torque, for a comparison alone
+    torque: TorqueColumns | None = None
     temperature: TemperatureColumns | None = None  #: columns of the temperature
     rate_hz: Rate | None = None  #: sampling rate [Hz]; either this or `time`
     time: TimeColumn | None = None  #: the time column, instead of a rate
     keep: KeptPart | None = None  #: part of the recording that is imported; all of it by default
     holdout: HoldoutPart | None = None  #: end of it that becomes a second log
     topic: str | None = None  #: topic of the joint states in a ROS 2 bag; needed if it has several
-    #: Which publisher of that topic, by the number that an import names; needed if several publish the same joints.
+    #: Which publisher of that topic, by the number that an import names; needed if several publish
+    #: the same joints.
     publisher: Annotated[int, Field(ge=1)] | None = None
+    #: Which of two even rows of stamps in a bag; needed if nothing else tells two publishers apart.
+    rhythm: Annotated[int, Field(ge=1, le=2)] | None = None
     payload: Name | None = None  #: mounted payload, as named in the cell; None without load
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it
 
     def sections(self) -> tuple[tuple[str, Section], ...]:
         """Return the sections with a column for each axis, by their keys."""
-        stated = ((key, getattr(self, key)) for key in ("position", "current", "velocity", "torque", "temperature"))
+        stated = (
+            (key, getattr(self, key))
+            for key in ("position", "current", "velocity", "torque", "temperature")
+        )
         return tuple((key, section) for key, section in stated if section is not None)
+
+    def published(self) -> tuple[PublishedColumns, ...]:
+        """Return the sections that a bag may have."""
+        stated = (self.position, self.current, self.velocity, self.torque)
+        return tuple(section for section in stated if section is not None)
 
     def files(self) -> dict[str, tuple[Column, ...]]:
         """Return the files, each with its columns of numbers; the time column is not among them."""
@@ -322,17 +363,30 @@ def load_import(path: Path) -> ImportDescription:
     for name, section in wanted.sections():
         factors = section.stated_factors if isinstance(section, ScaledColumns) else ()
         if any(abs(one) < SMALLEST_FACTOR for one in factors):
-            expected = f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
+            expected = (
+                f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
+            )
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
-        # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import counts.
+        # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import
+        # counts.
         own = len(section.places)
         if own != axes and 1 not in {axes, own}:
             found = f"{own} columns"
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
     timed = () if wanted.time is None else (wanted.time.column,)
-    named = [c for columns in (*wanted.files().values(), timed) for c in columns if isinstance(c, str)]
+    named = [
+        c for columns in (*wanted.files().values(), timed) for c in columns if isinstance(c, str)
+    ]
     if named and not wanted.table.header:
-        faults.append(Fault(("table", "header"), f"false, and column {named[0]!r} by name", "column numbers from 1"))
+        faults.append(
+            Fault(
+                ("table", "header"),
+                f"false, and column {named[0]!r} by name",
+                "column numbers from 1",
+            )
+        )
     if faults:
-        raise ConfigurationInconsistent(**fault_texts(document, faults), remedy="correct the import description")
+        raise ConfigurationInconsistent(
+            **fault_texts(document, faults), remedy="correct the import description"
+        )
     return wanted

@@ -1,4 +1,6 @@
-"""`policy` and `history` of a cell file: permissions, bounds of the write-back, approvers, the record of all writes."""
+"""`policy` and `history` of a cell file: permissions, bounds of the write-back, approvers,
+the record of all writes.
+"""
 
 from __future__ import annotations
 
@@ -50,19 +52,25 @@ class ApplyPolicy:
     max_change_percent: _Percent = 35.0  #: change from the current gain [%]
     max_nameplate_percent: _Percent = 50.0  #: change from the nameplate [%]
     max_std_percent: _Percent = 3.0  #: relative standard deviation of the identified gain [%]
-    max_error_percent: _Percent = 25.0  #: relative error of all torques, on held-out data where available [%]
+    #: relative error of all torques, on held-out data where available [%]
+    max_error_percent: _Percent = 25.0
     max_axis_error_percent: _Percent = 50.0  #: the same for each axis [%]
-    #: Misfit of redundant encoders that nothing explains [mrad, or thousandths of the robot's size].
+    #: Misfit of redundant encoders that nothing explains [mrad, or thousandths of the robot's
+    #: size].
     max_encoder_misfit_mrad: Annotated[float, Field(ge=0)] = 0.1
-    #: Age of the oldest log [days]; None to ignore it, as for imported logs without the time of day.
+    #: Age of the oldest log [days]; None to ignore it, as for imported logs without the time of
+    #: day.
     max_age_days: Annotated[float, Field(gt=0)] | None = 30.0
-    max_saturated_percent: _Percent = 2.0  #: share of an axis's samples in which a limit was active [%]
+    #: share of an axis's samples in which a limit was active [%]
+    max_saturated_percent: _Percent = 2.0
     by: AppliedBy = AppliedBy.PERSON  #: who applies the result of a scheduled job
-    #: Number of signers who must have signed the calibration, not counting the operator who applies it.
+    #: Number of signers who must have signed the calibration, not counting the operator who applies
+    #: it.
     signatures: Annotated[int, Field(ge=0)] = 0
     #: Public key (minisign) of each person who may sign, by name.
     signers: Mapping[str, str] = field(default_factory=dict)
-    holdout: HoldOut | None = None  #: whether held-out data are required; None means required if the job itself applies
+    #: whether held-out data are required; None means required if the job itself applies
+    holdout: HoldOut | None = None
     #: Largest change from the current gain, by axis name [unit of the gain].
     max_change: Mapping[str, Annotated[float, Field(ge=0)]] = field(default_factory=dict)
 
@@ -74,7 +82,10 @@ class ApplyPolicy:
     @model_validator(mode="after")
     def _check_holdout_and_signers(self) -> ApplyPolicy:
         if self.signatures > len(self.signers):
-            raise ValueError(f"at least {self.signatures} `signers`, a public key by each name, for so many signatures")
+            raise ValueError(
+                f"at least {self.signatures} `signers`, a public key by each name, for so many "
+                "signatures"
+            )
         if self.by is AppliedBy.JOB and self.holdout is HoldOut.OPTIONAL:
             raise ValueError("`holdout: required` where the job applies by itself")
         return self
@@ -88,11 +99,16 @@ def max_change_faults(policy: ApplyPolicy, axes: Collection[str]) -> Iterator[Fa
     """Find bounds for axes that the cell does not have: misspelt, they would bound nothing."""
     for name in policy.max_change:
         if name not in axes:
-            yield Fault(("policy", "apply", "max_change", name), f"axis {name!r}", f"one of {', '.join(axes)}")
+            yield Fault(
+                ("policy", "apply", "max_change", name),
+                f"axis {name!r}",
+                f"one of {', '.join(axes)}",
+            )
 
 
 def policy_judged(cell_file: Path, key: str, path: Path) -> Path:
-    """Resolve a path that a cell file names or implies, so far as its links can be trusted (`daq.files.follow_links`).
+    """Resolve a path that a cell file names or implies, so far as its links can be trusted
+    (`daq.files.follow_links`).
 
     Raises:
         ConfigurationInconsistent: they cannot.
@@ -110,29 +126,39 @@ def policy_judged(cell_file: Path, key: str, path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class HistorySection:
-    """`history`: file names relative to the cell file. By default they are beside it, with its name."""
+    """`history`: file names relative to the cell file.
+
+    By default they are beside it, with its name.
+    """
 
     store: FileName | None = None
     audit: FileName | None = None
 
     def place(self, cell_file: Path, controller: str | None) -> HistoryPlace:
-        """Resolve the file names; refuse a history that would replace the cell file or the controller file.
+        """Resolve the file names; refuse a history that would replace the cell file or the
+        controller file.
 
         Raises:
             ConfigurationInconsistent: it would, or a link in one of the names must not be followed.
         """
         folder = cell_file.parent
         stem = cell_file.stem
-        store = policy_judged(cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite"))
+        store = policy_judged(
+            cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite")
+        )
         for other in (cell_file, folder / (controller or cell_file.name)):
-            if str(store) == os.path.realpath(other) or (store.exists() and other.exists() and store.samefile(other)):
+            if str(store) == os.path.realpath(other) or (
+                store.exists() and other.exists() and store.samefile(other)
+            ):
                 raise ConfigurationInconsistent(
                     f"{cell_file}: history.store",
                     found=f"the same file as {other}",
                     expected="a file of the history's own",
                     remedy="give it another name",
                 )
-        audit = policy_judged(cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl"))
+        audit = policy_judged(
+            cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl")
+        )
         return HistoryPlace(store, audit)
 
 
@@ -140,7 +166,9 @@ class HistorySection:
 class HistoryPlace:
     """Files of a cell's history, absolute."""
 
-    store: Path  #: SQLite file in which earlier versions kept the history; the records of drives are named after it
+    #: SQLite file in which earlier versions kept the history; the records of drives are named after
+    #: it
+    store: Path
     audit: Path  #: hash-chained record of all write actions, of which the history is folded
 
 
@@ -175,23 +203,31 @@ def parse_public_key(text: str) -> PublicKey:
         ValueError: it is none.
     """
     lines = text.strip().splitlines()
-    algorithm, key_id, key = _LAYOUT.unpack(decode_line(lines[-1] if lines else "", _LAYOUT.size, "a public key"))
+    algorithm, key_id, key = _LAYOUT.unpack(
+        decode_line(lines[-1] if lines else "", _LAYOUT.size, "a public key")
+    )
     if algorithm != KEY_ALGORITHM or len(lines) > 2:
         raise ValueError(f"a key of algorithm {algorithm!r}, or more than a key")
     return PublicKey(key_id, key)
 
 
 def signer_faults(signers: Mapping[str, str]) -> Iterator[Fault]:
-    """Find malformed keys and names when the cell is read, and not at the first signature, long after the recording."""
+    """Find malformed keys and names when the cell is read, and not at the first signature,
+    long after the recording.
+    """
     owners: dict[bytes, str] = {}
     for name, line in signers.items():
-        problem = None if SIGNER_NAME.fullmatch(name) else "a name that cannot be part of a file name"
+        if SIGNER_NAME.fullmatch(name):
+            problem = None
+        else:
+            problem = "a name that cannot be part of a file name"
         try:
             key = parse_public_key(line).key
         except ValueError as error:
             problem = str(error)
         else:
-            problem = f"the key of {owners[key]}" if key in owners else problem
+            if key in owners:
+                problem = f"the key of {owners[key]}"
             owners.setdefault(key, name)
         if problem is not None:
             expected = "a public key of their own, the line that `drivegain sign key` prints"
@@ -202,7 +238,8 @@ def public_keys(signers: Mapping[str, str]) -> dict[str, PublicKey]:
     """Parse and check the keys of the trusted people.
 
     Raises:
-        ConfigurationInconsistent: a public key is none, or two names share one: they would be one person.
+        ConfigurationInconsistent: a public key is none, or two names share one: they would be one
+            person.
     """
     for fault in signer_faults(signers):
         raise ConfigurationInconsistent(

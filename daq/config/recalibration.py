@@ -30,12 +30,17 @@ class Command:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interlock:
-    """Sources that confirm that the cell is closed, empty and in automatic mode. If both are given, both must agree."""
+    """Sources that confirm that the cell is closed, empty and in automatic mode.
 
-    command: Arguments | None = None  #: program of the safety controller's gateway, with its arguments
+    If both are given, both must agree.
+    """
+
+    #: program of the safety controller's gateway, with its arguments
+    command: Arguments | None = None
     timeout_s: Seconds = 10.0  #: time after which the program is killed and counts as failed [s]
     file: FilePath | None = None  #: file that the gateway renews while the cell is closed
-    says: Annotated[str, Field(min_length=1, max_length=200)] = "closed"  #: its first line while the robot may move
+    #: its first line while the robot may move
+    says: Annotated[str, Field(min_length=1, max_length=200)] = "closed"
     max_age_s: Seconds = 10.0  #: an older file releases nothing [s]
 
     @model_validator(mode="after")
@@ -58,8 +63,10 @@ class PlannedRun:
     """One recording of a session."""
 
     name: RunName  #: name of its log
-    payload: Annotated[str, Field(min_length=1)] | None = None  #: mounted payload, None without load
-    #: Mass of the payload as weighed for this job, beside that in `payloads` [kg]; None without load.
+    #: mounted payload, None without load
+    payload: Annotated[str, Field(min_length=1)] | None = None
+    #: Mass of the payload as weighed for this job, beside that in `payloads` [kg]; None without
+    #: load.
     mass_kg: Annotated[float, Field(gt=0)] | None = None
     plan: SeededPlan | None = None  #: moves planned from a seed
     plan_file: FilePath | None = None  #: approved moves instead
@@ -70,7 +77,9 @@ class PlannedRun:
         if self.name in RESERVED:
             raise ValueError(f"another name than {self.name}")
         if (self.payload is None) != (self.mass_kg is None):
-            raise ValueError("payload and its mass_kg, as weighed for this job, or neither of the two")
+            raise ValueError(
+                "payload and its mass_kg, as weighed for this job, or neither of the two"
+            )
         if (self.plan is None) == (self.plan_file is None):
             raise ValueError("plan: {seed, duration_s}, or plan_file with approved moves")
         return self
@@ -80,20 +89,25 @@ class PlannedRun:
 class RecalibrationSection:
     """`recalibration`; docs/how-to/schedule-recalibration.md has an example."""
 
-    runs: Annotated[tuple[PlannedRun, ...], Field(min_length=3, max_length=100)]  #: in the order of their recording
+    #: in the order of their recording
+    runs: Annotated[tuple[PlannedRun, ...], Field(min_length=3, max_length=100)]
     interlock: Interlock  #: checked before each run
     mount: Command  #: called before each run with the payload's name, or "none", as last argument
     #: Duration of the moves before the first run, which are not logged [min].
     warm_up_min: Annotated[float, Field(ge=0, le=240)] = 10.0
     every_h: Hours = 144.0  #: nothing is due while the last good calibration is younger [h]
-    max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0  #: longest duration of a job [min]
+    #: longest duration of a job [min]
+    max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0
     resume_within_h: Hours = 12.0  #: largest age of a session that is resumed [h]
-    retries: Annotated[int, Field(ge=0, le=5)] = 1  #: further attempts of a run that its recorder marked invalid
-    min_free_mb: Annotated[float, Field(ge=0)] = 1000.0  #: free space on the disk required at the start [MB]
+    #: further attempts of a run that its recorder marked invalid
+    retries: Annotated[int, Field(ge=0, le=5)] = 1
+    #: free space on the disk required at the start [MB]
+    min_free_mb: Annotated[float, Field(ge=0)] = 1000.0
     keep_sessions: Annotated[int, Field(ge=1)] = 20  #: number of ended sessions whose logs are kept
     seed: Annotated[int, Field(ge=0)] = 0  #: seed of the significance test
     metrics: FilePath | None = None  #: folder of Prometheus' textfile collector, None without one
-    folder: FilePath | None = None  #: parent of its sessions; None for the one named after the cell file
+    #: parent of its sessions; None for the one named after the cell file
+    folder: FilePath | None = None
 
     @model_validator(mode="after")
     def _check_runs(self) -> RecalibrationSection:
@@ -102,7 +116,9 @@ class RecalibrationSection:
             raise ValueError("runs with names of their own")
         fitted = {run.payload is None for run in self.runs if not run.holdout}
         if fitted != {True, False}:
-            raise ValueError("at least one run without and one with a payload that the fit sees (no holdout)")
+            raise ValueError(
+                "at least one run without and one with a payload that the fit sees (no holdout)"
+            )
         if not any(run.holdout for run in self.runs):
             raise ValueError("at least one run with holdout: true, by which the result is judged")
         return self

@@ -1,8 +1,10 @@
-"""Whether a log, a calibration and a description are of one cell, and in what a corrected description differs.
+"""Whether a log, a plan or a calibration and a description are of one cell,
+and in what a corrected description differs.
 
-A description that replaces the one in a log corrects it: gravity, zero offsets, ratios, geometry, masses, nameplate.
-It is of the same cell where the name, the axes, their joints and their drives are the same. All of these are needed:
-two robots of one make have the same axes and joints, and a copied cell file even the same name.
+A description that replaces the one in a log corrects it: gravity, zero offsets, ratios, geometry,
+masses, nameplate. It is of the same cell where the name, the axes, their joints and their drives
+are the same. All of these are needed: two robots of one make have the same axes and joints, and a
+copied cell file even the same name.
 """
 
 from __future__ import annotations
@@ -10,25 +12,26 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from itertools import zip_longest
 
 from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch
+from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch, first_few
 from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot, Calibration
 from ident.model.urdf import read_urdf
 
 _REMEDY = (
-    "another robot's description gives wrong gains: give the description of this cell, or none, since the log has its "
-    "own; `name`, `axes`, joints and drives have to be as in the log, and everything else may be corrected"
+    "another robot's description gives wrong gains: give the description of this cell, or none, "
+    "since the log has its own; `name`, `axes`, joints and drives have to be as in the log, and "
+    "everything else may be corrected"
 )
 
 
 _RECORD_AGAIN = (
-    "the node numbers were exchanged after this recording, and a log keeps those that it was recorded with: "
-    "record again with the corrected cell file"
+    "the node numbers were exchanged after this recording, and a log keeps those that it was "
+    "recorded with: record again with the corrected cell file"
 )
 
 
@@ -52,13 +55,15 @@ class Correction:
 def correction_of(
     log: str, files: Mapping[str, bytes], given: Cell, serials: Sequence[int | None] = ()
 ) -> Correction | None:
-    """Return what a given description replaces in that of a log; None where nothing of a fit depends on it.
+    """Return what a given description replaces in that of a log;
+    None where nothing of a fit depends on it.
 
     Args:
         log: name of the log in messages.
         files: the description in the log, as by `daq.config.cell_file.bundle`.
         given: the description that replaces it.
-        serials: serial number that the drive of each axis reported; None for one that reported none.
+        serials: serial number that the drive of each axis reported; None for one that reported
+            none.
 
     Raises:
         LogsDiffer: the description is of another cell.
@@ -69,7 +74,8 @@ def correction_of(
     try:
         own = cell_from_bundle(files, names={CELL: name})
     except (ConfigurationInconsistent, SchemaMismatch):
-        # A description that this version refuses may be what the given one corrects: its names are compared.
+        # A description that this version refuses may be what the given one corrects: its names are
+        # compared.
         own = None
         found = _mismatch_of_names(files, given, name) or _mismatch_of_drives(None, given, serials)
     else:
@@ -83,20 +89,27 @@ def correction_of(
 
 
 def mismatch(own: Cell, given: Cell) -> Mismatch | None:
-    """Return what shows that a description is of another cell than that of a log; None for the same cell."""
+    """Return what shows that a description is of another cell than that of a log;
+    None for the same cell.
+    """
     found = _mismatch_of_axes(own.name, own.axis_names, given)
     if found is not None:
         return found
-    joints = _joints(own)
-    expected = _joints(given)
-    if joints != expected:
-        return Mismatch(f"joints {', '.join(joints)}", f"{', '.join(expected)}, as in the given description")
+    differences = robot_differences(calibrated_robot(own), calibrated_robot(given))
+    if differences:
+        if _has_exchanged_nodes(own, given):
+            remedy = _RECORD_AGAIN
+        else:
+            remedy = _REMEDY
+        expected = f"{expected_text(differences)}, as in the given description"
+        return Mismatch(found_text(differences), expected, remedy)
+    # A log was recorded with these very drives, so it alone is compared by serial numbers, too.
     for one, other in zip(own.axes, given.axes, strict=True):
-        for label, recorded, wanted in _drive_of(one, other):
-            if recorded is not None and wanted is not None and recorded != wanted:
-                found_text = f"{label} {recorded} of axis {one.name}"
-                remedy = _RECORD_AGAIN if _has_exchanged_nodes(own, given) else _REMEDY
-                return Mismatch(found_text, f"{wanted}, as in the given description", remedy)
+        recorded = _serial(one)
+        wanted = _serial(other)
+        if recorded is not None and wanted is not None and recorded != wanted:
+            found_serial = f"serial number {recorded} of axis {one.name}"
+            return Mismatch(found_serial, f"{wanted}, as in the given description")
     return None
 
 
@@ -107,43 +120,12 @@ def _has_exchanged_nodes(own: Cell, given: Cell) -> bool:
     return first != second and set(first) == set(second)
 
 
-@dataclass(frozen=True, slots=True)
-class RobotIdentity:
-    """What tells a robot from another of the same name and axes, for a file that is made for one of them.
-
-    What a description corrects (zero offsets, gravity, lengths, masses, nameplate gains) is no part of it, nor is a
-    serial number: a drive that is exchanged does not make a robot another one.
-    """
-
-    kinematics_sha256: str  #: of joints, their kinds and order, and the motors of a closed chain, hex
-    drives_sha256: str  #: of node id, vendor and product code of each axis, hex
-
-    def differences(self, expected: RobotIdentity) -> tuple[str, ...]:
-        """Name the parts that differ: none for the same robot."""
-        parts = []
-        if self.kinematics_sha256 != expected.kinematics_sha256:
-            parts.append("joints (names, kinds, parents or motors)")
-        if self.drives_sha256 != expected.drives_sha256:
-            parts.append("drives (node ids, vendors or product codes)")
-        return tuple(parts)
-
-
-def robot_identity(cell: Cell) -> RobotIdentity:
-    """Return the identity of a cell's robot."""
-    parents = [joint.parent for joint in read_urdf(cell.urdf).joints]
-    kinematics = [_joints(cell), parents]
-    drives = []
-    for axis in cell.axes:
-        identity = axis.identity
-        vendor_id = None if identity is None else identity.vendor_id
-        product_code = None if identity is None else identity.product_code
-        drives.append([axis.name, axis.node_id, vendor_id, product_code])
-    return RobotIdentity(_sha256(kinematics), _sha256(drives))
-
-
 def calibrated_robot(cell: Cell) -> CalibratedRobot:
-    """Return a cell's robot as its calibrations and its history name it."""
-    identity = robot_identity(cell)
+    """Return a cell's robot as its plans, its calibrations and its history name it.
+
+    What a description corrects (zero offsets, gravity, lengths, masses, nameplate gains) is no part
+    of it, nor is a serial number: a drive that is exchanged does not make a robot another one.
+    """
     described = read_urdf(cell.urdf).joints
     joints = []
     for joint in described:
@@ -155,7 +137,15 @@ def calibrated_robot(cell: Cell) -> CalibratedRobot:
         product_code = None if axis.identity is None else axis.identity.product_code
         drives.append(CalibratedDrive(axis.name, axis.node_id, vendor_id, product_code))
     motors = () if cell.chain is None else tuple(cell.chain.motors)
-    return CalibratedRobot(identity.kinematics_sha256, identity.drives_sha256, tuple(joints), tuple(drives), motors)
+    parents = [joint.parent for joint in described]
+    kinematics_sha256 = _sha256([_joints(cell), parents])
+    return CalibratedRobot(
+        kinematics_sha256, _drives_sha256(drives), tuple(joints), tuple(drives), motors
+    )
+
+
+def _drives_sha256(drives: Sequence[CalibratedDrive]) -> str:
+    return _sha256([astuple(drive) for drive in drives])
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,38 +156,88 @@ class RobotDifference:
     expected: str
 
 
-def robot_differences(found: CalibratedRobot | None, expected: CalibratedRobot | None) -> tuple[RobotDifference, ...]:
+def robot_differences(
+    found: CalibratedRobot | None, expected: CalibratedRobot | None
+) -> tuple[RobotDifference, ...]:
     """Name the joints and drives in which two robots differ; none for the same robot.
 
-    A number of a drive that one of the two leaves open differs from none. A calibration of an earlier version does not
-    say its robot (None), so that nothing differs.
+    This is the one rule for logs, plans and calibrations: the same axes, the same joints (name,
+    kind, parent, motor) in the same order, and the same drives (node id, vendor, product). A number
+    of a drive that one of the two leaves open differs from none.
+
+    Args:
+        found: robot of a file; None for a file of an earlier version that does not say it, so that
+            nothing differs. A plan of an earlier version has the digests alone.
+        expected: robot that is compared with.
     """
     if found is None or expected is None:
         return ()
+    if not found.joints:
+        return _differences_of_digests(found, expected)
     differences = []
-    if found.kinematics_sha256 != expected.kinematics_sha256:
-        for one, other in zip_longest(map(_joint_text, found.joints), map(_joint_text, expected.joints)):
-            if one != other:
-                differences.append(RobotDifference(one or "no further joint", other or "no further joint"))
-        if found.motors != expected.motors:
-            differences.append(RobotDifference(_motors_text(found.motors), _motors_text(expected.motors)))
+    found_joints = map(_joint_text, found.joints)
+    expected_joints = map(_joint_text, expected.joints)
+    for one, other in zip_longest(found_joints, expected_joints):
+        if one != other:
+            differences.append(
+                RobotDifference(one or "no further joint", other or "no further joint")
+            )
+    if found.motors != expected.motors:
+        differences.append(
+            RobotDifference(_motors_text(found.motors), _motors_text(expected.motors))
+        )
     by_axis = {drive.axis: drive for drive in expected.drives}
+    axes = [drive.axis for drive in found.drives]
+    if axes != list(by_axis):
+        differences.append(RobotDifference(f"axes {', '.join(axes)}", f"axes {', '.join(by_axis)}"))
     for drive in found.drives:
         if drive.axis in by_axis:
             differences += _differences_of_drives(drive, by_axis[drive.axis])
     return tuple(differences)
 
 
+def _differences_of_digests(
+    found: CalibratedRobot, expected: CalibratedRobot
+) -> tuple[RobotDifference, ...]:
+    """Compare the digests of a file that lists neither joints nor drives.
+
+    Numbers that its cell file left open then, on every axis, may be declared by now.
+    """
+    differences = []
+    if found.kinematics_sha256 != expected.kinematics_sha256:
+        text = "joints (names, kinds, parents or motors)"
+        differences.append(RobotDifference(f"other {text}", f"the same {text}"))
+    without_vendor = []
+    without_product = []
+    without_both = []
+    for drive in expected.drives:
+        without_vendor.append(replace(drive, vendor_id=None))
+        without_product.append(replace(drive, product_code=None))
+        without_both.append(replace(drive, vendor_id=None, product_code=None))
+    known = map(_drives_sha256, (expected.drives, without_vendor, without_product, without_both))
+    if found.drives_sha256 not in known:
+        text = "drives (node ids, vendors or product codes)"
+        differences.append(RobotDifference(f"other {text}", f"the same {text}"))
+    return tuple(differences)
+
+
 def _joint_text(joint: CalibratedJoint) -> str:
-    behind = f"behind {joint.parent}" if joint.parent else "on the base"
+    if joint.parent:
+        behind = f"behind {joint.parent}"
+    else:
+        behind = "on the base"
     return f"joint {joint.name} ({joint.kind}, {behind})"
 
 
 def _motors_text(motors: Sequence[str]) -> str:
-    return f"motors on {', '.join(motors)}" if motors else "a motor on every joint"
+    if motors:
+        return f"motors on {', '.join(motors)}"
+    return "a motor on every joint"
 
 
-def _differences_of_drives(found: CalibratedDrive, expected: CalibratedDrive) -> list[RobotDifference]:
+def _differences_of_drives(
+    found: CalibratedDrive, expected: CalibratedDrive
+) -> list[RobotDifference]:
     pairs = (
         ("node id", "d", found.node_id, expected.node_id),
         ("vendor id", "#x", found.vendor_id, expected.vendor_id),
@@ -207,31 +247,30 @@ def _differences_of_drives(found: CalibratedDrive, expected: CalibratedDrive) ->
     for label, form, one, other in pairs:
         if one is not None and other is not None and one != other:
             words = f"drive of {found.axis} with {label} "
-            differences.append(RobotDifference(words + format(one, form), words + format(other, form)))
+            differences.append(
+                RobotDifference(words + format(one, form), words + format(other, form))
+            )
     return differences
-
-
-def found_text(differences: Sequence[RobotDifference]) -> str:
-    """Join what was found of each difference; of many, the first ones and the number of the others."""
-    return _first_of([difference.found for difference in differences])
-
-
-def expected_text(differences: Sequence[RobotDifference]) -> str:
-    """Join what was expected of each difference, as `found_text`."""
-    return _first_of([difference.expected for difference in differences])
 
 
 _SHOWN = 3  #: Differences in a message
 
 
-def _first_of(texts: Sequence[str]) -> str:
-    more = len(texts) - _SHOWN
-    shown = "; ".join(texts[:_SHOWN])
-    return f"{shown}; and {more} more" if more > 0 else shown
+def found_text(differences: Sequence[RobotDifference]) -> str:
+    """Join what was found of each difference;
+    of many, the first ones and the number of the others.
+    """
+    return first_few([difference.found for difference in differences], _SHOWN)
+
+
+def expected_text(differences: Sequence[RobotDifference]) -> str:
+    """Join what was expected of each difference, as `found_text`."""
+    return first_few([difference.expected for difference in differences], _SHOWN)
 
 
 def mismatch_of_robot(calibration: Calibration, cell: Cell) -> Mismatch | None:
-    """Return in what the robot of a calibration is not that of a cell; None for the same one, or one that is not known.
+    """Return in what the robot of a calibration is not that of a cell;
+    None for the same one, or one that is not known.
 
     The name of the cell is not compared.
     """
@@ -251,7 +290,9 @@ def _sha256(content: object) -> str:
 
 
 def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:
-    """Return what shows that a calibration is of another cell, or of another robot; None for the same one."""
+    """Return what shows that a calibration is of another cell, or of another robot;
+    None for the same one.
+    """
     axes = tuple(gain.axis for gain in calibration.gains)
     if (cell.name, cell.axis_names) == (calibration.cell, axes):
         return mismatch_of_robot(calibration, cell)
@@ -262,7 +303,8 @@ def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | 
 
 
 def differing_sections(own: Cell, given: Cell) -> tuple[str, ...]:
-    """Name the sections in which two descriptions of one cell differ, as far as a recording or its fit needs them.
+    """Name the sections in which two descriptions of one cell differ,
+    as far as a recording or its fit needs them.
 
     Both have the same axes (`mismatch`).
     """
@@ -302,7 +344,11 @@ def _differing_axes(own: Sequence[CellAxis], given: Sequence[CellAxis]) -> list[
     sections = []
     for field in fields(CellAxis):
         pairs = zip(own, given, strict=True)
-        differing = [one.name for one, other in pairs if getattr(one, field.name) != getattr(other, field.name)]
+        differing = [
+            one.name
+            for one, other in pairs
+            if getattr(one, field.name) != getattr(other, field.name)
+        ]
         if differing:
             key = _KEYS.get(field.name, field.name)
             sections.append(f"axes.{key} ({', '.join(differing)})")
@@ -327,29 +373,20 @@ _KEYS = {"zero_offset_rad": "zero_offset", "profile": "drive profile", "unit": "
 def _joints(cell: Cell) -> tuple[str, ...]:
     """Return name and kind of every joint that moves."""
     joints = tuple(f"{joint.name} ({joint.kind.value})" for joint in read_urdf(cell.urdf).joints)
-    return joints if cell.chain is None else (*joints, f"with motors on {', '.join(cell.chain.motors)}")
-
-
-def _drive_of(own: CellAxis, given: CellAxis) -> tuple[tuple[str, int | None, int | None], ...]:
-    """Pairs of numbers that tell one drive from another; a number that one of the two leaves open is None."""
-    first = own.identity
-    second = given.identity
-    node = ("node id", own.node_id, given.node_id)
-    if first is None or second is None:
-        return (node,)
-    return (
-        node,
-        ("vendor id", first.vendor_id, second.vendor_id),
-        ("product code", first.product_code, second.product_code),
-        ("serial number", first.serial, second.serial),
-    )
+    if cell.chain is None:
+        return joints
+    return (*joints, f"with motors on {', '.join(cell.chain.motors)}")
 
 
 def _mismatch_of_axes(name: str, axes: tuple[str, ...], given: Cell) -> Mismatch | None:
     if name != given.name:
-        return Mismatch(f"a log of cell {name!r}", f"one of cell {given.name!r}, as in the given description")
+        return Mismatch(
+            f"a log of cell {name!r}", f"one of cell {given.name!r}, as in the given description"
+        )
     if axes != given.axis_names:
-        return Mismatch(f"axes {', '.join(axes)}", f"{', '.join(given.axis_names)}, as in the given description")
+        return Mismatch(
+            f"axes {', '.join(axes)}", f"{', '.join(given.axis_names)}, as in the given description"
+        )
     return None
 
 
@@ -363,8 +400,11 @@ def _mismatch_of_names(files: Mapping[str, bytes], given: Cell, name: str) -> Mi
     return _mismatch_of_axes(str(cell.get("name")), names or given.axis_names, given)
 
 
-def _mismatch_of_drives(own: Cell | None, given: Cell, serials: Sequence[int | None]) -> Mismatch | None:
-    """Compare the serial numbers that the drives reported at the recording with those of a description.
+def _mismatch_of_drives(
+    own: Cell | None, given: Cell, serials: Sequence[int | None]
+) -> Mismatch | None:
+    """Compare the serial numbers that the drives reported at the recording with those of a
+    description.
 
     Where the description in the log has a serial number, that one is compared (`mismatch`).
     """
@@ -378,5 +418,7 @@ def _mismatch_of_drives(own: Cell | None, given: Cell, serials: Sequence[int | N
 
 
 def _serial(axis: CellAxis) -> int | None:
-    """Serial number that a description gives to the drive of an axis; None where it leaves it open."""
+    """Serial number that a description gives to the drive of an axis;
+    None where it leaves it open.
+    """
     return None if axis.identity is None else axis.identity.serial

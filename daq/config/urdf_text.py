@@ -7,7 +7,11 @@ import re
 
 from daq.errors import ConfigurationInconsistent
 
-_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
 _DECLARED = re.compile(rb"""<\?xml[^>]*?\bencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 DEFAULTS = ("utf-8", "utf8")  #: The encoding of XML without a declaration
 DECLARATION_BYTES = 1024  #: An XML declaration ends within so many bytes
@@ -16,9 +20,10 @@ DECLARATION_BYTES = 1024  #: An XML declaration ends within so many bytes
 def urdf_text(data: bytes, name: str) -> str:
     """Return the text of a URDF.
 
-    A byte order mark decides on the encoding, then the XML declaration. Without either, or where UTF-8 is declared, it
-    is UTF-8, or Windows-1252 where the bytes are no UTF-8: many editors declare the one and save the other. White space
-    before the declaration, which XML forbids, is left out.
+    A byte order mark decides on the encoding, then the XML declaration. Without either, or where
+    UTF-8 is declared, it is UTF-8, or Windows-1252 where the bytes are no UTF-8: many editors
+    declare the one and save the other. White space before the declaration, which XML forbids, is
+    left out.
 
     Args:
         data: content of the file.
@@ -35,7 +40,9 @@ def urdf_text(data: bytes, name: str) -> str:
     except UnicodeDecodeError as error:
         if encoding.lower() in DEFAULTS:
             return data.decode("cp1252", errors="replace").lstrip()
-        raise _refused(name, f"byte {error.start} is not in the declared encoding {encoding!r}") from error
+        raise _refused(
+            name, f"byte {error.start} is not in the declared encoding {encoding!r}"
+        ) from error
 
 
 def _encoding_of(data: bytes) -> str:

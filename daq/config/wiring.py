@@ -1,7 +1,8 @@
 """The part of a cell file that finds its drives: buses, node ids, identities and profiles.
 
-`scan` is how the drives of a new cell are found, so a number that is missing or wrong elsewhere must not keep it from
-them. Where a cell file is refused, its wiring is read by itself, axis by axis.
+`scan` is how the drives of a new cell are found, so a number that is missing or wrong elsewhere
+must not keep it from them. Where a cell file is refused, its wiring is read by itself, axis by
+axis.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ class Wiring:
     name: str
     buses: tuple[Bus, ...]
     axes: tuple[AxisWiring, ...]  #: without those whose bus or node id is not known
-    fault: str  #: why every other verb refuses the file, apart from the profiles; empty where none does
+    #: why every other verb refuses the file, apart from the profiles; empty where none does
+    fault: str
 
 
 class _Lenient(StrictModel):
@@ -107,12 +109,17 @@ def _wiring_alone(path: Path, refused: ConfigurationError) -> Wiring:
     axes = list[AxisWiring]()
     taken = set[int]()
     for axis in model.axes:
-        bus = names[0] if axis.bus is None and len(names) == 1 else axis.bus
+        if axis.bus is None and len(names) == 1:
+            bus = names[0]
+        else:
+            bus = axis.bus
         if bus not in names or not _is_node_id(axis.node_id) or axis.node_id in taken:
             continue  # the refusal names it
         taken.add(axis.node_id)
         profile, fault = _profile_of(path, axis.drive)
-        axes.append(AxisWiring(axis.name, axis.node_id, bus, _identity_of(axis.identity), profile, fault))
+        axes.append(
+            AxisWiring(axis.name, axis.node_id, bus, _identity_of(axis.identity), profile, fault)
+        )
     of_profile = str(refused) in {axis.profile_fault for axis in axes}
     return Wiring(model.name, buses, tuple(axes), "" if of_profile else str(refused))
 

@@ -1,4 +1,6 @@
-"""`workspace` and `clearance` of a cell file: the room around the arm, its shape, and the obstacles."""
+"""`workspace` and `clearance` of a cell file:
+the room around the arm, its shape, and the obstacles.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ Point = tuple[float, float, float]
 class Clearance:
     """The room around the arm, in the types of `ident.planning.clearance`."""
 
-    workspace: Box | None  #: box for everything on the link with the payload, None if it is not declared
+    #: box for everything on the link with the payload, None if it is not declared
+    workspace: Box | None
     minimum_m: float  #: smallest distance [m]
     capsules: tuple[Capsule, ...]  #: shape of the arm; empty if it is not declared
     obstacles: tuple[Box, ...]  #: boxes in the base frame
@@ -63,22 +66,29 @@ class ClearanceSection:
 
 
 def clearance_of(
-    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, joints: Mapping[str, int]
+    workspace: WorkspaceSection | None,
+    clearance: ClearanceSection | None,
+    joints: Mapping[str, int],
 ) -> Clearance | None:
     """Convert the sections of the cell file; None if it has neither.
 
     Args:
         workspace, clearance: of the cell file.
-        joints: index of the joint that each axis drives by the name of the axis, and of each joint without a motor.
+        joints: index of the joint that each axis drives by the name of the axis, and of each joint
+            without a motor.
     """
     if workspace is None and clearance is None:
         return None
     declared = clearance or ClearanceSection()
     links = {BASE_LINK: BASE, **joints}
     return Clearance(
-        workspace=None if workspace is None else Box("workspace", workspace.lower_m, workspace.upper_m),
+        workspace=None
+        if workspace is None
+        else Box("workspace", workspace.lower_m, workspace.upper_m),
         minimum_m=declared.minimum_m,
-        capsules=tuple(Capsule(c.name, links[c.link], c.from_m, c.to_m, c.radius_m) for c in declared.capsules),
+        capsules=tuple(
+            Capsule(c.name, links[c.link], c.from_m, c.to_m, c.radius_m) for c in declared.capsules
+        ),
         obstacles=declared.obstacles,
     )
 

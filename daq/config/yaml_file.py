@@ -1,9 +1,11 @@
-"""Strict YAML: misspelt or duplicate keys and wrong types are refused with their line, never guessed.
+"""Strict YAML: misspelt or duplicate keys and wrong types are refused with their line,
+never guessed.
 
-A document has one schema: a `StrictModel` for the whole file, whose sections are plain frozen dataclasses wherever the
-file and the program mean the same. pydantic checks these dataclasses as strictly as the model they are in, and a
-constraint (`Annotated[float, Field(gt=0)]`) is part of the field's type. A section has a second class only where the
-program's shape differs: other units, absolute paths, objects of another package.
+A document has one schema: a `StrictModel` for the whole file, whose sections are plain frozen
+dataclasses wherever the file and the program mean the same. pydantic checks these dataclasses as
+strictly as the model they are in, and a constraint (`Annotated[float, Field(gt=0)]`) is part of the
+field's type. A section has a second class only where the program's shape differs: other units,
+absolute paths, objects of another package.
 
 A file that was given in the place of another is named by its kind (`DocumentKind`).
 """
@@ -24,15 +26,24 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, g
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
-from daq.errors import ConfigurationMissing, DaqError, SchemaMismatch, YamlInvalid, reason_of
+from daq.errors import (
+    ConfigurationMissing,
+    DaqError,
+    SchemaMismatch,
+    YamlInvalid,
+    first_few,
+    reason_of,
+)
 from daq.files import follow_links, read_regular
 
 Location = tuple[str | int, ...]
 MAX_BYTES = 4 * 2**20  #: Largest configuration [bytes]
 MAX_DEPTH = 40  #: Deepest nesting; more takes time and memory beyond the size of the file
-MAX_VALUES = 50_000  #: Largest number of keys and values; the largest shipped configuration has a hundredth of that
+#: Largest number of keys and values; the largest shipped configuration has a hundredth of that
+MAX_VALUES = 50_000
 MAX_BITS = 64  #: Longest integer: no object of an amplifier is longer
-MAX_EXPLAINED = 100  #: Faults for which the nearest known key is searched; a hostile file has tens of thousands
+#: Faults for which the nearest known key is searched; a hostile file has tens of thousands
+MAX_EXPLAINED = 100
 MAX_SHOWN = 8  #: Faults listed in one message
 _NOT_IN_FILE = "\0"
 
@@ -54,7 +65,7 @@ if TYPE_CHECKING:
     FilePath = Path
 else:
     FilePath = Annotated[FileName, AfterValidator(_beside)]
-    """A path relative to the file that names it; absolute where `read_model` knows the folder of that file."""
+    """A path relative to the file that names it; absolute where `read_model` knows the folder of that file."""  # noqa: E501
 
 
 class DocumentKind(Enum):
@@ -87,7 +98,9 @@ KEYS = {
     DocumentKind.SIMULATION: {"urdf", "ratio", "axes"},
     DocumentKind.SCENARIO: {"faults"},
 }
-"""Keys that a file of a kind has, and of those before it no other; the first kind that fits counts."""
+"""Keys that a file of a kind has, and of those before it no other;
+the first kind that fits counts.
+"""
 MAGIC_OF_LOGS = b"\x89MCAP"
 
 
@@ -102,14 +115,19 @@ def kind_of_tree(tree: object) -> DocumentKind | None:
 
 
 def kind_of_head(content: bytes) -> DocumentKind | None:
-    """Return the kind of a file that is no YAML, by its first bytes; None for one of no known kind."""
+    """Return the kind of a file that is no YAML, by its first bytes;
+    None for one of no known kind.
+    """
     if content.startswith(MAGIC_OF_LOGS):
         return DocumentKind.LOG
     head = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
-    return DocumentKind.URDF if head.startswith(b"<") and b"<robot" in head else None
+    if head.startswith(b"<") and b"<robot" in head:
+        return DocumentKind.URDF
+    return None
 
 
-IN_ORDER = "give the files in the order of the command's help"  #: Remedy for a file in the place of another
+#: Remedy for a file in the place of another
+IN_ORDER = "give the files in the order of the command's help"
 
 
 class StrictModel(BaseModel):
@@ -118,8 +136,11 @@ class StrictModel(BaseModel):
     A schema is built when its first document is read: most programs read few of the kinds.
     """
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
-    reference: ClassVar[str] = ""  #: page of docs/reference with every key, for a file that people write
+    model_config = ConfigDict(
+        strict=True, extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
+    )
+    #: page of docs/reference with every key, for a file that people write
+    reference: ClassVar[str] = ""
     document_kind: ClassVar[DocumentKind | None] = (
         None  #: of a whole file; None for a section, and for a file of programs alone
     )
@@ -137,7 +158,9 @@ class Document:
     lines: dict[Location, int]  #: line number of every value, from 1, by its path
 
     def where(self, path: Location) -> str:
-        """Return 'FILE:LINE: axes[3].limits', with the line of the nearest ancestor that is in the file."""
+        """Return 'FILE:LINE: axes[3].limits', with the line of the nearest ancestor that is in the
+        file.
+        """
         known = path
         while known not in self.lines and known:
             known = known[:-1]
@@ -173,20 +196,24 @@ _CORE_SCALARS = (
 )
 for _tag, _pattern, _first in _CORE_SCALARS:
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
-_TAGS = {f"tag:yaml.org,2002:{tag}" for tag in ("null", "bool", "int", "float", "str", "map", "seq")}
+_TAGS = {
+    f"tag:yaml.org,2002:{tag}" for tag in ("null", "bool", "int", "float", "str", "map", "seq")
+}
 
 
 @lru_cache(maxsize=16)
 def parse_yaml(text: bytes, name: str) -> Document:
-    """Parse one YAML document. A cell reads its files for their names, their content and their digest: once is enough.
+    """Parse one YAML document.
+
+    A cell reads its files for their names, their content and their digest: once is enough.
 
     Args:
         text: content of the file.
         name: name of the file in messages.
 
     Raises:
-        YamlInvalid: not a single YAML document; duplicate keys, aliases, tags or keys that are not text; too large, too
-            deep, or too many values.
+        YamlInvalid: not a single YAML document; duplicate keys, aliases, tags or keys that are not
+            text; too large, too deep, or too many values.
     """
     if len(text) > MAX_BYTES:
         raise YamlInvalid(
@@ -204,7 +231,10 @@ def parse_yaml(text: bytes, name: str) -> Document:
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
-            tree = None if node is None else _convert(loader, node, (), name, lines)
+            if node is None:
+                tree = None
+            else:
+                tree = _convert(loader, node, (), name, lines)
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
@@ -217,7 +247,8 @@ def parse_yaml(text: bytes, name: str) -> Document:
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise YamlInvalid(
             name,
-            found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'nesting too deep'}",
+            found=f"{type(error).__name__}: "
+            f"{str(error).splitlines()[0] if str(error) else 'nesting too deep'}",
             expected="one YAML document in UTF-8",
             remedy="is this the right file?",
         ) from error
@@ -236,17 +267,27 @@ def _check_events(text: bytes, name: str) -> None:
     for event, depth, values in yaml_events(text):
         where = f"{name}:{_line(event.start_mark)}"
         if isinstance(event, yaml.AliasEvent):
-            raise YamlInvalid(where, found="an alias (*name)", expected="plain values", remedy="write the value out")
+            raise YamlInvalid(
+                where,
+                found="an alias (*name)",
+                expected="plain values",
+                remedy="write the value out",
+            )
         if depth > MAX_DEPTH:
             found = f"more than {MAX_DEPTH} lists in lists"
-            raise YamlInvalid(where, found=found, expected="plain values", remedy="is this the right file?")
+            raise YamlInvalid(
+                where, found=found, expected="plain values", remedy="is this the right file?"
+            )
         if values > MAX_VALUES:
             found = f"more than {MAX_VALUES} values"
-            raise YamlInvalid(where, found=found, expected="a configuration", remedy="is this the right file?")
+            raise YamlInvalid(
+                where, found=found, expected="a configuration", remedy="is this the right file?"
+            )
 
 
 def yaml_events(text: bytes) -> Iterator[tuple[yaml.Event, int, int]]:
-    """Yield each event of a YAML text, with the depth of nesting and the number of keys and values so far.
+    """Yield each event of a YAML text, with the depth of nesting and the number of keys and values
+    so far.
 
     libyaml needs a fraction of a second for a text of which a tree would take minutes.
 
@@ -271,12 +312,16 @@ def _line(mark: Any) -> int | str:
 
 
 def not_in_file(kind: str) -> str:
-    """Return the tag of one kind of value where a key allows several: a part of pydantic's path, not of the file's."""
+    """Return the tag of one kind of value where a key allows several:
+    a part of pydantic's path, not of the file's.
+    """
     return _NOT_IN_FILE + kind
 
 
 def kind_of_file(path: Path) -> DocumentKind | None:
-    """Return the kind of a file, for a message; None for one that cannot be read, and for one of no known kind."""
+    """Return the kind of a file, for a message;
+    None for one that cannot be read, and for one of no known kind.
+    """
     try:
         content = read_regular(path, MAX_BYTES)
     except OSError:
@@ -294,13 +339,15 @@ def read_yaml_bytes(path: Path) -> bytes:
     """Read a configuration file of at most MAX_BYTES.
 
     Raises:
-        ConfigurationMissing: the file does not exist, is not a regular file, is too large, or cannot be read.
+        ConfigurationMissing: the file does not exist, is not a regular file, is too large, or
+            cannot be read.
     """
     return read_file(
         path,
         ConfigurationMissing,
         expected=f"a readable, regular file of at most {MAX_BYTES} bytes",
-        remedy="check the name; it is relative to the file that names it, on a command line to the current folder",
+        remedy="check the name; it is relative to the file that names it, on a command line to the "
+        "current folder",
     )
 
 
@@ -308,7 +355,8 @@ def read_file(path: Path, missing: type[DaqError], *, expected: str, remedy: str
     """Read a file of at most MAX_BYTES that a person named; a pipe or device is not waited for.
 
     Raises:
-        DaqError: of the class `missing`, where it does not exist, is no regular file, is too large, or cannot be read.
+        DaqError: of the class `missing`, where it does not exist, is no regular file, is too large,
+            or cannot be read.
     """
     try:
         return read_regular(path, MAX_BYTES)
@@ -326,13 +374,18 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
         folder: folder of the file, which makes each `FilePath` in it absolute.
 
     Raises:
-        SchemaMismatch: with every unknown key, missing key and wrong type, its line and the nearest known key.
+        SchemaMismatch: with every unknown key, missing key and wrong type, its line and the nearest
+            known key.
     """
     try:
-        # Through JSON, where a list may become a tuple and a word an enum although everything else is strict.
+        # Through JSON, where a list may become a tuple and a word an enum although everything else
+        # is strict.
         return model.model_validate_json(json.dumps(document.tree), context=folder)
     except ValidationError as error:
-        page = f"; docs/reference/{model.reference} has every key" if model.reference else ""
+        if model.reference:
+            page = f"; docs/reference/{model.reference} has every key"
+        else:
+            page = ""
         kind = kind_of_tree(document.tree)
         if model.document_kind is not None and kind not in (None, model.document_kind):
             raise SchemaMismatch(
@@ -342,10 +395,15 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
                 remedy=f"{IN_ORDER} (CELL comes first){page}",
             ) from error
         required = [name for name, field in model.model_fields.items() if field.is_required()]
-        if len(required) > 1 and isinstance(document.tree, dict) and not document.tree.keys() & set(required):
+        if (
+            len(required) > 1
+            and isinstance(document.tree, dict)
+            and not document.tree.keys() & set(required)
+        ):
             raise SchemaMismatch(
                 document.name,
-                found=f"a file of another kind, with {', '.join(list(document.tree)[:MAX_EXPLAINED]) or 'no key'}",
+                found="a file of another kind, with "
+                f"{', '.join(list(document.tree)[:MAX_EXPLAINED]) or 'no key'}",
                 expected=f"a file with {', '.join(required)}",
                 remedy=f"{IN_ORDER} (CELL comes first){page}",
             ) from error
@@ -364,10 +422,19 @@ def fault_texts(document: Document, faults: list[Fault]) -> dict[str, str]:
     """Return subject, found and expected of an error with these faults, one a line."""
     if len(faults) == 1:
         only = faults[0]
-        return {"subject": document.where(only.path), "found": only.found, "expected": only.expected}
-    shown = [f"\n  {document.where(f.path)}: found {f.found}; expected {f.expected}" for f in faults[:MAX_SHOWN]]
-    more = f"\n  and {len(faults) - MAX_SHOWN} more" if len(faults) > MAX_SHOWN else ""
-    return {"subject": document.name, "found": f"{len(faults)} faults{''.join(shown)}{more}", "expected": "none"}
+        return {
+            "subject": document.where(only.path),
+            "found": only.found,
+            "expected": only.expected,
+        }
+    new_line = "\n  "
+    texts = [f"{document.where(f.path)}: found {f.found}; expected {f.expected}" for f in faults]
+    listed = first_few(texts, MAX_SHOWN, separator=new_line)
+    return {
+        "subject": document.name,
+        "found": f"{len(faults)} faults{new_line}{listed}",
+        "expected": "none",
+    }
 
 
 def yaml_text(path: Location) -> str:
@@ -376,8 +443,12 @@ def yaml_text(path: Location) -> str:
     return text.lstrip(".") or "the whole file"
 
 
-def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines: dict[Location, int]) -> Any:
-    """Convert a node to plain Python and note its lines; refuse YAML features that a configuration must not use."""
+def _convert(
+    loader: _Loader, node: yaml.Node, path: Location, name: str, lines: dict[Location, int]
+) -> Any:
+    """Convert a node to plain Python and note its lines;
+    refuse YAML features that a configuration must not use.
+    """
     line = node.start_mark.line + 1
     lines[path] = line
     if node.tag not in _TAGS:
@@ -390,7 +461,10 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
     if isinstance(node, yaml.MappingNode):
         mapping: dict[str, Any] = {}
         for key_node, value_node in node.value:
-            key = loader.construct_object(key_node) if isinstance(key_node, yaml.ScalarNode) else None
+            if isinstance(key_node, yaml.ScalarNode):
+                key = loader.construct_object(key_node)
+            else:
+                key = None
             if not isinstance(key, str):
                 raise YamlInvalid(
                     f"{name}:{key_node.start_mark.line + 1}: {yaml_text(path)}",
@@ -409,7 +483,9 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
             lines[*path, key] = key_node.start_mark.line + 1
         return mapping
     if isinstance(node, yaml.SequenceNode):
-        return [_convert(loader, child, (*path, i), name, lines) for i, child in enumerate(node.value)]
+        return [
+            _convert(loader, child, (*path, i), name, lines) for i, child in enumerate(node.value)
+        ]
     value = loader.construct_object(node)
     if isinstance(value, int) and value.bit_length() > MAX_BITS:
         raise YamlInvalid(
@@ -427,22 +503,39 @@ def _fault(item: Any, model: type[BaseModel]) -> Fault:
     if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
         known = _known_keys(model, path[:-1])
         near = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
-        hint = f"{near[0]} (did you mean that?)" if near else f"one of {', '.join(known)}"
+        if near:
+            hint = f"{near[0]} (did you mean that?)"
+        else:
+            hint = f"one of {', '.join(known)}"
         return Fault(path, f"unknown key {path[-1]!r}", hint)
     if item["type"] == "missing":
         return Fault(path, "nothing", "this key, it is required")
-    expected = re.sub(r"^\w+ should (be|have) |^Value error, | after validation, not .*$", "", item["msg"])
+    expected = re.sub(
+        r"^\w+ should (be|have) |^Value error, | after "
+        r"validation, not .*$",
+        "",
+        item["msg"],
+    )
     return Fault(path, _show(item["input"]), expected)
 
 
 def _show(value: Any) -> str:
-    kind = {str: "text", bool: "truth value", int: "integer", float: "number", list: "list", dict: "mapping"}
+    kind = {
+        str: "text",
+        bool: "truth value",
+        int: "integer",
+        float: "number",
+        list: "list",
+        dict: "mapping",
+    }
     text = json.dumps(value)
     return f"{kind.get(type(value), 'nothing')} {text if len(text) <= 60 else text[:57] + '...'}"
 
 
 def _known_keys(model: type[BaseModel], path: Location) -> list[str]:
-    """List the keys that the schema has at a path; list positions and names of a free mapping are skipped."""
+    """List the keys that the schema has at a path;
+    list positions and names of a free mapping are skipped.
+    """
     current: type[Any] = model
     for part in path:
         if isinstance(part, str) and part in (keys := _keys(current)):
@@ -460,7 +553,9 @@ def _keys(section: type[Any]) -> dict[str, Any]:
 
 def _nested(annotation: Any) -> type[Any] | None:
     """Find the first section in an annotation such as `tuple[Section, ...] | None`."""
-    if isinstance(annotation, type) and (dataclasses.is_dataclass(annotation) or issubclass(annotation, BaseModel)):
+    if isinstance(annotation, type) and (
+        dataclasses.is_dataclass(annotation) or issubclass(annotation, BaseModel)
+    ):
         return annotation
     found = (_nested(argument) for argument in get_args(annotation))
     return next((section for section in found if section is not None), None)

@@ -1,4 +1,6 @@
-"""The cell as a console knows it now: curves, states, events and losses, as the feed brings them; and the stop."""
+"""The cell as a console knows it now: curves, states, events and losses, as the feed brings them;
+and the stop.
+"""
 
 from __future__ import annotations
 
@@ -46,23 +48,27 @@ READ_S = 0.03  #: Time between two looks at the feed
 LARGEST_TURN = 100  #: Packets at one look; requests are answered between two
 RATE_S = 0.1  #: Shortest time over which a rate of samples is taken
 RETRY_S = 0.5  #: Time between two tries to find a feed
-OLD_S = {"running": 2.0, "watching": 65.0}  #: Silence after which values are old; readings of a monitor are rare
+#: Silence after which values are old; readings of a monitor are rare
+OLD_S = {"running": 2.0, "watching": 65.0}
 STOP_ACCEPTED_S = 3.0  #: Time for the recorder's answer to a stop
 STOP_ENDED_S = 60.0  #: Time until the recorder must have ended
 
 GONE = (
-    "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by themselves where they "
-    "supervise its heartbeat (1016h); look at the robot, and use the emergency stop if it moves"
+    "the recorder is gone without a word: it was killed or has crashed. The amplifiers stop by "
+    "themselves where they supervise its heartbeat (1016h); look at the robot, and use the "
+    "emergency stop if it moves"
 )
 HANGS = (
-    "The recorder is held, or waits for disk or bus; the amplifiers stop by themselves where they supervise its "
-    "heartbeat (1016h). If the robot moves, use the emergency stop"
+    "The recorder is held, or waits for disk or bus; the amplifiers stop by themselves where they "
+    "supervise its heartbeat (1016h). If the robot moves, use the emergency stop"
 )
 UNKNOWN = "this page could not follow the recorder, and does not know how it ended"
 
 
 class Ring:
-    """The last entries of a growing list; readers keep the number of the next entry that they have not seen."""
+    """The last entries of a growing list; readers keep the number of the next entry that they have
+    not seen.
+    """
 
     def __init__(self, size: int) -> None:
         self.end = 0  #: Number of entries ever
@@ -109,7 +115,9 @@ class Reader:
 class Live:
     """The cell as the feed shows it. All of it runs in one event loop."""
 
-    def __init__(self, cell_file: Path, cell: Cell, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, cell_file: Path, cell: Cell, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.cell = cell
         self._clock = clock  # [s]
         self.calibration: Calibration | None = None
@@ -205,7 +213,9 @@ class Live:
         self._unfit = ""
 
     def _shown(self, event: CellEvent) -> dict[str, Any]:
-        """Return an event for the page: time since the start of the run, axis by name, and the remedy."""
+        """Return an event for the page: time since the start of the run, axis by name,
+        and the remedy.
+        """
         if self.origin_ns is None:
             self.origin_ns = event.time_ns
         if event.kind is EventKind.MOVE_END:
@@ -234,12 +244,16 @@ class Live:
         if self._predictor is not None and not self.remark:
             self._predict(samples, position, current, float(times[-1]))
 
-    def _predict(self, samples: Any, position: FloatArray, current: FloatArray, last_s: float) -> None:
+    def _predict(
+        self, samples: Any, position: FloatArray, current: FloatArray, last_s: float
+    ) -> None:
         assert self._predictor is not None and self.run is not None
         cycle = samples["cycle"].astype(np.int64)
         complete = samples["missing"] == 0
         try:
-            for rows in self._predictor.take(cycle[complete], position[complete], current[complete]):
+            for rows in self._predictor.take(
+                cycle[complete], position[complete], current[complete]
+            ):
                 cycles_ago = cycle[-1] - rows.cycle
                 times = last_s - cycles_ago / self.run.rate_hz
                 curves = np.column_stack((times, rows.predicted, rows.residual))
@@ -342,7 +356,9 @@ class Live:
 
     @property
     def _is_simulated(self) -> bool:
-        """Whether the cell runs in lockstep: as fast as its computer can, in simulated time, on no real bus."""
+        """Whether the cell runs in lockstep: as fast as its computer can, in simulated time,
+        on no real bus.
+        """
         return self.cell.sync is not None and self.cell.sync.pacing is PacingMode.LOCKSTEP
 
     @property
@@ -365,7 +381,9 @@ class Live:
         return self._free
 
     async def follow(self) -> None:
-        """Follow the recorders of the cell, one after the other, for ever, and a monitor while there is none."""
+        """Follow the recorders of the cell, one after the other, for ever,
+        and a monitor while there is none.
+        """
         names = socket_names(self._file)
         while True:
             for name, phase in ((names.feed, "running"), (names.monitor, "watching")):
@@ -380,7 +398,9 @@ class Live:
             await asyncio.sleep(RETRY_S)
 
     async def _read(self, connection: socket.socket, phase: str) -> None:
-        """Follow one program until it ends, or until it sends what does not fit: `follow` then tries again."""
+        """Follow one program until it ends, or until it sends what does not fit:
+        `follow` then tries again.
+        """
         if not (self._unfit and self.phase == phase):  # else it is the same program again
             self._clear(phase, None)
             if phase == "running":
@@ -402,7 +422,10 @@ class Live:
         program = "monitor"
         if phase == "running":
             program = "recorder"
-        self._unfit = f"This page cannot show the {program}: {error}. Restart the console, with the same drivegain"
+        self._unfit = (
+            f"This page cannot show the {program}: {error}. Restart the console, with "
+            "the same drivegain"
+        )
 
     async def _take_all(self, connection: socket.socket, phase: str) -> None:
         """Take what has come every READ_S: waiting for each packet would cost as much as taking it.
@@ -433,7 +456,9 @@ class Live:
             await asyncio.sleep(READ_S)
 
     async def stop(self) -> dict[str, Any]:
-        """Ask the recorder to stop its axes, and return its answer; how it ended comes later, in `stop_state`."""
+        """Ask the recorder to stop its axes, and return its answer;
+        how it ended comes later, in `stop_state`.
+        """
         asked = time.strftime("%H:%M:%S")
         place = socket_names(self._file).stop
         recorder = self._recorder

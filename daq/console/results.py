@@ -1,7 +1,8 @@
-"""Results in the files of a cell after a run: gains, report, history and drift, proposals with the command to type.
+"""Results in the files of a cell after a run:
+gains, report, history and drift, proposals with the command to type.
 
-Everything is read, and nothing written. The places are those of the cell file and of the command line; a browser names
-none of them.
+Everything is read, and nothing written. The places are those of the cell file and of the command
+line; a browser names none of them.
 """
 
 from __future__ import annotations
@@ -29,7 +30,15 @@ from ident.errors import IdentificationError
 
 LARGEST_REPORT_BYTES = 64 << 20
 #: Errors of reading files, also of those whose content no reader expected
-UNREADABLE = (DaqError, IdentificationError, OSError, ValueError, LookupError, TypeError, ArithmeticError)
+UNREADABLE = (
+    DaqError,
+    IdentificationError,
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+)
 
 
 class Results:
@@ -43,7 +52,9 @@ class Results:
         report: Path | None = None,
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
-        """Store the places that may be read; calibration and folder of the report are those of the command line."""
+        """Store the places that may be read; calibration and folder of the report are those of the
+        command line.
+        """
         self._cell_file = cell_file
         self._cell = cell
         self._calibration = calibration
@@ -52,7 +63,8 @@ class Results:
         self._read: dict[Path, tuple[tuple[int, int], Calibration]] = {}
 
     def calibration(self) -> tuple[Path, Calibration] | None:
-        """Return the calibration of the command line, else that of the newest session; None without either.
+        """Return the calibration of the command line, else that of the newest session;
+        None without either.
 
         Raises:
             DaqError: it cannot be read.
@@ -74,14 +86,18 @@ class Results:
         return path, calibration
 
     def report(self) -> bytes | None:
-        """Return the page of the report, that of the command line or of the newest session; None without one."""
+        """Return the page of the report, that of the command line or of the newest session;
+        None without one.
+        """
         path = self._report_path()
         if path is None or path.stat().st_size > LARGEST_REPORT_BYTES:
             return None
         return path.read_bytes()
 
     def document(self) -> dict[str, Any]:
-        """Return everything for the page; a file that cannot be read is a sentence in `problems`."""
+        """Return everything for the page;
+        a file that cannot be read is a sentence in `problems`.
+        """
         problems: list[str] = []
         has_report = self._report_path() is not None
         found: dict[str, Any] = {"problems": problems, "report": has_report}
@@ -103,7 +119,9 @@ class Results:
         return found
 
     def _newest(self) -> Session | None:
-        """Return the session of the job or of `calibrate` that was begun last; None without either."""
+        """Return the session of the job or of `calibrate` that was begun last;
+        None without either.
+        """
         candidates = (self._newest_job(), self._newest_guided())
         found = [session for session in candidates if session is not None]
         return max(found, key=lambda session: session.began, default=None)
@@ -193,7 +211,9 @@ class Results:
         }
 
     def _guided(self) -> dict[str, Any] | None:
-        """Return where the newest session of `calibrate` is, and σ of each gain after each block."""
+        """Return where the newest session of `calibrate` is,
+        and σ of each gain after each block.
+        """
         newest = self._newest_guided()
         if newest is None or not isinstance(newest.state, GuidedState):
             return None
@@ -266,7 +286,9 @@ def _axis_history(series: Series) -> dict[str, Any]:
 
 
 def _precision(cell: Cell, state: GuidedState) -> dict[str, Any]:
-    """Return σ of each gain after each judged block, its target, the motion that is left, and why it is."""
+    """Return σ of each gain after each judged block, its target, the motion that is left,
+    and why it is.
+    """
     worst = max(state.gains, key=lambda gain: gain.std_percent / gain.target_percent)
     last = state.progress[-1]
     judged = state.blocks[: last.blocks]

@@ -1,9 +1,9 @@
 """The page on 127.0.0.1: who may read it, and its few addresses.
 
-Every address begins with a random token. A request passes only under the host of this server (a name that was bound
-to 127.0.0.1 by DNS rebinding is another host), and with the origin of this page where a browser names one. The content
-security policy allows this server's own files alone. No address carries a path of a file. The only thing that a browser
-can do is to stop the recorder.
+Every address begins with a random token. A request passes only under the host of this server (a
+name that was bound to 127.0.0.1 by DNS rebinding is another host), and with the origin of this page
+where a browser names one. The content security policy allows this server's own files alone. No
+address carries a path of a file. The only thing that a browser can do is to stop the recorder.
 """
 
 from __future__ import annotations
@@ -39,10 +39,12 @@ LARGEST_READERS = 8  #: Pages that are served curves at the same time
 CONNECTIONS = 64  #: Without a request at the same time
 REQUEST_S = 5.0  #: Time for the first request of a connection
 POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' "
+    "data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-REPORT_POLICY = "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'"
+REPORT_POLICY = (
+    "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-ancestors 'none'"
+)
 HEADERS = {
     "content-security-policy": POLICY,
     "cache-control": "no-store",
@@ -54,7 +56,9 @@ HEADERS = {
 
 
 class Guard:
-    """Refuses requests of other hosts, other origins and without the token, before anything else sees them."""
+    """Refuses requests of other hosts, other origins and without the token,
+    before anything else sees them.
+    """
 
     def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
         self._app = app
@@ -91,14 +95,17 @@ class Guard:
         hosts = headers.getlist("host")
         origins = headers.getlist("origin")
         if len(hosts) != 1 or hosts[0] not in self._hosts:
-            return PlainTextResponse("this server has another name: open the address that was printed", 421)
+            return PlainTextResponse(
+                "this server has another name: open the address that was printed", 421
+            )
         own = {f"http://{host}" for host in self._hosts}
         site = headers.get("sec-fetch-site", "none")
         is_foreign = not set(origins) <= own or site not in ("none", "same-origin")
         is_anonymous_post = scope["method"] == "POST" and not origins
         if is_foreign or is_anonymous_post:
             return PlainTextResponse("only the console's own page may ask", 403)
-        token = scope["path"].removeprefix("/").partition("/")[0]  # "*" is a path as well (RFC 9112, OPTIONS)
+        # "*" is a path as well (RFC 9112, OPTIONS)
+        token = scope["path"].removeprefix("/").partition("/")[0]
         if hmac.compare_digest(token.encode(), self._token):
             return None
         return PlainTextResponse("not found", 404)
@@ -150,7 +157,10 @@ class Page:
     def _note_end(self, task: asyncio.Task[None]) -> None:
         if not task.cancelled():
             cause = repr(task.exception())
-            self._live.failed = f"A part of this console has ended ({cause}), so this page is old: restart the console"
+            self._live.failed = (
+                f"A part of this console has ended ({cause}), so this page is old: restart the "
+                "console"
+            )
 
     async def _look(self) -> None:
         """Look at the files again and again."""
@@ -163,7 +173,10 @@ class Page:
             try:
                 self._document = await asyncio.to_thread(self._results.document)
             except UNREADABLE as error:
-                self._document = {"problems": [f"the results cannot be read: {error}"], "report": False}
+                self._document = {
+                    "problems": [f"the results cannot be read: {error}"],
+                    "report": False,
+                }
             await asyncio.sleep(RESULTS_S)
 
     @staticmethod
@@ -190,14 +203,20 @@ class Page:
             content = await asyncio.to_thread(self._results.report)
             if content is not None:
                 # Its own styles and pictures are inside; a script would not run.
-                return Response(content, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
+                return Response(
+                    content,
+                    media_type="text/html",
+                    headers={"content-security-policy": REPORT_POLICY},
+                )
         return PlainTextResponse("there is no report yet", 404)
 
     async def _stop(self, _: Request) -> Response:
         return JSONResponse(await self._live.stop())
 
     async def _curves(self, _: Request) -> Response:
-        """Everything that changes, as server-sent events; a page that does not read gets less, and delays no other."""
+        """Everything that changes, as server-sent events;
+        a page that does not read gets less, and delays no other.
+        """
         if self._readers >= LARGEST_READERS:
             return PlainTextResponse(f"{LARGEST_READERS} pages are open already: close one", 503)
         return _Curves(self._messages(), self._count)
@@ -213,7 +232,10 @@ class Page:
             begun, news = reader.news()
             message: dict[str, Any] = {**news}
             if begun:
-                message["run"] = None if live.run is None else asdict(live.run)
+                if live.run is None:
+                    message["run"] = None
+                else:
+                    message["run"] = asdict(live.run)
             status = _json(live.status())
             if message or status != before:
                 before = status
@@ -248,7 +270,8 @@ class _Curves(StreamingResponse):
 
 
 class _Connection(H11Protocol):
-    """A connection that is closed where no request comes: any program of this computer may open as many as it likes.
+    """A connection that is closed where no request comes:
+    any program of this computer may open as many as it likes.
 
     A limit of all connections would refuse the page's stop while others hold them.
     """
@@ -258,7 +281,9 @@ class _Connection(H11Protocol):
         super().connection_made(cast("asyncio.Transport", transport))
         self._begun_s = self.loop.time()
         self.loop.call_later(REQUEST_S, self._close_unasked)
-        waiting = [one for one in self.connections if isinstance(one, _Connection) and not one.headers]
+        waiting = [
+            one for one in self.connections if isinstance(one, _Connection) and not one.headers
+        ]
         if len(waiting) > CONNECTIONS:
             longest = min(waiting, key=lambda one: one._begun_s)
             longest._close_unasked()
@@ -304,7 +329,9 @@ def hosts_of(port: int) -> frozenset[str]:
 
 
 def server_of(page: Page, token: str, port: int) -> uvicorn.Server:
-    """Return a server of plain HTTP/1.1; when it ends, it waits a second for pages that do not read."""
+    """Return a server of plain HTTP/1.1;
+    when it ends, it waits a second for pages that do not read.
+    """
     config = uvicorn.Config(
         page.app(token, hosts_of(port)),
         log_level="critical",  # a page that was cut off at the end is no error

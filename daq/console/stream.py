@@ -1,11 +1,12 @@
 """The curves as a stream for Foxglove, which shows them live next to its 3-D view of the arm.
 
-The topics are those of a log: `/joint_states`, `/cell/currents`, `/cell/events` and `/robot_description`; with a
-calibration also `/cell/predicted` and `/cell/residual`, which a log does not have. The layout in `configs/viewers`
-serves both: panels of `/cell/samples`, raw numbers that only a log has, stay empty here. Values come at the rate of the
-page's curves; a velocity is the mean since the value before. The stream can only be read. It has no token: the protocol
-of Foxglove knows none, and its server accepts any origin, so that every program and every page on this computer can
-read it.
+The topics are those of a log: `/joint_states`, `/cell/currents`, `/cell/events` and
+`/robot_description`; with a calibration also `/cell/predicted` and `/cell/residual`, which a log
+does not have. The layout in `configs/viewers` serves both: panels of `/cell/samples`, raw numbers
+that only a log has, stay empty here. Values come at the rate of the page's curves; a velocity is
+the mean since the value before. The stream can only be read. It has no token: the protocol of
+Foxglove knows none, and its server accepts any origin, so that every program and every page on this
+computer can read it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
+"""`calibration.yaml`, the result of a fit:
+written whole, read strictly, and every edit by hand is detected.
 
-The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`,
-`Diagnosis`, `CalibratedRobot`) are read as the classes of `ident`.
+The file adds percentages for people and writes NaN as null. Sections without such a difference
+(`Source`, `Recording`, `Diagnosis`, `CalibratedRobot`) are read as the classes of `ident`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
+from daq.arguments import A_FILE_TO_WRITE, A_LIST, A_PATH, checks_arguments, of_kind
 from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
 from daq.config.yaml_file import (
     IN_ORDER,
@@ -29,7 +31,13 @@ from daq.config.yaml_file import (
     read_file,
     read_model,
 )
-from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
+from daq.errors import (
+    CalibrationMissing,
+    CalibrationRefused,
+    CalibrationUnreadable,
+    SchemaMismatch,
+    YamlInvalid,
+)
 from daq.files import replace_file
 from ident.calibration import (
     AcceptedEffect,
@@ -61,17 +69,25 @@ _FILTER_BOUNDS = {
 }
 
 
-def _check_filter(found: dict[str, int | float | list[float]]) -> dict[str, int | float | list[float]]:
-    """Check the settings that a filter is made of: one of order 10⁹, or of 10⁻³⁰⁰ Hz, takes all memory."""
+def _check_filter(
+    found: dict[str, int | float | list[float]],
+) -> dict[str, int | float | list[float]]:
+    """Check the settings that a filter is made of:
+    one of order 10⁹, or of 10⁻³⁰⁰ Hz, takes all memory.
+    """
     for name, (least, most) in _FILTER_BOUNDS.items():
         values = found.get(name, [])
-        if not all(least <= value <= most for value in (values if isinstance(values, list) else [values])):
+        if not all(
+            least <= value <= most for value in (values if isinstance(values, list) else [values])
+        ):
             raise ValueError(f"{name} from {least:g} to {most:g}")
     return found
 
 
 class GainEntry(StrictModel):
-    """One drive gain with its nameplate; the percentages are for people, `change_percent` from the nameplate."""
+    """One drive gain with its nameplate; the percentages are for people,
+    `change_percent` from the nameplate.
+    """
 
     axis: str
     value: _Number
@@ -198,7 +214,9 @@ class FullSetEntry(StrictModel):
 
 
 class CalibrationBody(StrictModel):
-    """Schema of a calibration, without the envelope of a file; its keys are in the order of `Calibration`."""
+    """Schema of a calibration, without the envelope of a file;
+    its keys are in the order of `Calibration`.
+    """
 
     cell: str
     method: str
@@ -232,11 +250,14 @@ class CalibrationBody(StrictModel):
         axes = [gain.axis for gain in self.gains]
         for one in self.payload_mass:
             if [influence.axis for influence in one.gains] != axes:
-                raise ValueError(f"payload_mass of {one.payload} with an entry for each of the axes {', '.join(axes)}")
+                raise ValueError(
+                    f"payload_mass of {one.payload} with an entry for each of the axes "
+                    f"{', '.join(axes)}"
+                )
             if one.parameters_per_kg and len(one.parameters_per_kg) != len(self.parameters):
                 raise ValueError(
-                    f"payload_mass of {one.payload} with parameters_per_kg for each of the {len(self.parameters)} "
-                    "parameters"
+                    f"payload_mass of {one.payload} with parameters_per_kg for each of the "
+                    f"{len(self.parameters)} parameters"
                 )
         return self
 
@@ -267,11 +288,15 @@ _CLASSES: dict[type, type] = {
 
 
 def _from_entry(entry: object) -> Any:
-    """Convert a checked entry, with all entries in it, to the class of `ident` whose fields it has."""
+    """Convert a checked entry, with all entries in it,
+    to the class of `ident` whose fields it has.
+    """
     if isinstance(entry, tuple):
         return tuple(map(_from_entry, entry))
     if isinstance(entry, RelativeErrorEntry):
-        return RelativeError(tuple(math.nan if value is None else value for value in entry.axes), entry.total)
+        return RelativeError(
+            tuple(math.nan if value is None else value for value in entry.axes), entry.total
+        )
     made = _CLASSES.get(type(entry))
     if made is None:
         return entry
@@ -280,7 +305,8 @@ def _from_entry(entry: object) -> Any:
 
 
 VERSION = 1
-_OF_THE_PROCESS = frozenset({"own_effects"})  #: Fields of a calibration that are code, and in no file
+#: Fields of a calibration that are code, and in no file
+_OF_THE_PROCESS = frozenset({"own_effects"})
 _ENVELOPE = ("format", "version", "digests")
 _HEADER = """\
 # Made by drivegain. Each section carries its digest:
@@ -302,13 +328,16 @@ class _QuickDumper(yaml.CSafeDumper):
     ignore_aliases = _Dumper.ignore_aliases
 
 
-_UNUSUAL = re.compile(r'\\|"":|[\U00010000-\U0010ffff]')  #: In JSON: escaped characters, an empty key, rare scripts
+#: In JSON: escaped characters, an empty key, rare scripts
+_UNUSUAL = re.compile(r'\\|"":|[\U00010000-\U0010ffff]')
 _NUMBER = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$")
 
 
 def _represent_text(dumper: _Dumper | _QuickDumper, text: str) -> yaml.ScalarNode:
     # Line breaks of Unicode (U+0085, U+2028) survive in double quotes only.
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if text.isprintable() else '"')
+    return dumper.represent_scalar(
+        "tag:yaml.org,2002:str", text, style=None if text.isprintable() else '"'
+    )
 
 
 for _kind in (_Dumper, _QuickDumper):
@@ -317,7 +346,8 @@ for _kind in (_Dumper, _QuickDumper):
 
 
 def as_document(calibration: Calibration) -> dict[str, Any]:
-    """Return the calibration as lists, mappings and numbers: the object of `fit --json` and the body of the file.
+    """Return the calibration as lists, mappings and numbers:
+    the object of `fit --json` and the body of the file.
 
     Percentages of zero are None.
     """
@@ -332,23 +362,37 @@ def _as_entry(value: Any) -> Any:
         case dict():
             return {key: _as_entry(item) for key, item in value.items()}
         case RelativeError():
-            # NaN marks an axis that did not move; the reader refuses any other number that is not finite.
-            return {"axes": [None if math.isnan(axis) else axis for axis in value.axes], "total": value.total}
+            # NaN marks an axis that did not move; the reader refuses any other number that is not
+            # finite.
+            return {
+                "axes": [None if math.isnan(axis) else axis for axis in value.axes],
+                "total": value.total,
+            }
         case Gain():
             change_percent = _percent(value.value - value.nameplate, value.nameplate)
             std_percent = _percent(value.std, abs(value.value))
-            entry = GainEntry.model_construct(**asdict(value), std_percent=std_percent, change_percent=change_percent)
+            entry = GainEntry.model_construct(
+                **asdict(value), std_percent=std_percent, change_percent=change_percent
+            )
             return entry.model_dump()
         case Parameter():
             std_percent = _percent(value.std, abs(value.value))
-            return ParameterEntry.model_construct(**asdict(value), std_percent=std_percent).model_dump()
-    return {f.name: _as_entry(getattr(value, f.name)) for f in fields(value)} if is_dataclass(value) else value
+            return ParameterEntry.model_construct(
+                **asdict(value), std_percent=std_percent
+            ).model_dump()
+    return (
+        {f.name: _as_entry(getattr(value, f.name)) for f in fields(value)}
+        if is_dataclass(value)
+        else value
+    )
 
 
-def save_calibration(calibration: Calibration, path: Path) -> None:
+@checks_arguments(calibration=of_kind(Calibration), path=A_FILE_TO_WRITE)
+def save_calibration(calibration: Calibration, path: Path | str) -> None:
     """Write `calibration` to `path` atomically, and read it back before it replaces an older file.
 
     Raises:
+        UsageError: an argument is of another type, or the path is that of a folder.
         CalibrationUnreadable: a number is not finite; nothing is written.
         OSError: from the file system; an old file stays as it was.
     """
@@ -363,29 +407,45 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
                 remedy="check the disk; the file was not replaced",
             )
 
-    replace_file(path, encode_calibration(calibration), check=check)
+    replace_file(Path(path), encode_calibration(calibration), check=check)
 
 
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return the content of the file."""
     body = as_document(calibration)
-    document = {"format": "drivegain-calibration", "version": VERSION, **body, "digests": _digests(body)}
+    document = {
+        "format": "drivegain-calibration",
+        "version": VERSION,
+        **body,
+        "digests": _digests(body),
+    }
     kind = _Dumper if _UNUSUAL.search(json.dumps(body, ensure_ascii=False)) else _QuickDumper
     # One entry a line: leaf collections in flow style, lines never folded.
-    text = yaml.dump(document, Dumper=kind, sort_keys=False, default_flow_style=None, allow_unicode=True, width=2**30)
+    text = yaml.dump(
+        document,
+        Dumper=kind,
+        sort_keys=False,
+        default_flow_style=None,
+        allow_unicode=True,
+        width=2**30,
+    )
     return (_HEADER + text).encode()
 
 
-def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibration:
+@checks_arguments(path=A_PATH, own_effects=A_LIST)
+def load_calibration(path: Path | str, own_effects: Sequence[Effect] = ()) -> Calibration:
     """Read a calibration.
 
     Args:
         path: of the file.
-        own_effects: effects of one's own that it may have and no installed package has; one of each name is enough.
+        own_effects: effects of one's own that it may have and no installed package has; one of each
+            name is enough.
 
     Raises:
+        UsageError: an argument is of another type.
         CalibrationMissing: the file does not exist, is a folder or a pipe, or cannot be read.
-        CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or number, with its line.
+        CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or
+            number, with its line.
         CalibrationRefused: the content was edited, with the names of the edited sections.
         EffectRefused: one of `own_effects` is no effect that can be used.
     """
@@ -393,7 +453,7 @@ def load_calibration(path: Path, own_effects: Sequence[Effect] = ()) -> Calibrat
         from ident.effects.own import families_of  # noqa: PLC0415 - reading a calibration needs no effects
 
         families_of(own_effects, "`own_effects`")
-    calibration = decode_calibration(read_calibration_bytes(path), str(path))
+    calibration = decode_calibration(read_calibration_bytes(Path(path)), str(path))
     return replace(calibration, own_effects=tuple(own_effects))
 
 
@@ -412,7 +472,8 @@ def decode_calibration(content: bytes, name: str) -> Calibration:
     _require_calibration(name, kind_of_head(content))
     try:
         document = parse_yaml(content, name)
-        # Before the schema: in a later version every key may be unknown, and only the version explains it.
+        # Before the schema: in a later version every key may be unknown, and only the version
+        # explains it.
         version = document.tree.get("version") if isinstance(document.tree, dict) else None
         _require_calibration(name, kind_of_tree(document.tree))
         if version != VERSION:
@@ -420,7 +481,8 @@ def decode_calibration(content: bytes, name: str) -> Calibration:
                 name,
                 found="no calibration" if version is None else f"version {version}",
                 expected=f"a calibration of version {VERSION}",
-                remedy="give the file that `drivegain fit` wrote, or fit the logs again with this drivegain",
+                remedy="give the file that `drivegain fit` wrote, or fit the logs again with this "
+                "drivegain",
             )
         entries = read_model(document, CalibrationDocument)
     except (YamlInvalid, SchemaMismatch) as error:
@@ -431,7 +493,11 @@ def decode_calibration(content: bytes, name: str) -> Calibration:
             remedy="give the file as `drivegain fit` wrote it, or fit the logs again",
         ) from error
     found = _digests({key: value for key, value in document.tree.items() if key not in _ENVELOPE})
-    edited = sorted(key for key in found.keys() | entries.digests.keys() if found.get(key) != entries.digests.get(key))
+    edited = sorted(
+        key
+        for key in found.keys() | entries.digests.keys()
+        if found.get(key) != entries.digests.get(key)
+    )
     if edited:
         raise CalibrationRefused(
             name,
@@ -457,7 +523,9 @@ def _require_calibration(name: str, kind: DocumentKind | None) -> None:
 def _digests(body: Mapping[str, object]) -> dict[str, str]:
     """Compute the SHA-256 of each section in canonical JSON, so that an edit can be located."""
     return {
-        key: hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+        key: hashlib.sha256(
+            json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
+        ).hexdigest()
         for key, value in body.items()
     }
 

@@ -36,7 +36,9 @@ class Outcome(Enum):
 
 
 class RecordedRun(StrictModel):
-    """A finished log: its digest, the number of recordings it took, and the losses of all of them."""
+    """A finished log: its digest, the number of recordings it took,
+    and the losses of all of them.
+    """
 
     name: str
     sha256: str
@@ -54,7 +56,8 @@ class Fitted(StrictModel):
 
 
 class JudgedGain(StrictModel):
-    """An identified gain beside the current gain, with their σ, and whether they differ significantly.
+    """An identified gain beside the current gain, with their σ,
+    and whether they differ significantly.
 
     `old` and `new` are keys of `state.json` and of `--json`, which stay.
     """
@@ -66,7 +69,8 @@ class JudgedGain(StrictModel):
     new: float  #: identified gain
     new_std: float  #: σ of the identified gain
     change_percent: float | None  #: None where the current gain is 0
-    drift_sigma: float | None  #: difference in σ of the difference, None where both σ are 0; an unknown σ is 0
+    #: difference in σ of the difference, None where both σ are 0; an unknown σ is 0
+    drift_sigma: float | None
     differs: bool
 
 
@@ -78,7 +82,9 @@ class Decision(StrictModel):
 
 
 class PlannedWrite(StrictModel):
-    """The planned write, saved before it is made: after a kill, the file's digest shows whether it was made."""
+    """The planned write, saved before it is made:
+    after a kill, the file's digest shows whether it was made.
+    """
 
     file: str
     base_sha256: str
@@ -96,7 +102,9 @@ class WatchedGain(StrictModel):
 
 
 class SessionState(StrictModel):
-    """What all sessions share; results of steps that are not done yet are None or missing from the list."""
+    """What all sessions share; results of steps that are not done yet are None or missing from the
+    list.
+    """
 
     format: str  #: kind of session
     version: Literal[1] = 1
@@ -122,8 +130,8 @@ class SessionState(StrictModel):
     def is_over(self) -> bool:
         """Whether no command goes on with it.
 
-        A command that was killed before it reported its end did not end it; nor did one that an error ended behind the
-        decision, before the certificate had it.
+        A command that was killed before it reported its end did not end it; nor did one that an
+        error ended behind the decision, before the certificate had it.
         """
         if self.outcome is None or self.ended is None:
             return False
@@ -178,7 +186,9 @@ class Progress(StrictModel):
 
 
 class ScaleOfAxis(StrictModel):
-    """Measured over predicted torque of a joint on new moves: 1 where its gain is right, None where it did not move."""
+    """Measured over predicted torque of a joint on new moves:
+    1 where its gain is right, None where it did not move.
+    """
 
     axis: str
     old: float | None  #: with the previous gain, which the controller had before the write
@@ -187,11 +197,14 @@ class ScaleOfAxis(StrictModel):
 
 
 class Acceptance(StrictModel):
-    """The short run after the write: torques of the currents beside those that the calibration predicts."""
+    """The short run after the write: torques of the currents beside those that the calibration
+    predicts.
+    """
 
     log_sha256: str
     scales: tuple[ScaleOfAxis, ...]
-    old_error_percent: float | None  #: of all axes, with the previous gains; None where it is no number
+    #: of all axes, with the previous gains; None where it is no number
+    old_error_percent: float | None
     new_error_percent: float | None  #: of all axes, with the current gains
     accepted: bool
     remark: str
@@ -202,15 +215,19 @@ class GuidedState(SessionState):
 
     format: Literal["drivegain-session"] = "drivegain-session"
     blocks: tuple[Block, ...] = ()
-    mass_kg: float | None = None  #: of the payload, as read from the scale, twice; None before the first loaded block
+    #: of the payload, as read from the scale, twice; None before the first loaded block
+    mass_kg: float | None = None
     rehearsed: _Count = 0  #: number of blocks that were rehearsed at low speed
-    block_s: float = 0.0  #: duration of the blocks that are to come [s], where it is longer than the asked one
-    bare_first: Annotated[int, Field(ge=1)] = 1  #: number of bare blocks before the first one with the payload
+    #: duration of the blocks that are to come [s], where it is longer than the asked one
+    block_s: float = 0.0
+    #: number of bare blocks before the first one with the payload
+    bare_first: Annotated[int, Field(ge=1)] = 1
     gains: tuple[GainSoFar, ...] = ()  #: after the last block that was judged
     judged_blocks: _Count = 0  #: number of blocks behind these gains
     progress: tuple[Progress, ...] = ()  #: after each block that was judged
     checked_blocks: _Count = 0  #: number of blocks in which mistakes were looked for
-    repeated: tuple[str, ...] = ()  #: names of blocks that were recorded again because of a mistake, once each time
+    #: names of blocks that were recorded again because of a mistake, once each time
+    repeated: tuple[str, ...] = ()
     complete: bool = False  #: nothing is left to record
     missing: str = ""  #: what was not reached when the recording ended, in words
     would_help: tuple[str, ...] = ()  #: what would help to reach it, a sentence each

@@ -1,13 +1,15 @@
 """Find the gains in a device configuration file (CiA 306 DCF).
 
-A number is decimal, or hexadecimal after `0x`. An integer with another zero before it (`010`) is octal to CiA 306 and
-decimal to many a tool: it is refused, not guessed.
+A number is decimal, or hexadecimal after `0x`. An integer with another zero before it (`010`) is
+octal to CiA 306 and decimal to many a tool: it is refused, not guessed.
 
-An object is named by index and subindex, both hexadecimal: `6076`, `2003:01`, `2003sub1`. Its number is the
-`ParameterValue` of its section. A data sheet (EDS) has none, and none is put there: that would be a new line.
+An object is named by index and subindex, both hexadecimal: `6076`, `2003:01`, `2003sub1`. Its
+number is the `ParameterValue` of its section. A data sheet (EDS) has none, and none is put there:
+that would be a new line.
 
-In compact storage an array has one section for all its elements: `[2003]` with `CompactSubObj`, the number of them. The
-values that differ from the default are in `[2003Value]`, each under its subindex.
+In compact storage an array has one section for all its elements: `[2003]` with `CompactSubObj`, the
+number of them. The values that differ from the default are in `[2003Value]`, each under its
+subindex.
 """
 
 from __future__ import annotations
@@ -18,7 +20,16 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, IntegerStyle, KeyPath, Scalar, Values
+from daq.formats.scalar import (
+    CORRECT_KEY,
+    DECIMAL,
+    OCTAL,
+    ControllerDocument,
+    IntegerStyle,
+    KeyPath,
+    Scalar,
+    Values,
+)
 
 _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
 _TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
@@ -61,7 +72,9 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class DcfDocument(ControllerDocument):
-    """A DCF as it was read: each byte a character (ISO 8859-1), so that nothing is lost in whatever encoding it is."""
+    """A DCF as it was read: each byte a character (ISO 8859-1),
+    so that nothing is lost in whatever encoding it is.
+    """
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`."""
@@ -100,8 +113,12 @@ class DcfDocument(ControllerDocument):
         section = self._section(sections, key, index, subindex, is_named=match[2] is not None)
         return _Place(section, section, _VALUE)
 
-    def _compact_place(self, sections: list[DcfSection], key: str, index: int, subindex: int) -> _Place | None:
-        """Return where an element of an array in compact storage is; None where it has its own section."""
+    def _compact_place(
+        self, sections: list[DcfSection], key: str, index: int, subindex: int
+    ) -> _Place | None:
+        """Return where an element of an array in compact storage is;
+        None where it has its own section.
+        """
         titles = [section.title for section in sections]
         arrays = [section for section in sections if section.title == f"{index:04x}"]
         own_title = f"{index:04x}sub{subindex:x}"
@@ -142,7 +159,9 @@ class DcfDocument(ControllerDocument):
             raise self._no_section(sections, key, index, subindex)
         return found[0]
 
-    def _no_section(self, sections: list[DcfSection], key: str, index: int, subindex: int) -> ControllerUnfit:
+    def _no_section(
+        self, sections: list[DcfSection], key: str, index: int, subindex: int
+    ) -> ControllerUnfit:
         titles = [section.title for section in sections]
         subs = [title for title in titles if title.startswith(f"{index:04x}")]
         has = "it does not have this index at all"
@@ -175,12 +194,15 @@ class DcfDocument(ControllerDocument):
         entry = self._entries(place.values, key).get(place.entry)
         if entry is None and place.is_compact:
             found = f"[{section.title}Value] without {place.entry}, so the device has its default"
-            raise self.unfit(key, found, f"add the line `{place.entry}=` with the current gain there")
+            raise self.unfit(
+                key, found, f"add the line `{place.entry}=` with the current gain there"
+            )
         if entry is None:
             raise self.unfit(
                 key,
                 f"[{section.title}] without ParameterValue",
-                "a data sheet (EDS) has none: give the device's DCF, or add the line with the current gain",
+                "a data sheet (EDS) has none: give the device's DCF, or add the line with the "
+                "current gain",
             )
         kind = self._number(entries, key, _TYPE, 0)
         where = f"line {entry.line}: {entry.value!r:.60}"
@@ -196,12 +218,18 @@ class DcfDocument(ControllerDocument):
                 raise self.unfit(key, f"{where} in a real object", "write a plain decimal number")
             return Scalar(key, float(entry.value), entry.value, entry.start, entry.line)
         if kind not in _INTEGERS:
-            raise self.unfit(key, f"DataType {kind:#06x} in [{section.title}]", "name an integer or a real object")
+            raise self.unfit(
+                key,
+                f"DataType {kind:#06x} in [{section.title}]",
+                "name an integer or a real object",
+            )
         style = self._style(entries, key, kind)
         try:
             value = style.read(entry.value)
         except ValueError as error:
-            raise self.unfit(key, where, "write a plain integer, decimal or 0x", "an integer of its type") from error
+            raise self.unfit(
+                key, where, "write a plain integer, decimal or 0x", "an integer of its type"
+            ) from error
         return Scalar(key, float(value), entry.value, entry.start, entry.line, style)
 
     def _entries(self, section: DcfSection, key: str) -> dict[str, DcfEntry]:
@@ -209,7 +237,9 @@ class DcfDocument(ControllerDocument):
         names = Counter(entry.name for entry in section.entries)
         doubled = sorted(name for name, count in names.items() if count > 1)
         if doubled:
-            raise self.unfit(key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them")
+            raise self.unfit(
+                key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them"
+            )
         return {entry.name: entry for entry in section.entries}
 
     def _style(self, entries: dict[str, DcfEntry], key: str, kind: int) -> IntegerStyle:
@@ -229,7 +259,9 @@ class DcfDocument(ControllerDocument):
             highest = min(highest, high_limit)
         return IntegerStyle(bits, lowest, highest)
 
-    def _limit(self, entries: dict[str, DcfEntry], key: str, name: str, style: IntegerStyle) -> int | None:
+    def _limit(
+        self, entries: dict[str, DcfEntry], key: str, name: str, style: IntegerStyle
+    ) -> int | None:
         """Return a limit of the file; None where it gives none."""
         entry = entries.get(name)
         if entry is None or not entry.value:
@@ -246,7 +278,10 @@ class DcfDocument(ControllerDocument):
             return default
         if not _CODE.fullmatch(entry.value):
             found = f"line {entry.line}: {entry.value!r:.60}"
-            expected = f"{name} in decimal digits without a leading zero, or in hexadecimal digits after 0x"
+            expected = (
+                f"{name} in decimal digits without a leading zero, or in hexadecimal "
+                "digits after 0x"
+            )
             raise self.unfit(key, found, "correct it", expected)
         return int(entry.value, 0)
 
@@ -285,7 +320,9 @@ class DcfEntry:
 
 @dataclass(frozen=True, slots=True)
 class DcfSection:
-    """The entries under one `[title]`; keys and titles in lower case, as CiA 306 ignores the case."""
+    """The entries under one `[title]`; keys and titles in lower case,
+    as CiA 306 ignores the case.
+    """
 
     title: str
     line: int
@@ -313,7 +350,9 @@ def sections_of(text: str) -> list[DcfSection]:
 
 
 def _object_of(section: DcfSection) -> tuple[int, int] | None:
-    """Return index and subindex of a section: 2003sub1 and 2003sub01 are one object; None where it is of no object."""
+    """Return index and subindex of a section: 2003sub1 and 2003sub01 are one object;
+    None where it is of no object.
+    """
     title = _TITLE.fullmatch(section.title)
     if title is None:
         return None
@@ -342,7 +381,8 @@ def parsed_values(file: str, text: str) -> dict[KeyPath, str]:
     try:
         parser.read_string(text.removeprefix(_BYTE_ORDER_MARK))
     except (configparser.Error, AttributeError) as error:
-        # An indented line goes on with the value above it; without a value, Python before 3.13 fails for want of one.
+        # An indented line goes on with the value above it; without a value, Python before 3.13
+        # fails for want of one.
         no_value = isinstance(error, AttributeError)
         why = "an indented line below a name without `=`"
         if not no_value:

@@ -5,14 +5,16 @@ Comments, order, quotes, spacing, line ends and encoding belong to the person wh
 
 To add a format:
 
-1. Write `formats/<name>_document.py` with a frozen dataclass that derives from `ControllerDocument`. It implements
-   `locate` (keys to places in the text) and `readings` (all values, once for each parser). It overrides
-   `path_of` where keys are no dotted paths, and `number` where a parser's value contains blanks around the number;
-   `encoding` is that of a file that is not UTF-8.
-2. Add one line to `FORMATS` below, and the name of the format to `ControllerFormat`: the word in the cell file.
-3. In `tests/daq/formats/test_documents.py` add a strategy of files to `CASES`, an independent reader to
-   `test_another_reader_sees_the_new_numbers_and_nothing_else_new`, and the suffixes to `test_the_name_gives_the_format`
-   (`a.conf` is there for a suffix that no format has).
+1. Write `formats/<name>_document.py` with a frozen dataclass that derives from
+   `ControllerDocument`. It implements `locate` (keys to places in the text) and `readings` (all
+   values, once for each parser). It overrides `path_of` where keys are no dotted paths, and
+   `number` where a parser's value contains blanks around the number; `encoding` is that of a file
+   that is not UTF-8.
+2. Add one line to `FORMATS` below, and the name of the format to `ControllerFormat`: the word in
+   the cell file.
+3. In `tests/daq/formats/test_documents.py` add a strategy of files to `CASES`, an independent
+   reader to `test_another_reader_sees_the_new_numbers_and_nothing_else_new`, and the suffixes to
+   `test_the_name_gives_the_format` (`a.conf` is there for a suffix that no format has).
 """
 
 from __future__ import annotations
@@ -30,7 +32,9 @@ from daq.formats.scalar import ControllerDocument
 from daq.formats.xml_document import xml_document
 from daq.formats.yaml_document import yaml_document
 
-FORMATS: dict[ControllerFormat, tuple[Callable[[bytes, str], ControllerDocument], tuple[str, ...]]] = {
+FORMATS: dict[
+    ControllerFormat, tuple[Callable[[bytes, str], ControllerDocument], tuple[str, ...]]
+] = {
     ControllerFormat.YAML: (yaml_document, (".yaml", ".yml")),
     ControllerFormat.JSON: (json_document, (".json",)),
     ControllerFormat.XML: (xml_document, (".xml",)),
@@ -70,7 +74,11 @@ def comment_behind(rest: str, name: str, file_format: ControllerFormat | None = 
     return found[1]
 
 
-def decode_document(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002
+def decode_document(
+    content: bytes,
+    name: str,
+    format: ControllerFormat | None = None,  # noqa: A002
+) -> ControllerDocument:
     """Parse a controller file; without a format, its name says it.
 
     Raises:

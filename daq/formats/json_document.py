@@ -40,12 +40,16 @@ class JsonDocument(ControllerDocument):
         return {path: token.text for path, token in self._scanned().items()}
 
     def _scanned(self) -> dict[KeyPath, _Token]:
-        """Return every value with its place, and `{}` or `[]` with the size of every object and list."""
+        """Return every value with its place, and `{}` or `[]` with the size of every object and
+        list.
+        """
         self._loaded()  # refuses all that is not JSON: the scanner need not
         tokens = _tokens(self.text)
         return dict(self._scan(tokens, (), next(tokens)))
 
-    def _scan(self, tokens: Iterator[_Token], path: KeyPath, token: _Token) -> Iterator[tuple[KeyPath, _Token]]:
+    def _scan(
+        self, tokens: Iterator[_Token], path: KeyPath, token: _Token
+    ) -> Iterator[tuple[KeyPath, _Token]]:
         if len(path) > MAX_DEPTH:
             raise self._no_json(f"more than {MAX_DEPTH} lists in lists")
         if token.text not in ("{", "["):
@@ -91,7 +95,8 @@ class JsonDocument(ControllerDocument):
             self.name,
             found=f"no JSON ({found})",
             expected=f"one JSON document, each key once, at most {MAX_DEPTH} lists in lists",
-            remedy="correct the file (JSON knows no comments, no NaN and no Infinity); nothing was written",
+            remedy="correct the file (JSON knows no comments, no NaN and no Infinity); nothing "
+            "was written",
         )
 
     def _locate(self, tokens: dict[KeyPath, _Token], key: str) -> Scalar:
@@ -108,10 +113,16 @@ class JsonDocument(ControllerDocument):
             parent = path[:depth]
             if _is_container(tokens, parent):
                 place = ".".join(parent) or "the file"
-                names = {other[depth] for other in tokens if len(other) > depth and other[:depth] == parent}
+                names = {
+                    other[depth]
+                    for other in tokens
+                    if len(other) > depth and other[:depth] == parent
+                }
                 names -= {"{}", "[]"}
                 has = ", ".join(sorted(names)[:12]) or "nothing"
-                raise self.unfit(key, f"no key {path[depth]!r} in {place} (it has {has})", CORRECT_KEY)
+                raise self.unfit(
+                    key, f"no key {path[depth]!r} in {place} (it has {has})", CORRECT_KEY
+                )
             if parent in tokens:
                 break
         *parents, last = path
@@ -148,7 +159,8 @@ def json_document(content: bytes, name: str) -> JsonDocument:
 
 
 def _broken_place(text: str, position: int) -> str:
-    """Say where a text stops being JSON, and what is there: the parser's own words differ between versions of Python.
+    """Say where a text stops being JSON, and what is there:
+    the parser's own words differ between versions of Python.
 
     So does the place of a comma too many: the comma since 3.13, what follows it before.
     """

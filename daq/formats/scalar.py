@@ -1,7 +1,8 @@
 """One number in the text of a controller's file, and the base class of all formats.
 
-A format finds the numbers (`locate`) and reads the text with its parsers (`readings`). The rest is the same for every
-format: only the characters of the named numbers are replaced, and the new text is read back and compared.
+A format finds the numbers (`locate`) and reads the text with its parsers (`readings`). The rest is
+the same for every format: only the characters of the named numbers are replaced, and the new text
+is read back and compared.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from daq.errors import ControllerUnfit
 _EXPONENT = re.compile(r"([eE])[-+]?([0-9]+)$")
 _INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)|0[xX][0-9a-fA-F]+")
 DECIMAL = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-OCTAL = re.compile(r"[-+]?0[0-9]+")  #: To CiA 306 and YAML 1.1; a decimal number to YAML 1.2 and many a tool
+#: To CiA 306 and YAML 1.1; a decimal number to YAML 1.2 and many a tool
+OCTAL = re.compile(r"[-+]?0[0-9]+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,8 @@ class IntegerStyle:
         """Parse an integer.
 
         Raises:
-            ValueError: it is none, is ambiguous (a leading zero is octal to CiA 306), or has too many bits.
+            ValueError: it is none, is ambiguous (a leading zero is octal to CiA 306), or has too
+                many bits.
         """
         if not _INTEGER.fullmatch(text):
             raise ValueError(text)
@@ -49,7 +52,9 @@ class IntegerStyle:
         return value
 
     def spell(self, value: int, like: str) -> str:
-        """Format an integer; in hexadecimal where `like` is, with at least as many digits and in the same case."""
+        """Format an integer; in hexadecimal where `like` is,
+        with at least as many digits and in the same case.
+        """
         prefix = like[:2]
         digits_like = like[2:]
         if prefix not in ("0x", "0X"):
@@ -62,16 +67,17 @@ class IntegerStyle:
 
 
 def spell(value: float, std: float, like: str = "") -> str:
-    """Format a gain: two digits beyond the first digit of σ, at least five significant, no more than a float has.
+    """Format a gain: two digits beyond the first digit of σ, at least five significant,
+    no more than a float has.
 
-    The text always has a point, and its exponent a sign: no reader takes it for an integer or for text (YAML 1.1 has no
-    1e3).
+    The text always has a point, and its exponent a sign: no reader takes it for an integer or for
+    text (YAML 1.1 has no 1e3).
 
     Args:
         value: not zero [unit].
         std: standard deviation [unit].
-        like: text of the number that it replaces. Its exponent, its plus and at least as many decimals stay, as the
-            file's readers are used to them.
+        like: text of the number that it replaces. Its exponent, its plus and at least as many
+            decimals stay, as the file's readers are used to them.
     """
     mantissa_like = like
     mark = "e"
@@ -129,7 +135,8 @@ class Scalar:
         return float(self.integer.read(text))
 
     def spell(self, value: float, std: float) -> str:
-        """Format a number for this place: finite, not zero; σ bounds the error of rounding to an integer.
+        """Format a number for this place: finite, not zero;
+        σ bounds the error of rounding to an integer.
 
         Raises:
             ControllerUnfit: only integers are allowed here, and none is near enough or in range.
@@ -144,15 +151,16 @@ class Scalar:
                 self.key,
                 found=f"{value:.6g} for an integer of {lowest} to {highest}",
                 expected="a gain that fits",
-                remedy="check the factor in `controller.gains` of the cell configuration; nothing was written",
+                remedy="check the factor in `controller.gains` of the cell configuration; nothing "
+                "was written",
             )
         if rounded == 0 or 0 < std < abs(rounded - value):
             raise ControllerUnfit(
                 self.key,
                 found=f"{value:.6g} ± {std:.2g}, which the integer {rounded} does not represent",
                 expected="a rounding below σ",
-                remedy="this object is too coarse: write the gain to another one, or in a finer unit by its factor in "
-                "`controller.gains`; nothing was written",
+                remedy="this object is too coarse: write the gain to another one, or in a finer "
+                "unit by its factor in `controller.gains`; nothing was written",
             )
         return self.integer.spell(rounded, self.text)
 
@@ -167,7 +175,8 @@ class RewrittenGain:
 
 
 def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) -> RewrittenGain:
-    """Put a gain in the place of a number; gain, finite and not zero, × factor = number in the document.
+    """Put a gain in the place of a number;
+    gain, finite and not zero, × factor = number in the document.
 
     Raises:
         ControllerUnfit: see `Scalar.spell`.
@@ -180,14 +189,16 @@ def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) 
 
 
 def dotted_paths(key: str, paths: Collection[KeyPath]) -> tuple[KeyPath, ...]:
-    """Return every path in a file that reads as a dotted key: names of the file may have dots themselves.
+    """Return every path in a file that reads as a dotted key:
+    names of the file may have dots themselves.
 
     Args:
         key: such as `ros__parameters.gains.joint1`.
         paths: of all values of the file.
 
     Returns:
-        the key split at every dot where no path reads so; more than one path where the key is ambiguous.
+        the key split at every dot where no path reads so; more than one path where the key is
+        ambiguous.
     """
     found = tuple(path for path in paths if ".".join(path) == key)
     return found or (tuple(key.split(".")),)
@@ -211,12 +222,15 @@ class ControllerDocument(ABC):
         """Find the numbers of some keys, in their order.
 
         Raises:
-            ControllerUnfit: the file does not parse, or a key leads to no number that can be changed on its own.
+            ControllerUnfit: the file does not parse, or a key leads to no number that can be
+                changed on its own.
         """
 
     @abstractmethod
     def readings(self) -> tuple[Values, ...]:
-        """Return the values as each parser of the format reads them. Two parsers should share no code.
+        """Return the values as each parser of the format reads them.
+
+        Two parsers should share no code.
 
         Raises:
             ControllerUnfit: a parser cannot read the text.
@@ -235,7 +249,8 @@ class ControllerDocument(ABC):
         return ControllerUnfit(place, found=found, expected=expected, remedy=remedy)
 
     def path_of(self, key: str) -> KeyPath:
-        """Return the path of a key's number among the values; here a dotted one (`drives.J1.gain`, `gains.0`).
+        """Return the path of a key's number among the values;
+        here a dotted one (`drives.J1.gain`, `gains.0`).
 
         Raises:
             ControllerUnfit: several places of the file read as this key.
@@ -243,7 +258,9 @@ class ControllerDocument(ABC):
         found = dotted_paths(key, _paths(self))
         if len(found) > 1:
             places = " and ".join(" / ".join(path) for path in found)
-            raise self.unfit(key, f"{len(found)} places that read as this key: {places}", "rename one of them")
+            raise self.unfit(
+                key, f"{len(found)} places that read as this key: {places}", "rename one of them"
+            )
         return found[0]
 
     def number(self, value: str) -> str:
@@ -251,7 +268,8 @@ class ControllerDocument(ABC):
         return value
 
     def with_values(self, spelling: Mapping[str, str]) -> Self:
-        """Replace some numbers, each by the text for its key, and check the result with `check_against`.
+        """Replace some numbers, each by the text for its key,
+        and check the result with `check_against`.
 
         Raises:
             ControllerUnfit: as `locate`, or the new text has another change than these.
@@ -262,7 +280,8 @@ class ControllerDocument(ABC):
         return changed
 
     def check_against(self, before: Self, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named numbers alone, for every parser and as text.
+        """Refuse unless this file differs from `before` in the named numbers alone,
+        for every parser and as text.
 
         Raises:
             ControllerUnfit: it differs in more, or in less.
@@ -308,7 +327,9 @@ def _spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) 
     return text
 
 
-CORRECT_KEY = "is this the controller's file? then correct `controller.gains` of the cell configuration"
+CORRECT_KEY = (
+    "is this the controller's file? then correct `controller.gains` of the cell configuration"
+)
 
 
 def utf8(content: bytes, name: str, kind: str) -> str:

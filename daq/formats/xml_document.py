@@ -1,9 +1,9 @@
 """Find the gains in a controller's XML.
 
-A number is named by a path from the root as it is written, prefixes included: `Robot/Axis[@name='J1']/Gain` is the text
-of an element, `Robot/Axis[2]/@gain` an attribute. It is read as an xs:double: decimal, whatever zeros it begins with
-(`010` is 10). A document type is refused: without one there are no entities of the document's own, and nothing to fetch
-or to expand.
+A number is named by a path from the root as it is written, prefixes included:
+`Robot/Axis[@name='J1']/Gain` is the text of an element, `Robot/Axis[2]/@gain` an attribute. It is
+read as an xs:double: decimal, whatever zeros it begins with (`010` is 10). A document type is
+refused: without one there are no entities of the document's own, and nothing to fetch or to expand.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class Element:
 
     name: str  #: as it is written, prefix included
     attributes: dict[str, str]  #: values by name
-    label: str  #: its name, and its number in the file: a path from the root would grow with the depth
+    #: its name, and its number in the file: a path from the root would grow with the depth
+    label: str
     start: int  #: place of its start tag's `<`
     line: int  #: from 1
     end: int = 0  #: place of its end tag's `<`; that of its start tag where it is empty
@@ -71,7 +72,9 @@ def parse(content: bytes, name: str) -> tuple[Element, str]:
     def end(_: str) -> None:
         opened.pop().end = parser.CurrentByteIndex
 
-    parser.XmlDeclHandler = lambda _version, encoding, _standalone: encodings.append(encoding or encodings[0])
+    parser.XmlDeclHandler = lambda _version, encoding, _standalone: encodings.append(
+        encoding or encodings[0]
+    )
     parser.StartDoctypeDeclHandler = document_type
     parser.StartElementHandler = start
     parser.EndElementHandler = end
@@ -82,7 +85,10 @@ def parse(content: bytes, name: str) -> tuple[Element, str]:
         parser.Parse(content, True)
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise ControllerUnfit(
-            name, found=f"no XML ({error})", expected="one XML document", remedy="correct the file; nothing was written"
+            name,
+            found=f"no XML ({error})",
+            expected="one XML document",
+            remedy="correct the file; nothing was written",
         ) from error
     return around, encodings[-1]
 
@@ -105,7 +111,9 @@ class XmlDocument(ControllerDocument):
         return tuple(self._locate(content, around, key) for key in keys)
 
     def readings(self) -> tuple[Values]:
-        """Read every attribute, piece of text, comment and instruction, and the order of the elements."""
+        """Read every attribute, piece of text, comment and instruction,
+        and the order of the elements.
+        """
         values: dict[KeyPath, str] = {}
         around, _ = parse(self.content, self.name)
         waiting = [around]
@@ -151,7 +159,8 @@ class XmlDocument(ControllerDocument):
             raise self.unfit(
                 key,
                 f"line {element.line}: {written!r:.60}",
-                "write a plain decimal number there, without entities, CDATA, comments or other elements beside it",
+                "write a plain decimal number there, without entities, CDATA, comments or other "
+                "elements beside it",
             )
         start += written.index(number)
         line = self.text.count("\n", 0, start) + 1
@@ -174,7 +183,10 @@ class XmlDocument(ControllerDocument):
                 raise self.unfit(key, text, CORRECT_KEY)
             if len(found) > 1:
                 lines = ", ".join(str(one.line) for one in found[:12])
-                remedy = f"choose one by an attribute ({step.name}[@name='…']) or its number ({step.name}[1])"
+                remedy = (
+                    f"choose one by an attribute ({step.name}[@name='…']) or its number "
+                    f"({step.name}[1])"
+                )
                 text = f"{len(found)} of {step.written} in {place}, on lines {lines}"
                 raise self.unfit(key, text, remedy)
             element = found[0]
@@ -244,8 +256,8 @@ def xml_document(content: bytes, name: str) -> XmlDocument:
     """Parse an XML document.
 
     Raises:
-        ControllerUnfit: they are no XML, have a document type, or are in an encoding in which ASCII is not one byte a
-            character.
+        ControllerUnfit: they are no XML, have a document type, or are in an encoding in which ASCII
+            is not one byte a character.
     """
     _, encoding = parse(content, name)
     ascii_bytes = bytes(range(128))

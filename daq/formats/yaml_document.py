@@ -16,7 +16,16 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from daq.config.yaml_file import yaml_events
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, DECIMAL, OCTAL, ControllerDocument, KeyPath, Scalar, Values, utf8
+from daq.formats.scalar import (
+    CORRECT_KEY,
+    DECIMAL,
+    OCTAL,
+    ControllerDocument,
+    KeyPath,
+    Scalar,
+    Values,
+    utf8,
+)
 
 #: Of a file: two parsers in Python read it before and after
 MAX_BYTES = 2**19
@@ -24,7 +33,9 @@ MAX_VALUES = 15_000
 MAX_DEPTH = 100
 _MERGE = "<<"
 _TABS = re.compile(r"(?<=:)[ ]*\t[ \t]*|[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
-"""Tabs after a key, before a comment and at the end of a line: white space in YAML 1.2 (6.1, 6.6) and to libyaml."""
+"""Tabs after a key, before a comment and at the end of a line:
+white space in YAML 1.2 (6.1, 6.6) and to libyaml.
+"""
 _FLOAT = "tag:yaml.org,2002:float"
 
 
@@ -32,7 +43,8 @@ _FLOAT = "tag:yaml.org,2002:float"
 class YamlDocument(ControllerDocument):
     """A YAML file as it was read.
 
-    ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
+    ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the
+    same.
     """
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
@@ -57,7 +69,8 @@ class YamlDocument(ControllerDocument):
         for step in self.path_of(key):
             node = self._child(node, step, key, walked)
             walked = (*walked, step)
-            # A value that another place refers to by an alias cannot be changed without changing that place too.
+            # A value that another place refers to by an alias cannot be changed without changing
+            # that place too.
             if references[id(node)] > 1:
                 found = f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)"
                 raise self.unfit(key, found, "write it out")
@@ -66,7 +79,8 @@ class YamlDocument(ControllerDocument):
         quote = node.style or ""
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
-        # An anchor or a tag may precede the number; an escape within quotes makes its text another than its value.
+        # An anchor or a tag may precede the number; an escape within quotes makes its text another
+        # than its value.
         before = self.text[start - 1 : start]
         begins = start == node.start_mark.index or before.isspace()
         if quote:
@@ -75,13 +89,19 @@ class YamlDocument(ControllerDocument):
         if not begins or not is_literal or not DECIMAL.fullmatch(node.value):
             raise self.unfit(key, f"{node.value!r:.60}", "write a plain decimal number")
         if OCTAL.fullmatch(node.value):
-            found = f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to those of 1.2"
+            found = (
+                f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to "
+                "those of 1.2"
+            )
             raise self.unfit(key, found, "write it without leading zeros")
-        # Anchor and tag precede the number. A new gain has a point, and is no integer even where this one is.
+        # Anchor and tag precede the number. A new gain has a point, and is no integer even where
+        # this one is.
         properties = self.text[node.start_mark.index : start].split()
         tags = [part for part in properties if part.startswith("!")]
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
-            raise self.unfit(key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
+            raise self.unfit(
+                key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float"
+            )
         line = node.start_mark.line + 1
         return Scalar(key, float(node.value), node.value, start, line)
 
@@ -131,7 +151,8 @@ def _check_size(content: bytes, name: str) -> None:
             name,
             found=f"YAML with {found}",
             expected=expected,
-            remedy="is this the controller's file? then keep its gains in a file of their own; nothing was written",
+            remedy="is this the controller's file? then keep its gains in a file of their own; "
+            "nothing was written",
         )
 
 
@@ -143,10 +164,11 @@ def _is_large(content: bytes) -> bool:
     return False
 
 
-@lru_cache(maxsize=8)  # composing is expensive, and a write reads each of its two texts several times
+# Composing is expensive, and a write reads each of its two texts several times
+@lru_cache(maxsize=8)
 def _composed(text: str, name: str, version: str) -> Any:
-    # The parsers in Python refuse these tabs. As many blanks keep every place in the text; the text itself keeps its
-    # tabs, and `locate` compares each number with it.
+    # The parsers in Python refuse these tabs. As many blanks keep every place in the text; the text
+    # itself keeps its tabs, and `locate` compares each number with it.
     text = _TABS.sub(lambda tabs: " " * len(tabs[0]), text)
     try:
         if version == "1.2":
@@ -161,7 +183,8 @@ def _composed(text: str, name: str, version: str) -> Any:
         raise ControllerUnfit(
             name,
             found=f"no YAML {version} ({found})",
-            expected="the controller's parameters, in one YAML document for readers of both YAML 1.1 and 1.2",
+            expected="the controller's parameters, in one YAML document for readers of both YAML "
+            "1.1 and 1.2",
             remedy="is this the right file? If it is, correct it; nothing was written",
         )
     return root
@@ -184,8 +207,8 @@ def _count_references(node: Node, references: Counter[int]) -> None:
 def _values(root: Any) -> dict[KeyPath, str]:
     """Return every scalar of a tree by its path, and the size of every list and mapping.
 
-    The two parsers have unrelated node classes whose parts have the same names. A node that an alias repeats is
-    followed once: it is the same text.
+    The two parsers have unrelated node classes whose parts have the same names. A node that an
+    alias repeats is followed once: it is the same text.
     """
     values: dict[KeyPath, str] = {}
     seen: set[int] = set()

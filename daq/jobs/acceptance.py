@@ -34,12 +34,15 @@ TOLERANCE = 0.02  #: Distance from 1 that is no mistake: friction of another mom
 
 @dataclass(frozen=True, slots=True)
 class Accept:
-    """Record new moves, and compare the torques by the previous and the current gains with the predicted ones."""
+    """Record new moves, and compare the torques by the previous and the current gains with the
+    predicted ones.
+    """
 
     duration_s: float = DURATION_S
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Do nothing where nothing was written; the run is made once, and its result entered in the audit log once.
+        """Do nothing where nothing was written;
+        the run is made once, and its result entered in the audit log once.
 
         Raises:
             DaqError, DriverError: as from a recording, or because the audit log takes no entry.
@@ -62,17 +65,22 @@ class Accept:
         path = session.folder / f"plan-{RUN}.yaml"
         body = next(block.payload for block in guided(session).blocks if block.payload is not None)
         experiment = experiment_of(context.cell, body)
-        made, _ = plan_with_room(context, experiment, context.settings.seed + SEED_STEP, self.duration_s)
+        made, _ = plan_with_room(
+            context, experiment, context.settings.seed + SEED_STEP, self.duration_s
+        )
         plan = write_plan(context, path, made)
         say_moves(context, RUN, path)
-        planned = PlannedRun(name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True)
+        planned = PlannedRun(
+            name=RUN, payload=last.payload, mass_kg=last.mass_kg, plan_file=path, holdout=True
+        )
         context.operator.mount(planned)
         record_valid(context, session, NextRun(planned, plan))
         return judge_acceptance(context, session)
 
 
 def _require_written(context: SessionContext, session: Session) -> None:
-    """Read the gains back from the drives before anything moves; a file is compared when it is written.
+    """Read the gains back from the drives before anything moves;
+    a file is compared when it is written.
 
     Raises:
         ControllerChanged: the drives have other values than those that were written.
@@ -87,14 +95,17 @@ def _require_written(context: SessionContext, session: Session) -> None:
             context.target.subject,
             found="other values than those that this session wrote",
             expected="the written gains, read back before the moves that accept them",
-            remedy="nothing has moved; see whether the drives lost power before they saved, or were written since "
-            "(`drivegain history`), and write them again with `drivegain apply --drives`",
+            remedy="nothing has moved; see whether the drives lost power before they saved, or "
+            "were written since (`drivegain history`), and write them again with `drivegain apply "
+            "--drives`",
         )
     context.journal.say(Level.INFO, "the gains were read back from the drives")
 
 
 def _enter(context: SessionContext, session: Session) -> None:
-    """Enter the result in the audit log, unless an earlier command of this session was killed behind that."""
+    """Enter the result in the audit log, unless an earlier command of this session was killed
+    behind that.
+    """
     acceptance = guided(session).acceptance
     if acceptance is None:
         return
@@ -120,7 +131,9 @@ def _enter(context: SessionContext, session: Session) -> None:
 
 
 def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
-    """Compare predicted torques with those of the currents, by the gains before and after the write."""
+    """Compare predicted torques with those of the currents,
+    by the gains before and after the write.
+    """
     calibration = calibration_made(session)
     decision = session.state.decision
     previous_gains = {}
@@ -135,8 +148,8 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
         scales.append(scale)
     off = [one for one in scales if not _is_right(one)]
     remark = (
-        f"the error of the torques is {after.error.total:.2f} % with the current gains, {before.error.total:.2f} % "
-        "with the previous gains"
+        f"the error of the torques is {after.error.total:.2f} % with the current gains, "
+        f"{before.error.total:.2f} % with the previous gains"
     )
     if off:
         listed = ", ".join(_scale_text(one) for one in off)
@@ -152,7 +165,9 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
 
 
 def _is_right(scale: ScaleOfAxis) -> bool:
-    """Whether a scale is 1 within its σ; that of an axis that did not move shows nothing, and accepts nothing."""
+    """Whether a scale is 1 within its σ; that of an axis that did not move shows nothing,
+    and accepts nothing.
+    """
     if scale.new is None or scale.std is None:
         return False
     bound = max(TOLERANCE, SIGMAS * scale.std)
@@ -169,12 +184,16 @@ def _scale_text(scale: ScaleOfAxis) -> str:
 
 
 def axis_scales(found: Validation) -> list[tuple[float, float]]:
-    """Return Σ τ̂ τ/Σ τ̂² of each joint, with its σ by leaving out each of PIECES pieces of the run in turn.
+    """Return Σ τ̂ τ/Σ τ̂² of each joint, with its σ by leaving out each of PIECES pieces of the run
+    in turn.
 
-    τ̂ is what the calibration predicts, τ what the currents and gains say: a gain that is 3 % too small gives 0.97.
+    τ̂ is what the calibration predicts, τ what the currents and gains say: a gain that is 3 % too
+    small gives 0.97.
     """
     scales: list[tuple[float, float]] = []
-    for predicted, measured, use in zip(found.predicted_nm, found.measured_nm, found.use, strict=True):
+    for predicted, measured, use in zip(
+        found.predicted_nm, found.measured_nm, found.use, strict=True
+    ):
         products = np.array_split((predicted * measured)[use], PIECES)
         squares = np.array_split((predicted**2)[use], PIECES)
         product = np.array([part.sum() for part in products])
@@ -201,5 +220,7 @@ def _predicted(calibration: Calibration, context: SessionContext, session: Sessi
 
 def _with_gains(calibration: Calibration, values: dict[str, float]) -> Calibration:
     """Return a calibration with other gains, by axis."""
-    gains = tuple(replace(gain, value=values.get(gain.axis, gain.value)) for gain in calibration.gains)
+    gains = tuple(
+        replace(gain, value=values.get(gain.axis, gain.value)) for gain in calibration.gains
+    )
     return replace(calibration, gains=gains)

@@ -1,8 +1,10 @@
-"""Look at a block right after its recording: a mistake that it shows costs one block then, and not the session.
+"""Look at a block right after its recording:
+a mistake that it shows costs one block then, and not the session.
 
-The body on the flange is weighed with the nameplate gains (`ident.weighing`), beside the blocks before. These
-gains may be off by a quarter; a body that was forgotten is off by all of its mass. In a wrong geometry the weighing
-tells nothing, so gravity and the positions are judged before a body is blamed.
+The body on the flange is weighed with the nameplate gains (`ident.weighing`), beside the blocks
+before. These gains may be off by a quarter; a body that was forgotten is off by all of its mass. In
+a wrong geometry the weighing tells nothing, so gravity and the positions are judged before a body
+is blamed.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ LEAST_SIGMAS = 5.0  #: Of the difference
 COARSE_SHARE = 0.5  #: The same of the payload's mass: a coarser weighing tells nothing
 MOMENT = slice(6, 9)  #: m x, m y and m z among the ten parameters of a body
 LARGEST_SHIFT_M = 0.02  #: Of the centre of mass between two blocks; a turned body moves it by more
-SAME_BODY = (0.5, 2.0)  #: Weighed over declared mass: outside, it is another body, or a gain is far off
+#: Weighed over declared mass: outside, it is another body, or a gain is far off
+SAME_BODY = (0.5, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +39,13 @@ class BlockFacts:
     """What the log of a block shows by itself, and beside earlier blocks."""
 
     unreadable: str = ""  #: why no fit can use it; empty where one can
-    saturated_percent: tuple[float, ...] = ()  #: share of samples with an active current limit, by axis
-    added_kg: float | None = None  #: mass on the flange beyond that in the earlier blocks; None where it does not show
+    #: share of samples with an active current limit, by axis
+    saturated_percent: tuple[float, ...] = ()
+    #: mass on the flange beyond that in the earlier blocks; None where it does not show
+    added_kg: float | None = None
     added_std_kg: float = 0.0  #: its σ, the gains taken as exact
-    added_moment_kg_m: float = 0.0  #: size of the first moment of mass that comes with it; 0 where it does not show
+    #: size of the first moment of mass that comes with it; 0 where it does not show
+    added_moment_kg_m: float = 0.0
     added_moment_std_kg_m: float = 0.0  #: its σ likewise
 
 
@@ -71,7 +77,9 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
     if not others:
         return BlockFacts(saturated_percent=saturated)
     try:
-        body = weigh(_with_nameplate_gains(cell), model_of(cell), (run,), cell.conditioning, bare=others)
+        body = weigh(
+            _with_nameplate_gains(cell), model_of(cell), (run,), cell.conditioning, bare=others
+        )
     except IdentificationError:
         return BlockFacts(saturated_percent=saturated)
     if not np.isfinite(body.mass_kg):
@@ -90,11 +98,14 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
 
 
 def look_at_geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
-    """Return what is wrong with gravity, a zero or the sense of a position by these logs, as a fit of them says it.
+    """Return what is wrong with gravity, a zero or the sense of a position by these logs,
+    as a fit of them says it.
 
     None where the description explains them as well as any other, and where they tell nothing.
     """
-    recordings = Recordings(tuple(logs), lambda log: load_run(log, cell), gains_fixed=False, described=cell)
+    recordings = Recordings(
+        tuple(logs), lambda log: load_run(log, cell), gains_fixed=False, described=cell
+    )
     try:
         return turned_geometry(recordings, (), None)
     except (DataError, IdentificationError):
@@ -104,8 +115,8 @@ def look_at_geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
 def compared_with(blocks: Sequence[Block]) -> tuple[Block, ...]:
     """Return the earlier blocks that the last one is weighed beside.
 
-    They have the same body; without such blocks, a loaded block is weighed beside bare ones, and a bare block that is
-    recorded again beside loaded ones.
+    They have the same body; without such blocks, a loaded block is weighed beside bare ones, and a
+    bare block that is recorded again beside loaded ones.
     """
     *earlier, last = blocks
     same = tuple(block for block in earlier if block.payload == last.payload)
@@ -113,13 +124,18 @@ def compared_with(blocks: Sequence[Block]) -> tuple[Block, ...]:
 
 
 def mistake_in(
-    cell: Cell, payload: str, blocks: Sequence[Block], facts: BlockFacts, repeated: Sequence[str] = ()
+    cell: Cell,
+    payload: str,
+    blocks: Sequence[Block],
+    facts: BlockFacts,
+    repeated: Sequence[str] = (),
 ) -> Mistake | None:
     """Judge the last block.
 
     Args:
         cell: of the session.
-        payload: name of the body of the loaded blocks; its mass is that of the cell file until it was weighed.
+        payload: name of the body of the loaded blocks; its mass is that of the cell file until it
+            was weighed.
         blocks: of the session, in the order of their recording.
         facts: of the last block, beside `compared_with` of these blocks.
         repeated: names of the blocks that were recorded again because of a mistake.
@@ -152,21 +168,25 @@ def _mistake_of_body(
     if has_same and last.payload is None:
         return _bare_beside_bare(blocks, body, added_kg, least_kg)
     if has_same:
-        return _loaded_beside_loaded(last, body, added_kg, least_kg) or _turned(last, body.mass_kg, facts)
+        return _loaded_beside_loaded(last, body, added_kg, least_kg) or _turned(
+            last, body.mass_kg, facts
+        )
     if last.payload is None:
         return _bare_beside_loaded(last, body, added_kg, least_kg)
     return _loaded_beside_bare(blocks, body, added_kg, least_kg, is_again=is_again)
 
 
 def _limited(cell: Cell, facts: BlockFacts) -> str:
-    """Name the axis that was at its current limit for longer than a write takes; empty where none was."""
+    """Name the axis that was at its current limit for longer than a write takes;
+    empty where none was.
+    """
     most_percent = cell.apply.max_saturated_percent
     for axis, percent in zip(cell.axis_names, facts.saturated_percent, strict=False):
         if percent > most_percent:
             return (
-                f"{axis} was at its current limit for {percent:.1f} % of this block, and a write takes at most "
-                f"{most_percent:g} %. Press Ctrl-C, lower the acceleration limit of {axis} in the cell file, and start "
-                "again."
+                f"{axis} was at its current limit for {percent:.1f} % of this block, and a write "
+                f"takes at most {most_percent:g} %. Press Ctrl-C, lower the acceleration limit of "
+                f"{axis} in the cell file, and start again."
             )
     return ""
 
@@ -180,23 +200,31 @@ def _bare_beside_bare(
     last = blocks[-1]
     if added_kg > 0.0:
         name = body.name.upper()
-        text = f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: take {name} off."
+        text = (
+            f"A body of about {added_kg:.2g} kg was on the flange, and this block has none: "
+            f"take {name} off."
+        )
         return Mistake((last.name,), text)
     earlier = tuple(block.name for block in compared_with(blocks))
     text = (
-        f"The flange carried about {-added_kg:.2g} kg less than in {' and '.join(earlier)}, where it should be bare, "
-        "too. All of these are recorded again, without anything on the flange."
+        f"The flange carried about {-added_kg:.2g} kg less than in {' and '.join(earlier)}, where "
+        "it should be bare, too. All of these are recorded again, without anything on the flange."
     )
     return Mistake((*earlier, last.name), text)
 
 
-def _loaded_beside_loaded(last: Block, body: WeighedPayload, added_kg: float, least_kg: float) -> Mistake | None:
+def _loaded_beside_loaded(
+    last: Block, body: WeighedPayload, added_kg: float, least_kg: float
+) -> Mistake | None:
     """Judge a loaded block beside earlier loaded ones."""
     if abs(added_kg) <= least_kg:
         return None
     change = f"{abs(added_kg):.2g} kg {'more' if added_kg > 0.0 else 'less'}"
     name = body.name.upper()
-    text = f"The flange carried about {change} than in the loaded blocks before: mount {name}, as it was then."
+    text = (
+        f"The flange carried about {change} than in the loaded blocks before: mount {name}, as "
+        "it was then."
+    )
     return Mistake((last.name,), text)
 
 
@@ -209,46 +237,59 @@ def _turned(last: Block, mass_kg: float, facts: BlockFacts) -> Mistake | None:
     if shift_m <= max(LARGEST_SHIFT_M, noise_m):
         return None
     text = (
-        f"The centre of mass of {last.payload.upper()} was about {1000.0 * shift_m:.0f} mm away from where it was in "
-        "the loaded blocks before: mount it as it was then, not turned."
+        f"The centre of mass of {last.payload.upper()} was about {1000.0 * shift_m:.0f} mm away "
+        "from where it was in the loaded blocks before: mount it as it was then, not turned."
     )
     return Mistake((last.name,), text)
 
 
-def _bare_beside_loaded(last: Block, body: WeighedPayload, added_kg: float, least_kg: float) -> Mistake | None:
+def _bare_beside_loaded(
+    last: Block, body: WeighedPayload, added_kg: float, least_kg: float
+) -> Mistake | None:
     """Judge a bare block beside loaded ones, as the first bare block that is recorded again."""
     if abs(added_kg) > least_kg:
         return None
-    text = f"The flange carried the same as in the loaded blocks before: take {body.name.upper()} off."
+    text = (
+        f"The flange carried the same as in the loaded blocks before: take {body.name.upper()} off."
+    )
     return Mistake((last.name,), text)
 
 
 def _loaded_beside_bare(
-    blocks: Sequence[Block], body: WeighedPayload, added_kg: float, least_kg: float, *, is_again: bool
+    blocks: Sequence[Block],
+    body: WeighedPayload,
+    added_kg: float,
+    least_kg: float,
+    *,
+    is_again: bool,
 ) -> Mistake | None:
     """Judge the first loaded block beside the bare ones.
 
-    Where it carries the same, the body was forgotten, as a rule: one block tells. Only where it carries the same once
-    more, the body was there in the bare ones.
+    Where it carries the same, the body was forgotten, as a rule: one block tells. Only where it
+    carries the same once more, the body was there in the bare ones.
     """
     last = blocks[-1]
     name = body.name.upper()
     everything = tuple(block.name for block in blocks)
     bare = " and ".join(everything[:-1])
-    again = "All of these are recorded again, those before the last one without anything on the flange."
+    again = (
+        "All of these are recorded again, those before the last one without anything on the flange."
+    )
     is_same = abs(added_kg) <= least_kg
     if is_same and not is_again:
-        return Mistake((last.name,), f"The flange carried the same as in {bare}: {name} was missing. Mount it.")
+        return Mistake(
+            (last.name,), f"The flange carried the same as in {bare}: {name} was missing. Mount it."
+        )
     if is_same:
         text = (
-            f"The flange carried the same as in {bare} once more: if {name} is mounted now, it was there before, too. "
-            f"{again}"
+            f"The flange carried the same as in {bare} once more: if {name} is mounted now, it was "
+            f"there before, too. {again}"
         )
         return Mistake(everything, text)
     if added_kg < 0.0:
         text = (
-            f"In {' and '.join(everything)} the flange carried about {-added_kg:.2g} kg more without load than with "
-            f"{name}: the two were exchanged. {again}"
+            f"In {' and '.join(everything)} the flange carried about {-added_kg:.2g} kg more "
+            f"without load than with {name}: the two were exchanged. {again}"
         )
         return Mistake(everything, text)
     lower, upper = SAME_BODY

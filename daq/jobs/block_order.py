@@ -1,14 +1,16 @@
 """Which block comes next in a guided session: without load, or with the payload.
 
-With one friction for all blocks, the first three are bare, loaded, and loaded once more, held out. Pairs follow in an
-order that cancels drift: loaded, bare, bare, loaded. The means of the bare and of the loaded blocks then lie at one
-time, and friction that falls evenly as the arm gets warm is the same for both.
+With one friction for all blocks, the first three are bare, loaded, and loaded once more, held out.
+Pairs follow in an order that cancels drift: loaded, bare, bare, loaded. The means of the bare and
+of the loaded blocks then lie at one time, and friction that falls evenly as the arm gets warm is
+the same for both.
 
-With `friction_by_payload`, a change of friction between bare and loaded blocks is no gain, in whatever order they come.
-So the order is the one that takes a person the least time, and a change of the payload takes minutes. All bare blocks
-that the target needs by the plan come first; then the payload stays on. Gains are seen by the difference of bare and
-loaded blocks: of n and k of them, σ² of a gain falls as 1/n + 1/k. Where the time of the session is too short for the
-target, the order is the one that leaves σ smallest at its end.
+With `friction_by_payload`, a change of friction between bare and loaded blocks is no gain, in
+whatever order they come. So the order is the one that takes a person the least time, and a change
+of the payload takes minutes. All bare blocks that the target needs by the plan come first; then the
+payload stays on. Gains are seen by the difference of bare and loaded blocks: of n and k of them, σ²
+of a gain falls as 1/n + 1/k. Where the time of the session is too short for the target, the order
+is the one that leaves σ smallest at its end.
 """
 
 from __future__ import annotations
@@ -45,19 +47,22 @@ class BlocksSoFar:
 
 
 def first_blocks(bare: int) -> tuple[BlockRole, ...]:
-    """Return the blocks with which every session begins: so many bare ones, then a loaded one, and one held out."""
+    """Return the blocks with which every session begins:
+    so many bare ones, then a loaded one, and one held out.
+    """
     return (*(BlockRole.BARE,) * bare, *FIRST_BLOCKS[1:])
 
 
 def bare_blocks_first(variance_ratio: float, blocks_in_time: int) -> int:
     """Return how many bare blocks to record before the payload is mounted, at least one.
 
-    Of n bare and as many loaded blocks, σ² is that of one of each over n. One bare block too many costs its time; with
-    one too few the payload comes off again, which takes longer. Of a session too short for the target, half of the
-    blocks of the fit are bare.
+    Of n bare and as many loaded blocks, σ² is that of one of each over n. One bare block too many
+    costs its time; with one too few the payload comes off again, which takes longer. Of a session
+    too short for the target, half of the blocks of the fit are bare.
 
     Args:
-        variance_ratio: predicted σ² of the worst gain over that of its target, with one bare and one loaded block.
+        variance_ratio: predicted σ² of the worst gain over that of its target, with one bare and
+            one loaded block.
         blocks_in_time: number of blocks until the time limit, the held-out one included.
     """
     most = min(MOST_BARE_FIRST, max(1, (blocks_in_time - 1) // 2))
@@ -86,7 +91,9 @@ class BlocksToCome:
         return self.bare + self.loaded
 
 
-def quickest_way(so_far: BlocksSoFar, variance_ratio: float, block_s: float, most: int = FAR) -> BlocksToCome:
+def quickest_way(
+    so_far: BlocksSoFar, variance_ratio: float, block_s: float, most: int = FAR
+) -> BlocksToCome:
     """Return the further blocks with which every gain is precise in the least time of a person.
 
     Where they are more than there is time for, it is the blocks of that time that leave σ smallest.
@@ -133,7 +140,9 @@ def next_role(so_far: BlocksSoFar, way: BlocksToCome) -> BlockRole:
 
 
 def _with_bare(so_far: BlocksSoFar, bare: int, wanted: float) -> BlocksToCome | None:
-    """The fewest loaded blocks that are enough beside so many bare ones; None where no number is."""
+    """The fewest loaded blocks that are enough beside so many bare ones;
+    None where no number is.
+    """
     left = wanted - 1.0 / (so_far.bare + bare)
     if left <= 0.0:
         return None

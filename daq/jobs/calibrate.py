@@ -1,4 +1,6 @@
-"""A guided session: from a wired cell to an accepted calibration, with a person who mounts, weighs and approves."""
+"""A guided session: from a wired cell to an accepted calibration, with a person who mounts,
+weighs and approves.
+"""
 
 from __future__ import annotations
 
@@ -52,17 +54,25 @@ def calibrate(
     """Calibrate a cell with an operator, or go on with the session that was ended before.
 
     Raises:
-        JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next line.
-        DaqError, DriverError, IdentificationError: the error that ended the session; the axes were stopped, and audit
-            and state report it. The same call goes on from there.
+        JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next
+            line.
+        DaqError, DriverError, IdentificationError: the error that ended the session; the axes were
+            stopped, and audit and state report it. The same call goes on from there.
     """
     context = context_of(cell_file, cell, settings, operator, tools, journal)
     with bus_lock(cell, lock_folder):
         session = _resumed_or_new(context)
         journal = replace(journal, session=session.state.session)
-        context = replace(context, journal=journal, began_s=tools.monotonic_s(), block_signals=block_signals)
+        context = replace(
+            context, journal=journal, began_s=tools.monotonic_s(), block_signals=block_signals
+        )
         try:
-            audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
+            audit_entry(
+                context,
+                AuditAction.RECALIBRATION_BEGUN,
+                session,
+                {"attempt": session.state.attempt},
+            )
             session = run_stages(stages_of(settings), context, session)
         except BaseException as error:
             report_failure(context, session.folder, error)
@@ -77,7 +87,8 @@ def _name_next_step(cell_file: Path, folder: Path, error: BaseException) -> None
     if found is None or not isinstance(found.state, GuidedState):
         return
     blocks = ", ".join(run.name for run in found.state.runs)
-    is_taken = any(note.startswith("kept: ") for note in all_notes(error))  # by what could not be recorded
+    # By what could not be recorded
+    is_taken = any(note.startswith("kept: ") for note in all_notes(error))
     if not is_taken:
         error.add_note(f"kept: {blocks or 'no block yet'}")
     next_step = next_step_after(error, cell_file, found)
@@ -94,19 +105,30 @@ def stages_of(settings: GuidedSettings) -> tuple[Stage, ...]:
 
 
 def context_of(
-    cell_file: Path, cell: Cell, settings: GuidedSettings, operator: Operator, tools: Tools, journal: Journal
+    cell_file: Path,
+    cell: Cell,
+    settings: GuidedSettings,
+    operator: Operator,
+    tools: Tools,
+    journal: Journal,
 ) -> SessionContext:
     """Return what the stages of a guided session share."""
-    return SessionContext(cell_file, cell, settings, UntilPrecise(settings), operator, target_of(cell), tools, journal)
+    return SessionContext(
+        cell_file, cell, settings, UntilPrecise(settings), operator, target_of(cell), tools, journal
+    )
 
 
 def session_basis(cell: Cell) -> Basis:
-    """Return what a session must share with the present cell to be resumed; its plans are its own."""
+    """Return what a session must share with the present cell to be resumed;
+    its plans are its own.
+    """
     return Basis(cell.name, cell.digest, "")
 
 
 def _resumed_or_new(context: SessionContext) -> Session:
-    """Take up the newest session if it is unfinished, of the same cell file and recent; else begin one."""
+    """Take up the newest session if it is unfinished, of the same cell file and recent;
+    else begin one.
+    """
     now = context.tools.now()
     folder = context.settings.folder
     found = sessions_that_count(sessions.sessions(folder, context.cell.name), now, context.journal)
@@ -118,7 +140,9 @@ def _resumed_or_new(context: SessionContext) -> Session:
         return session
     attempt = session.state.attempt + 1
     blocks = [run.name for run in session.state.runs]
-    context.journal.say(Level.NOTICE, "session taken up", attempt=attempt, recorded=", ".join(blocks) or "nothing")
+    context.journal.say(
+        Level.NOTICE, "session taken up", attempt=attempt, recorded=", ".join(blocks) or "nothing"
+    )
     return sessions.resume(session, now)
 
 
@@ -136,7 +160,12 @@ def _say_why_new(context: SessionContext, found: tuple[Session, ...], now: datet
     reason = f"the cell file has changed since{refit}"
     if now - last.began > timedelta(hours=RESUME_WITHIN_H):
         reason = f"it is older than {RESUME_WITHIN_H:g} h"
-    context.journal.say(Level.WARNING, "an unfinished session is not taken up", folder=str(last.folder), reason=reason)
+    context.journal.say(
+        Level.WARNING,
+        "an unfinished session is not taken up",
+        folder=str(last.folder),
+        reason=reason,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,10 +182,16 @@ class CheckLine:
         return self.error is None
 
 
-def check_readiness(context: SessionContext, payload: str | None, block_s: float) -> tuple[CheckLine, ...]:
-    """Check what a session needs, and predict what it can know; nothing moves, and nothing is written."""
+def check_readiness(
+    context: SessionContext, payload: str | None, block_s: float
+) -> tuple[CheckLine, ...]:
+    """Check what a session needs, and predict what it can know;
+    nothing moves, and nothing is written.
+    """
     return (
-        _checked("cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"),
+        _checked(
+            "cell file", lambda: f"{len(context.cell.axes)} axes, digest {context.cell.digest[:12]}"
+        ),
         _checked("payload", lambda: _payload_text(context.cell, payload)),
         _checked("disk, interlock, drives", lambda: _ready_text(context)),
         _checked("expected precision", lambda: _predicted_text(context, payload, block_s)),
@@ -192,7 +227,9 @@ def payload_for_blocks(cell: Cell, name: str | None) -> WeighedPayload:
     else:
         expected = "at least one in `payloads`: its mass is the scale of all gains"
         remedy = "add it to the cell file with its mass"
-    raise ConfigurationInconsistent(f"payload of cell {cell.name!r}", found=found, expected=expected, remedy=remedy)
+    raise ConfigurationInconsistent(
+        f"payload of cell {cell.name!r}", found=found, expected=expected, remedy=remedy
+    )
 
 
 def _payload_text(cell: Cell, name: str | None) -> str:

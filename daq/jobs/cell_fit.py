@@ -1,4 +1,6 @@
-"""Fit one cell of a fleet, in any process: a calibration, or the reason for a failure; and the cache of results."""
+"""Fit one cell of a fleet, in any process: a calibration, or the reason for a failure;
+and the cache of results.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,8 @@ class Summary:
 
     gains: tuple[Gain, ...]  #: one an axis
     effects: tuple[tuple[str, str], ...]  #: family and axis of each accepted effect
-    error_percent: float  #: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%]
+    #: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%]
+    error_percent: float
     held_out: bool  #: whether it is that of a run held out
     partial: bool  #: it rests on a log that was never finished, or with losses
 
@@ -163,18 +166,23 @@ _SUMMARY = TypeAdapter(Summary)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationCache:
-    """A calibration file a cell, and beside each a small JSON file that says what it was made of."""
+    """A calibration file a cell, and beside each a small JSON file that says what it was made
+    of.
+    """
 
     folder: Path  #: made already
     loop: Loop  #: what is wanted of every cell
 
     def file(self, cell: CellLogs) -> Path:
-        """Calibration file of a cell: its name in safe characters, and the first digits of its digest."""
+        """Calibration file of a cell: its name in safe characters,
+        and the first digits of its digest.
+        """
         name = re.sub(r"[^\w.-]", "_", cell.cell)[:40]
         return self.folder / f"{name}-{cell.configuration_sha256[:12]}.yaml"
 
     def cached(self, cell: CellLogs) -> tuple[Summary, float] | None:
-        """Summary of the cached calibration of these logs, and the seconds that it took; None where there is none.
+        """Summary of the cached calibration of these logs, and the seconds that it took;
+        None where there is none.
 
         The file itself is not parsed: its digest identifies it.
 
@@ -187,7 +195,11 @@ class CalibrationCache:
         try:
             # Read without waiting for a pipe, and no more than a calibration can have.
             state = json.loads(read_regular(file.with_suffix(".json"), MAX_BYTES))
-            wanted = (FORMAT, self._inputs(cell), hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest())
+            wanted = (
+                FORMAT,
+                self._inputs(cell),
+                hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest(),
+            )
             if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != wanted:
                 return None
             found = _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
@@ -202,7 +214,8 @@ class CalibrationCache:
         return None
 
     def store(self, cell: CellLogs, fitted: FleetFit) -> Path:
-        """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.
+        """Store a calibration; after a kill at any point,
+        the cache is whole or the entry is made anew.
 
         Raises:
             OutputFailed: the file system refuses.
@@ -223,10 +236,19 @@ class CalibrationCache:
         return file
 
     def _inputs(self, cell: CellLogs) -> str:
-        """Digest of all that decides a calibration: software, options, configuration, logs and their roles."""
+        """Digest of all that decides a calibration:
+        software, options, configuration, logs and their roles.
+        """
         logs = [_input("fit", seen) for seen in cell.fit]
         logs += [_input("holdout", seen) for seen in cell.holdout]
-        decisive = (STATE_VERSION, software(), self.loop.value, cell.cell, cell.configuration_sha256, logs)
+        decisive = (
+            STATE_VERSION,
+            software(),
+            self.loop.value,
+            cell.cell,
+            cell.configuration_sha256,
+            logs,
+        )
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
 
@@ -244,7 +266,9 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
         OutputFailed: the file system refuses.
     """
     if folder.exists() and not folder.is_dir():
-        raise UsageError(str(folder), found="a file", expected="a folder, or none", remedy="choose another name")
+        raise UsageError(
+            str(folder), found="a file", expected="a folder, or none", remedy="choose another name"
+        )
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

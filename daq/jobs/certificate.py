@@ -1,7 +1,9 @@
-"""The certificate of a calibration that a session has made: first before its decision, and again behind it.
+"""The certificate of a calibration that a session has made:
+first before its decision, and again behind it.
 
-The page needs the fit for its details, and a command that goes on with a session does not have it any more. So they are
-kept in a file beside the page, and the page is made again from calibration, audit log and this file.
+The page needs the fit for its details, and a command that goes on with a session does not have it
+any more. So they are kept in a file beside the page, and the page is made again from calibration,
+audit log and this file.
 """
 
 from __future__ import annotations
@@ -39,7 +41,12 @@ class StoredDetails(StrictModel):
 
 
 def save_certificate(
-    cell_file: Path, cell: Cell, fitted: Fit, changed: Account, calibration: Calibration, folder: Path
+    cell_file: Path,
+    cell: Cell,
+    fitted: Fit,
+    changed: Account,
+    calibration: Calibration,
+    folder: Path,
 ) -> Certificate:
     """Write the page of a session, with the gains beside the current ones.
 
@@ -98,6 +105,10 @@ def read_details(path: Path) -> PageDetails:
     return PageDetails(stored.consequence, stored.sections)
 
 
-def _compared(cell_file: Path, cell: Cell, calibration: Calibration, session: Path, now: datetime) -> Comparison:
-    command = f"drivegain apply {shlex.quote(str(cell_file))} {shlex.quote(str(session / CALIBRATION))}"
+def _compared(
+    cell_file: Path, cell: Cell, calibration: Calibration, session: Path, now: datetime
+) -> Comparison:
+    command = (
+        f"drivegain apply {shlex.quote(str(cell_file))} {shlex.quote(str(session / CALIBRATION))}"
+    )
     return compare(cell, Request(calibration, now), command)

@@ -48,22 +48,28 @@ from ident.discovery.loop import Step
 from ident.errors import Diagnosis
 
 PROGRAM_SINCE = datetime(2026, 1, 1, tzinfo=UTC)
-"""No right clock is before this program was made: a computer without battery begins in 1970, or at an older date."""
+"""No right clock is before this program was made:
+a computer without battery begins in 1970, or at an older date.
+"""
 
-# A killed recorder cannot remove the power. Its drives watch its heartbeat (1016h) and quick stop when it stays away,
-# so a session waits for that. Most drives then remove the power themselves. Those that stay in QUICK STOP ACTIVE
-# (605Ah = 5 to 8) or SWITCHED ON lose it here, at standstill, with the interlock closed. A drive that watches no killed
-# recorder belongs to another controller: it is left alone.
+# A killed recorder cannot remove the power. Its drives watch its heartbeat (1016h) and quick stop
+# when it stays away, so a session waits for that. Most drives then remove the power themselves.
+# Those that stay in QUICK STOP ACTIVE (605Ah = 5 to 8) or SWITCHED ON lose it here, at standstill,
+# with the interlock closed. A drive that watches no killed recorder belongs to another controller:
+# it is left alone.
 
 FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
-LEFT = (State.QUICK_STOP_ACTIVE, State.SWITCHED_ON)  #: States of power without a motion that a killed recorder leaves
-IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)  #: Without power in the motor, and without a request for it
-STOP_S = 15.0  #: For the quick stop after a guard has expired; a simulated cell on a busy machine may be that slow
+#: States of power without a motion that a killed recorder leaves
+LEFT = (State.QUICK_STOP_ACTIVE, State.SWITCHED_ON)
+#: Without power in the motor, and without a request for it
+IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)
+#: For the quick stop after a guard has expired; a simulated cell on a busy machine may be that slow
+STOP_S = 15.0
 ASK_S = 0.1  #: Between two questions for the states
 STANDSTILL_S = 0.2  #: Between two readings of a position that must agree
 OTHERS = (
-    "nothing was changed: end the other controller; if a recorder was killed there, `drivegain record` takes the drive "
-    "over, or switch it off and on"
+    "nothing was changed: end the other controller; if a recorder was killed there, `drivegain "
+    "record` takes the drive over, or switch it off and on"
 )
 
 Powered = tuple[tuple[Axis, int], ...]  #: Axes with power, and their statuswords
@@ -75,7 +81,8 @@ def check_drives(cell: Cell, block_signals: SignalBlocker, take_over: bool) -> N
     Args:
         cell: whose drives these are.
         block_signals: as in `network_of`.
-        take_over: remove the power of drives that a killed recorder left with it; else nothing is changed.
+        take_over: remove the power of drives that a killed recorder left with it; else nothing is
+            changed.
 
     Raises:
         DriveFault: one has a fault; to reset it is a person's decision.
@@ -84,7 +91,8 @@ def check_drives(cell: Cell, block_signals: SignalBlocker, take_over: bool) -> N
         DriverError: a drive does not answer, is another one than declared, or the bus has gone.
     """
     with network_of(cell, block_signals) as network:
-        network.require_quiet()  # a recorder on another computer is not excluded by the lock of the bus
+        # A recorder on another computer is not excluded by the lock of the bus
+        network.require_quiet()
         network.check_identities()
         left = _with_power(network)
         if not left:
@@ -106,7 +114,9 @@ def _with_power(network: CanopenNetwork) -> Powered:
     found = tuple(zip(network.axes, network.statuswords(), strict=True))
     for axis, statusword in found:
         if (state := decode(statusword)) in FAULTS:
-            raise DriveFault(axis, f"{state} before the job began; find its cause, then reset it", statusword)
+            raise DriveFault(
+                axis, f"{state} before the job began; find its cause, then reset it", statusword
+            )
     return tuple((axis, statusword) for axis, statusword in found if decode(statusword) not in IDLE)
 
 
@@ -120,7 +130,9 @@ def _require_ours(network: CanopenNetwork, left: Powered) -> None:
 
 
 def _wait(network: CanopenNetwork, left: Powered) -> Powered:
-    """Let the guards expire and the axes stop by themselves; return those that have power all the same."""
+    """Let the guards expire and the axes stop by themselves;
+    return those that have power all the same.
+    """
     clock = network.link.clock
     end_ns = clock() + network.guard_ms * 10**6 + round(STOP_S * 1e9)
     while left and clock() < end_ns:
@@ -134,11 +146,16 @@ def _require_stopped(network: CanopenNetwork, left: Powered) -> None:
     axes = [axis for axis, _ in left]
     before = _positions(network, axes)
     network.link.wait(STANDSTILL_S if left else 0.0)
-    for (axis, statusword), here, there in zip(left, before, _positions(network, axes), strict=True):
+    for (axis, statusword), here, there in zip(
+        left, before, _positions(network, axes), strict=True
+    ):
         if decode(statusword) not in LEFT:
             raise _refused(axis, statusword, OTHERS)
         if abs(there - here) > DEFAULT_BOUNDS.standstill_counts:
-            moves = f"it moves by {abs(there - here)} counts in {STANDSTILL_S:g} s: press the emergency stop"
+            moves = (
+                f"it moves by {abs(there - here)} counts in {STANDSTILL_S:g} s: press the "
+                "emergency stop"
+            )
             raise _refused(axis, statusword, moves)
 
 
@@ -147,7 +164,9 @@ def _positions(network: CanopenNetwork, axes: Sequence[Axis]) -> tuple[int, ...]
 
 
 def _refused(axis: Axis, statusword: int, remedy: str) -> StateRefused:
-    return StateRefused(axis, "no power before a job begins", str(decode(statusword)), statusword, remedy=remedy)
+    return StateRefused(
+        axis, "no power before a job begins", str(decode(statusword)), statusword, remedy=remedy
+    )
 
 
 class Planner(Protocol):
@@ -208,14 +227,18 @@ class GeometryJudge(Protocol):
 class Validator(Protocol):
     """Predicts logs with a calibration."""
 
-    def __call__(self, calibration: Calibration, logs: Sequence[Path], cell: Cell) -> tuple[Validation, ...]:
+    def __call__(
+        self, calibration: Calibration, logs: Sequence[Path], cell: Cell
+    ) -> tuple[Validation, ...]:
         """As `daq.workflow.validate.validate`."""
 
 
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
-    def __call__(self, proposal: Proposal[Any], now: datetime, *, audit: Path, who: str) -> Written | None:
+    def __call__(
+        self, proposal: Proposal[Any], now: datetime, *, audit: Path, who: str
+    ) -> Written | None:
         """As `daq.writeback.target.apply`."""
 
 
@@ -223,11 +246,14 @@ class ChangeWriter(Protocol):
 class Tools:
     """Functions that a job calls; tests replace those whose result they know."""
 
-    save_report: Callable[[Fit, Account, Calibration, Path], object]  #: writes the report of a fit into a folder
-    #: Checks the drives before anything moves, and takes over those of a killed recorder if the last argument says so.
+    #: writes the report of a fit into a folder
+    save_report: Callable[[Fit, Account, Calibration, Path], object]
+    #: Checks the drives before anything moves, and takes over those of a killed recorder if the
+    #: last argument says so.
     drives: Callable[[Cell, SignalBlocker, bool], None] = check_drives
     plan: Planner = plan
-    preview: Callable[[Cell, Plan, Path, Path], None] = save_preview  #: writes a page that shows a plan, from its file
+    #: writes a page that shows a plan, from its file
+    preview: Callable[[Cell, Plan, Path, Path], None] = save_preview
     record: Recorder = record
     look: BlockReader = look_at_block
     geometry: GeometryJudge = look_at_geometry
@@ -287,7 +313,9 @@ class NextRun:
 
 
 class Schedule(Protocol):
-    """Which runs a session consists of: those of the cell file, or blocks until every gain is precise."""
+    """Which runs a session consists of: those of the cell file,
+    or blocks until every gain is precise.
+    """
 
     def prepare(self, context: SessionContext, session: Session) -> Session:
         """Make what the first runs need, before anything moves."""
@@ -299,7 +327,9 @@ class Schedule(Protocol):
         """Whether nothing is left to record; the recorded runs of the session are verified."""
 
     def next_run(self, context: SessionContext, session: Session) -> tuple[Session, NextRun | None]:
-        """Decide the next run; None where the session has what it needs. The decision is in the session's state.
+        """Decide the next run; None where the session has what it needs.
+
+        The decision is in the session's state.
 
         Args:
             context: of the session.
@@ -335,7 +365,9 @@ class SessionContext:
         return self.target.opened(self.tools.network, self.block_signals)
 
     def content_sha256(self, calibration: Calibration) -> str | None:
-        """Return the SHA-256 of what is in the place of the gains now; see `GainTarget.content_sha256`."""
+        """Return the SHA-256 of what is in the place of the gains now;
+        see `GainTarget.content_sha256`.
+        """
         return self.target.content_sha256(calibration, self.tools.network, self.block_signals)
 
     @property
@@ -380,23 +412,28 @@ def section_of(cell: Cell) -> Recalibration:
             raise ConfigurationInconsistent(
                 f"recalibration.runs[{index}].mass_kg",
                 found=f"{run.mass_kg:g} kg",
-                expected=f"{payload.mass_kg:g} kg ± {payload.mass_tolerance_kg:g} kg, as `payloads` has {run.payload}",
+                expected=f"{payload.mass_kg:g} kg ± {payload.mass_tolerance_kg:g} kg, as "
+                f"`payloads` has {run.payload}",
                 remedy="weigh the payload again: its mass is in every gain",
             )
     if cell.motion is not MotionPolicy.ALLOWED:
         raise MotionRefused(
-            f"`policy: {{motion: {cell.motion.value}}}` for a job that moves the robot without an operator",
+            f"`policy: {{motion: {cell.motion.value}}}` for a job that moves the robot without "
+            "an operator",
             expected="`policy: {motion: allowed}` in the cell file",
-            remedy="nothing has moved; whoever answers for the cell writes it there, or a person records with "
-            "`drivegain record`",
+            remedy="nothing has moved; whoever answers for the cell writes it there, or a person "
+            "records with `drivegain record`",
         )
     return cell.recalibration
 
 
-def sessions_that_count(found: tuple[Session, ...], now: datetime, journal: Journal) -> tuple[Session, ...]:
+def sessions_that_count(
+    found: tuple[Session, ...], now: datetime, journal: Journal
+) -> tuple[Session, ...]:
     """Return the sessions of the past, and say those that were made under a later date.
 
-    A date that was wrong once must not hold every job until that day comes. The session is left as it is, for a person.
+    A date that was wrong once must not hold every job until that day comes. The session is left as
+    it is, for a person.
 
     Raises:
         JobHeld: the clock is before this program was made, so it is the clock that is wrong.
@@ -406,8 +443,8 @@ def sessions_that_count(found: tuple[Session, ...], now: datetime, journal: Jour
             "the clock of this computer",
             found=now.isoformat(timespec="seconds"),
             expected=f"a time after {PROGRAM_SINCE:%Y-%m-%d}, when this program was made",
-            remedy="nothing was begun; set the clock (`timedatectl`): ages of calibrations, names of folders, history "
-            "and audit log depend on it",
+            remedy="nothing was begun; set the clock (`timedatectl`): ages of calibrations, names "
+            "of folders, history and audit log depend on it",
         )
     counted = begun_until(found, now)
     for session in found:
@@ -415,11 +452,17 @@ def sessions_that_count(found: tuple[Session, ...], now: datetime, journal: Jour
             continue
         text = (
             f"found {session.folder}, begun {session.state.began}; expected a time before now, "
-            f"{now.isoformat(timespec='seconds')}; it counts neither for what is due nor as the last calibration, and "
-            "is not continued. If it was made under a wrong date, move the folder away once its logs are not needed; "
-            "if the clock is behind now, set it (`timedatectl`)"
+            f"{now.isoformat(timespec='seconds')}; it counts neither for what is due nor as the "
+            "last calibration, and is not continued. If it was made under a wrong date, move the "
+            "folder away once its logs are not needed; if the clock is behind now, set it "
+            "(`timedatectl`)"
         )
-        journal.say(Level.WARNING, "a session from the future does not count", text=text, folder=str(session.folder))
+        journal.say(
+            Level.WARNING,
+            "a session from the future does not count",
+            text=text,
+            folder=str(session.folder),
+        )
     return counted
 
 
@@ -437,7 +480,7 @@ def _require_own_history(context: SessionContext) -> None:
             f"cell {name!r}",
             found=f"a robot that was renamed to {history.renamed.new!r} at {history.renamed.at}",
             expected="a cell file with its present name",
-            remedy="nothing has moved; write the new name into the cell file, and make the schedule again "
+            remedy=f"nothing has moved; {history.renamed.remedy}; then make the schedule again "
             "(`drivegain schedule`)",
         )
     if history.other_robots:
@@ -445,14 +488,15 @@ def _require_own_history(context: SessionContext) -> None:
             str(context.ledger.audit),
             found=str(history.other_robots[0]),
             expected="a history of one robot",
-            remedy="nothing has moved; give the cell file of that robot, or name another audit log for this one "
-            "(`history.audit` of the cell file)",
+            remedy="nothing has moved; give the cell file of that robot, or name another audit log "
+            "for this one (`history.audit` of the cell file)",
         )
     for other in history.possible_names:
         text = (
-            f"found calibrations of cell {other!r} in the audit log, of a robot with the same joints and drives, and "
-            f"none of {name!r}; if this is that robot under a new name, `drivegain history {context.file} --rename "
-            f"{other}` takes its history and sessions over"
+            f"found calibrations of cell {other!r} in the audit log, of a robot with the same "
+            f"joints and drives, and none of {name!r}; if this is that robot under a new name, "
+            f"`drivegain history {context.file} --rename {other}` takes its history and sessions "
+            "over"
         )
         context.journal.say(Level.WARNING, "the cell may have been renamed", text=text)
 
@@ -462,10 +506,12 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
 
     Args:
         context: of the job.
-        take_over: remove the power of drives that a killed recorder left with it; else nothing is changed.
+        take_over: remove the power of drives that a killed recorder left with it; else nothing is
+            changed.
 
     Raises:
-        DiskSpaceShort, JobHeld, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing has moved.
+        DiskSpaceShort, JobHeld, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing
+            has moved.
         OutputFailed: the session's folder is gone.
     """
     settings = context.settings
@@ -477,9 +523,11 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
             str(settings.folder),
             found=f"{free_mb:.0f} MB free",
             expected=f"{settings.min_free_mb:g} MB (min_free_mb)",
-            remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
+            remedy="nothing has moved; free space, keep fewer sessions, or name a folder on "
+            "another disk",
         )
-    # The gains are compared with it: what is wrong with it is better known now than after the recordings.
+    # The gains are compared with it: what is wrong with it is better known now than after the
+    # recordings.
     _require_own_history(context)
     release_check(context.cell, tools.now, tools.run)()
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))

@@ -26,16 +26,22 @@ from daq.writeback.request import GainChange, Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 
-CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: an operator decides."
+CHANGED_SINCE_START = (
+    "The controller's file was written or rolled back since the session began: an operator decides."
+)
 PROPOSAL = "proposal.json"
 DIFF = "proposal.diff"
 
 
-def decide_outcome(context: SessionContext, session: Session, calibration: Calibration, history: History) -> Session:
-    """Compare a calibration with the current gains, and act on it; the outcome is in the returned state.
+def decide_outcome(
+    context: SessionContext, session: Session, calibration: Calibration, history: History
+) -> Session:
+    """Compare a calibration with the current gains, and act on it;
+    the outcome is in the returned state.
 
     Raises:
-        CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
+        CalibrationRefused: a check failed; the controller's file is unchanged, and the session is
+            over.
         AuditUnusable, OutputFailed: see `daq.writeback.target`.
     """
     path = session.folder / CALIBRATION
@@ -45,19 +51,31 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
     touched = _written_since(context, session)
     if before is not None and _has_written(context, before, calibration):
         if touched or not context.target.in_drives:
-            # The job was killed right after its write: the history has it by now, and it is never repeated.
-            words = "the controller has these gains already: an earlier job of this session wrote them"
+            # The job was killed right after its write: the history has it by now, and it is never
+            # repeated.
+            words = (
+                "the controller has these gains already: an earlier job of this session wrote them"
+            )
             context.journal.say(Level.NOTICE, words)
             return session.update(outcome=Outcome.APPLIED)
         return _saved_again(context, session, calibration)
-    proposal = _proposed(context, Request(calibration, now, file=path, content=read_calibration_bytes(path)))
+    proposal = _proposed(
+        context, Request(calibration, now, file=path, content=read_calibration_bytes(path))
+    )
     edit = proposal.edit
-    decision = decision_of(proposal, known_of(history, context.target.subject, digest, edit.changes))
+    decision = decision_of(
+        proposal, known_of(history, context.target.subject, digest, edit.changes)
+    )
     differs = any(gain.differs for gain in decision.gains)
     if differs and touched:
-        decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
+        decision = decision.model_copy(
+            update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"}
+        )
     context.journal.say(
-        Level.NOTICE, "compared with the gains in the controller", words=decision.remark, differs=differs
+        Level.NOTICE,
+        "compared with the gains in the controller",
+        words=decision.remark,
+        differs=differs,
     )
     after = sha256(edit.after)
     unsigned = any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals)
@@ -75,7 +93,9 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
     closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
     if closed:
         for refusal in closed:
-            context.journal.say(Level.ERROR, "a check failed", gate=refusal.gate.value, text=str(refusal))
+            context.journal.say(
+                Level.ERROR, "a check failed", gate=refusal.gate.value, text=str(refusal)
+            )
         session.update(outcome=Outcome.REFUSED)
         _apply(context, proposal, now)  # which refuses it, and writes that down
     if not edit.has_effect or not differs:
@@ -95,19 +115,30 @@ def decide_outcome(context: SessionContext, session: Session, calibration: Calib
             subject=context.target.subject,
             details=details,
         )
-        context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
+        context.journal.say(
+            Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder)
+        )
         return session.update(outcome=Outcome.PROPOSED)
     return _written(context, session, proposal, now)
 
 
-def _written(context: SessionContext, session: Session, proposal: Proposal[Any], now: datetime) -> Session:
+def _written(
+    context: SessionContext, session: Session, proposal: Proposal[Any], now: datetime
+) -> Session:
     """Write a change that the operator has approved."""
     written = _apply(context, proposal, now)
     if written is not None:
         subject = proposal.edit.subject
-        context.journal.say(Level.NOTICE, "written to the controller's file", file=subject, backup=str(written.backup))
+        context.journal.say(
+            Level.NOTICE,
+            "written to the controller's file",
+            file=subject,
+            backup=str(written.backup),
+        )
         if written.not_in_history:
-            words = "the history may lack this write; the next job, apply or history --add enters it"
+            words = (
+                "the history may lack this write; the next job, apply or history --add enters it"
+            )
             context.journal.say(Level.WARNING, words, text=written.not_in_history)
     return session.update(outcome=Outcome.APPLIED)
 
@@ -120,10 +151,14 @@ def _has_written(context: SessionContext, before: PlannedWrite, calibration: Cal
 
 
 def _saved_again(context: SessionContext, session: Session, calibration: Calibration) -> Session:
-    """Let drives save what a killed job wrote: without its last entry in the audit log, they may not have saved."""
+    """Let drives save what a killed job wrote:
+    without its last entry in the audit log, they may not have saved.
+    """
     now = context.tools.now()
     path = session.folder / CALIBRATION
-    proposal = _proposed(context, Request(calibration, now, file=path, content=read_calibration_bytes(path)))
+    proposal = _proposed(
+        context, Request(calibration, now, file=path, content=read_calibration_bytes(path))
+    )
     context.journal.say(Level.NOTICE, "the drives have these gains, and may not have saved them")
     if proposal.refusals or not context.operator.approve(proposal, touched=False):
         return session.update(outcome=Outcome.PROPOSED)
@@ -138,8 +173,8 @@ def _proposed(context: SessionContext, request: Request) -> Proposal[Any]:
 def _apply(context: SessionContext, proposal: Proposal[Any], now: datetime) -> Written | None:
     """Write what was proposed.
 
-    The bus is not kept open while the operator looks at the change. What is in the drives is read again, and another
-    change than the one that was looked at is refused.
+    The bus is not kept open while the operator looks at the change. What is in the drives is read
+    again, and another change than the one that was looked at is refused.
     """
     audit = context.target.history.audit
     with writing(proposal.edit.place):
@@ -152,7 +187,9 @@ def _apply(context: SessionContext, proposal: Proposal[Any], now: datetime) -> W
 
 
 def decision_of(proposal: Proposal[Any], known: Spread) -> Decision:
-    """Judge which gains differ significantly from the current ones (`daq.writeback.judgement`), each among all axes."""
+    """Judge which gains differ significantly from the current ones (`daq.writeback.judgement`),
+    each among all axes.
+    """
     judged, words = judge(proposal.edit.changes, known)
     gains = []
     for change in proposal.edit.changes:
@@ -177,8 +214,8 @@ def decision_of(proposal: Proposal[Any], known: Spread) -> Decision:
 def _written_since(context: SessionContext, session: Session) -> bool:
     """Whether the audit has a write or a rollback of the controller's file since the session began.
 
-    An earlier job may have been killed right after its write, and an operator may have undone that since. The file is
-    then as it was before, and the job must not repeat the write.
+    An earlier job may have been killed right after its write, and an operator may have undone that
+    since. The file is then as it was before, and the job must not repeat the write.
     """
     entries = read_audit(context.target.history.audit)
     begun = 0
@@ -188,13 +225,16 @@ def _written_since(context: SessionContext, session: Session) -> bool:
             break
     file = context.target.subject
     ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
-    # Without the entry of the begin, the older part of the audit was moved away: all entries are later.
+    # Without the entry of the begin, the older part of the audit was moved away: all entries are
+    # later.
     return any(entry.action in ends and entry.subject == file for entry in entries[begun:])
 
 
 def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str) -> None:
     """Write the change beside the calibration, as JSON and as a diff."""
-    refusals = [FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals]
+    refusals = [
+        FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals
+    ]
     report = ProposalReport(
         file=str(proposal.edit.name),
         base_sha256=proposal.edit.base_sha256,

@@ -1,6 +1,7 @@
 """Fit the cells of a fleet in parallel, and report a row for each: as a table, as CSV and as JSON.
 
-The workers are threads of this process, processes of this machine, or the workers of a dask scheduler.
+The workers are threads of this process, processes of this machine, or the workers of a dask
+scheduler.
 """
 
 from __future__ import annotations
@@ -10,7 +11,14 @@ import io
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -23,7 +31,15 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from daq.errors import ConfigurationMissing, UsageError, WorkersLost
-from daq.jobs.cell_fit import CalibrationCache, Failure, FleetFit, Loop, Summary, failure_of, fit_cell
+from daq.jobs.cell_fit import (
+    CalibrationCache,
+    Failure,
+    FleetFit,
+    Loop,
+    Summary,
+    failure_of,
+    fit_cell,
+)
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
 from daq.report.gains import with_deviation
 from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetGain, FleetReport
@@ -32,10 +48,15 @@ from ident.calibration import Gain
 
 HERE = "127.0.0.1"
 TRIMMING = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
-"""By which dask lets its workers give memory back after every use: a fit would spend a fifth of its time on that."""
+"""By which dask lets its workers give memory back after every use:
+a fit would spend a fifth of its time on that.
+"""
 WORKER_LOG = "distributed.nanny.pre-spawn-environ.DASK_LOGGING__DISTRIBUTED"
-"""By which workers choose what they log. A fit that fails is an error of its task; what they log besides is about their
-end, where on a busy machine a heartbeat finds the scheduler gone: a traceback that says nothing to anybody."""
+"""By which workers choose what they log.
+
+A fit that fails is an error of its task; what they log besides is about their end, where on a busy
+machine a heartbeat finds the scheduler gone: a traceback that says nothing to anybody.
+"""
 CONNECT_S = 10  #: How long a scheduler may take to answer [s]
 
 
@@ -56,7 +77,8 @@ def worker_pool(scheduler: str, workers: int | None) -> AbstractContextManager[W
         workers: None for as many as there are processors, or as the scheduler has threads.
 
     Raises:
-        UsageError: it is none of these; on entering, no scheduler answers at the address, or it has no workers.
+        UsageError: it is none of these; on entering, no scheduler answers at the address, or it has
+            no workers.
         ConfigurationMissing: on entering, dask.distributed is not installed.
     """
     here = workers or len(os.sched_getaffinity(0))
@@ -76,7 +98,9 @@ def worker_pool(scheduler: str, workers: int | None) -> AbstractContextManager[W
 
 @contextmanager
 def _threads(workers: int) -> Iterator[WorkerPool]:
-    """Yield a pool of threads; no installation is needed. Much of a fit is Python, of which one thread runs at a time.
+    """Yield a pool of threads; no installation is needed.
+
+    Much of a fit is Python, of which one thread runs at a time.
 
     At the end, running tasks are waited for and waiting ones are given up.
     """
@@ -91,8 +115,9 @@ def _threads(workers: int) -> Iterator[WorkerPool]:
 def _processes(workers: int) -> Iterator[WorkerPool]:
     distributed = _distributed()
     dask = import_module("dask")
-    # On this machine alone: who reaches a scheduler can run anything on its workers. Its dashboard is left out;
-    # its HTTP server cannot be, and takes a free port: on the usual one it would warn of any other cluster.
+    # On this machine alone: who reaches a scheduler can run anything on its workers. Its dashboard
+    # is left out; its HTTP server cannot be, and takes a free port: on the usual one it would warn
+    # of any other cluster.
     with (
         dask.config.set({TRIMMING: None, WORKER_LOG: "critical"}),
         distributed.LocalCluster(
@@ -110,7 +135,9 @@ def _processes(workers: int) -> Iterator[WorkerPool]:
 
 @contextmanager
 def _scheduler(address: str, workers: int | None) -> Iterator[WorkerPool]:
-    """Connect to a scheduler, here or on another machine; it and its workers go on when the block ends."""
+    """Connect to a scheduler, here or on another machine;
+    it and its workers go on when the block ends.
+    """
     try:
         client = _distributed().Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -118,7 +145,8 @@ def _scheduler(address: str, workers: int | None) -> Iterator[WorkerPool]:
             f"--scheduler {address}",
             found=str(error) or type(error).__name__,
             expected="a dask scheduler that answers",
-            remedy="start `dask scheduler`, and `dask worker ADDRESS` on each machine; or use --scheduler processes",
+            remedy="start `dask scheduler`, and `dask worker ADDRESS` on each machine; or use "
+            "--scheduler processes",
         ) from error
     with client:
         threads = sum(client.nthreads().values())
@@ -170,9 +198,12 @@ class FleetRow:
 
 
 SURVEYED = 16
-"""Logs whose heads one task reads: a cell's logs lie together, and share a configuration that is read once."""
+"""Logs whose heads one task reads: a cell's logs lie together,
+and share a configuration that is read once.
+"""
 
-LOOK_S = 30.0  #: Time without a result after which the workers are checked; a cell may well take longer
+#: Time without a result after which the workers are checked; a cell may well take longer
+LOOK_S = 30.0
 
 ProgressCallback = Callable[[int, int, str], None]  #: Done, total, and a remark
 Work = TypeVar("Work")
@@ -204,7 +235,15 @@ def fit_fleet(
     def row_of(cell: CellLogs, result: Summary | Failure, seconds: float) -> FleetRow:
         fit = tuple(seen.log.name for seen in cell.fit)
         holdout = tuple(seen.log.name for seen in cell.holdout)
-        return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, configurations[cell.cell])
+        return FleetRow(
+            cell.cell,
+            cell.configuration_sha256,
+            fit,
+            holdout,
+            result,
+            seconds,
+            configurations[cell.cell],
+        )
 
     missing = []
     for cell in cells:
@@ -221,7 +260,8 @@ def fit_fleet(
         return pool.executor.submit(fit_cell, cell, loop, now())
 
     for cell, made in each(submit, missing, pool):
-        # An exception is a worker that was killed, or an error of ours: the other cells have nothing to do with it.
+        # An exception is a worker that was killed, or an error of ours: the other cells have
+        # nothing to do with it.
         if isinstance(made, BaseException):
             found: FleetFit | Failure = failure_of(made)
         else:
@@ -292,7 +332,9 @@ def _surveyed(
     seen: list[SeenLog] = []
     unknown: list[UnknownLog] = []
     surveyed = 0
-    for portion, found in each(lambda portion: pool.executor.submit(survey, portion), portions, pool):
+    for portion, found in each(
+        lambda portion: pool.executor.submit(survey, portion), portions, pool
+    ):
         if isinstance(found, BaseException):  # a worker that was killed, or an error of ours
             unknown += [UnknownLog(log, found) for log in portion]
         else:
@@ -359,10 +401,14 @@ def _remarks(rows: Sequence[FleetRow]) -> list[str]:
         again = f" ({cached} of them kept from earlier, with the same logs)"
     lines = [f"{len(fitted)} of {len(rows)} fitted{again}."]
     if not all(summary.held_out for _, summary in fitted):
-        lines.append("* on the moves of the fit: the cell has no second run with the same payload to hold out.")
+        lines.append(
+            "* on the moves of the fit: the cell has no second run with the same payload "
+            "to hold out."
+        )
     several = {row.cell: row.configurations for row in rows if row.configurations > 1}
     lines += [
-        f"{cell}: logs of {count} configurations, each fitted on its own; check which one is current."
+        f"{cell}: logs of {count} configurations, each fitted on its own; check which one "
+        "is current."
         for cell, count in several.items()
     ]
     lines += [
@@ -374,7 +420,8 @@ def _remarks(rows: Sequence[FleetRow]) -> list[str]:
 
 
 def fleet_csv(rows: Sequence[FleetRow]) -> str:
-    """Write a line per cell, with all digits; gain, σ and unit of every axis that any of the cells has.
+    """Write a line per cell, with all digits;
+    gain, σ and unit of every axis that any of the cells has.
 
     Missing values are empty. No text is a formula to a spreadsheet.
     """
@@ -412,7 +459,11 @@ def _line(row: FleetRow) -> dict[str, Any]:
         "seconds": f"{row.seconds:.3f}",
     }
     if isinstance(result, Failure):
-        return line | {"exit_code": result.exit_code, "error_kind": result.kind, "error": result.text}
+        return line | {
+            "exit_code": result.exit_code,
+            "error_kind": result.kind,
+            "error": result.text,
+        }
     for gain in result.gains:
         line[f"{gain.axis} gain"] = gain.value
         line[f"{gain.axis} std"] = gain.std
@@ -479,4 +530,6 @@ def _measured_on(summary: Summary) -> Literal["holdout", "fit"]:
 
 
 def _fleet_gain(gain: Gain) -> FleetGain:
-    return FleetGain(axis=gain.axis, value=gain.value, std=gain.std, std_percent=gain.std_percent, unit=gain.unit)
+    return FleetGain(
+        axis=gain.axis, value=gain.value, std=gain.std, std_percent=gain.std_percent, unit=gain.unit
+    )

@@ -50,16 +50,23 @@ def list_logs(place: str) -> tuple[StoredLog, ...]:
         with _name_errors(place):
             store, root = _store(place)
             if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
-                logs = _listed_local(Path(root))  # file://: with links, pipes and devices, which fsspec does not report
+                # `file://` may have links, pipes and devices, which fsspec does not report.
+                logs = _listed_local(Path(root))
             else:
                 below = root.rstrip("/") + "/"
                 paths = [path for path in store.find(root) if path.endswith(ENDING)]
-                logs = [StoredLog(store.unstrip_protocol(path), path.removeprefix(below)) for path in paths]
+                logs = [
+                    StoredLog(store.unstrip_protocol(path), path.removeprefix(below))
+                    for path in paths
+                ]
     else:
         logs = _listed_local(Path(place))
     if not logs:
         raise LogMissing(
-            place, found=f"no file *{ENDING}", expected="a folder with the logs of cells", remedy="check the place"
+            place,
+            found=f"no file *{ENDING}",
+            expected="a folder with the logs of cells",
+            remedy="check the place",
         )
     return tuple(sorted(logs, key=lambda log: log.name))
 
@@ -98,15 +105,21 @@ def fingerprint(log: StoredLog) -> str:
 def _listed_local(folder: Path) -> list[StoredLog]:
     if not folder.is_dir():
         raise LogMissing(
-            str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
+            str(folder),
+            found="no such folder",
+            expected="a folder with the logs of cells",
+            remedy="check the name",
         )
-    # Absolute: a worker may run elsewhere. Entries that are no files stay: one may be in place of a cell's log.
+    # Absolute: a worker may run elsewhere. Entries that are no files stay: one may be in place of a
+    # cell's log.
     paths = folder.rglob(f"*{ENDING}")
     return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in paths]
 
 
 def _regular(path: Path) -> Path:
-    """Check that a log is a regular file before it is opened: a pipe or a device would never end."""
+    """Check that a log is a regular file before it is opened:
+    a pipe or a device would never end.
+    """
     if path.is_symlink() and not path.exists():
         found = f"a link to {path.readlink()}, which leads nowhere"
         remedy = "mount or copy what it leads to, or move the link away"
@@ -117,7 +130,9 @@ def _regular(path: Path) -> Path:
         remedy = f"put the log there, or give this a name without {ENDING}"
     else:
         return path
-    raise LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
+    raise LogMissing(
+        str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy
+    )
 
 
 def _copy(log: StoredLog, folder: Path) -> Path:
@@ -136,7 +151,9 @@ def _store(address: str) -> tuple[Any, str]:
             address,
             found=str(error),
             expected="an address that fsspec can read with what is installed",
-            remedy="pip install 'drivegain[fleet]'" if bare else "install what it names (for s3://: pip install s3fs)",
+            remedy="pip install 'drivegain[fleet]'"
+            if bare
+            else "install what it names (for s3://: pip install s3fs)",
         ) from error
     return store, path
 
@@ -158,7 +175,9 @@ def _name_errors(address: str) -> Iterator[None]:
 
 
 HEAD_BYTES = 4 * 2**20
-"""First read of a log in an object store; it usually holds the configuration files and the first samples."""
+"""First read of a log in an object store;
+it usually holds the configuration files and the first samples.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,11 +232,13 @@ def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
 def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
     """The logs of each cell and configuration, by name and digest.
 
-    The newest run with a payload is held out where the fit keeps another one with the same mounting and one without
-    load: its error is then measured on moves that no estimate has seen, and all gains can still be found.
+    The newest run with a payload is held out where the fit keeps another one with the same mounting
+    and one without load: its error is then measured on moves that no estimate has seen, and all
+    gains can still be found.
     """
     groups: dict[tuple[str, str], list[SeenLog]] = {}
-    # The order of a session, and by content where clocks agree: a fit's last digits depend on the order.
+    # The order of a session, and by content where clocks agree: a fit's last digits depend on the
+    # order.
     for log in sorted(seen, key=lambda log: (log.started_ns, log.fingerprint, log.log.name)):
         groups.setdefault((log.cell, log.configuration_sha256), []).append(log)
     cells = []
@@ -262,7 +283,8 @@ def _head(log: StoredLog) -> LogHead:
             next(iter(reader), None)
             head = reader.head
         except LogUnreadable as damage:
-            # A log with a damaged end still names its cell; the fit of that cell then reports the damage.
+            # A log with a damaged end still names its cell; the fit of that cell then reports the
+            # damage.
             try:
                 return _unfinished_head(path)
             except LogUnreadable:

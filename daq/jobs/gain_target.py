@@ -1,4 +1,6 @@
-"""Where a session finds and writes the gains of a cell: the controller's file, or the drives themselves."""
+"""Where a session finds and writes the gains of a cell:
+the controller's file, or the drives themselves.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ class GainTarget:
         return str(resolve_links(self.file))
 
     @contextmanager
-    def opened(self, network_of: NetworkMaker, block_signals: SignalBlocker) -> Iterator[Target[Any]]:
+    def opened(
+        self, network_of: NetworkMaker, block_signals: SignalBlocker
+    ) -> Iterator[Target[Any]]:
         """Open the target of a write; a bus is open within the context alone.
 
         Raises:
@@ -66,7 +70,8 @@ class GainTarget:
     def content_sha256(
         self, calibration: Calibration, network_of: NetworkMaker, block_signals: SignalBlocker
     ) -> str | None:
-        """Return the SHA-256 of the content now, read back from the drives; None for a file that is not there.
+        """Return the SHA-256 of the content now, read back from the drives;
+        None for a file that is not there.
 
         Raises:
             DriverError: a drive does not answer.
@@ -82,8 +87,10 @@ def target_of(cell: Cell) -> GainTarget:
     """Find the place of a cell's gains; a controller's file, where there are both.
 
     Raises:
-        ConfigurationInconsistent: the cell names neither a controller's file nor objects in its drives.
-        ControllerUnfit: the file is a symbolic link that a write would not follow (`daq.writeback.file_access`).
+        ConfigurationInconsistent: the cell names neither a controller's file nor objects in its
+            drives.
+        ControllerUnfit: the file is a symbolic link that a write would not follow
+            (`daq.writeback.file_access`).
     """
     controller = cell.controller
     file = cell.controller_path
@@ -102,7 +109,8 @@ def target_of(cell: Cell) -> GainTarget:
 
 
 def file_of(cell: Cell) -> GainTarget:
-    """Find the controller's file of a cell, for a job without an operator: what is in drives a person writes.
+    """Find the controller's file of a cell, for a job without an operator:
+    what is in drives a person writes.
 
     Raises:
         ConfigurationInconsistent: the cell names no controller file.
@@ -113,7 +121,8 @@ def file_of(cell: Cell) -> GainTarget:
             f"cell {cell.name!r}: controller",
             found="no file",
             expected="a controller's file: a job compares its gains with those in it",
-            remedy="name it in the cell file; `drivegain calibrate` writes what is in drives, with an operator",
+            remedy="name it in the cell file; `drivegain calibrate` writes what is in drives, with "
+            "an operator",
         )
     resolve_links(cell.controller_path)  # refused now, not after an hour of recordings
     return GainTarget(cell, cell.history, cell.controller_path)

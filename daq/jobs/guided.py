@@ -1,13 +1,15 @@
 """The schedule of a guided session: short blocks, bare and loaded, until every gain is precise.
 
-The first blocks are bare, then one is loaded, and one loaded but held out: with these, gains and their σ are known, and
-one change of the payload is enough. `block_order` says how many are bare, and which kind comes next.
+The first blocks are bare, then one is loaded, and one loaded but held out: with these, gains and
+their σ are known, and one change of the payload is enough. `block_order` says how many are bare,
+and which kind comes next.
 
-The moves are for all gains until these are known. Those of every later block are for the gain that is farthest from its
-target by then. From the fourth block on, moves stay inside the room and the speed of the first three, which the
-operator has looked at.
+The moves are for all gains until these are known. Those of every later block are for the gain that
+is farthest from its target by then. From the fourth block on, moves stay inside the room and the
+speed of the first three, which the operator has looked at.
 
-Where a block of the asked duration has no room for enough moves, it takes longer, and so do all later ones.
+Where a block of the asked duration has no room for enough moves, it takes longer, and so do all
+later ones.
 """
 
 from __future__ import annotations
@@ -67,8 +69,10 @@ class GuidedSettings:
 
     folder: Path  #: parent of the sessions
     payload: str  #: name of the body for the loaded blocks
-    target_percent: float = DEFAULT_TARGET_SIGMA_PERCENT  #: σ of each gain at which the recording ends
-    block_s: float = 20.0  #: duration of a block [s]; where it has no room for enough moves, blocks are longer
+    #: σ of each gain at which the recording ends
+    target_percent: float = DEFAULT_TARGET_SIGMA_PERCENT
+    #: duration of a block [s]; where it has no room for enough moves, blocks are longer
+    block_s: float = 20.0
     time_limit_min: float = 30.0  #: motion after which the recording ends, precise or not [min]
     warm_up_min: float = 0.0
     retries: int = 1
@@ -99,7 +103,8 @@ class UntilPrecise:
     settings: GuidedSettings
 
     def prepare(self, context: SessionContext, session: Session) -> Session:
-        """Forget blocks that were decided, but not recorded, and judge the others if that was not done.
+        """Forget blocks that were decided, but not recorded,
+        and judge the others if that was not done.
 
         Raises:
             ConfigurationInconsistent: its blocks carry another payload than is asked for.
@@ -150,7 +155,9 @@ class UntilPrecise:
         path = session.folder / plan_name(number)
         if number < len(FIRST_BLOCKS):
             session, plan = self._rehearsed_plan(context, session, name, number, path)
-            session = session.update(bare_first=self._bare_first(context, guided(session), plan, number))
+            session = session.update(
+                bare_first=self._bare_first(context, guided(session), plan, number)
+            )
         else:
             session, plan = self._later_plan(context, session, number, path)
             say_moves(context, name, path)
@@ -193,13 +200,19 @@ class UntilPrecise:
         recorded = [run.name for run in state.runs if run.name in mounted]
         so_far = blocks_so_far(state.blocks, is_mounted=mounted[recorded[-1]])
         block_s = self.block_s(state)
-        until_limit_s = 60.0 * self.settings.time_limit_min - motion_s(state.blocks, self.settings.block_s)
+        until_limit_s = 60.0 * self.settings.time_limit_min - motion_s(
+            state.blocks, self.settings.block_s
+        )
         most = max(1, math.floor(until_limit_s / block_s))
         way = quickest_way(so_far, _variance_ratio(gains), block_s, most)
         return next_role(so_far, way)
 
-    def _bare_first(self, context: SessionContext, state: GuidedState, plan: Plan, number: int) -> int:
-        """Return how many bare blocks come before the first one with the payload, by what the first plan predicts."""
+    def _bare_first(
+        self, context: SessionContext, state: GuidedState, plan: Plan, number: int
+    ) -> int:
+        """Return how many bare blocks come before the first one with the payload,
+        by what the first plan predicts.
+        """
         predicted_percent = plan.predicted_std_percent
         if number or not context.cell.friction_by_payload or not predicted_percent:
             return state.bare_first
@@ -213,8 +226,8 @@ class UntilPrecise:
         The session is complete when all gains are precise, or its time is up.
 
         Raises:
-            ChannelsExchanged, GeometryTurned: the blocks show another cell than described; they are kept, and the
-                session is over.
+            ChannelsExchanged, GeometryTurned: the blocks show another cell than described; they are
+                kept, and the session is over.
             JobHeld: a block was recorded again too often because of a mistake.
         """
         try:
@@ -224,7 +237,9 @@ class UntilPrecise:
             raise
 
     def _checked(self, context: SessionContext, session: Session) -> Session:
-        """Look for mistakes in the block that was recorded last, and forget it if it is to be recorded again."""
+        """Look for mistakes in the block that was recorded last,
+        and forget it if it is to be recorded again.
+        """
         state = guided(session)
         recorded = len(state.blocks)
         if state.checked_blocks >= recorded:
@@ -236,8 +251,14 @@ class UntilPrecise:
         facts = context.tools.look(context.cell, log_of(session, last.name), earlier)
         mistake = mistake_in(context.cell, self.settings.payload, in_order, facts, state.repeated)
         if mistake is None:
-            if facts.added_kg is not None and last.payload is not None and compared_with(in_order)[-1].payload is None:
-                context.journal.say(Level.INFO, "weighed", added_kg=facts.added_kg, std_kg=facts.added_std_kg)
+            if (
+                facts.added_kg is not None
+                and last.payload is not None
+                and compared_with(in_order)[-1].payload is None
+            ):
+                context.journal.say(
+                    Level.INFO, "weighed", added_kg=facts.added_kg, std_kg=facts.added_std_kg
+                )
             return session.update(checked_blocks=recorded)
         if mistake.is_of_body:
             logs = [log_of(session, block.name) for block in in_order]
@@ -251,13 +272,17 @@ class UntilPrecise:
         if repeated.count(last.name) > MAX_REPETITIONS:
             raise JobHeld(
                 last.name,
-                found=f"a mistake in {MAX_REPETITIONS + 1} recordings; the last one: {mistake.text}",
+                found=f"a mistake in {MAX_REPETITIONS + 1} recordings; the last one: "
+                f"{mistake.text}",
                 expected="a block without it",
-                remedy="see to the flange and to the cell file; the same command goes on with this block",
+                remedy="see to the flange and to the cell file; the same command goes on with "
+                "this block",
             )
         blocks = tuple(block for block in state.blocks if block.name not in mistake.blocks)
         runs = tuple(run for run in state.runs if run.name not in mistake.blocks)
-        return session.update(blocks=blocks, runs=runs, checked_blocks=len(blocks), repeated=repeated)
+        return session.update(
+            blocks=blocks, runs=runs, checked_blocks=len(blocks), repeated=repeated
+        )
 
     def _judged(self, context: SessionContext, session: Session) -> Session:
         """Judge the gains by all blocks, and plan the next one for the worst gain."""
@@ -273,7 +298,9 @@ class UntilPrecise:
         progress = state.progress
         if gains:
             std_percent = tuple(gain.std_percent for gain in gains)
-            now = Progress(blocks=recorded, motion_s=moved_s, fitted_s=fitted_s, std_percent=std_percent)
+            now = Progress(
+                blocks=recorded, motion_s=moved_s, fitted_s=fitted_s, std_percent=std_percent
+            )
             progress = (*progress, now)
             context.journal.say(
                 Level.INFO,
@@ -303,8 +330,12 @@ class UntilPrecise:
             would_help=would_help,
         )
 
-    def _plan_next(self, context: SessionContext, session: Session, estimate: BlockEstimate) -> Session:
-        """Plan the next block for the worst gain; nothing is planned where the gains are not known yet."""
+    def _plan_next(
+        self, context: SessionContext, session: Session, estimate: BlockEstimate
+    ) -> Session:
+        """Plan the next block for the worst gain;
+        nothing is planned where the gains are not known yet.
+        """
         outlook = estimate.outlook
         number = _next_number(guided(session))
         if outlook is None or number < len(first_blocks(guided(session).bare_first)):
@@ -328,21 +359,27 @@ class UntilPrecise:
         axis = context.cell.axis_names.index(worst.axis)
         predicted_percent = float(outlook.scale[axis]) * made.predicted_std_percent[axis]
         purpose = (
-            f"the gain that is farthest from its target after {len(guided(session).blocks)} blocks: {worst.axis}, "
-            f"± {worst.std_percent:.2f} % (target {worst.target_percent:g} %). With these moves ± "
-            f"{predicted_percent:.2f} % is predicted. They stay between the joint positions of the first blocks, and "
-            "are no faster."
+            f"the gain that is farthest from its target after {len(guided(session).blocks)} "
+            f"blocks: {worst.axis}, ± {worst.std_percent:.2f} % (target {worst.target_percent:g} "
+            f"%). With these moves ± {predicted_percent:.2f} % is predicted. They stay between the "
+            "joint positions of the first blocks, and are no faster."
         )
         write_plan(context, session.folder / plan_name(number), replace(made, purpose=purpose))
         return session
 
-    def _later_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> tuple[Session, Plan]:
-        """Load the moves that were planned for the worst gain; where there are none, make some for all gains."""
+    def _later_plan(
+        self, context: SessionContext, session: Session, number: int, path: Path
+    ) -> tuple[Session, Plan]:
+        """Load the moves that were planned for the worst gain;
+        where there are none, make some for all gains.
+        """
         with suppress(ConfigurationError):  # what is missing or damaged is made again
             return session, load_plan(path, context.cell)
         return self._unaimed_plan(context, session, number, path)
 
-    def _unaimed_plan(self, context: SessionContext, session: Session, number: int, path: Path) -> tuple[Session, Plan]:
+    def _unaimed_plan(
+        self, context: SessionContext, session: Session, number: int, path: Path
+    ) -> tuple[Session, Plan]:
         """Make moves for all gains, inside the room of the first blocks."""
         experiment = experiment_of(context.cell, self.settings.payload)
         room = self._accepted_room(context, session, experiment)
@@ -370,29 +407,41 @@ class UntilPrecise:
             **further: arguments of the planner.
         """
         if accepted is not None:
-            further |= {"speed": accepted.speed, "acceleration": accepted.acceleration, "box": accepted.box}
+            further |= {
+                "speed": accepted.speed,
+                "acceleration": accepted.acceleration,
+                "box": accepted.box,
+            }
         block_s = self.block_s(guided(session))
-        plan, taken_s = plan_with_room(context, experiment, self.settings.seed + number, block_s, **further)
+        plan, taken_s = plan_with_room(
+            context, experiment, self.settings.seed + number, block_s, **further
+        )
         if taken_s > block_s:
             session = session.update(block_s=taken_s)
         return session, plan
 
-    def _accepted_room(self, context: SessionContext, session: Session, experiment: Experiment) -> AcceptedRoom:
-        """Return room and speed of the first blocks, which the operator has looked at before they were recorded.
+    def _accepted_room(
+        self, context: SessionContext, session: Session, experiment: Experiment
+    ) -> AcceptedRoom:
+        """Return room and speed of the first blocks, which the operator has looked at before they
+        were recorded.
 
         Raises:
             ConfigurationInconsistent: none of their plans can be read any more.
         """
         plans = []
         for number in range(len(FIRST_BLOCKS)):
-            with suppress(ConfigurationError):  # the room of the others is smaller, and was accepted, too
+            # The room of the others is smaller, and was accepted, too
+            with suppress(ConfigurationError):
                 plans.append(load_plan(session.folder / plan_name(number), context.cell))
         if not plans:
             raise ConfigurationInconsistent(
                 str(session.folder),
                 found="no plan of the first blocks that can be read",
-                expected="plan-1.yaml, plan-2.yaml or plan-3.yaml: later moves stay inside the room of these",
-                remedy="nothing moves; put one of them back, or begin a new session in another folder (--sessions)",
+                expected="plan-1.yaml, plan-2.yaml or plan-3.yaml: later moves stay inside the "
+                "room of these",
+                remedy="nothing moves; put one of them back, or begin a new session in another "
+                "folder (--sessions)",
             )
         return accepted_room(context.cell, experiment.scene, plans)
 
@@ -401,7 +450,8 @@ class UntilPrecise:
     ) -> tuple[Session, Plan]:
         """Load the moves of one of the first blocks if they were rehearsed; else make them.
 
-        A later rehearsal may have found that blocks have to be longer: what the operator has seen stays as it is.
+        A later rehearsal may have found that blocks have to be longer: what the operator has seen
+        stays as it is.
         """
         if number < guided(session).rehearsed:
             with suppress(ConfigurationError):  # what is missing or damaged is made again
@@ -442,10 +492,14 @@ class UntilPrecise:
         except (ChannelsExchanged, GeometryTurned):
             raise
         except IdentificationError as error:
-            context.journal.say(Level.WARNING, "the blocks so far do not give the gains", text=str(error))
+            context.journal.say(
+                Level.WARNING, "the blocks so far do not give the gains", text=str(error)
+            )
             return BlockEstimate(())
         std_percent = np.array([gain.std_percent for gain in gains])
-        outlook = outlook_of(fitted, experiment_of(context.cell, self.settings.payload), std_percent)
+        outlook = outlook_of(
+            fitted, experiment_of(context.cell, self.settings.payload), std_percent
+        )
         explained = []
         for gain, cause in zip(gains, outlook.causes, strict=True):
             explained.append(gain.model_copy(update={"cause": cause.value}))
@@ -463,7 +517,8 @@ class Rehearse:
     speed: float = REHEARSAL_SPEED  #: share of the planned speed
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Go on after the last block that was rehearsed; do nothing where a block was recorded already.
+        """Go on after the last block that was rehearsed;
+        do nothing where a block was recorded already.
 
         Raises:
             DaqError, DriverError: as from a recording.
@@ -513,8 +568,8 @@ def _require_same_payload(state: GuidedState, payload: str) -> None:
             f"payload {payload!r}",
             found=f"a session whose blocks carry {others[0]!r}",
             expected="the same payload in all loaded blocks of a session",
-            remedy=f"nothing moves; pass --payload {others[0]} to go on, or begin a new session in another folder "
-            "(--sessions)",
+            remedy=f"nothing moves; pass --payload {others[0]} to go on, or begin a new session in "
+            "another folder (--sessions)",
         )
 
 
@@ -532,7 +587,8 @@ def _refuse_geometry(diagnoses: Sequence[Diagnosis]) -> None:
 def plan_with_room(
     context: SessionContext, experiment: Experiment, seed: int, duration_s: float, **further: Any
 ) -> tuple[Plan, float]:
-    """Make a plan, of twice the duration where it has no room for enough moves, and so on; return both.
+    """Make a plan, of twice the duration where it has no room for enough moves, and so on;
+    return both.
 
     Args:
         context: of the session.
@@ -584,7 +640,9 @@ def write_plan(context: SessionContext, path: Path, made: Plan) -> Plan:
 
 def say_moves(context: SessionContext, run: str, path: Path) -> None:
     """Say where the page is that shows the moves of a run."""
-    context.journal.say(Level.NOTICE, "moves to look at", run=run, page=str(path.with_suffix(".html")))
+    context.journal.say(
+        Level.NOTICE, "moves to look at", run=run, page=str(path.with_suffix(".html"))
+    )
 
 
 def next_step_after(error: BaseException, cell_file: Path, session: Session) -> str:
@@ -632,7 +690,8 @@ def fit_corrected_command(cell_file: Path, session: Session) -> str:
 
 
 def require_same_cell(context: SessionContext, session: Session) -> None:
-    """Refuse a cell file that was changed since the session began; its next log would be of another cell.
+    """Refuse a cell file that was changed since the session began;
+    its next log would be of another cell.
 
     Raises:
         ConfigurationError: it was changed, or cannot be read any more.
@@ -642,19 +701,24 @@ def require_same_cell(context: SessionContext, session: Session) -> None:
         command = fit_corrected_command(context.file, session)
         refit = ""
         if command:
-            refit = f". The recorded blocks are not lost: `{command}` fits them with the new content"
+            refit = (
+                f". The recorded blocks are not lost: `{command}` fits them with the new content"
+            )
         expected = f"the same cell in all blocks of a session (digest {context.cell.digest[:12]})"
         raise ConfigurationInconsistent(
             str(context.file),
             found=f"another content (digest {found[:12]}) than at the start of this command",
             expected=expected,
-            remedy="nothing moves; put the old content back and start the same command, which goes on, or start it "
-            f"with the new content, which begins a new session{refit}",
+            remedy="nothing moves; put the old content back and start the same command, which goes "
+            f"on, or start it with the new content, which begins a new session{refit}",
         )
 
 
-def motion_left_s(cell: Cell, gains: Sequence[GainSoFar], blocks: Sequence[Block], block_s: float) -> float:
-    """Return the motion that is left until every gain is at its target [s]; 0 where it is, or nothing is known.
+def motion_left_s(
+    cell: Cell, gains: Sequence[GainSoFar], blocks: Sequence[Block], block_s: float
+) -> float:
+    """Return the motion that is left until every gain is at its target [s];
+    0 where it is, or nothing is known.
 
     Args:
         cell: with its model of friction, which the order of the blocks depends on.
@@ -704,7 +768,9 @@ def _variance_ratio(gains: Sequence[GainSoFar]) -> float:
     return max((gain.std_percent / gain.target_percent) ** 2 for gain in gains)
 
 
-def gains_so_far(context: SessionContext, estimate: Estimate, target_percent: float) -> tuple[GainSoFar, ...]:
+def gains_so_far(
+    context: SessionContext, estimate: Estimate, target_percent: float
+) -> tuple[GainSoFar, ...]:
     """Return the gains of an estimate beside their target."""
     std_percent = 100.0 * np.abs(estimate.gains_std / estimate.gains)
     gains = []
@@ -754,11 +820,14 @@ def _missing(gains: tuple[GainSoFar, ...], minutes: float) -> str:
     if not coarse:
         return f"a held-out block in {minutes:g} min of motion; every gain is at its target"
     listed = ", ".join(f"{gain.axis} {gain.std_percent:.2f} %" for gain in coarse)
-    return f"σ after {minutes:g} min of motion: {listed}; the target is {coarse[0].target_percent:g} %"
+    return (
+        f"σ after {minutes:g} min of motion: {listed}; the target is {coarse[0].target_percent:g} %"
+    )
 
 
 def _would_help(estimate: BlockEstimate, needed_s: float) -> tuple[str, ...]:
-    """Say what would help to reach the target: more time, and for each axis what its slowness comes from.
+    """Say what would help to reach the target:
+    more time, and for each axis what its slowness comes from.
 
     Args:
         estimate: of the blocks so far.
@@ -769,7 +838,10 @@ def _would_help(estimate: BlockEstimate, needed_s: float) -> tuple[str, ...]:
     found: list[str] = []
     if math.isfinite(needed_s):
         needed_min = math.ceil(needed_s / 60.0)
-        found.append(f"more time: about {needed_min} min of motion in all at this rate (--time-limit {needed_min})")
+        found.append(
+            f"more time: about {needed_min} min of motion in all at this rate "
+            f"(--time-limit {needed_min})"
+        )
     if estimate.outlook is None:
         return tuple(found)
     for gain, cause in zip(estimate.gains, estimate.outlook.causes, strict=True):

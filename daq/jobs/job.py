@@ -1,4 +1,6 @@
-"""A recalibration job: preflight, record, fit, decide, report; it resumes the session of a job that was ended."""
+"""A recalibration job: preflight, record, fit, decide, report;
+it resumes the session of a job that was ended.
+"""
 
 from __future__ import annotations
 
@@ -42,9 +44,11 @@ def recalibrate(
     """Recalibrate a cell, or finish the session of an earlier job.
 
     Raises:
-        JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next line.
-        DaqError, DriverError, IdentificationError: the error that ended the session; the axes were stopped, the
-            controller's file is unchanged, and audit, state, metrics and summary report it.
+        JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next
+            line.
+        DaqError, DriverError, IdentificationError: the error that ended the session; the axes were
+            stopped, the controller's file is unchanged, and audit, state, metrics and summary
+            report it.
     """
     section = section_of(cell)
     context = _context(cell_file, cell, tools, journal, who)
@@ -64,7 +68,12 @@ def recalibrate(
         journal = replace(journal, session=session.state.session)
         context = replace(context, journal=journal, began_s=tools.monotonic_s())
         try:
-            audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
+            audit_entry(
+                context,
+                AuditAction.RECALIBRATION_BEGUN,
+                session,
+                {"attempt": session.state.attempt},
+            )
             with time_bound(section.max_duration_min) as in_time:
 
                 @contextmanager
@@ -88,7 +97,13 @@ class Preview:
 
 
 def preview(
-    cell_file: Path, cell: Cell, tools: Tools, journal: Journal, *, who: str, lock_folder: Path | None = None
+    cell_file: Path,
+    cell: Cell,
+    tools: Tools,
+    journal: Journal,
+    *,
+    who: str,
+    lock_folder: Path | None = None,
 ) -> Preview:
     """Make all checks of a job before its first motion, and list its steps; nothing is written.
 
@@ -120,14 +135,20 @@ def preview(
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
         steps += ["identify gains and missing effects"]
-    steps += ["compare with the current gains", f"write, approved by: {cell.apply.by.value}", "report"]
+    steps += [
+        "compare with the current gains",
+        f"write, approved by: {cell.apply.by.value}",
+        "report",
+    ]
     taken = "a new session"
     if session is not None:
         taken = f"session {session.state.session} continues"
     return Preview(tuple(steps), taken)
 
 
-def _context(cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: str) -> SessionContext:
+def _context(
+    cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: str
+) -> SessionContext:
     """What the stages share in a job: the runs of the cell file, and its policy as the operator."""
     section = section_of(cell)
     return SessionContext(
@@ -143,12 +164,16 @@ def _context(cell_file: Path, cell: Cell, tools: Tools, journal: Journal, who: s
     )
 
 
-def _counted(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> tuple[Session, ...]:
+def _counted(
+    section: Recalibration, cell: Cell, now: datetime, journal: Journal
+) -> tuple[Session, ...]:
     """Return the sessions of the cell that count at this time; see `sessions_that_count`."""
     return sessions_that_count(sessions.sessions(section.folder, cell.name), now, journal)
 
 
-def _not_due(section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime) -> Conclusion | None:
+def _not_due(
+    section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime
+) -> Conclusion | None:
     """Conclude early where no calibration is due."""
     good = sessions.last_good(found)
     if good is None:
@@ -160,11 +185,16 @@ def _not_due(section: Recalibration, cell: Cell, found: tuple[Session, ...], now
     if _open_session(section, cell, found, now) is not None:  # begun with --now
         return None
     hours = left.total_seconds() / 3600.0
-    remark = f"The calibration of session {good.state.session} is good for another {hours:.1f} h (every_h)."
+    remark = (
+        f"The calibration of session {good.state.session} is good for another {hours:.1f} h "
+        "(every_h)."
+    )
     return Conclusion(Outcome.NOT_DUE, ExitCode.OK, None, remark)
 
 
-def _open_session(section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime) -> Session | None:
+def _open_session(
+    section: Recalibration, cell: Cell, found: tuple[Session, ...], now: datetime
+) -> Session | None:
     """Session that a job would resume; plans are read only where one is unfinished."""
     if not found or found[-1].finished:
         return None
@@ -177,10 +207,14 @@ def _resumed_or_new(
     session = _open_session(section, cell, found, now)
     if session is None:
         session = sessions.begin(section.folder, basis_of(cell, section), now)
-        replace(journal, session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
+        replace(journal, session=session.state.session).say(
+            Level.INFO, "session begun", folder=str(session.folder)
+        )
         return session
     attempt = session.state.attempt + 1
-    replace(journal, session=session.state.session).say(Level.NOTICE, "session taken up", attempt=attempt)
+    replace(journal, session=session.state.session).say(
+        Level.NOTICE, "session taken up", attempt=attempt
+    )
     return sessions.resume(session, now)
 
 
@@ -189,7 +223,8 @@ AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for
 
 @contextmanager
 def time_bound(minutes: float) -> Iterator[SignalBlocker]:
-    """Raise TimeBoundReached in the block when its time is up; yields a function that defers it during a stop.
+    """Raise TimeBoundReached in the block when its time is up;
+    yields a function that defers it during a stop.
 
     There is no alarm outside the main thread, where Python handles no signals.
 
@@ -209,8 +244,8 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
             "the job",
             found=f"more than {minutes:g} min since it began",
             expected="its end within max_duration_min",
-            remedy="the axes were commanded to stop, and the next job continues the session; find in the log what "
-            "takes so long, or raise max_duration_min",
+            remedy="the axes were commanded to stop, and the next job continues the session; find "
+            "in the log what takes so long, or raise max_duration_min",
         )
 
     @contextmanager

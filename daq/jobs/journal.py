@@ -1,9 +1,9 @@
 """Journal of a job: one line an event, as text, as JSON, or for the system's journal.
 
-Under systemd a line is JSON behind ``<N>``, its priority (sd-daemon(3)). That is chosen before the journal's own
-protocol because it is one write to the stream that we were given: no socket that may be full or absent, no limit of a
-datagram, and the order of everything else that goes to that stream is kept. ``journalctl -p err`` finds what is wrong,
-and ``journalctl -o cat | jq`` reads the fields.
+Under systemd a line is JSON behind ``<N>``, its priority (sd-daemon(3)). That is chosen before the
+journal's own protocol because it is one write to the stream that we were given: no socket that may
+be full or absent, no limit of a datagram, and the order of everything else that goes to that stream
+is kept. ``journalctl -p err`` finds what is wrong, and ``journalctl -o cat | jq`` reads the fields.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ class Form(Enum):
 
 
 _IN_CONCLUSION = frozenset({"found"})
-"""Events that the conclusion of a job, on standard output, has for a person. A terminal would show them twice."""
+"""Events that the conclusion of a job, on standard output, has for a person.
+
+A terminal would show them twice.
+"""
 
 
 _REPEATED_FIELDS = {"session ended": ("remark",)}
@@ -74,7 +77,9 @@ class Journal:
         at = self.now().isoformat(timespec="milliseconds")
         if self.form is Form.TEXT:
             repeated = _REPEATED_FIELDS.get(event, ())
-            words = [in_words(name, value) for name, value in fields.items() if name not in repeated]
+            words = [
+                in_words(name, value) for name, value in fields.items() if name not in repeated
+            ]
             details = ", ".join(filter(None, words))
             details = "".join(letter if letter.isprintable() else " " for letter in details)
             line = f"{at} "
@@ -111,7 +116,8 @@ def in_words(name: str, value: object) -> str:
     return f"{_label(name)} {words}"
 
 
-_SENTENCES = frozenset({"text", "remark", "reason", "words"})  #: Fields that are sentences, and need no name
+#: Fields that are sentences, and need no name
+_SENTENCES = frozenset({"text", "remark", "reason", "words"})
 _FOR_PROGRAMS = frozenset({"in_short", "differs", "error", "exit_code"})
 _OF_EACH_AXIS = {"missing": "missing samples of each axis"}
 _UNITS = {"_s": "s", "_mb": "MB", "_kg": "kg", "_percent": "%"}
@@ -145,8 +151,9 @@ def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
     """Choose the form for a stream.
 
     Args:
-        environment: of this process; systemd names device and inode of the stream that it reads in JOURNAL_STREAM
-            (systemd.exec(5)), so that a stream that was redirected since is recognised.
+        environment: of this process; systemd names device and inode of the stream that it reads in
+            JOURNAL_STREAM (systemd.exec(5)), so that a stream that was redirected since is
+            recognised.
     """
     if stream.isatty():
         return Form.TEXT

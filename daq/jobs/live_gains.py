@@ -1,9 +1,9 @@
 """Show the gains after each move of a guided session, without ever delaying the recording.
 
-A process of its own connects to the feed of the recorder, as a console does: the recorder never waits for it, and drops
-what it does not read. It folds the blocks that the session has recorded, and the samples of the present one, into the
-triangles of a growing fit, and prints a look at the gains after each move as a line of JSON. A thread of the session
-waits for these lines.
+A process of its own connects to the feed of the recorder, as a console does: the recorder never
+waits for it, and drops what it does not read. It folds the blocks that the session has recorded,
+and the samples of the present one, into the triangles of a growing fit, and prints a look at the
+gains after each move as a line of JSON. A thread of the session waits for these lines.
 """
 
 from __future__ import annotations
@@ -29,7 +29,15 @@ from daq.documents.session_state import GuidedState
 from daq.errors import DaqError
 from daq.jobs.session import sessions
 from daq.log.conversion import load_run
-from daq.log.feed import LARGEST_PACKET, FeedUnfit, QuickLook, RunFacts, connected, read_packet, socket_names
+from daq.log.feed import (
+    LARGEST_PACKET,
+    FeedUnfit,
+    QuickLook,
+    RunFacts,
+    connected,
+    read_packet,
+    socket_names,
+)
 from daq.workflow.quick_look import HONEST_S, BlockMove, GainsSoFar, RunSoFar
 from drivers.messages import CellEvent, EventKind
 from ident.errors import IdentificationError
@@ -38,15 +46,23 @@ CONNECT_S = 5.0  #: Time for the feed to accept
 END_S = 3.0  #: Time for the process to end
 NICENESS = 10  #: The recorder comes first
 SHORTEST_S = 2.1  #: Of a block before it is looked at: the filters need that
-LOST = "samples of this block were not seen in time; its log has them, and they count when it is complete"
-ENDED = "the process that estimates them after each move has ended (exit code {code}); the session goes on without it"
+LOST = (
+    "samples of this block were not seen in time; its log has them, and they count when it "
+    "is complete"
+)
+ENDED = (
+    "the process that estimates them after each move has ended (exit code {code}); the session "
+    "goes on without it"
+)
 _LOOK = TypeAdapter(QuickLook)
 
 
 class BlockWatch:
     """Follows the blocks of a session by the packets of the feed."""
 
-    def __init__(self, cell: Cell, payload: str, target_percent: float, honest_s: float = HONEST_S) -> None:
+    def __init__(
+        self, cell: Cell, payload: str, target_percent: float, honest_s: float = HONEST_S
+    ) -> None:
         """Begin before the first block; see `GainsSoFar` for the arguments."""
         self._cell = cell
         self._nothing = replace(GainsSoFar.of(cell, payload, target_percent), honest_s=honest_s)
@@ -88,7 +104,9 @@ class BlockWatch:
             return None
         self._looked = run.finished_moves
         place = replace(self._place, move=run.finished_moves)
-        nothing = QuickLook(place.block, place.move, place.moves, self._recorded.motion_s, place.is_held_out)
+        nothing = QuickLook(
+            place.block, place.move, place.moves, self._recorded.motion_s, place.is_held_out
+        )
         problem = self._problem
         if not run.is_whole and not place.is_held_out:
             problem = problem or LOST
@@ -98,8 +116,12 @@ class BlockWatch:
             return self._recorded.look(place, self._causes)
         return self._look_at_growing(run, place, nothing)
 
-    def _look_at_growing(self, run: RunSoFar, place: BlockMove, nothing: QuickLook) -> QuickLook | None:
-        """Fold in the present block as far as it is recorded; None before it is long enough for the filters."""
+    def _look_at_growing(
+        self, run: RunSoFar, place: BlockMove, nothing: QuickLook
+    ) -> QuickLook | None:
+        """Fold in the present block as far as it is recorded;
+        None before it is long enough for the filters.
+        """
         samples = run.run()
         if samples is None or samples.time_s[-1] < SHORTEST_S:
             return None
@@ -153,7 +175,9 @@ class BlockWatch:
         return None
 
     def _fold(self, folder: Path, digests: Mapping[str, str]) -> None:
-        """Fold in the logs of complete blocks, by their digests; begin anew where one of them has gone."""
+        """Fold in the logs of complete blocks, by their digests;
+        begin anew where one of them has gone.
+        """
         if not set(self._folded) <= set(digests):
             self._recorded = self._nothing
             self._folded = ()
@@ -166,7 +190,8 @@ class BlockWatch:
 
 
 def tells_something_new(look: QuickLook, before: QuickLook | None) -> bool:
-    """Whether a person has not read this look: figures change with each move, what is missing does not.
+    """Whether a person has not read this look:
+    figures change with each move, what is missing does not.
 
     Figures during a held-out block are those of before it.
     """
@@ -179,7 +204,9 @@ def tells_something_new(look: QuickLook, before: QuickLook | None) -> bool:
     return look.missing != before.missing
 
 
-def follow_feed(connection: socket.socket, watch: BlockWatch, report: Callable[[QuickLook], None]) -> None:
+def follow_feed(
+    connection: socket.socket, watch: BlockWatch, report: Callable[[QuickLook], None]
+) -> None:
     """Read packets until the feed ends; look at the gains where nothing more waits to be read.
 
     Raises:
@@ -205,7 +232,13 @@ def follow_feed(connection: socket.socket, watch: BlockWatch, report: Callable[[
 class LiveGains:
     """Context manager that runs the process, and passes its looks on from a thread of its own."""
 
-    def __init__(self, cell_file: Path, payload: str, target_percent: float, show: Callable[[QuickLook], None]) -> None:
+    def __init__(
+        self,
+        cell_file: Path,
+        payload: str,
+        target_percent: float,
+        show: Callable[[QuickLook], None],
+    ) -> None:
         """Store the arguments.
 
         Args:
@@ -220,7 +253,9 @@ class LiveGains:
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> LiveGains:
-        """Start the process; without it a session goes on, and shows no gains between two blocks."""
+        """Start the process; without it a session goes on,
+        and shows no gains between two blocks.
+        """
         # Not this folder's modules, and no Ctrl-C of the terminal: the process ends with the feed.
         command = [sys.executable, "-P", "-m", __name__, *self._arguments]
         try:
@@ -234,11 +269,15 @@ class LiveGains:
             )
         except OSError:
             return self
-        self._thread = threading.Thread(target=self._wait, args=(self._process,), name="live gains", daemon=True)
+        self._thread = threading.Thread(
+            target=self._wait, args=(self._process,), name="live gains", daemon=True
+        )
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
         if self._process is None or self._thread is None:
             return
         self._process.terminate()
@@ -261,7 +300,9 @@ class LiveGains:
 
 
 def main(arguments: list[str]) -> int:
-    """Follow the feed of a cell file, and print each look as a line of JSON; 1 where there is no feed."""
+    """Follow the feed of a cell file, and print each look as a line of JSON;
+    1 where there is no feed.
+    """
     cell_file, payload, target_percent = arguments
     os.nice(NICENESS)
     path = Path(cell_file)

@@ -1,4 +1,7 @@
-"""Who acts in a session: mounts payloads, answers for motion, approves a write. A person, or the policy of the cell."""
+"""Who acts in a session: mounts payloads, answers for motion, approves a write.
+
+A person, or the policy of the cell.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,8 @@ class Operator(Protocol):
         """
 
     def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
-        """Decide whether blocks are recorded again because of a mistake that the last one shows; else they stay.
+        """Decide whether blocks are recorded again because of a mistake that the last one shows;
+        else they stay.
 
         Args:
             run: the last block.
@@ -93,7 +97,8 @@ class CellPolicy:
                 f"mount command {self.section.mount.command[0]} {wanted}",
                 found=str(ended),
                 expected="exit code 0: it is mounted as the run needs it",
-                remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {run.name}",
+                remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with "
+                f"run {run.name}",
             )
 
     def weigh(self, payload: str) -> float:
@@ -117,7 +122,9 @@ class CellPolicy:
         return True
 
     def approve(self, proposal: Proposal[Any], *, touched: bool) -> bool:
-        """Whether `policy: {apply: {by: job}}` lets the job write; what an operator changed since is left to one."""
+        """Whether `policy: {apply: {by: job}}` lets the job write;
+        what an operator changed since is left to one.
+        """
         is_of_job = self.cell.apply.by is AppliedBy.JOB
         has_drives = self.cell.controller is not None and bool(self.cell.controller.objects)
         return is_of_job and not has_drives and not touched
@@ -125,7 +132,9 @@ class CellPolicy:
 
 @dataclass(frozen=True, slots=True)
 class GivenAnswers:
-    """Answers that were given beforehand: for a demonstration, and for a simulated cell without a person."""
+    """Answers that were given beforehand:
+    for a demonstration, and for a simulated cell without a person.
+    """
 
     who: str
     masses_kg: Mapping[str, float]  #: of each payload

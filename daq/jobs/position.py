@@ -1,4 +1,7 @@
-"""Where a guided session is: its stage, the next step of the operator, and how σ falls. For terminal and console."""
+"""Where a guided session is: its stage, the next step of the operator, and how σ falls.
+
+For terminal and console.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,25 @@ class Position:
 
 def sessions_folder(cell_file: Path) -> Path:
     """Return the folder of the guided sessions of a cell, where none was named."""
-    return cell_file.with_suffix(".sessions")
+    return cell_file.with_suffix(SESSIONS_SUFFIX)
+
+
+SESSIONS_SUFFIX = ".sessions"
+
+
+def former_session_folders(cell_file: Path) -> tuple[Path, ...]:
+    """Return the folders beside a cell file that have sessions of a cell file of another name.
+
+    A cell file that was renamed leaves its sessions behind, under its earlier name. Where there is
+    a cell file of that name, the sessions are its own.
+    """
+    found = []
+    for folder in sorted(cell_file.parent.glob(f"*{SESSIONS_SUFFIX}")):
+        owners = [folder.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+        is_owned = any(owner.exists() for owner in owners)
+        if folder.is_dir() and folder != sessions_folder(cell_file) and not is_owned:
+            found.append(folder)
+    return tuple(found)
 
 
 def on_flange(run: PlannedRun | Block) -> str:
@@ -63,7 +84,10 @@ def position_of(state: GuidedState) -> Position:
     if recording is not None:
         return recording
     if state.outcome is Outcome.APPLIED and state.acceptance is None:
-        return Position(StageName.ACCEPT, f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new")
+        return Position(
+            StageName.ACCEPT,
+            f"{on_flange(state.blocks[-1])}, then the robot makes moves that are new",
+        )
     if state.outcome is not None and state.outcome.good:
         return Position(StageName.ACCEPT, "nothing: the certificate is being made")
     if state.decision is None:
@@ -76,7 +100,9 @@ def _recording_position(state: GuidedState) -> Position | None:
     recorded = {run.name for run in state.runs}
     waiting = [block for block in state.blocks if block.name not in recorded]
     if waiting:
-        return Position(StageName.RECORD, f"{on_flange(waiting[0])}, then the robot moves: {waiting[0].name}")
+        return Position(
+            StageName.RECORD, f"{on_flange(waiting[0])}, then the robot moves: {waiting[0].name}"
+        )
     if not state.complete:
         return Position(StageName.RECORD, "nothing yet: the next block is being prepared")
     return None

@@ -103,7 +103,9 @@ def _warm_up(context: SessionContext, session: Session, run: NextRun) -> None:
         move_without_log(context, session, run)
 
 
-def move_without_log(context: SessionContext, session: Session, run: NextRun, speed: float = 1.0) -> None:
+def move_without_log(
+    context: SessionContext, session: Session, run: NextRun, speed: float = 1.0
+) -> None:
     """Make the moves of a run, recorded under the same supervision; the log is dropped.
 
     Args:
@@ -168,7 +170,12 @@ class FixedRuns:
         with writing(path):
             body = next((run.payload for run in self.listed if run.payload is not None), None)
             experiment = experiment_of(context.cell, body)
-            save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s, experiment=experiment), path)
+            save_plan(
+                context.tools.plan(
+                    context.cell, seed=seed, duration_s=duration_s, experiment=experiment
+                ),
+                path,
+            )
         return load_plan(path, context.cell)  # as a person can read it
 
 
@@ -188,7 +195,9 @@ def record_valid(context: SessionContext, session: Session, run: NextRun) -> Rec
         lost += log.lost_cycles
         missing = tuple(one + other for one, other in zip(missing, log.missing, strict=True))
         if log.valid:
-            context.journal.say(Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing)
+            context.journal.say(
+                Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing
+            )
             return RecordedRun(
                 name=planned.name,
                 sha256=sha256_of(out) or "",
@@ -197,23 +206,30 @@ def record_valid(context: SessionContext, session: Session, run: NextRun) -> Rec
                 lost_cycles=lost,
                 missing=missing,
             )
-        context.journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
+        context.journal.say(
+            Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt
+        )
     raise RunInvalid(
         str(out),
-        found=f"{context.settings.retries + 1} recordings, none of them valid (the last: {log.reason})",
+        found=f"{context.settings.retries + 1} recordings, none of them valid (the last: "
+        f"{log.reason})",
         expected="a valid one",
-        remedy="see to the bus, the load of this computer and the encoders; the next job records this run again",
+        remedy="see to the bus, the load of this computer and the encoders; the next job records "
+        "this run again",
     )
 
 
 def _record(context: SessionContext, run: NextRun, out: Path, speed: float = 1.0) -> Recorded:
-    """Make one recording; the interlock is checked before the drives are used, and again before they get power.
+    """Make one recording; the interlock is checked before the drives are used,
+    and again before they get power.
 
     Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
     """
     planned = run.planned
     # `section_of` has checked that the cell has it.
-    payload = next((one.payload for one in context.cell.payloads if one.name == planned.payload), None)
+    payload = next(
+        (one.payload for one in context.cell.payloads if one.name == planned.payload), None
+    )
     request = RecordingRequest(
         context.file,
         context.cell,
@@ -237,7 +253,9 @@ def _record(context: SessionContext, run: NextRun, out: Path, speed: float = 1.0
 
 
 def _set_aside(out: Path, journal: Journal) -> None:
-    """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one."""
+    """Rename the remnants of an earlier recording of this name:
+    a log that the state does not list, or half of one.
+    """
     part = out.with_name(out.name + UNFINISHED)
     with writing(out):
         if out.exists():
@@ -265,7 +283,8 @@ def _free_names(out: Path, kind: str) -> Iterator[Path]:
 
 
 def fit_session(context: SessionContext, session: Session) -> Session:
-    """Fit the logs, add missing effects, and write calibration and report, unless an earlier job did.
+    """Fit the logs, add missing effects, and write calibration and report,
+    unless an earlier job did.
 
     Raises:
         DataError, IdentificationError: the recordings cannot be used; the session is over.
@@ -298,7 +317,10 @@ def fit_session(context: SessionContext, session: Session) -> Session:
         report.mkdir(exist_ok=True)
     context.tools.save_report(closed, changed, calibration, report)
     context.journal.say(Level.INFO, "certificate", page=str(report / PAGE))
-    fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed, calibration.effects))
+    fit = Fitted(
+        calibration_sha256=sha256_of(path) or "",
+        sentences=summary(closed, changed, calibration.effects),
+    )
     in_short = headline(closed, changed, calibration.effects)
     for sentence in fit.sentences:
         context.journal.say(Level.INFO, "found", text=sentence, in_short=sentence in in_short)

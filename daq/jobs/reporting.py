@@ -1,4 +1,6 @@
-"""Report the end of a job: in the audit, the session's state and summary, the metrics and the journal."""
+"""Report the end of a job: in the audit, the session's state and summary,
+the metrics and the journal.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ from typing import TypeVar
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
 from daq.documents.session_state import GuidedState, Outcome, RecordedRun, SessionState
-from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
+from daq.errors import (
+    AuditUnusable,
+    DaqError,
+    ExitCode,
+    HistoryUnreadable,
+    OutputFailed,
+    exit_code,
+    writing,
+)
 from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import SessionContext
@@ -47,7 +57,8 @@ class Conclusion:
     exit_code: int  #: of the command
     session: Session | None  #: with its final state; None where none was begun
     remark: str  #: reason, in one sentence
-    next_step: str = ""  #: of the operator, after an error that has ended a guided session; empty otherwise
+    #: of the operator, after an error that has ended a guided session; empty otherwise
+    next_step: str = ""
 
 
 def report_success(context: SessionContext, session: Session) -> Conclusion:
@@ -69,7 +80,9 @@ def report_success(context: SessionContext, session: Session) -> Conclusion:
 
 
 def report_failure(context: SessionContext, folder: Path, error: BaseException) -> None:
-    """Report the error that ended a job; failures of the report itself are attached to the error as notes."""
+    """Report the error that ended a job; failures of the report itself are attached to the error as
+    notes.
+    """
     try:
         session = next(one for one in sessions.sessions(folder.parent) if one.folder == folder)
         interrupted = isinstance(error, KeyboardInterrupt)
@@ -77,12 +90,17 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
         code = ExitCode.INTERRUPTED
         if not interrupted:
             code = exit_code(type(error)) or ExitCode.UNEXPECTED
-        problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        if str(error):
+            problem = f"{type(error).__name__}: {error}"
+        else:
+            problem = type(error).__name__
         remark = "; ".join((problem, *stop_notes(error)))
         next_step = ""
         if isinstance(session.state, GuidedState):
             next_step = next_step_after(error, context.file, session)
-        _report(context, Conclusion(outcome, int(code), session, remark, next_step), session, problem)
+        _report(
+            context, Conclusion(outcome, int(code), session, remark, next_step), session, problem
+        )
     except Exception as second:  # noqa: BLE001 - whatever it is, it must not hide the error that ended the job
         error.add_note(f"kept: the end of the session could not be recorded: {second}")
 
@@ -106,7 +124,9 @@ def audit_entry(
     )
 
 
-def _report(context: SessionContext, ended: Conclusion, session: Session, problem: str) -> Conclusion:
+def _report(
+    context: SessionContext, ended: Conclusion, session: Session, problem: str
+) -> Conclusion:
     """Write down how a session ended: in audit, state, summary and metrics.
 
     Raises:
@@ -141,7 +161,9 @@ def _report(context: SessionContext, ended: Conclusion, session: Session, proble
     level = Level.ERROR
     if outcome.good:
         level = Level.NOTICE
-    context.journal.say(level, "session ended", outcome=outcome.value, exit_code=code, remark=ended.remark)
+    context.journal.say(
+        level, "session ended", outcome=outcome.value, exit_code=code, remark=ended.remark
+    )
     try:
         _write_summary(conclusion, session, context.file)
     finally:
@@ -152,7 +174,12 @@ def _report(context: SessionContext, ended: Conclusion, session: Session, proble
         duration_s = context.tools.monotonic_s() - context.began_s
         try:
             write_metrics(
-                context.settings.metrics, context.cell.name, conclusion, now, duration_s, sessions.last_good(found)
+                context.settings.metrics,
+                context.cell.name,
+                conclusion,
+                now,
+                duration_s,
+                sessions.last_good(found),
             )
         except OutputFailed as error:
             # A monitor reports missing metrics itself; the calibration is done.
@@ -170,7 +197,10 @@ def _write_summary(conclusion: Conclusion, session: Session, cell_file: Path) ->
         OutputFailed: the file system refuses.
     """
     is_guided = isinstance(session.state, GuidedState)
-    report = session_report(conclusion, cell_file) if is_guided else conclusion_report(conclusion, cell_file)
+    if is_guided:
+        report = session_report(conclusion, cell_file)
+    else:
+        report = conclusion_report(conclusion, cell_file)
     with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, cell_file).encode())
         replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
@@ -202,7 +232,9 @@ def session_report(conclusion: Conclusion, cell_file: Path) -> SessionReport | R
     return _as_report(SessionReport, conclusion, cell_file)
 
 
-def _as_report(kind: type[AnyReport], conclusion: Conclusion, cell_file: Path) -> AnyReport | RefusedJob:
+def _as_report(
+    kind: type[AnyReport], conclusion: Conclusion, cell_file: Path
+) -> AnyReport | RefusedJob:
     refused = RefusedJob(
         outcome=conclusion.outcome,
         exit_code=conclusion.exit_code,
@@ -221,20 +253,28 @@ def _run_text(run: RecordedRun) -> str:
     recordings = "recordings"
     if run.attempts == 1:
         recordings = "recording"
-    return f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} {recordings}"
+    return (
+        f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} "
+        f"{recordings}"
+    )
 
 
 def text(conclusion: Conclusion, cell_file: Path) -> str:
     """Write the summary as text."""
     session = conclusion.session
     # The remark of a decision is printed above its table.
-    decided = session is not None and session.state.decision is not None and not session.state.problem
+    decided = (
+        session is not None and session.state.decision is not None and not session.state.problem
+    )
     lines = [f"Outcome: {conclusion.outcome.value} (exit code {conclusion.exit_code})"]
     if conclusion.remark and not decided:
         lines.append(conclusion.remark)
     if session is not None:
         state = session.state
-        lines.append(f"Session {state.session} of cell {state.cell}, begun {state.began}, attempt {state.attempt}.")
+        lines.append(
+            f"Session {state.session} of cell {state.cell}, begun {state.began}, attempt "
+            f"{state.attempt}."
+        )
         lines += map(_run_text, state.runs)
         if state.fitted is not None:
             lines += ["", "Residual:", *(f"  {sentence}" for sentence in state.fitted.sentences)]
@@ -251,14 +291,18 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
                 if gain.differs:
                     differs = ": differs"
                 lines.append(
-                    f"  {gain.axis}: current gain {gain.old:.5g}, identified {gain.new:.5g} ± {gain.new_std:.2g} "
-                    f"{gain.unit}{change}{drift}{differs}"
+                    f"  {gain.axis}: current gain {gain.old:.5g}, identified {gain.new:.5g} ± "
+                    f"{gain.new_std:.2g} {gain.unit}{change}{drift}{differs}"
                 )
         if isinstance(state, GuidedState):
             lines += _guided_lines(state)
         drifts = [gain.alarm for gain in state.watched if gain.alarm]
         if drifts:
-            lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
+            lines += [
+                "",
+                "Drift (`drivegain history` shows it):",
+                *(f"  {alarm}" for alarm in drifts),
+            ]
     lines += _closing(conclusion, cell_file)
     return "\n".join(lines) + "\n"
 
@@ -312,10 +356,11 @@ def undo_command(cell_file: Path, *, in_drives: bool) -> str:
 
 
 def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
-    """List the next steps for the operator, a line each: those of the outcome, and what the fit says to check.
+    """List the next steps for the operator, a line each:
+    those of the outcome, and what the fit says to check.
 
-    What is wrong with the description comes first as long as nothing is written: with a corrected cell file, the
-    calibration of the old one can no longer be.
+    What is wrong with the description comes first as long as nothing is written: with a corrected
+    cell file, the calibration of the old one can no longer be.
     """
     steps = _steps(conclusion, cell_file)
     diagnoses = _diagnoses(conclusion)
@@ -333,7 +378,9 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
 
 
 def _diagnoses(conclusion: Conclusion) -> tuple[Diagnosis, ...]:
-    """What a good calibration says to check; a failed check of another outcome says itself what to do."""
+    """What a good calibration says to check;
+    a failed check of another outcome says itself what to do.
+    """
     if conclusion.session is None or not conclusion.outcome.good:
         return ()
     calibration = calibration_of_session(conclusion.session)
@@ -353,12 +400,16 @@ def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
     if outcome is Outcome.APPLIED and session is not None and _is_contradicted(session.state):
         return [
             f"undo the write: {undo}",
-            "compare the controller's numbers and the payload with the certificate, then calibrate again",
+            "compare the controller's numbers and the payload with the certificate, then "
+            "calibrate again",
         ]
     if outcome is Outcome.PROPOSED and session is not None and target is not None:
         calibration = shlex.quote(str(session.folder / CALIBRATION))
         cell = shlex.quote(str(cell_file.absolute()))
-        sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
+        sign = (
+            f"let a second person sign it: drivegain sign calibration {calibration} --key KEY "
+            "--name NAME"
+        )
         command = f"drivegain apply {cell} {calibration}"
         if target.in_drives:
             command += " --drives"
@@ -379,28 +430,44 @@ def _steps(conclusion: Conclusion, cell_file: Path) -> list[str]:
     if is_to_go_on and session is not None and isinstance(session.state, GuidedState):
         return [go_on(session.state)]
     return {
-        Outcome.REFUSED: ["find out why the check failed; the same command then begins a new session"],
-        Outcome.UNFIT: [
-            "find out what is wrong with the recordings (`drivegain info LOG`); the same command then begins a new "
-            "session"
+        Outcome.REFUSED: [
+            "find out why the check failed; the same command then begins a new session"
         ],
-        Outcome.STOPPED: ["remove the cause; the same command continues this session while it is recent"],
-        Outcome.INTERRUPTED: ["nothing, or the same command again: it continues this session while it is recent"],
+        Outcome.UNFIT: [
+            "find out what is wrong with the recordings (`drivegain info LOG`); the same command "
+            "then begins a new session"
+        ],
+        Outcome.STOPPED: [
+            "remove the cause; the same command continues this session while it is recent"
+        ],
+        Outcome.INTERRUPTED: [
+            "nothing, or the same command again: it continues this session while it is recent"
+        ],
     }.get(outcome, NOTHING_TO_DO)
 
 
 def _is_contradicted(state: SessionState) -> bool:
     """Whether new moves contradict the gains that were written."""
-    return isinstance(state, GuidedState) and state.acceptance is not None and not state.acceptance.accepted
+    return (
+        isinstance(state, GuidedState)
+        and state.acceptance is not None
+        and not state.acceptance.accepted
+    )
 
 
 PREFIX = "drivegain_recalibration_"
 
 
 def write_metrics(
-    folder: Path, cell: str, conclusion: Conclusion, ended: datetime, duration_s: float, good: Session | None
+    folder: Path,
+    cell: str,
+    conclusion: Conclusion,
+    ended: datetime,
+    duration_s: float,
+    good: Session | None,
 ) -> Path:
-    """Write the metrics for the textfile collector of the Prometheus node exporter; the file is replaced whole.
+    """Write the metrics for the textfile collector of the Prometheus node exporter;
+    the file is replaced whole.
 
     Where the session of this job has no calibration, figures are those of the last good one.
 
@@ -423,7 +490,9 @@ def write_metrics(
     for outcome in Outcome:
         outcomes.labels(cell, outcome.value).set(float(outcome is conclusion.outcome))
     gauge("exit_code", "Of the last job.").labels(cell).set(conclusion.exit_code)
-    gauge("last_run_timestamp_seconds", "When the last job ended.").labels(cell).set(ended.timestamp())
+    gauge("last_run_timestamp_seconds", "When the last job ended.").labels(cell).set(
+        ended.timestamp()
+    )
     gauge("duration_seconds", "Of the last job.").labels(cell).set(duration_s)
     if good is not None:
         last = gauge("last_success_timestamp_seconds", "When the last good calibration was begun.")
@@ -441,7 +510,9 @@ def write_metrics(
 
 
 def file_stem(cell: str) -> str:
-    """File name of a cell; with six digits of its hash where characters that distinguish two cells were lost."""
+    """File name of a cell; with six digits of its hash where characters that distinguish two cells
+    were lost.
+    """
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", cell)
     if plain == cell:
         return plain
@@ -450,26 +521,36 @@ def file_stem(cell: str) -> str:
 
 def _set_session_gauges(gauge: Callable[..., Gauge], state: SessionState, cell: str) -> None:
     lost = gauge("lost_cycles", "Cycles that are not in any recording of a run.", "run")
-    missing = gauge("missing_answers", "Answers of drives that never came, of all recordings of a run.", "run")
+    missing = gauge(
+        "missing_answers", "Answers of drives that never came, of all recordings of a run.", "run"
+    )
     attempts = gauge("recordings", "Recordings of a run until a valid one.", "run")
     for run in state.runs:
         lost.labels(cell, run.name).set(run.lost_cycles)
         missing.labels(cell, run.name).set(sum(run.missing))
         attempts.labels(cell, run.name).set(run.attempts)
     if state.watched:
-        alarm = gauge("drift_alarm", "1 where the chart of all calibrations raises an alarm, else 0.", "axis")
+        alarm = gauge(
+            "drift_alarm", "1 where the chart of all calibrations raises an alarm, else 0.", "axis"
+        )
         for watched in state.watched:
             alarm.labels(cell, watched.axis).set(float(bool(watched.alarm)))
     if state.decision is not None:
-        drift = gauge("gain_drift_sigma", "Change from the current gain, in σ of the change.", "axis")
-        in_force = gauge("gain_in_force", "Current gain when the job looked, in Nm or N per A.", "axis", "unit")
+        drift = gauge(
+            "gain_drift_sigma", "Change from the current gain, in σ of the change.", "axis"
+        )
+        in_force = gauge(
+            "gain_in_force", "Current gain when the job looked, in Nm or N per A.", "axis", "unit"
+        )
         for gain in state.decision.gains:
             in_force.labels(cell, gain.axis, gain.unit).set(gain.old)
             if gain.drift_sigma is not None:
                 drift.labels(cell, gain.axis).set(gain.drift_sigma)
 
 
-def _set_calibration_gauges(gauge: Callable[..., Gauge], calibration: Calibration, cell: str) -> None:
+def _set_calibration_gauges(
+    gauge: Callable[..., Gauge], calibration: Calibration, cell: str
+) -> None:
     value = gauge("gain", "Identified drive gain, in Nm or N per A.", "axis", "unit")
     std = gauge("gain_std", "Its standard deviation, in the same unit.", "axis", "unit")
     for gain in calibration.gains:
@@ -477,7 +558,10 @@ def _set_calibration_gauges(gauge: Callable[..., Gauge], calibration: Calibratio
         std.labels(cell, gain.axis, gain.unit).set(gain.std)
     residual = gauge("residual_percent", "Relative error of the torques.", "axis", "data")
     axes = [gain.axis for gain in calibration.gains]
-    for data, error in (("fit", calibration.relative_error_percent), ("holdout", calibration.holdout_error_percent)):
+    for data, error in (
+        ("fit", calibration.relative_error_percent),
+        ("holdout", calibration.holdout_error_percent),
+    ):
         if error is not None:
             for axis, percent in zip((*axes, "total"), (*error.axes, error.total), strict=True):
                 residual.labels(cell, axis, data).set(percent)

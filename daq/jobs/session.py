@@ -1,7 +1,8 @@
-"""A recalibration session on disk: a folder with logs, calibration and report, and a state file with its progress.
+"""A recalibration session on disk: a folder with logs, calibration and report,
+and a state file with its progress.
 
-The state is replaced whole after every step, with the digests of the files that the step made. A file that the state
-does not list, or lists with another digest, is a remnant of a killed job.
+The state is replaced whole after every step, with the digests of the files that the step made. A
+file that the state does not list, or lists with another digest, is a remnant of a killed job.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _ANY_STATE: TypeAdapter[JobState | GuidedState] = TypeAdapter(JobState | GuidedS
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 _REMOVED = re.compile(rf"\.{_NAME.pattern}\.removed")  #: A session that is being removed
-_UNWRITTEN = f".{STATE}."  #: First part of the name of a state that is being written (`daq.files.replace_file`)
+#: First part of the name of a state that is being written (`daq.files.replace_file`)
+_UNWRITTEN = f".{STATE}."
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,8 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
 def rename_sessions(folders: Iterable[Path], old: str, new: str, until: datetime) -> int:
     """Give the sessions of a cell its new name; return their number.
 
-    Each state is replaced whole, so a process that is killed in between leaves the rest to the next call.
+    Each state is replaced whole, so a process that is killed in between leaves the rest to the next
+    call.
 
     Args:
         folders: of sessions; one that does not exist has none.
@@ -100,21 +103,25 @@ def rename_sessions(folders: Iterable[Path], old: str, new: str, until: datetime
 
 
 def sessions_to_rename(folder: Path, old: str, until: datetime) -> tuple[Session, ...]:
-    """Return the sessions of a cell that `rename_sessions` gives another name. Args and errors as there."""
+    """Return the sessions of a cell that `rename_sessions` gives another name.
+
+    Args and errors as there.
+    """
     return tuple(session for session in sessions(folder, old) if session.began <= until)
 
 
 def begun_until(found: tuple[Session, ...], now: datetime) -> tuple[Session, ...]:
     """Return the sessions that began by now.
 
-    One that begins later was made under a wrong date. By its date it would be the newest one for as long, so no age, no
-    order and no removal counts it.
+    One that begins later was made under a wrong date. By its date it would be the newest one for as
+    long, so no age, no order and no removal counts it.
     """
     return tuple(session for session in found if session.began - now <= CLOCK_SLACK)
 
 
 def session_of(calibration: Path, digest: str) -> str | None:
-    """Return the name of the session that made a calibration; None for a file in no session's folder.
+    """Return the name of the session that made a calibration;
+    None for a file in no session's folder.
 
     Args:
         calibration: its file.
@@ -143,14 +150,18 @@ def _listing(folder: Path) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """Cell, configuration and approved plans of a session: a session is resumed only with the same ones."""
+    """Cell, configuration and approved plans of a session:
+    a session is resumed only with the same ones.
+    """
 
     cell: str
     configuration_sha256: str
     plans_sha256: str
 
 
-def begin(folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = JobState) -> Session:
+def begin(
+    folder: Path, basis: Basis, now: datetime, kind: type[SessionState] = JobState
+) -> Session:
     """Begin a session: make its folder and write its state.
 
     Args:
@@ -185,7 +196,9 @@ def save(session: Session) -> Session:
     return session
 
 
-def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, within_h: float) -> Session | None:
+def resumable_session(
+    found: tuple[Session, ...], basis: Basis, now: datetime, within_h: float
+) -> Session | None:
     """Newest session, if it is unfinished, has the same basis and is recent enough."""
     if not found or found[-1].finished:
         return None
@@ -221,13 +234,16 @@ def last_good(found: tuple[Session, ...]) -> Session | None:
     return None
 
 
-def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str]) -> tuple[Path, ...]:
+def remove_old(
+    found: tuple[Session, ...], keep: int, in_force: Collection[str]
+) -> tuple[Path, ...]:
     """Remove old sessions, except the last good one and those whose calibration is in force.
 
     Args:
         found: oldest first, those that count (`begun_until`).
         keep: number of the newest sessions to keep.
-        in_force: digests of the calibrations in force: their logs and signatures are the evidence for current gains.
+        in_force: digests of the calibrations in force: their logs and signatures are the evidence
+            for current gains.
 
     Returns:
         folders that were removed; one that the file system does not release is skipped.
@@ -238,7 +254,8 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
         fitted = session.state.fitted
         if session is not good and (fitted is None or fitted.calibration_sha256 not in in_force):
             with suppress(OSError):
-                # Renamed first: killed halfway, it would be a folder without a state, which no job removes.
+                # Renamed first: killed halfway, it would be a folder without a state, which no job
+                # removes.
                 doomed = session.folder.with_name(f".{session.folder.name}.removed")
                 session.folder.rename(doomed)
                 shutil.rmtree(doomed)
@@ -250,10 +267,11 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
 
 
 def _remove_remnants(newest: Path) -> None:
-    """Remove what killed jobs left beside this folder: sessions half removed, and those that never got a state.
+    """Remove what killed jobs left beside this folder:
+    sessions half removed, and those that never got a state.
 
-    A later folder without a state may be that of another cell's job, which begins just now. One with any other file in
-    it is left to a person.
+    A later folder without a state may be that of another cell's job, which begins just now. One
+    with any other file in it is left to a person.
     """
     for entry in tuple(newest.parent.iterdir()):
         if _REMOVED.fullmatch(entry.name):

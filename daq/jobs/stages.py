@@ -1,7 +1,9 @@
-"""The stages of a session, in order; each leaves its result in the session's folder and finds that of the one before.
+"""The stages of a session, in order; each leaves its result in the session's folder and finds that
+of the one before.
 
-A stage that finds its own result there does nothing, so a session goes on where it was ended. A scheduled job and a
-guided session take the same stages: they differ in the schedule of runs and in the operator.
+A stage that finds its own result there does nothing, so a session goes on where it was ended. A
+scheduled job and a guided session take the same stages: they differ in the schedule of runs and in
+the operator.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ class Record:
     """Record the runs that the schedule asks for."""
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Check disk, history, interlock and drives, then record; nothing is checked where nothing is left."""
+        """Check disk, history, interlock and drives, then record;
+        nothing is checked where nothing is left.
+        """
         session = verified_runs(session)
         if context.schedule.is_complete(session):
             return session
@@ -58,13 +62,16 @@ class WatchDrift:
     """Enter the calibration into the history, and look at the drift of each gain."""
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Enter it before the decision: what is only proposed is in the history, too. This also ends the write of a
-        killed job.
+        """Enter it before the decision: what is only proposed is in the history, too.
+
+        This also ends the write of a killed job.
         """
         calibration = calibration_made(session)
         journal = context.within("watch").journal
         digest = sha256_of(session.folder / CALIBRATION) or ""
-        enter_calibration(context.ledger, calibration, digest=digest, who=context.who, at=context.tools.now())
+        enter_calibration(
+            context.ledger, calibration, digest=digest, who=context.who, at=context.tools.now()
+        )
         history = read_history(context.ledger)
         if history.may_lack:
             journal.say(Level.WARNING, "history may be incomplete", text=MAY_LACK)
@@ -88,19 +95,31 @@ class Decide:
 
 
 class Certify:
-    """Make the certificate again: who wrote the gains and when, and whether new moves accept them."""
+    """Make the certificate again: who wrote the gains and when,
+    and whether new moves accept them.
+    """
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Write the page; where the file system refuses, the session ends all the same: its gains are what counts."""
+        """Write the page; where the file system refuses, the session ends all the same:
+        its gains are what counts.
+        """
         journal = context.within("certify").journal
         calibration = calibration_made(session)
         now = context.tools.now()
         try:
-            certificate = context.tools.certify(context.file, context.cell, calibration, session.folder, now)
+            certificate = context.tools.certify(
+                context.file, context.cell, calibration, session.folder, now
+            )
         except OutputFailed as error:
             calibration_file = session.folder / CALIBRATION
-            remedy = f"`drivegain certificate {calibration_file} --cell {context.file}` makes another"
-            journal.say(Level.WARNING, "the certificate is that of before the decision", text=f"{error}; {remedy}")
+            remedy = (
+                f"`drivegain certificate {calibration_file} --cell {context.file}` makes another"
+            )
+            journal.say(
+                Level.WARNING,
+                "the certificate is that of before the decision",
+                text=f"{error}; {remedy}",
+            )
             return session
         status = status_text(certificate.comparison)
         journal.say(Level.NOTICE, "certified", id=certificate.origin.id, text=status)

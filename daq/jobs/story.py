@@ -1,7 +1,7 @@
 """The journal of a session in plain words, for the person at the terminal.
 
-The events are those that the other forms of the journal have. One that is missing here is for programs alone, unless it
-is a warning or an error.
+The events are those that the other forms of the journal have. One that is missing here is for
+programs alone, unless it is a warning or an error.
 """
 
 from __future__ import annotations
@@ -19,9 +19,12 @@ Fields = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Story(Journal):
-    """A journal for a person: short lines without times, and one table of the gains after a block."""
+    """A journal for a person: short lines without times,
+    and one table of the gains after a block.
+    """
 
-    said: set[str] = field(default_factory=set)  #: warnings that were printed; the same one once is enough
+    #: warnings that were printed; the same one once is enough
+    said: set[str] = field(default_factory=set)
 
     def say(self, level: Level, event: str, /, **fields: object) -> None:
         """Print one event, if it tells the person something."""
@@ -70,8 +73,8 @@ def _gains(fields: Fields) -> str:
         if worst.get("cause"):
             why = f" ({worst['cause']})"
         lines.append(
-            f"The target is ± {target}. {worst['axis']} needs the longest{why}: about {duration(left_s)} more at this "
-            "rate."
+            f"The target is ± {target}. {worst['axis']} needs the longest{why}: about "
+            f"{duration(left_s)} more at this rate."
         )
     else:
         lines.append(f"Every gain is within ± {target}: the recording is complete.")
@@ -90,7 +93,9 @@ def _gain_text(gain: Fields) -> str:
 
 
 def _quick(fields: Fields) -> str:
-    """Return the quick estimate after a move in one line, the worst gain first; before there is one, what it lacks."""
+    """Return the quick estimate after a move in one line, the worst gain first;
+    before there is one, what it lacks.
+    """
     if fields["missing"]:
         return f"No gains yet: {fields['missing']}."
     gains = fields["gains"]
@@ -154,13 +159,17 @@ PARAGRAPHS: dict[str, Callable[[Fields], str]] = {
 SENTENCES = {
     "session begun": "New session: {folder}",
     "session taken up": "The session continues. Already recorded: {recorded}.",
-    "an unfinished session is not taken up": "! The unfinished session in {folder} is not continued: {reason}.",
-    "drives are as declared, without fault and without power": "Checked: disk, history, interlock, drives.",
-    "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected {expected}. The "
-    "moves take {duration_s:g} s instead.",
+    "an unfinished session is not taken "
+    "up": "! The unfinished session in {folder} is not continued: {reason}.",
+    "drives are as declared, without fault and without "
+    "power": "Checked: disk, history, interlock, drives.",
+    "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected {expected}. "
+    "The moves take {duration_s:g} s instead.",
     "moves to look at": "\nMoves to look at: {page}",
     "rehearsing": "Rehearsing at {speed:.0%} of the speed; nothing is logged.",
-    "recording is invalid": "! This recording cannot be used: {reason}. It is kept, and the block is recorded again.",
+    "recording is "
+    "invalid": "! This recording cannot be used: {reason}. It is kept, and the block is "
+    "recorded again.",
     "set aside": "The earlier recording is now {log}.",
     "warning of the recorder": "! {text}",
     "weighed": "By the moves, {added_kg:.2g} kg more than without load.",

@@ -17,10 +17,13 @@ MARK = "# Made by `drivegain schedule`, which may replace this file."
 """First line of a unit that drivegain made."""
 MARKS = (MARK, "# Made by `drivegain install-units`, which may replace this file.")
 """The same and that of earlier versions; a file of that name without one of them is not ours."""
-_SEARCHED = (("systemd", "system"), ("systemd", "user"))  #: Ends of the folders in which systemd finds units
+#: Ends of the folders in which systemd finds units
+_SEARCHED = (("systemd", "system"), ("systemd", "user"))
 STOP_S = 30  #: Time for the axes to stop and the session to be saved, after SIGTERM [s]
 CRON = {"hourly": "0 * * * *", "daily": "0 0 * * *", "weekly": "0 0 * * 1", "monthly": "0 0 1 * *"}
-"""The dates of crontab(5) that systemd.time(7) means by a word: `weekly` is Monday 00:00 for both."""
+"""The dates of crontab(5) that systemd.time(7) means by a word:
+`weekly` is Monday 00:00 for both.
+"""
 _NEEDS_LITTLE = """\
 NoNewPrivileges=yes
 ProtectSystem=full
@@ -44,8 +47,8 @@ RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_CAN
 SystemCallArchitectures=native
 # The capture may have the lowest real-time priority, by sched(7) without a capability.
 LimitRTPRIO=1"""
-#: Capabilities of a service of root: to keep the owner of a controller's file, and a receive buffer beyond
-#: net.core.rmem_max, which loses no frame of the bus.
+#: Capabilities of a service of root: to keep the owner of a controller's file, and a receive buffer
+#: beyond net.core.rmem_max, which loses no frame of the bus.
 _CAPABILITIES = {"root": "CAP_CHOWN CAP_DAC_OVERRIDE CAP_FOWNER CAP_NET_ADMIN"}
 
 
@@ -84,12 +87,14 @@ AccuracySec=1min
 
 [Install]
 WantedBy=timers.target
-"""
+"""  # noqa: E501
     return Unit(f"{name}.service", _service(cell, section, wanted)), Unit(f"{name}.timer", timer)
 
 
 def unit_name(cell: Cell) -> str:
-    """Without its suffix; cells whose names differ in more than small letters, digits and hyphens get a digest too."""
+    """Without its suffix; cells whose names differ in more than small letters,
+    digits and hyphens get a digest too.
+    """
     plain = re.sub(r"[^a-z0-9]+", "-", cell.name.lower()).strip("-")
     digest = ""
     if plain != cell.name:
@@ -153,7 +158,8 @@ def _command(wanted: Installation) -> tuple[str, ...]:
 def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
     command = " ".join(_quoted(part) for part in _command(wanted))
     seconds = round(60 * section.max_duration_min) + 2 * STOP_S
-    # The lock of the bus is in a folder that all share, so the service must see the same /tmp and /run.
+    # The lock of the bus is in a folder that all share, so the service must see the same /tmp and
+    # /run.
     hardening = ""
     owner = ""
     writable = ""
@@ -163,7 +169,9 @@ def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
             f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
             f"CapabilityBoundingSet={capabilities}\n"
         )
-        owner = f"# Whose the cell file is: what the job writes stays theirs.\nUser={wanted.owner}\n"
+        owner = (
+            f"# Whose the cell file is: what the job writes stays theirs.\nUser={wanted.owner}\n"
+        )
         writable = _writable(cell, section, wanted.cell_file)
     return f"""{MARK}
 [Unit]
@@ -185,11 +193,13 @@ KillSignal=SIGTERM
 KillMode=mixed
 TimeoutStopSec={STOP_S}
 Environment=OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
-{hardening}{writable}"""
+{hardening}{writable}"""  # noqa: E501
 
 
 def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
-    """Folders that ProtectHome= and ProtectSystem= would lock; of links, those where the files are."""
+    """Folders that ProtectHome= and ProtectSystem= would lock;
+    of links, those where the files are.
+    """
     folders = {cell_file.parent, section.folder.parent, section.folder}
     if cell.controller_path is not None:
         folders.add(Path(os.path.realpath(cell.controller_path)).parent)
@@ -208,7 +218,9 @@ def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
 
 
 def _quoted(part: str, *, dollar: str = "$$") -> str:
-    """An argument as systemd.service(5) reads it: % and $ doubled, in quotes where it needs them."""
+    """An argument as systemd.service(5) reads it:
+    % and $ doubled, in quotes where it needs them.
+    """
     if not part.isprintable():
         raise UsageError(
             f"{part!r}",

@@ -1,11 +1,12 @@
 """The audit log of a cell: entries are appended and never removed.
 
-One JSON line an entry, each with the digest of the one before: the chain reveals lines that were edited, removed,
-moved or added. An entry is on the disk before `append` returns, written in one piece under a lock. A killed writer
-leaves at most an unfinished line. That line stays; the next entry begins on a line of its own and records its digest.
+One JSON line an entry, each with the digest of the one before: the chain reveals lines that were
+edited, removed, moved or added. An entry is on the disk before `append` returns, written in one
+piece under a lock. A killed writer leaves at most an unfinished line. That line stays; the next
+entry begins on a line of its own and records its digest.
 
-Beside the log is FILE.head with the digest of its last entry: a chain alone cannot show that its end, or all of it,
-is missing. docs/decisions/0036 says what this defends against.
+Beside the log is FILE.head with the digest of its last entry: a chain alone cannot show that its
+end, or all of it, is missing. docs/decisions/0036 says what this defends against.
 """
 
 from __future__ import annotations
@@ -32,9 +33,12 @@ _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
 FIRST = "0" * 64  #: Previous digest of the first entry
 GONE = "gone"  #: Takes the place of a missing file's digest
 BACKUPS_WITHOUT_LOG = "backups_without_log"
-"""Detail of the first write in a log: the number of backups of earlier writes, which this log does not have."""
+"""Detail of the first write in a log: the number of backups of earlier writes,
+which this log does not have.
+"""
 _BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
-_DIGEST = b',"sha256":"'  #: Before the digest of a line; in a text of it, the quotation marks would be escaped
+#: Before the digest of a line; in a text of it, the quotation marks would be escaped
+_DIGEST = b',"sha256":"'
 _DIGITS = 64  #: Of a digest, hexadecimal
 
 
@@ -48,22 +52,36 @@ class AuditAction(Enum):
     ROLLBACK_BEGUN = "rollback begun"
     ROLLED_BACK = "rolled back"
     FAILED = "failed"
-    NOTHING_TO_DO = "nothing to do"  #: A write was asked for, and the target had this content already
+    #: A write was asked for, and the target had this content already
+    NOTHING_TO_DO = "nothing to do"
     RECALIBRATION_BEGUN = "recalibration begun"
     RECALIBRATION_ENDED = "recalibration ended"
     ACCEPTED = "accepted"
-    """A calibration was tried in the cell and accepted; details: cell, session, SHA-256 of the calibration's file."""
+    """A calibration was tried in the cell and accepted; details:
+    cell, session, SHA-256 of the calibration's file.
+    """
     NOT_ACCEPTED = "not accepted"
-    """A calibration was tried in the cell, and new moves contradict it; details as of ACCEPTED, and how to undo it."""
+    """A calibration was tried in the cell, and new moves contradict it;
+    details as of ACCEPTED, and how to undo it.
+    """
     ACKNOWLEDGED = "acknowledged"
     CALIBRATION_ENTERED = "calibration entered"
-    """The history has this calibration; details: SHA-256 of its file, cell, time, document, and its figures."""
+    """The history has this calibration; details:
+    SHA-256 of its file, cell, time, document, and its figures.
+    """
     RENAMED = "renamed"
-    """A cell has another name; details: `old_name`, `cell`, robot. It counts for the entries before it."""
+    """A cell has another name; details: `old_name`, `cell`, robot.
+
+    It counts for the entries before it.
+    """
     WRITE_FOUND = "write found"
-    """A controller has these gains, though no entry ends the write that put them there; details as of its begin."""
+    """A controller has these gains, though no entry ends the write that put them there;
+    details as of its begin.
+    """
     TORN_LINE = "torn line"
-    """The line before was left by a writer that was killed or had no room; details: its length and SHA-256."""
+    """The line before was left by a writer that was killed or had no room; details:
+    its length and SHA-256.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +99,13 @@ class AuditEntry:
 
 
 def entry(
-    number: int, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object], previous: str
+    number: int,
+    at: str,
+    who: str,
+    action: AuditAction,
+    subject: str,
+    details: Mapping[str, object],
+    previous: str,
 ) -> AuditEntry:
     """Make an entry with its digest.
 
@@ -95,7 +119,12 @@ def entry(
 
 
 def entry_after(
-    before: AuditEntry | None, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object]
+    before: AuditEntry | None,
+    at: str,
+    who: str,
+    action: AuditAction,
+    subject: str,
+    details: Mapping[str, object],
 ) -> AuditEntry:
     """Make the entry that follows another one, or the first one; raises as `entry`."""
     if before is None:
@@ -115,13 +144,19 @@ _TYPES = {
 
 
 def _decode(line: bytes) -> tuple[AuditEntry | None, bool]:
-    """Return the entry of a line, None for one that `encode` could not write, and whether its digest is right."""
+    """Return the entry of a line, None for one that `encode` could not write,
+    and whether its digest is right.
+    """
     try:
         tree = json.loads(line)
-        if not isinstance(tree, dict) or {name: type(value) for name, value in tree.items()} != _TYPES:
+        if (
+            not isinstance(tree, dict)
+            or {name: type(value) for name, value in tree.items()} != _TYPES
+        ):
             return None, False
         found = AuditEntry(**{**tree, "action": AuditAction(tree["action"])})
-        # Encoding again costs four times as much as reading: it is only done to tell what a changed line is.
+        # Encoding again costs four times as much as reading: it is only done to tell what a changed
+        # line is.
         if found.sha256 == _digest_of_line(line):
             return found, True
         return (found if encode(found) == line else None), False
@@ -169,7 +204,13 @@ def _canonical(tree: object) -> bytes:
 
 
 def append(
-    path: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+    path: Path,
+    action: AuditAction,
+    *,
+    at: datetime,
+    who: str,
+    subject: str,
+    details: Mapping[str, object],
 ) -> AuditEntry:
     """Append an entry durably; a new file is made in an existing folder.
 
@@ -199,7 +240,8 @@ def append(
 
 
 def _write_all(descriptor: int, data: bytes) -> None:
-    """Write all bytes, in several calls where the system takes a part: the next call says why it took no more.
+    """Write all bytes, in several calls where the system takes a part:
+    the next call says why it took no more.
 
     Raises:
         OSError: from the file system; what was written until then stays.
@@ -213,16 +255,20 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 
 def noted_heads(path: Path) -> tuple[str, ...]:
-    """Return the digests of entries that were noted beside an audit log, and that it must have; none without a note.
+    """Return the digests of entries that were noted beside an audit log, and that it must have;
+    none without a note.
 
-    The last one is that of the last entry. Others are of entries that were missing when the next one was appended.
+    The last one is that of the last entry. Others are of entries that were missing when the next
+    one was appended.
     """
     try:
         text = read_regular(head_file(path), MAX_BYTES).decode(errors="replace")
     except OSError:
         return ()
     lines = text.split("\n")
-    return tuple(line for line in lines if len(line) == _DIGITS and set(line) <= set("0123456789abcdef"))
+    return tuple(
+        line for line in lines if len(line) == _DIGITS and set(line) <= set("0123456789abcdef")
+    )
 
 
 def head_file(path: Path) -> Path:
@@ -242,7 +288,8 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
     with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
         descriptor = os.open(head_file(path), flags, 0o666)
         try:
-            # In one piece and in place: there are never fewer lines than before, but where a missing entry came back.
+            # In one piece and in place: there are never fewer lines than before, but where a
+            # missing entry came back.
             os.pwrite(descriptor, noted, 0)
             os.ftruncate(descriptor, len(noted))
         finally:
@@ -260,10 +307,11 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
 
 
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
-    """Check that the audit log is what was written, and find writes that were begun and never ended.
+    """Check that the audit log is what was written,
+    and find writes that were begun and never ended.
 
-    A chain alone cannot show that its last lines are missing: `heads` are the digests of entries noted elsewhere. A
-    missing file is an empty one.
+    A chain alone cannot show that its last lines are missing: `heads` are the digests of entries
+    noted elsewhere. A missing file is an empty one.
 
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
@@ -287,9 +335,9 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
                 str(path),
                 found=f"line {number}, which drivegain did not write",
                 expected="an audit log whose entries were never changed",
-                remedy="if this is another file, correct `history.audit` of the cell file or --audit; if it is the "
-                "audit log, check it with `drivegain history --verify`, then move it away, keep it, and begin another; "
-                "nothing was written",
+                remedy="if this is another file, correct `history.audit` of the cell file or "
+                "--audit; if it is the audit log, check it with `drivegain history --verify`, then "
+                "move it away, keep it, and begin another; nothing was written",
             )
         unfinished.append(line)
     return None, unfinished[::-1]
@@ -321,7 +369,8 @@ def _locked(path: Path) -> Iterator[int]:
             )
         yield descriptor
     finally:
-        with contextlib.suppress(OSError):  # the entry was flushed; the descriptor is closed all the same (close(2))
+        # The entry was flushed; the descriptor is closed all the same (close(2))
+        with contextlib.suppress(OSError):
             os.close(descriptor)
 
 
@@ -343,14 +392,16 @@ def _content_of(path: Path) -> bytes:
 
 
 def _require_target(path: Path) -> None:
-    """Refuse a link that leads to no file: an audit log on a disk that is not mounted is not a new one."""
+    """Refuse a link that leads to no file:
+    an audit log on a disk that is not mounted is not a new one.
+    """
     if path.is_symlink() and not path.exists():
         raise AuditUnusable(
             str(path),
             found=f"a link to {path.readlink()}, where there is no file",
             expected="a link to the cell's audit log",
-            remedy="mount the disk that it is on, or correct the link; for a new audit log there make an empty file; "
-            "nothing was written",
+            remedy="mount the disk that it is on, or correct the link; for a new audit log there "
+            "make an empty file; nothing was written",
         )
 
 
@@ -359,12 +410,15 @@ def _no_file(path: Path, found: str) -> AuditUnusable:
         str(path),
         found=found,
         expected="the cell's audit, a regular file",
-        remedy="correct `history.audit` of the cell file, or --audit where you gave it; nothing was written",
+        remedy="correct `history.audit` of the cell file, or --audit where you gave it; nothing "
+        "was written",
     )
 
 
 def digest_now(subject: str) -> str | None:
-    """Return the SHA-256 of a file as it is now, `GONE` without one, None where it cannot be read."""
+    """Return the SHA-256 of a file as it is now, `GONE` without one,
+    None where it cannot be read.
+    """
     path = Path(subject)
     try:
         return sha256_of(path) if path.exists() else GONE
@@ -409,7 +463,8 @@ class OpenWrite:
     """A write without an entry that ends it: its writer was killed."""
 
     begun: AuditEntry  #: the entry
-    content: Content  #: of the file afterwards: as the next write found it, or, where there was none, as it is now
+    #: of the file afterwards: as the next write found it, or, where there was none, as it is now
+    content: Content
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,7 +479,9 @@ class AuditVerdict:
 
     @property
     def holds(self) -> bool:
-        """Whether every entry is what was written and none is missing, as far as a chain can show it."""
+        """Whether every entry is what was written and none is missing,
+        as far as a chain can show it.
+        """
         return not self.flaws
 
     @property
@@ -433,13 +490,17 @@ class AuditVerdict:
         return self.flaws[0].line if self.flaws else None
 
 
-def judge_chain(content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()) -> AuditVerdict:
+def judge_chain(
+    content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()
+) -> AuditVerdict:
     """Check a chain.
 
     Args:
         content: of the audit log.
-        digest_now: SHA-256 of a controller file by its path, `GONE` where there is none, None where it cannot be read.
-        heads: digests of entries that were noted elsewhere. One that is not in the chain shows that its end is missing.
+        digest_now: SHA-256 of a controller file by its path, `GONE` where there is none, None where
+            it cannot be read.
+        heads: digests of entries that were noted elsewhere. One that is not in the chain shows that
+            its end is missing.
     """
     chain = _Chain(content)
     for index, (one, holds) in enumerate(chain.decoded):
@@ -482,7 +543,9 @@ class _Chain:
     def __init__(self, content: bytes) -> None:
         self.lines = _lines_of(content)
         self.decoded = [_decode(line) for line in self.lines]
-        """The entry of each line, None for a line that is none, and whether its digest is that of its content."""
+        """The entry of each line, None for a line that is none,
+        and whether its digest is that of its content.
+        """
         self.numbers = Counter(one.number for one, _ in self.decoded if one is not None)
         self.flaws: list[AuditFlaw] = []
         self.torn: list[int] = []
@@ -499,26 +562,39 @@ class _Chain:
         self.settle(one)
         place = index + 1
         if not holds:
-            self._add_flaw(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
+            self._add_flaw(
+                place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content"
+            )
             self.number += 1
             self.previous = None
             self.place = place
             return
         if one.number < self.number:
             twice = self.numbers[one.number] > 1
-            says = f"entry {one.number} {'is there more than once' if twice else 'is after a later one'}"
+            says = (
+                f"entry {one.number} "
+                f"{'is there more than once' if twice else 'is after a later one'}"
+            )
             self._add_flaw(place, Flaw.ADDED if twice else Flaw.MOVED, says)
             return
         if one.number > self.number:
             missing = range(self.number, one.number)
             gone = [number for number in missing if number not in self.numbers]
             if gone:
-                which = f"entry {gone[0]} is" if len(gone) == 1 else f"entries {gone[0]} to {gone[-1]} are"
+                if len(gone) == 1:
+                    which = f"entry {gone[0]} is"
+                else:
+                    which = f"entries {gone[0]} to {gone[-1]} are"
                 self._add_flaw(place, Flaw.REMOVED, f"{which} missing before entry {one.number}")
             else:
-                self._add_flaw(place, Flaw.MOVED, f"entry {one.number} is before entry {missing[0]}")
+                self._add_flaw(
+                    place, Flaw.MOVED, f"entry {one.number} is before entry {missing[0]}"
+                )
         elif self.previous is not None and one.previous != self.previous:
-            says = f"entry {one.number} follows another entry than the one before it, which was put in its place"
+            says = (
+                f"entry {one.number} follows another entry than the one before it, which was "
+                "put in its place"
+            )
             self._add_flaw(self.place, Flaw.EDITED, says)
         self.number = one.number + 1
         self.previous = one.sha256
@@ -530,7 +606,9 @@ class _Chain:
         is_torn = follower is not None and follower.action is AuditAction.TORN_LINE
         if follower is not None and is_torn and follower.details != _torn_details(fragments):
             says = f"entry {follower.number} reports an unfinished line that is not there as it was"
-            self._add_flaw(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
+            self._add_flaw(
+                self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says
+            )
         elif is_torn or (follower is None and all(map(_is_fragment, fragments))):
             self.torn += [index + 1 for index in self.unfinished]
         else:
@@ -545,22 +623,32 @@ class _Chain:
         self.flaws.append(AuditFlaw(line, flaw, says))
 
 
-def open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
+def open_writes(
+    entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]
+) -> Iterator[OpenWrite]:
     """Find writes that were begun and never ended. Args as of `judge_chain`."""
     ended = {begun_by(one) for one in entries if one.action in _ENDS}
     begins = [one for one in entries if one.action in _BEGUN]
     for place, one in enumerate(begins):
         if one.number in ended:
             continue
-        # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
-        witness = next((later for later in begins[place + 1 :] if later.subject == one.subject), None)
-        found = digest_now(one.subject) if witness is None else _digest_before(witness)
+        # The next write read the file under its lock, before it changed anything: that is nearer
+        # than the file now.
+        witness = next(
+            (later for later in begins[place + 1 :] if later.subject == one.subject), None
+        )
+        if witness is None:
+            found = digest_now(one.subject)
+        else:
+            found = _digest_before(witness)
         before = _digest_before(one)
         after = one.details.get("sha256_after")
         if found is None or before is None or not isinstance(after, str):
             yield OpenWrite(one, Content.UNKNOWN)
         else:
-            yield OpenWrite(one, {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER))
+            yield OpenWrite(
+                one, {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER)
+            )
 
 
 def begun_by(entry: AuditEntry) -> int:
@@ -580,7 +668,9 @@ def witnessed_writes(entries: Sequence[AuditEntry]) -> list[OpenWrite]:
 
 
 def _digest_before(begun: AuditEntry) -> str | None:
-    """Return the digest of the file when the write began, `GONE` without a file, None for an entry without one."""
+    """Return the digest of the file when the write began, `GONE` without a file,
+    None for an entry without one.
+    """
     recorded = begun.details.get("sha256_before", 0)
     if recorded is None:
         return GONE

@@ -1,4 +1,6 @@
-"""The history of a cell, folded from its audit log: calibrations, writes to controllers, acknowledged changes."""
+"""The history of a cell, folded from its audit log:
+calibrations, writes to controllers, acknowledged changes.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,23 @@ from daq.config.same_cell import (
 from daq.documents.calibration_file import decode_calibration
 from daq.errors import DaqError
 from daq.files import sha256
-from daq.ledger.audit import AuditAction, AuditEntry, OpenWrite, begun_by, made_writes, witnessed_writes
+from daq.ledger.audit import (
+    AuditAction,
+    AuditEntry,
+    OpenWrite,
+    begun_by,
+    made_writes,
+    witnessed_writes,
+)
 from daq.ledger.dates import corrected, times_by_order
-from daq.ledger.names import RenamedCell, drives_of, names_in, renamed_to, with_present_names
+from daq.ledger.names import (
+    RenamedCell,
+    drives_of,
+    names_in,
+    rename_of,
+    renamed_to,
+    with_present_names,
+)
 from ident.calibration import CalibratedRobot, Calibration, Gain, Source
 
 
@@ -39,14 +55,16 @@ class WriteAction(Enum):
 class Event:
     """A write to a controller."""
 
-    #: Of the calibration whose gains the controller had afterwards; None for a rollback to gains of no calibration.
+    #: Of the calibration whose gains the controller had afterwards; None for a rollback to gains of
+    #: no calibration.
     digest: str | None
     action: WriteAction  #: its kind
     at: datetime  #: when, UTC
     who: str  #: the person or the job
     target: str  #: the controller's file, or the drives
     audit: str | None = None  #: SHA-256 of its entry in the audit log, None where none was given
-    sha256_after: str | None = None  #: of the target's content afterwards, None where none was given
+    #: of the target's content afterwards, None where none was given
+    sha256_after: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +72,13 @@ class Entry:
     """One calibration."""
 
     digest: str  #: SHA-256 of its file
-    created: datetime  #: when it was fitted, UTC; when it was entered where its own time cannot be read
-    recorded: datetime  #: when the newest log of its fit was recorded, UTC; as `created` where no log has a time
-    logs: str  #: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings
+    #: when it was fitted, UTC; when it was entered where its own time cannot be read
+    created: datetime
+    #: when the newest log of its fit was recorded, UTC; as `created` where no log has a time
+    recorded: datetime
+    #: digest of the logs of its fit, as a set; calibrations with the same one rest on the same
+    #: recordings
+    logs: str
     entered: datetime  #: when it was entered, UTC
     cell: str  #: name of the cell
     configuration_sha256: str  #: of the cell configuration that its logs carry
@@ -67,11 +89,13 @@ class Entry:
     rows: int  #: of the observation
     gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
     events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first
-    acceptance: RecordedAcceptance | None = None  #: result of the last new moves with its gains; None without any
-    #: `created` by the clock of that day, where the order of the audit log shows that it was wrong; else None. Then
-    #: `created` and `recorded` are what that order allows.
+    #: result of the last new moves with its gains; None without any
+    acceptance: RecordedAcceptance | None = None
+    #: `created` by the clock of that day, where the order of the audit log shows that it was wrong;
+    #: else None. Then `created` and `recorded` are what that order allows.
     created_by_clock: datetime | None = None
-    robot: CalibratedRobot | None = None  #: that it is of; None where it was entered by an earlier version
+    #: that it is of; None where it was entered by an earlier version
+    robot: CalibratedRobot | None = None
 
     def gain_of(self, axis: str) -> Gain | None:
         """Return the gain of an axis, None for an axis that it does not have."""
@@ -92,10 +116,40 @@ class ForeignEntry:
 
     def __str__(self) -> str:
         return (
-            f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is of another robot with the "
-            f"cell name {self.entry.cell!r}: found {found_text(self.differences)}; expected "
-            f"{expected_text(self.differences)}, as in the cell file"
+            f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is of "
+            f"another robot with the cell name {self.entry.cell!r}: found "
+            f"{found_text(self.differences)}; expected {expected_text(self.differences)}, as in "
+            "the cell file"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class IncomparableEntry:
+    """A calibration of this cell with other axes or units than the newest one.
+
+    Earlier versions entered such ones into one history.
+    """
+
+    entry: Entry  #: itself
+    expected: Mapping[str, str]  #: unit of each axis in the newest calibration
+
+    def __str__(self) -> str:
+        found = _units(self.entry)
+        if found.keys() != self.expected.keys():
+            found_text = f"gains of {', '.join(found)}"
+            expected_text = f"of {', '.join(self.expected)}"
+        else:
+            differing = [axis for axis, unit in found.items() if unit != self.expected[axis]]
+            found_text = _units_text(differing, found)
+            expected_text = _units_text(differing, self.expected)
+        return (
+            f"calibration {self.entry.digest[:12]}… of {self.entry.recorded:%Y-%m-%d} is not "
+            f"compared: found {found_text}; expected {expected_text}, as in the newest one"
+        )
+
+
+def _units_text(axes: Sequence[str], units: Mapping[str, str]) -> str:
+    return ", ".join(f"{axis} in {units[axis]}" for axis in axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,16 +178,24 @@ class RecordedAcceptance:
 
 
 def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
-    """Return when the newest log of a fit was recorded, UTC; `otherwise` where no log has a time."""
-    times_s = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
+    """Return when the newest log of a fit was recorded, UTC;
+    `otherwise` where no log has a time.
+    """
+    times_s = [
+        one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None
+    ]
     try:
-        return datetime.fromtimestamp(max(seconds for seconds in times_s if seconds is not None), UTC)
+        return datetime.fromtimestamp(
+            max(seconds for seconds in times_s if seconds is not None), UTC
+        )
     except (ValueError, OverflowError, OSError):
         return otherwise.astimezone(UTC)
 
 
 def logs_of(calibration: Calibration, digest: str) -> str:
-    """Return the digest of the set of logs of a fit; that of the calibration itself without logs."""
+    """Return the digest of the set of logs of a fit;
+    that of the calibration itself without logs.
+    """
     logs = sorted({one.sha256 for one in _fitted(calibration)})
     return sha256("\n".join(logs).encode()) if logs else digest
 
@@ -143,7 +205,9 @@ def _fitted(calibration: Calibration) -> list[Source]:
 
 
 def utc(text: str, otherwise: datetime) -> datetime:
-    """Parse an ISO 8601 time as UTC, one without a zone as UTC; `otherwise` where the text is no time."""
+    """Parse an ISO 8601 time as UTC, one without a zone as UTC;
+    `otherwise` where the text is no time.
+    """
     try:
         read = datetime.fromisoformat(text)
         return (read.replace(tzinfo=UTC) if read.tzinfo is None else read).astimezone(UTC)
@@ -175,7 +239,8 @@ def zoned(text: str) -> datetime:
 
 
 def figures_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
-    """Return what a history shows of a calibration, as plain JSON: parsing its document takes a hundred times as long.
+    """Return what a history shows of a calibration, as plain JSON:
+    parsing its document takes a hundred times as long.
 
     Args:
         calibration: of the document.
@@ -198,7 +263,9 @@ def figures_of(calibration: Calibration, digest: str, entered: datetime) -> dict
     }
 
 
-def entry_of(digest: str, cell: str, entered: datetime, figures: Mapping[str, Any], events: Sequence[Event]) -> Entry:
+def entry_of(
+    digest: str, cell: str, entered: datetime, figures: Mapping[str, Any], events: Sequence[Event]
+) -> Entry:
     """Return a calibration by its `figures_of`; `events` are the writes of its gains, oldest first.
 
     Raises:
@@ -221,7 +288,10 @@ def entry_of(digest: str, cell: str, entered: datetime, figures: Mapping[str, An
 
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
-_BEGINS = {AuditAction.APPLY_BEGUN: WriteAction.APPLIED, AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK}
+_BEGINS = {
+    AuditAction.APPLY_BEGUN: WriteAction.APPLIED,
+    AuditAction.ROLLBACK_BEGUN: WriteAction.ROLLED_BACK,
+}
 _NEVER = datetime.min.replace(tzinfo=UTC)
 
 
@@ -232,17 +302,37 @@ class History:
     entries: tuple[Entry, ...]  #: calibrations in the order in which they were fitted
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: explained changes, oldest first
-    acceptances: tuple[RecordedAcceptance, ...] = ()  #: runs of new moves after a write, oldest first
-    unreadable: tuple[str, ...] = ()  #: calibrations of the audit log that cannot be read, as sentences
-    may_lack: bool = False  #: whether the audit log is not what was written, so that something may be missing here
-    #: Calibrations of another robot with the cell's name, oldest first. No change of a gain is computed with them.
+    #: runs of new moves after a write, oldest first
+    acceptances: tuple[RecordedAcceptance, ...] = ()
+    #: calibrations of the audit log that cannot be read, as sentences
+    unreadable: tuple[str, ...] = ()
+    #: whether the audit log is not what was written, so that something may be missing here
+    may_lack: bool = False
+    #: Calibrations of another robot with the cell's name, oldest first. No change of a gain is
+    #: computed with them.
     other_robots: tuple[ForeignEntry, ...] = ()
+    #: Calibrations with other axes or units than the newest one, oldest first. No change of a gain
+    #: is computed with them.
+    not_compared: tuple[IncomparableEntry, ...] = ()
     renamed: RenamedCell | None = None  #: the rename by which this same robot has another name now
-    #: Names in the same audit log whose calibrations are all of a robot like this one, where the cell has none.
+    #: Names in the same audit log whose calibrations are all of a robot like this one, where the
+    #: cell has none.
     possible_names: tuple[str, ...] = ()
 
+    @property
+    def digests(self) -> frozenset[str]:
+        """SHA-256 of every calibration, also of those that no change of a gain is computed with."""
+        digests = {entry.digest for entry in self.entries}
+        for other in self.other_robots:
+            digests.add(other.entry.digest)
+        for incomparable in self.not_compared:
+            digests.add(incomparable.entry.digest)
+        return frozenset(digests)
+
     def in_force(self, target: str | None = None) -> str | None:
-        """Return the digest of the calibration in a target, or in the last written one; None for other numbers."""
+        """Return the digest of the calibration in a target, or in the last written one;
+        None for other numbers.
+        """
         events = [event for event in self.events if target in {None, event.target}]
         return events[-1].digest if events else None
 
@@ -251,30 +341,43 @@ class History:
 class AuditedWrite:
     """A successful write, as the audit log reports it."""
 
-    #: The entry before the write, with its details; None where the audit log has none. Of a write that was found later,
-    #: the entry of the finding.
+    #: The entry before the write, with its details; None where the audit log has none. Of a write
+    #: that was found later, the entry of the finding.
     begun: AuditEntry | None
-    ended: AuditEntry  #: the entry after it; the one before it, where the writer was killed in between
+    #: the entry after it; the one before it, where the writer was killed in between
+    ended: AuditEntry
 
     @property
     def action(self) -> WriteAction:
         """Applied or rolled back."""
-        return {**_ENDS, **_BEGINS}.get(self.ended.action) or WriteAction(text_field(self.ended, "action"))
+        return {**_ENDS, **_BEGINS}.get(self.ended.action) or WriteAction(
+            text_field(self.ended, "action")
+        )
 
     @property
     def calibration(self) -> str | None:
         """SHA-256 of the calibration, None where the audit log has none."""
-        return None if self.begun is None else calibration_field(self.begun, "sha256")
+        if self.begun is None:
+            return None
+        return calibration_field(self.begun, "sha256")
 
     @property
     def sha256_after(self) -> str | None:
         """SHA-256 of the target's content after the write, None where the audit log has none."""
-        return None if self.begun is None else text_field(self.begun, "sha256_after")
+        if self.begun is None:
+            return None
+        return text_field(self.begun, "sha256_after")
 
     def __str__(self) -> str:
         one = self.ended
-        written = f", calibration {self.calibration[:12]}…" if self.calibration else ""
-        return f"entry {one.number} of the audit, {one.action.value} by {one.who} at {one.at} to {one.subject}{written}"
+        if self.calibration:
+            written = f", calibration {self.calibration[:12]}…"
+        else:
+            written = ""
+        return (
+            f"entry {one.number} of the audit, {one.action.value} by {one.who} at {one.at} to "
+            f"{one.subject}{written}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,18 +386,23 @@ class EnteredCalibration:
 
     number: int  #: of the entry
     digest: str  #: SHA-256 of its file
-    at: datetime  #: time of the entry itself; later than the next where a history of an earlier version was taken in
+    #: time of the entry itself; later than the next where a history of an earlier version was taken
+    #: in
+    at: datetime
     entered: datetime  #: when it was entered, UTC
     document: str | None  #: the whole calibration; None where an earlier entry has it
     figures: dict[str, Any] | None  #: as of `figures_of`; None in an entry of an earlier version
-    robot: object = None  #: as of `ident.calibration.CalibratedRobot`; None in an entry of an earlier version
+    #: as of `ident.calibration.CalibratedRobot`; None in an entry of an earlier version
+    robot: object = None
 
 
 def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
-    """Fold the entries of an audit log, oldest first, into the history of a cell; other cells may share the log.
+    """Fold the entries of an audit log, oldest first, into the history of a cell;
+    other cells may share the log.
 
-    A write without an end counts where a later entry shows that it was made: the next write found its content, or a
-    process did (`write found`). What the controller's file is by now is not asked: a history does not change by itself.
+    A write without an end counts where a later entry shows that it was made: the next write found
+    its content, or a process did (`write found`). What the controller's file is by now is not
+    asked: a history does not change by itself.
     """
     events = _events(writes_to(cell, entries, witnessed_writes(entries), everywhere=True))
     by_digest: dict[str | None, list[Event]] = {}
@@ -306,20 +414,27 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     unreadable: list[str] = []
     calibrations = entered_calibrations(entries, cell.name)
     by_order = times_by_order([one.at for one in calibrations])
-    recorded: dict[str, datetime] = {}  # of logs, by calibrations that were entered while the clock was right
+    # Of logs, by calibrations that were entered while the clock was right
+    recorded: dict[str, datetime] = {}
     for one, time in zip(calibrations, by_order, strict=True):
         try:
             figures = one.figures or figures_of_document(one)
-            entry = entry_of(one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ()))
+            entry = entry_of(
+                one.digest, cell.name, one.entered, figures, by_digest.get(one.digest, ())
+            )
             entry = replace(entry, robot=_robot_of(one.robot))
             if time is None:
                 recorded.setdefault(entry.logs, entry.recorded)
             entry = _dated(entry, one.at, time, recorded)
             found.append(replace(entry, acceptance=accepted.get(one.digest)))
         except DaqError as error:
-            unreadable.append(f"{_named(one)}: its document is {error.found}, expected {error.expected}")
+            unreadable.append(
+                f"{_named(one)}: its document is {error.found}, expected {error.expected}"
+            )
         except (KeyError, TypeError, ValueError) as error:
-            unreadable.append(f"{_named(one)}: its figures are not those that drivegain writes: {error}")
+            unreadable.append(
+                f"{_named(one)}: its figures are not those that drivegain writes: {error}"
+            )
     robot = calibrated_robot(cell)
     own = []
     foreign = []
@@ -330,7 +445,13 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         else:
             own.append(entry)
     last = _units(own[-1]) if own else {}
-    comparable = [one for one in own if _units(one) == last]
+    comparable = []
+    incomparable = []
+    for entry in own:
+        if _units(entry) == last:
+            comparable.append(entry)
+        else:
+            incomparable.append(IncomparableEntry(entry, last))
     return History(
         entries=tuple(sorted(comparable, key=lambda one: (one.created, one.entered, one.digest))),
         events=tuple(events),
@@ -338,6 +459,7 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
         acceptances=acceptances,
         unreadable=tuple(unreadable),
         other_robots=tuple(foreign),
+        not_compared=tuple(incomparable),
         renamed=_rename_of_robot(entries, cell.name, robot),
         possible_names=() if calibrations else _names_of_robot(entries, robot),
     )
@@ -355,8 +477,12 @@ def _robot_of(tree: object) -> CalibratedRobot | None:
     return _ROBOT.validate_python(tree)
 
 
-def _rename_of_robot(entries: Iterable[AuditEntry], name: str, robot: CalibratedRobot) -> RenamedCell | None:
-    """Return the rename of a robot that is described under its old name; None for another robot of that name."""
+def _rename_of_robot(
+    entries: Iterable[AuditEntry], name: str, robot: CalibratedRobot
+) -> RenamedCell | None:
+    """Return the rename of a robot that is described under its old name;
+    None for another robot of that name.
+    """
     rename = renamed_to(entries, name)
     if rename is None:
         return None
@@ -368,7 +494,9 @@ def _rename_of_robot(entries: Iterable[AuditEntry], name: str, robot: Calibrated
 
 
 def _names_of_robot(entries: Sequence[AuditEntry], robot: CalibratedRobot) -> tuple[str, ...]:
-    """Return the names in an audit log under which every calibration is of a robot that looks the same."""
+    """Return the names in an audit log under which every calibration is of a robot that looks the
+    same.
+    """
     names = []
     for name in names_in(with_present_names(entries)):
         robots = []
@@ -377,12 +505,16 @@ def _names_of_robot(entries: Sequence[AuditEntry], robot: CalibratedRobot) -> tu
                 robots.append(_robot_of(one.robot))
             except ValueError:
                 continue
-        if robots and all(other is not None and not robot_differences(other, robot) for other in robots):
+        if robots and all(
+            other is not None and not robot_differences(other, robot) for other in robots
+        ):
             names.append(name)
     return tuple(names)
 
 
-def _dated(entry: Entry, at: datetime, by_order: datetime | None, known: Mapping[str, datetime]) -> Entry:
+def _dated(
+    entry: Entry, at: datetime, by_order: datetime | None, known: Mapping[str, datetime]
+) -> Entry:
     """Return a calibration with the dates that the order of the audit log allows.
 
     Args:
@@ -399,7 +531,8 @@ def _dated(entry: Entry, at: datetime, by_order: datetime | None, known: Mapping
 
 
 def figures_of_document(one: EnteredCalibration) -> dict[str, object]:
-    """Return the figures of a calibration that an earlier version entered; parsing its document takes 7 ms.
+    """Return the figures of a calibration that an earlier version entered;
+    parsing its document takes 7 ms.
 
     Raises:
         DaqError: the document cannot be read.
@@ -413,7 +546,7 @@ def _named(one: EnteredCalibration) -> str:
 
 
 def _units(entry: Entry) -> dict[str, str]:
-    """Return the axes with their units; calibrations with other ones are of a history that an earlier version began."""
+    """Return the axes with their units."""
     return {gain.axis: gain.unit for gain in entry.gains}
 
 
@@ -426,15 +559,22 @@ def _events(writes: Iterable[AuditedWrite]) -> list[Event]:
             continue
         digest = write.calibration
         if write.action is WriteAction.ROLLED_BACK:
-            # Not the calibration before the last one: the content shows which gains are back, if any calibration's.
+            # Not the calibration before the last one: the content shows which gains are back, if
+            # any calibration's.
             like = (one.subject, write.sha256_after)
-            digest = next((e.digest for e in reversed(events) if (e.target, e.sha256_after) == like), digest)
-        events.append(Event(digest, write.action, at, one.who, one.subject, one.sha256, write.sha256_after))
+            digest = next(
+                (e.digest for e in reversed(events) if (e.target, e.sha256_after) == like), digest
+            )
+        events.append(
+            Event(digest, write.action, at, one.who, one.subject, one.sha256, write.sha256_after)
+        )
     return events
 
 
 def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[EnteredCalibration]:
-    """Return the calibrations of a cell that an audit log has, once each, in the order in which they were entered."""
+    """Return the calibrations of a cell that an audit log has, once each,
+    in the order in which they were entered.
+    """
     found: dict[str, EnteredCalibration] = {}
     for entry in with_present_names(tuple(entries)):
         one = _entered_calibration(entry, cell)
@@ -444,7 +584,10 @@ def entered_calibrations(entries: Iterable[AuditEntry], cell: str) -> list[Enter
         # A later entry gives the figures of one that an earlier version has entered.
         document = first.document or one.document
         found[one.digest] = replace(
-            first, document=document, figures=first.figures or one.figures, robot=first.robot or one.robot
+            first,
+            document=document,
+            figures=first.figures or one.figures,
+            robot=first.robot or one.robot,
         )
     return list(found.values())
 
@@ -460,7 +603,9 @@ def _entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | N
     if digest is None or entered == _NEVER or (document is None and known is None):
         return None
     at = at_of(entry) or entered
-    return EnteredCalibration(entry.number, digest, at, entered, document, known, entry.details.get("robot"))
+    return EnteredCalibration(
+        entry.number, digest, at, entered, document, known, entry.details.get("robot")
+    )
 
 
 def acknowledgements_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[Acknowledgement]:
@@ -472,7 +617,9 @@ def acknowledgements_of(entries: Iterable[AuditEntry], cell: str) -> Iterator[Ac
 
 
 def _acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
-    """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
+    """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis
+    beforehand.
+    """
     axis = text_field(entry, "axis")
     why = text_field(entry, "why")
     at = at_of(entry)
@@ -514,17 +661,22 @@ def _acceptance_of(entry: AuditEntry) -> RecordedAcceptance | None:
 def is_end(entry: AuditEntry) -> bool:
     """Whether an entry says that a controller has other gains now."""
     return entry.action in _ENDS or (
-        entry.action is AuditAction.WRITE_FOUND and text_field(entry, "action") in {one.value for one in WriteAction}
+        entry.action is AuditAction.WRITE_FOUND
+        and text_field(entry, "action") in {one.value for one in WriteAction}
     )
 
 
 def writes_to(
-    cell: Cell, entries: Sequence[AuditEntry], made: Iterable[OpenWrite], *, everywhere: bool = False
+    cell: Cell,
+    entries: Sequence[AuditEntry],
+    made: Iterable[OpenWrite],
+    *,
+    everywhere: bool = False,
 ) -> list[AuditedWrite]:
     """Return the writes of this cell's calibrations, and the rollbacks of them, in their order.
 
-    Another cell may have the same audit log, and even the same controller file: what was written with its calibrations,
-    and rolled back from there, is in its own history.
+    Another cell may have the same audit log, and even the same controller file: what was written
+    with its calibrations, and rolled back from there, is in its own history.
 
     Args:
         cell: whose writes are wanted.
@@ -544,13 +696,17 @@ def writes_to(
         if not (is_end(one) or one.number in unended) or not (everywhere or one.subject in targets):
             continue
         same = _identity(one)
-        if same in known:  # two processes found it at once, or one found it before its writer ended it
+        # Two processes found it at once, or one found it before its writer ended it
+        if same in known:
             continue
         known.add(same)
         itself = one.number in unended or one.action is AuditAction.WRITE_FOUND
         write = AuditedWrite(one if itself else begun.get(begun_by(one)), one)
         if write.action is WriteAction.APPLIED:
-            owner = None if write.begun is None else calibration_field(write.begun, "cell")
+            if write.begun is None:
+                owner = None
+            else:
+                owner = calibration_field(write.begun, "cell")
             owners[one.subject] = owner or (cell.name if one.subject in targets else "")
         if owners.get(one.subject) == cell.name:
             found.insert(_place(found, one, times), write)
@@ -579,7 +735,8 @@ def _identity(one: AuditEntry) -> object:
 def _times_by_number(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
     """Return when entries were written, by their numbers, corrected where the clock was wrong.
 
-    A write that was found has the time of the write, which is out of the order of the log by intent.
+    A write that was found has the time of the write, which is out of the order of the log by
+    intent.
     """
     timed = []
     for one in entries:
@@ -591,7 +748,9 @@ def _times_by_number(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
 
 
 def _place(found: Sequence[AuditedWrite], one: AuditEntry, times: Mapping[int, datetime]) -> int:
-    """Return where a write belongs among the ones before; the entry of a found one may be younger than the write."""
+    """Return where a write belongs among the ones before;
+    the entry of a found one may be younger than the write.
+    """
     at = at_of(one)
     if one.action is AuditAction.WRITE_FOUND and at is not None:
         for place, other in enumerate(found):
@@ -602,7 +761,10 @@ def _place(found: Sequence[AuditedWrite], one: AuditEntry, times: Mapping[int, d
 
 
 def unknown_writes(
-    cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite], calibrations: Collection[str]
+    cell: Cell,
+    entries: Sequence[AuditEntry],
+    opened: Sequence[OpenWrite],
+    calibrations: Collection[str],
 ) -> tuple[AuditedWrite, ...]:
     """Return the writes to this cell's controller that its history lacks.
 
@@ -613,23 +775,50 @@ def unknown_writes(
         calibrations: SHA-256 of those in the history.
 
     Returns:
-        writes whose content the controller has now, though no later entry shows it; writes of calibrations that were
-        never entered.
+        writes whose content the controller has now, though no later entry shows it; writes of
+        calibrations that were never entered.
     """
     shown = shown_writes(cell, entries, opened)
     return tuple(
         write
         for write in writes_to(cell, entries, made_writes(opened))
-        if write in shown or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
+        if write in shown
+        or (write.action is WriteAction.APPLIED and write.calibration not in calibrations)
     )
 
 
-def shown_writes(cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite]) -> list[AuditedWrite]:
-    """Return the writes without an end that only the content of their target shows, not a later entry."""
+def shown_writes(
+    cell: Cell, entries: Sequence[AuditEntry], opened: Sequence[OpenWrite]
+) -> list[AuditedWrite]:
+    """Return the writes without an end that only the content of their target shows,
+    not a later entry.
+    """
     witnessed = {one.begun.number for one in witnessed_writes(entries)}
     made = made_writes(opened)
     shown = {one.begun.number for one in made} - witnessed
-    return [one for one in writes_to(cell, entries, made, everywhere=True) if one.ended.number in shown]
+    return [
+        one for one in writes_to(cell, entries, made, everywhere=True) if one.ended.number in shown
+    ]
+
+
+def name_after_renames(entries: Sequence[AuditEntry], name: str, since: datetime) -> str:
+    """Return the name that a cell has after the renames that were entered since a time.
+
+    Args:
+        entries: of the audit log, oldest first.
+        name: of the cell at that time.
+        since: the time, with zone.
+    """
+    times = _times_by_number(entries)
+    found = name
+    for one in entries:
+        rename = rename_of(one)
+        if rename is None or rename.old != found:
+            continue
+        renamed_at = times.get(one.number)
+        if renamed_at is not None and renamed_at >= since:
+            found = rename.new
+    return found
 
 
 def at_of(entry: AuditEntry) -> datetime | None:

@@ -1,8 +1,9 @@
 """The ledger of a cell: its audit log, and the history that is folded from it.
 
-Everything is written once, into the audit log. `record_write` is for `apply` and `rollback` of `daq.writeback.target`
-alone: whoever writes gains calls these. A history of an earlier version, in SQLite, is taken into the audit log by the
-first command that enters or shows the history (`migrate`).
+Everything is written once, into the audit log. `record_write` is for `apply` and `rollback` of
+`daq.writeback.target` alone: whoever writes gains calls these. A history of an earlier version, in
+SQLite, is taken into the audit log by the first command that enters or shows the history
+(`migrate`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,16 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.same_cell import calibrated_robot, mismatch_of_robot
 from daq.documents.calibration_file import encode_calibration
-from daq.errors import DataError, HistoryInaccessible, HistoryUnreadable, OutputFailed, evidence, reason_of, writing
+from daq.errors import (
+    DataError,
+    HistoryInaccessible,
+    HistoryUnreadable,
+    OutputFailed,
+    evidence,
+    first_few,
+    reason_of,
+    writing,
+)
 from daq.files import fsync_folder
 from daq.ledger.audit import (
     AuditAction,
@@ -42,6 +52,7 @@ from daq.ledger.fold import (
     figures_of,
     fold,
     iso,
+    name_after_renames,
     shown_writes,
     unknown_writes,
 )
@@ -91,11 +102,14 @@ class Ledger:
 
     cell: Cell  #: as it is now
     audit: Path  #: the audit log
-    stored: Path | None = None  #: history of an earlier version; None where the cell cannot have one
+    #: history of an earlier version; None where the cell cannot have one
+    stored: Path | None = None
 
     @classmethod
     def of(cls, cell: Cell, audit: Path | None = None) -> Ledger | None:
-        """The ledger of a cell, or that of another audit log; None for a cell from a log without either."""
+        """The ledger of a cell, or that of another audit log;
+        None for a cell from a log without either.
+        """
         place = cell.history
         if place is not None and audit in {None, place.audit}:
             return cls(cell, place.audit, place.store)
@@ -114,9 +128,11 @@ class Verification:
     audit: Path  #: the audit log
     verdict: AuditVerdict  #: on it
     history: History  #: as far as it can be read
-    broken: tuple[str, ...]  #: what the history cannot show, and what a history of an earlier version says otherwise
+    #: what the history cannot show, and what a history of an earlier version says otherwise
+    broken: tuple[str, ...]
     unknown: tuple[AuditedWrite, ...] = ()  #: writes that the history lacks
-    noted: bool = True  #: whether the last entry of the audit log is noted, without which a missing end does not show
+    #: whether the last entry of the audit log is noted, without which a missing end does not show
+    noted: bool = True
 
     @property
     def complete(self) -> bool:
@@ -130,18 +146,20 @@ class Migrated:
 
     entries: int  #: number of entries that the audit log got
     aside: Path | None  #: new name of the file; None where there was none
-    flaws: tuple[str, ...] = ()  #: why nothing was taken over from it, as sentences; empty where it is sound
+    #: why nothing was taken over from it, as sentences; empty where it is sound
+    flaws: tuple[str, ...] = ()
 
 
 MAY_LACK = (
-    "the audit log is not what was written, so the history may lack something: `drivegain history CELL --verify` says "
-    "what"
+    "the audit log is not what was written, so the history may lack something: `drivegain history "
+    "CELL --verify` says what"
 )
 """What a reader of a history with `may_lack` must know."""
 
 
 def read_history(ledger: Ledger) -> History:
-    """Read the history of a cell, as far as the audit log is what was written (`may_lack`); nothing is written.
+    """Read the history of a cell, as far as the audit log is what was written (`may_lack`);
+    nothing is written.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
@@ -155,16 +173,24 @@ def read_history(ledger: Ledger) -> History:
     return replace(history, may_lack=not verdict.holds)
 
 
-def names_of(cell: Cell) -> frozenset[str]:
-    """Return the name of a cell, and those that it had before its audit log says that it was renamed.
+def present_name(cell: Cell, name: str, at: datetime) -> str:
+    """Return the name that a cell has now by an audit log, which had another name at a time.
+
+    A name that a rename has freed may be another cell's: what was made under it before the rename
+    is of the renamed cell, and what was made later is not.
+
+    Args:
+        cell: whose audit log is read.
+        name: of any cell in that log, at the time.
+        at: time, with zone.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
     """
     ledger = Ledger.of(cell)
     if ledger is None:
-        return frozenset({cell.name})
-    return former_names(verify(ledger.audit).intact, cell.name) | {cell.name}
+        return name
+    return name_after_renames(verify(ledger.audit).intact, name, at)
 
 
 def is_damaged(audit: Path) -> bool:
@@ -181,7 +207,8 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
 
     Args:
         ledger: to check.
-        heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the note beside it.
+        heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the note
+            beside it.
 
     Raises:
         AuditUnusable, HistoryUnreadable: see `read_history`.
@@ -194,16 +221,23 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     broken = stored.flaws + history.unreadable
     if not verdict.holds:  # its entries do not prove that anything is missing
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
-    known = {one.digest for one in history.entries} | {one.entry.digest for one in history.other_robots}
+    known = history.digests
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
     is_noted = bool(noted) or not verdict.entries
     return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
 
 
 def record_write(
-    audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+    audit: Path,
+    action: AuditAction,
+    *,
+    at: datetime,
+    who: str,
+    subject: str,
+    details: Mapping[str, object],
 ) -> AuditEntry:
-    """Enter one step of a write to a controller; only `apply` and `rollback` of `daq.writeback.target` do.
+    """Enter one step of a write to a controller;
+    only `apply` and `rollback` of `daq.writeback.target` do.
 
     Raises:
         ValueError: the action is none of `WRITES`.
@@ -215,7 +249,13 @@ def record_write(
 
 
 def record_session(
-    audit: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+    audit: Path,
+    action: AuditAction,
+    *,
+    at: datetime,
+    who: str,
+    subject: str,
+    details: Mapping[str, object],
 ) -> AuditEntry:
     """Enter a step of a session, which writes to no controller.
 
@@ -229,8 +269,11 @@ def record_session(
         return append(audit, action, at=at, who=who, subject=subject, details=details)
 
 
-def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, who: str, at: datetime) -> bool:
-    """Enter a calibration, with the SHA-256 of its file, and writes whose writer was killed before it ended them.
+def enter_calibration(
+    ledger: Ledger, calibration: Calibration, *, digest: str, who: str, at: datetime
+) -> bool:
+    """Enter a calibration, with the SHA-256 of its file,
+    and writes whose writer was killed before it ended them.
 
     A history of an earlier version is migrated first, but not into an audit log that was changed.
 
@@ -265,13 +308,18 @@ def enter_calibration(ledger: Ledger, calibration: Calibration, *, digest: str, 
         if calibration.robot is not None:
             details["robot"] = asdict(calibration.robot)
         _append(
-            ledger, EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details)
+            ledger,
+            EntryDraft(
+                AuditAction.CALIBRATION_ENTERED, at, who, history_subject(ledger.cell.name), details
+            ),
         )
     _end_found_writes(ledger)
     return new
 
 
-def acknowledge(ledger: Ledger, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
+def acknowledge(
+    ledger: Ledger, axis: str, *, since: datetime, at: datetime, who: str, why: str
+) -> None:
     """Enter that a change of a gain is explained.
 
     Args:
@@ -310,8 +358,8 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
         old: the name before.
 
     Raises:
-        DataError: the audit log is not what was written, has nothing under the old name, or has calibrations of
-            another robot under one of the two names.
+        DataError: the audit log is not what was written, has nothing under the old name, or has
+            calibrations of another robot under one of the two names.
         AuditUnusable: the audit log is no regular file, or it cannot be read.
     """
     new = ledger.cell.name
@@ -330,21 +378,25 @@ def plan_rename(ledger: Ledger, old: str) -> PlannedRename:
             str(ledger.audit),
             found=f"nothing of a cell {old!r}; cells in it: {known}",
             expected=f"the history of the cell that is called {new!r} now",
-            remedy="give its earlier name as the audit log has it, or correct `history.audit` of the cell file",
+            remedy="give its earlier name as the audit log has it, or correct `history.audit` of "
+            "the cell file",
         )
+    incomparable = [one.entry for one in under_old.not_compared]
+    calibrations = [*under_old.entries, *incomparable]
     return PlannedRename(
         old=old,
         new=new,
-        calibrations=len(under_old.entries),
+        calibrations=len(calibrations),
         writes=len(under_old.events),
         acknowledgements=len(under_old.acknowledgements),
-        undescribed=sum(entry.robot is None for entry in under_old.entries),
+        undescribed=sum(entry.robot is None for entry in calibrations),
         entered_at=_entered_rename_at(entries, old, new) if is_entered else None,
     )
 
 
 def rename_cell(ledger: Ledger, planned: PlannedRename, *, who: str, at: datetime) -> None:
-    """Enter that a cell has another name: one entry, which counts for all that was entered before it.
+    """Enter that a cell has another name:
+    one entry, which counts for all that was entered before it.
 
     Raises:
         AuditUnusable, OutputFailed: it could not be recorded.
@@ -360,7 +412,9 @@ def rename_cell(ledger: Ledger, planned: PlannedRename, *, who: str, at: datetim
 
 
 def _entered_rename_at(entries: Sequence[AuditEntry], old: str, new: str) -> datetime | None:
-    """Return when a cell gave up a name that it had before its present one; None where the entry has no time."""
+    """Return when a cell gave up a name that it had before its present one;
+    None where the entry has no time.
+    """
     own = [rename for rename in renames_to(entries, new) if rename.old == old]
     found = None
     for one in entries:
@@ -390,15 +444,16 @@ def _require_own_robot(ledger: Ledger, history: History) -> None:
             str(ledger.audit),
             found=found,
             expected=expected,
-            remedy="two robots have no common history: give the earlier name of this robot; nothing was entered",
+            remedy="two robots have no common history: give the earlier name of this robot; "
+            "nothing was renamed",
         )
 
 
 def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> Migrated:
     """Take what only a history of an earlier version has into the audit log, and rename its file.
 
-    A process that is killed in between leaves the file; the next one enters what is still missing. Calibrations that
-    an earlier version has entered get their figures.
+    A process that is killed in between leaves the file; the next one enters what is still missing.
+    Calibrations that an earlier version has entered get their figures.
 
     Args:
         ledger: of the cell.
@@ -408,7 +463,8 @@ def migrate(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) -> 
             add figures where there is no such file.
 
     Raises:
-        HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was changed.
+        HistoryInaccessible: the file is locked, or its rights do not let it be read; nothing was
+            changed.
         HistoryUnreadable: the file is broken, without `forced`; nothing was changed.
         DataError: the audit log is not what was written; nothing was changed.
         AuditUnusable, OutputFailed: a file cannot be written; the next call goes on.
@@ -473,32 +529,40 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
             str(audit),
             found=f"no file; {first.says}",
             expected="the audit log with these entries",
-            remedy="restore it from a backup; if there is none, begin a new log (another name in `history.audit`)",
+            remedy="restore it from a backup; if there is none, begin a new log (another name in "
+            "`history.audit`)",
         )
     cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in verdict.flaws)
-    note = f" (if the entries that are missing are of another log, remove {head_file(audit)})" if cut_off else ""
-    places = "1 place that is" if len(verdict.flaws) == 1 else f"{len(verdict.flaws)} places that are"
-    more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
+    if cut_off:
+        note = f" (if the entries that are missing are of another log, remove {head_file(audit)})"
+    else:
+        note = ""
+    if len(verdict.flaws) == 1:
+        places = "1 place that is"
+    else:
+        places = f"{len(verdict.flaws)} places that are"
+    more = "".join(
+        f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws
+    )
     return DataError(
         f"{audit}, line {first.line}",
         found=f"{places} not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
-        remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; until that is "
-        "known trust the controller's file by its backups only, and begin another log under a new name "
-        "(`history.audit`)",
+        remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; "
+        "until that is known trust the controller's file by its backups only, and begin another "
+        "log under a new name (`history.audit`)",
     )
 
 
 def stored_error(ledger: Ledger, flaws: Collection[str]) -> HistoryUnreadable:
     """Return the error for a history of an earlier version that is broken."""
-    listed = list(flaws)
-    more = len(listed) - _SHOWN
     return HistoryUnreadable(
         str(ledger.stored),
-        found="; ".join(listed[:_SHOWN]) + (f"; and {more} more" if more > 0 else ""),
+        found=first_few(tuple(flaws), _SHOWN),
         expected="a sound SQLite file whose calibrations can be read",
-        remedy="ask who can write to it, and restore the last good one from a backup, or go on without it: "
-        "`drivegain history CELL --migrate` keeps it under another name, and takes nothing over from it",
+        remedy="ask who can write to it, and restore the last good one from a backup, or go on "
+        "without it: `drivegain history CELL --migrate` keeps it under another name, and takes "
+        "nothing over from it",
     )
 
 
@@ -508,7 +572,9 @@ def _read_stored(ledger: Ledger) -> StoredHistory:
     return read_stored(ledger.stored)
 
 
-def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell) -> tuple[AuditEntry, ...]:
+def _with_stored(
+    entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cell
+) -> tuple[AuditEntry, ...]:
     """Return the entries as they will be once a history of an earlier version is migrated."""
     chain = list(entries)
     never = datetime.min.replace(tzinfo=UTC)  # these entries are only folded
@@ -522,12 +588,18 @@ def _with_stored(entries: Sequence[AuditEntry], stored: StoredHistory, cell: Cel
 def _append(ledger: Ledger, draft: EntryDraft) -> AuditEntry:
     with writing(ledger.audit):
         return append(
-            ledger.audit, draft.action, at=draft.at, who=draft.who, subject=draft.subject, details=draft.details
+            ledger.audit,
+            draft.action,
+            at=draft.at,
+            who=draft.who,
+            subject=draft.subject,
+            details=draft.details,
         )
 
 
 def _end_found_writes(ledger: Ledger) -> None:
-    """Enter the writes without an end whose content the controller has now, in the name of their writers.
+    """Enter the writes without an end whose content the controller has now,
+    in the name of their writers.
 
     Nothing is concluded from an audit log that was changed.
     """
@@ -552,7 +624,7 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     """Refuse a calibration that cannot be compared with those of the history."""
     remedy = (
         "gains are compared over time only where they mean the same: begin another audit log "
-        "(`history.audit` of the cell file); nothing was entered"
+        "(`history.audit` of the cell file); it was not entered"
     )
     units = {gain.axis: gain.unit for gain in calibration.gains}
     known: dict[str, str] = {}
@@ -566,11 +638,13 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     elif robot is not None:
         found = robot.found
         expected = robot.expected
-        remedy = "give the cell file of the robot that was calibrated; nothing was entered"
+        remedy = "give the cell file of the robot that was calibrated; it was not entered"
     elif history.renamed is not None:
-        found = f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
+        found = (
+            f"the cell name {ledger.cell.name!r}, which this robot had until {history.renamed.at}"
+        )
         expected = f"{history.renamed.new!r}, its name since"
-        remedy = "give the cell file with the new name; nothing was entered"
+        remedy = f"{history.renamed.remedy}; it was not entered"
     elif history.other_robots:
         found = str(history.other_robots[0])
         expected = "calibrations of one robot in a history"
@@ -608,10 +682,12 @@ class Standing:
 
     as_of: datetime | None  #: when the ledger was read, with zone; None where it was not
     unknown: str = ""  #: why it was not, in words; empty where it was
-    write: Event | None = None  #: last write of its gains, one that is in force if there is any; None if never written
+    #: last write of its gains, one that is in force if there is any; None if never written
+    write: Event | None = None
     #: Next write or rollback at the same place; None while the gains are in force.
     ended: Event | None = None
-    #: Previous gains, at that place before the write, by axis; empty where the ledger does not have them.
+    #: Previous gains, at that place before the write, by axis; empty where the ledger does not have
+    #: them.
     before: Mapping[str, float] = field(default_factory=dict)
     acceptance: RecordedAcceptance | None = None  #: result of the last new moves with these gains
     history: History = field(default_factory=lambda: History((), (), ()))  #: that it was read from
@@ -632,14 +708,17 @@ class Standing:
         return StandingState.NOT_WRITTEN
 
 
-def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | None = None) -> Standing:
+def read_standing(
+    ledger: Ledger, digest: str, as_of: datetime, place: str | None = None
+) -> Standing:
     """Read the state of a calibration from the ledger of its cell.
 
     Args:
         ledger: of the cell.
         digest: SHA-256 of the calibration's file.
         as_of: time now, with zone.
-        place: controller's file, whose write counts before others where it is in force; None for any place.
+        place: controller's file, whose write counts before others where it is in force; None for
+            any place.
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.
@@ -666,7 +745,9 @@ def read_standing(ledger: Ledger, digest: str, as_of: datetime, place: str | Non
 
 
 def _last_write(history: History, digest: str, place: str | None) -> Event | None:
-    """Return the last write of a calibration's gains, one that is in force if there is any, and `place` first."""
+    """Return the last write of a calibration's gains, one that is in force if there is any,
+    and `place` first.
+    """
     newest = {event.target: event for event in history.events}
     in_force = [event for event in newest.values() if event.digest == digest]
     here = [event for event in in_force if event.target == place]
@@ -676,19 +757,24 @@ def _last_write(history: History, digest: str, place: str | None) -> Event | Non
 
 
 def _next_at_its_place(history: History, write: Event) -> Event | None:
-    """Return the write or rollback that followed a write at the same place; None where there was none."""
+    """Return the write or rollback that followed a write at the same place;
+    None where there was none.
+    """
     later = history.events[history.events.index(write) + 1 :]
     return next((event for event in later if event.target == write.target), None)
 
 
 def _gains_before(write: Event, entries: Sequence[AuditEntry]) -> dict[str, float]:
-    """Return the previous gains, those before a write, by axis; none where the audit log lacks them."""
+    """Return the previous gains, those before a write, by axis;
+    none where the audit log lacks them.
+    """
     by_digest = {entry.sha256: entry for entry in entries}
     by_number = {entry.number: entry for entry in entries}
     ended = by_digest.get(write.audit or "")
     if ended is None:
         return {}
-    # The end names the begin, which has the numbers; a write that its killed writer did not end is the begin itself.
+    # The end names the begin, which has the numbers; a write that its killed writer did not end is
+    # the begin itself.
     begun = by_number.get(begun_by(ended), ended)
     changes = begun.details.get("changes")
     if not isinstance(changes, list):

@@ -1,7 +1,9 @@
-"""The SQLite file in which earlier versions kept the history: what only it has goes into the audit log, once.
+"""The SQLite file in which earlier versions kept the history:
+what only it has goes into the audit log, once.
 
-Those versions wrote each calibration and each write to a controller twice. What the audit log has is right, whatever
-the file says of it; from a file that is broken nothing is taken over (docs/decisions/0036).
+Those versions wrote each calibration and each write to a controller twice. What the audit log has
+is right, whatever the file says of it; from a file that is broken nothing is taken over
+(docs/decisions/0036).
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ VERSION = 1  #: Of its tables; there was no other
 class StoredHistory:
     """Content of the file."""
 
-    calibrations: tuple[EnteredCalibration, ...]  #: oldest first; of no entry (0), and without figures
+    #: oldest first; of no entry (0), and without figures
+    calibrations: tuple[EnteredCalibration, ...]
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: oldest first
     flaws: tuple[str, ...]  #: what is broken in it, as sentences
@@ -48,7 +51,9 @@ class StoredHistory:
     @property
     def noted(self) -> frozenset[str]:
         """SHA-256 of the entries that the audit log must have."""
-        digests = [event.audit for event in self.events] + [noted.audit for noted in self.acknowledgements]
+        digests = [event.audit for event in self.events] + [
+            noted.audit for noted in self.acknowledgements
+        ]
         return frozenset(digest for digest in digests if digest is not None)
 
 
@@ -73,9 +78,13 @@ def read_stored(path: Path) -> StoredHistory:
         HistoryInaccessible: it is locked for long, or its rights do not let it be read.
         HistoryUnreadable: it is none, of a later version, or broken.
     """
-    # Not "ro", which could not undo the unfinished transaction of a killed writer; "rw" opens a read-only file, too.
+    # Not "ro", which could not undo the unfinished transaction of a killed writer; "rw" opens a
+    # read-only file, too.
     address = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
-    with _translate_errors(path), contextlib.closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as connection:
+    with (
+        _translate_errors(path),
+        contextlib.closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as connection,
+    ):
         (tables,) = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
         (application,) = connection.execute("PRAGMA application_id").fetchone()
         if not tables and not application:  # its first writer was killed before it was done
@@ -83,8 +92,12 @@ def read_stored(path: Path) -> StoredHistory:
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         if application != APPLICATION_ID or version != VERSION:
             known = application == APPLICATION_ID
-            raise _unreadable(path, f"a history of version {version}" if known else "a file of another program")
-        damaged = [str(row[0]) for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"]
+            raise _unreadable(
+                path, f"a history of version {version}" if known else "a file of another program"
+            )
+        damaged = [
+            str(row[0]) for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"
+        ]
         if damaged:  # rows of a broken file prove nothing
             return StoredHistory((), (), (), tuple(damaged))
         return _content(connection)
@@ -104,13 +117,22 @@ def _translate_errors(path: Path) -> Iterator[None]:
             raise HistoryInaccessible(
                 str(path),
                 found=found,
-                expected="the history that earlier versions of drivegain kept of a cell, readable and not locked",
-                remedy="check its rights, and who has it open (`fuser`), then try again; nothing was changed",
+                expected="the history that earlier versions of drivegain kept of a cell, readable "
+                "and not locked",
+                remedy="check its rights, and who has it open (`fuser`), then try again; nothing "
+                "was changed",
             ) from error
         raise _unreadable(path, found) from error
 
 
-_INACCESSIBLE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_CANTOPEN", "SQLITE_PERM", "SQLITE_READONLY", "SQLITE_IOERR")
+_INACCESSIBLE = (
+    "SQLITE_BUSY",
+    "SQLITE_LOCKED",
+    "SQLITE_CANTOPEN",
+    "SQLITE_PERM",
+    "SQLITE_READONLY",
+    "SQLITE_IOERR",
+)
 """Errors of SQLite, by the begin of their names, that say nothing of what the file has."""
 
 
@@ -119,29 +141,40 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
         str(path),
         found=found,
         expected="the history that earlier versions of drivegain kept of a cell",
-        remedy="restore the last good one from a backup, or go on without it: `drivegain history CELL --migrate` "
-        "keeps it under another name",
+        remedy="restore the last good one from a backup, or go on without it: `drivegain history "
+        "CELL --migrate` keeps it under another name",
     )
 
 
 def _content(connection: sqlite3.Connection) -> StoredHistory:
     """Read all rows; raises ValueError for one that drivegain did not write."""
-    rows = connection.execute("SELECT digest, entered, document FROM calibration ORDER BY created, digest")
-    calibrations = [EnteredCalibration(0, str(row[0]), zoned(row[1]), zoned(row[1]), str(row[2]), None) for row in rows]
+    rows = connection.execute(
+        "SELECT digest, entered, document FROM calibration ORDER BY created, digest"
+    )
+    calibrations = [
+        EnteredCalibration(0, str(row[0]), zoned(row[1]), zoned(row[1]), str(row[2]), None)
+        for row in rows
+    ]
     events = []
     query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
     for digest, deed, at, who, target, audit, after in connection.execute(query):
-        events.append(Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after))
+        events.append(
+            Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after)
+        )
     acknowledgements = []
     query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
     for axis, since, at, who, why, audit in connection.execute(query):
-        acknowledgements.append(Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit))
+        acknowledgements.append(
+            Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit)
+        )
     flaws = tuple(_unreadable_documents(calibrations))
     return StoredHistory(tuple(calibrations), tuple(events), tuple(acknowledgements), flaws)
 
 
 def _raw(text: str) -> str:
-    """Turn bytes of a name that are not UTF-8, which SQLite refuses, into what they are in the audit log."""
+    """Turn bytes of a name that are not UTF-8, which SQLite refuses,
+    into what they are in the audit log.
+    """
     return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)
 
 
@@ -150,7 +183,10 @@ def _unreadable_documents(calibrations: Iterable[EnteredCalibration]) -> Iterato
         try:
             figures_of_document(one)
         except DaqError as error:
-            yield f"calibration {one.digest[:12]}…: its document is {error.found}, expected {error.expected}"
+            yield (
+                f"calibration {one.digest[:12]}…: its document is {error.found}, expected "
+                f"{error.expected}"
+            )
 
 
 def drafts_of(
@@ -173,12 +209,20 @@ def drafts_of(
 
 
 def _calibration_drafts(
-    stored: Iterable[EnteredCalibration], entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
+    stored: Iterable[EnteredCalibration],
+    entries: Sequence[AuditEntry],
+    cell: str,
+    who: str,
+    at: datetime,
 ) -> Iterator[EntryDraft]:
-    """Enter calibrations that only the file has, and the figures of those that an earlier version entered."""
+    """Enter calibrations that only the file has, and the figures of those that an earlier version
+    entered.
+    """
     known = {one.digest: one for one in entered_calibrations(entries, cell)}
     lacking = [one for one in stored if one.digest not in known]
-    without_figures = [one for one in known.values() if one.figures is None and one.document is not None]
+    without_figures = [
+        one for one in known.values() if one.figures is None and one.document is not None
+    ]
     for one in (*without_figures, *lacking):
         try:
             figures = figures_of_document(one)
@@ -200,9 +244,13 @@ def history_subject(cell: str) -> str:
     return f"history of {cell}"
 
 
-def _event_drafts(stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str) -> Iterator[EntryDraft]:
+def _event_drafts(
+    stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str
+) -> Iterator[EntryDraft]:
     by_digest = {one.sha256: one for one in entries}
-    found = {(one.subject, one.at, one.who) for one in entries if one.action is AuditAction.WRITE_FOUND}
+    found = {
+        (one.subject, one.at, one.who) for one in entries if one.action is AuditAction.WRITE_FOUND
+    }
     for event in stored:
         named = by_digest.get(event.audit or "")
         if named is not None and is_end(named):
@@ -224,7 +272,8 @@ def _acknowledgement_drafts(
 ) -> Iterator[EntryDraft]:
     entered = list(acknowledgements_of(entries, cell))
     named = {one.audit for one in entered}
-    known = {replace(one, audit="") for one in entered}  # migrated before, under an entry of its own
+    # Migrated before, under an entry of its own
+    known = {replace(one, audit="") for one in entered}
     for noted in stored:
         # The first versions did not enter the name of the cell.
         if noted.audit not in named and replace(noted, audit="") not in known:
@@ -235,7 +284,9 @@ def _acknowledgement_drafts(
                 "why": noted.why,
                 "migrated": True,
             }
-            yield EntryDraft(AuditAction.ACKNOWLEDGED, noted.at, noted.who, f"gain of {noted.axis}", details)
+            yield EntryDraft(
+                AuditAction.ACKNOWLEDGED, noted.at, noted.who, f"gain of {noted.axis}", details
+            )
 
 
 def set_aside(path: Path, at: datetime) -> Path:

@@ -1,4 +1,6 @@
-"""The gains of a history as series with their charts, and their alarms as sentences for a technician."""
+"""The gains of a history as series with their charts,
+and their alarms as sentences for a technician.
+"""
 
 from __future__ import annotations
 
@@ -53,17 +55,23 @@ class Series:
 
     axis: str  #: of the gain
     unit: str  #: of the gain
-    dispersion: float  #: scatter of repeated calibrations over their σ; it is in every σ of this series
+    #: scatter of repeated calibrations over their σ; it is in every σ of this series
+    dispersion: float
     #: Oldest recording first, one for the same logs, without calibrations that held the gain fixed.
     points: tuple[Point, ...]
     stretches: tuple[Stretch, ...]  #: between changes that were explained, oldest first
-    watching: bool  #: whether the last of them goes on; not where no calibration came since the last explanation
+    #: whether the last of them goes on; not where no calibration came since the last explanation
+    watching: bool
     acknowledged: tuple[Acknowledgement, ...]  #: changes that were explained, oldest first
 
     @property
     def began(self) -> int:
-        """Index of the first point of the present baseline; as many as there are points where none came since."""
-        return self.stretches[-1].began if self.watching else len(self.points)
+        """Index of the first point of the present baseline;
+        as many as there are points where none came since.
+        """
+        if self.watching:
+            return self.stretches[-1].began
+        return len(self.points)
 
     @property
     def drift(self) -> Drift | None:
@@ -77,7 +85,9 @@ class Series:
 
     @property
     def onset(self) -> datetime | None:
-        """When the last calibration before the change was recorded; None where the newest one raises no alarm."""
+        """When the last calibration before the change was recorded;
+        None where the newest one raises no alarm.
+        """
         if self.drift is None or self.drift.onset is None:
             return None
         return self.points[self.began + self.drift.onset].entry.recorded
@@ -89,11 +99,17 @@ class Series:
     def alarm_at(self, index: int) -> Alarm | None:
         """The alarm of a point, by its index in `points`."""
         stretch = self.stretch_at(index)
-        return next((alarm for alarm in stretch.drift.alarms if stretch.began + alarm.index == index), None)
+        return next(
+            (alarm for alarm in stretch.drift.alarms if stretch.began + alarm.index == index), None
+        )
 
 
-def watch(entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement]) -> tuple[Series, ...]:
-    """Return one series an axis, in the order of the axes; entries are of one cell, acknowledgements oldest first."""
+def watch(
+    entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement]
+) -> tuple[Series, ...]:
+    """Return one series an axis, in the order of the axes;
+    entries are of one cell, acknowledgements oldest first.
+    """
     if not entries:
         return ()
     axes = {gain.axis: gain.unit for gain in entries[-1].gains}
@@ -112,24 +128,39 @@ def watch(entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement])
             change = None
             if index:
                 before = known[index - 1][1]
-                change = change_significance(before.value, before.std, gain.value, gain.std, dispersion=dispersion)
+                change = change_significance(
+                    before.value, before.std, gain.value, gain.std, dispersion=dispersion
+                )
             points.append(Point(entry, gain, change))
         watching = bool(stretches) and len(known) not in starts
-        found.append(Series(axis, axes[axis], dispersion, tuple(points), tuple(stretches), watching, acknowledged))
+        found.append(
+            Series(
+                axis,
+                axes[axis],
+                dispersion,
+                tuple(points),
+                tuple(stretches),
+                watching,
+                acknowledged,
+            )
+        )
     return tuple(found)
 
 
 def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, float]:
     """Return the scatter of a cell's calibrations over their σ, by axis, in the order of `axes`.
 
-    It is estimated from the calibrations that identified an axis, one for the same logs (`of_each_recording`), together
-    for axes that the same recordings identified (`ident.drift.change.dispersions`), also where a gain of one of them
-    was held fixed when these were fitted again.
+    It is estimated from the calibrations that identified an axis, one for the same logs
+    (`of_each_recording`), together for axes that the same recordings identified
+    (`ident.drift.change.dispersions`), also where a gain of one of them was held fixed when these
+    were fitted again.
 
     Returns:
-        at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
+        at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the
+        axis.
     """
-    alike: dict[tuple[str, ...], dict[str, FloatArray]] = {}  #: for each axis its gains and their σ, shape (2, n)
+    #: for each axis its gains and their σ, shape (2, n)
+    alike: dict[tuple[str, ...], dict[str, FloatArray]] = {}
     for axis in axes:
         known = _known(entries, axis)
         numbers = np.array([(gain.value, gain.std) for _, gain in known]).reshape(-1, 2)
@@ -155,8 +186,9 @@ def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
 def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
     """Return one calibration for the same logs, in the order in which the logs were recorded.
 
-    The robot is watched: the same logs fitted again show nothing new of it, and logs of last year show last year,
-    whenever they were fitted. Of several fits the newest applied one counts, else the newest.
+    The robot is watched: the same logs fitted again show nothing new of it, and logs of last year
+    show last year, whenever they were fitted. Of several fits the newest applied one counts, else
+    the newest.
     """
     chosen: dict[str, Entry] = {}
     for entry in sorted(entries, key=lambda one: (one.applied, one.created, one.entered)):
@@ -166,30 +198,34 @@ def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
 
 # Questions, not verdicts: a gain shows that the torque for a current has changed, not why.
 _LESS = (
-    "less torque for the same current: magnets warmer than usual or demagnetised, a gear that turns harder under load, "
-    "or an amplifier that was exchanged or scales its current otherwise? Worn teeth alone do not change a ratio; they "
-    "show as backlash and friction (`drivegain residual`)"
+    "less torque for the same current: magnets warmer than usual or demagnetised, a gear that "
+    "turns harder under load, or an amplifier that was exchanged or scales its current otherwise? "
+    "Worn teeth alone do not change a ratio; they show as backlash and friction (`drivegain "
+    "residual`)"
 )
 _MORE = (
-    "more torque for the same current: magnets colder than usual, a gear that was greased or has run in, or an "
-    "amplifier that was exchanged or scales its current otherwise? Magnets do not grow stronger"
+    "more torque for the same current: magnets colder than usual, a gear that was greased or has "
+    "run in, or an amplifier that was exchanged or scales its current otherwise? Magnets do not "
+    "grow stronger"
 )
 _ALL_LESS = (
-    "all gains fell by the same factor, as motors seldom do: is the payload heavier than the mass that was entered, or "
-    "was the scale of the currents changed (RMS or peak, rated current)?"
+    "all gains fell by the same factor, as motors seldom do: is the payload heavier than the mass "
+    "that was entered, or was the scale of the currents changed (RMS or peak, rated current)?"
 )
 _ALL_MORE = (
-    "all gains rose by the same factor, as motors seldom do: is the payload lighter than the mass that was entered, or "
-    "was the scale of the currents changed (RMS or peak, rated current)?"
+    "all gains rose by the same factor, as motors seldom do: is the payload lighter than the mass "
+    "that was entered, or was the scale of the currents changed (RMS or peak, rated current)?"
 )
 _SEVERAL = (
-    "several axes, each by an amount of its own: another temperature of the cell, a payload that was mounted "
-    "otherwise, or amplifiers that were exchanged?"
+    "several axes, each by an amount of its own: another temperature of the cell, a payload that "
+    "was mounted otherwise, or amplifiers that were exchanged?"
 )
 
 
 def alarm_text(series: Series) -> str | None:
-    """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`; None where the newest calibration raises no alarm."""
+    """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`;
+    None where the newest calibration raises no alarm.
+    """
     drift = series.drift
     onset = series.onset
     if drift is None or drift.alarm is None or onset is None:
@@ -210,7 +246,9 @@ def alarm_text(series: Series) -> str | None:
 
 
 def pattern_of(all_series: Sequence[Series]) -> Pattern:
-    """Return the pattern of the changes of all axes, without axes that have no calibration since their baseline."""
+    """Return the pattern of the changes of all axes, without axes that have no calibration since
+    their baseline.
+    """
     known = [(s, s.drift) for s in all_series if s.drift is not None and s.drift.change_sigmas != 0]
     changes = [drift.change_percent for _, drift in known]
     stds = [drift.change_percent / drift.change_sigmas for _, drift in known]
@@ -230,6 +268,11 @@ def questions(all_series: Sequence[Series]) -> tuple[str, ...]:
             found = [_MORE if rose[0] else _LESS]
         case Pattern.SEVERAL:
             found = [_SEVERAL]
-    configurations = {point.entry.configuration_sha256 for s in all_series for point in s.points[s.began :]}
+    configurations = {
+        point.entry.configuration_sha256 for s in all_series for point in s.points[s.began :]
+    }
     changed = len(configurations) > 1
-    return (*found, *(["the cell's configuration changed in this time: what was changed?"] if changed else []))
+    return (
+        *found,
+        *(["the cell's configuration changed in this time: what was changed?"] if changed else []),
+    )

@@ -1,6 +1,7 @@
 """Open a file of a bag: MCAP or SQLite of ROS 2, or one of ROS 1; packed as a whole by zstd or not.
 
-The file may be truncated, damaged or malicious: what it unfolds to, or makes SQLite compute, is bounded by its size.
+The file may be truncated, damaged or malicious: what it unfolds to, or makes SQLite compute, is
+bounded by its size.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from daq.log.message import JOINTS_SCHEMA
 from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag
 
 SQLITE_MAGIC = b"SQLite format 3\0"
-STEPS = 10_000_000  #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
+#: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
+STEPS = 10_000_000
 STEPS_A_BYTE = 2
 COUNTED_STEPS = 1000  #: Instructions between two counts
 BYTES_A_TOPIC = 64  #: Least size of a topic in the file
@@ -30,7 +32,9 @@ PIECE_BYTES = 2**20  #: Unpacked at a time
 
 
 class SqliteBag:
-    """A bag in SQLite (.db3), which has no checksums: a flipped bit of a number passes, as in every reader of it."""
+    """A bag in SQLite (.db3), which has no checksums:
+    a flipped bit of a number passes, as in every reader of it.
+    """
 
     def __init__(self, path: Path, source: Path) -> None:
         """Store the path and where the content is."""
@@ -71,7 +75,9 @@ class SqliteBag:
         return self._broken(f"{self.path}, row {place}", found, expected)
 
     def _bound(self, database: sqlite3.Connection) -> None:
-        """Bound time and memory: a table of the file may be computed, and then has any number of rows of any size."""
+        """Bound time and memory: a table of the file may be computed,
+        and then has any number of rows of any size.
+        """
         with open_regular(self._source) as stream:
             size = os.fstat(stream.fileno()).st_size
         self._bytes_left = size
@@ -87,13 +93,21 @@ class SqliteBag:
 
     def _messages(self, database: sqlite3.Connection) -> Iterator[BagMessage]:
         topics: dict[int, Topic] = {}
-        for row, name, schema, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
+        for row, name, schema, encoding in database.execute(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ):
             self._spend(row, BYTES_A_TOPIC + len(str(name)))
-            topics[row] = Topic(str(name), schema == JOINTS_SCHEMA and encoding == "cdr")
-        for row, number, time_ns, data in database.execute("SELECT id, topic_id, timestamp, data FROM messages"):
+            has_joint_states = schema == JOINTS_SCHEMA and encoding == "cdr"
+            others = [topic for topic in topics.values() if topic.name == str(name)]
+            topics[row] = Topic(str(name), has_joint_states, channel=len(others) + 1)
+        for row, number, time_ns, data in database.execute(
+            "SELECT id, topic_id, timestamp, data FROM messages"
+        ):
             topic = topics.get(number)
             if topic is None or not isinstance(time_ns, int) or not isinstance(data, bytes):
-                raise self.corrupt(row, f"topic {number}, time {time_ns!r:.40}", "a topic, nanoseconds and bytes")
+                raise self.corrupt(
+                    row, f"topic {number}, time {time_ns!r:.40}", "a topic, nanoseconds and bytes"
+                )
             self._spend(row, len(data))
             yield BagMessage(row, topic, time_ns, data)
 
@@ -104,7 +118,9 @@ class SqliteBag:
             raise self.corrupt(row, "more bytes than the file has", "a recording")
 
     def _refuse_unfinished(self) -> None:
-        """Refuse a file beside which SQLite has left what belongs into it: it would be read without that."""
+        """Refuse a file beside which SQLite has left what belongs into it:
+        it would be read without that.
+        """
         name = self.path.name
         for rest in (self.path.with_name(f"{name}-wal"), self.path.with_name(f"{name}-journal")):
             if rest.exists() and rest.stat().st_size > 0:
@@ -112,17 +128,24 @@ class SqliteBag:
                     str(self.path),
                     found=f"{rest.name}, with messages that are not in it yet",
                     expected="a finished bag",
-                    remedy=f"the recorder was killed: copy both, and run `sqlite3 {name} 'PRAGMA quick_check'` there",
+                    remedy=f"the recorder was killed: copy both, and run `sqlite3 {name} 'PRAGMA "
+                    "quick_check'` there",
                 )
 
-    def _broken(self, subject: str, found: str, expected: str = "a ROS 2 bag in SQLite") -> LogCorrupt:
-        remedy = "copy it again from where it was recorded, or convert it: `ros2 bag convert` with storage_id mcap"
+    def _broken(
+        self, subject: str, found: str, expected: str = "a ROS 2 bag in SQLite"
+    ) -> LogCorrupt:
+        remedy = (
+            "copy it again from where it was recorded, or convert it: `ros2 bag convert` with "
+            "storage_id mcap"
+        )
         return LogCorrupt(subject, found=found, expected=expected, remedy=remedy)
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
-    """Open a file of a bag, by its content; a file that cannot be read is reported with its messages.
+    """Open a file of a bag, by its content;
+    a file that cannot be read is reported with its messages.
 
     Raises:
         LogCorrupt: it is packed, and unfolds to more than a recording.
@@ -162,7 +185,9 @@ def _unpack_file(path: Path, target: Path) -> None:
                 while piece := reader.read(PIECE_BYTES):
                     left -= len(piece)
                     if left < 0:
-                        raise _packed_wrong(path, f"a file that unfolds to {LARGEST_RATIO} times its size")
+                        raise _packed_wrong(
+                            path, f"a file that unfolds to {LARGEST_RATIO} times its size"
+                        )
                     stream.write(piece)
         except zstandard.ZstdError as error:
             raise _packed_wrong(path, str(error)) from error

@@ -1,13 +1,16 @@
 """Read joint states from ROS bags as tables.
 
-A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`. Messages of one
-stamp that hold different joints make one row, because several publishers may share a topic. Several that publish the
-same joints differ in frame, joints or fields, and the import description chooses one of them.
+A column is `position.JOINT`, `velocity.JOINT` or `effort.JOINT`; the time column is `header.stamp`.
+Messages of one stamp that hold different joints make one row, because several publishers may share
+a topic. Several that publish the same joints differ in node, channel, frame, joints, fields or the
+rhythm of their stamps, and the import description chooses one of them. Columns of different topics
+or publishers, as positions and efforts, are joined by their stamps.
 """
 
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +21,7 @@ from daq.config.import_description import Column, ImportDescription, KeptPart, T
 from daq.errors import TableUnfit, counted
 from daq.files import read_regular
 from daq.log.bag_file import open_bag
-from daq.log.mcap_bag import JointState, joint_state_from_cdr, unpack_message
+from daq.log.mcap_bag import JointState, Topic, joint_state_from_cdr, unpack_message
 from daq.log.message import JOINTS_SCHEMA
 from daq.log.table import (
     LATEST_NS,
@@ -29,17 +32,20 @@ from daq.log.table import (
     rows_in_time,
     stamps_of_ns,
 )
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, IntArray
 
 STAMP = "header.stamp"  #: Name of the time column
 FIELDS = ("position", "velocity", "effort")
 PACKED = ".zstd"  #: Suffix of a file that is packed as a whole
 METADATA = "metadata.yaml"  #: Of a bag in its folder
 LARGEST_METADATA = 64 * 2**20
-PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")  #: Files of a bag in its folder
+#: Files of a bag in its folder
+PATTERNS = ("*.mcap", "*.db3", "*.bag", "*.mcap.zstd", "*.db3.zstd", "*.bag.zstd")
 
 
-def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
+def read_bag(
+    path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None
+) -> Table:
     """Read columns of a bag, which is a file or a folder of several.
 
     Raises:
@@ -48,29 +54,211 @@ def read_bag(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     """
     if time is not None and (time.column != STAMP or time.unit is not TimeUnit.NANOSECOND):
         found = f"time column {time.column!r} in {time.unit.value}"
-        raise _unfit(path, found, f"`column: {STAMP}` and `unit: ns`", "correct `time` in the import description")
-    rows = _Rows(path, tuple(_field_and_joint(path, column) for column in columns), wanted.publisher)
+        raise _unfit(
+            path,
+            found,
+            f"`column: {STAMP}` and `unit: ns`",
+            "correct `time` in the import description",
+        )
+    sources = _sources(path, wanted, columns)
+    rows: dict[_ColumnSource, _Rows] = {}
+    for source, own in sources.items():
+        fields_and_joints = tuple(_field_and_joint(path, column) for column in own)
+        rows[source] = _Rows(path, fields_and_joints, source.publisher, wanted.rhythm)
     topics: dict[str, bool] = {}
     for file in _files(path):
         with open_bag(file) as bag, closing(bag.messages()) as messages:
             for message in messages:
                 topic = message.topic
-                chosen = topic.has_joint_states and wanted.topic in {None, topic.name}
-                topics[topic.name] = chosen
-                if chosen:
+                reading = [rows[source] for source in sources if source.reads(topic)]
+                topics[topic.name] = bool(reading)
+                if reading:
                     try:
                         state = joint_state_from_cdr(unpack_message(message.data))
-                        rows.add(state, message.time_ns, topic.publisher)
+                        for one in reading:
+                            one.add(state, message.time_ns, topic)
                     except ValueError as error:
-                        raise bag.corrupt(message.place, f"{topic.name} with {error}", JOINTS_SCHEMA) from error
-    used = [topic for topic, chosen in topics.items() if chosen]
+                        raise bag.corrupt(
+                            message.place, f"{topic.name} with {error}", JOINTS_SCHEMA
+                        ) from error
+    for source in sources:
+        _require_one_topic(path, source, topics)
+    if len(rows) == 1:
+        (only,) = rows.values()
+        return only.table(columns, time, wanted.keep)
+    parts = {source: rows[source].table(own, STAMPED, None) for source, own in sources.items()}
+    return _joined(path, parts, columns, time, wanted.keep)
+
+
+STAMPED = TimeColumn(file="", column=STAMP, unit=TimeUnit.NANOSECOND)
+"""Stands for the time column: tables that are joined need their stamps."""
+
+
+@dataclass(frozen=True, slots=True)
+class _ColumnSource:
+    """Where columns are published."""
+
+    topic: str | None  #: None: the only topic of joint states
+    publisher: int | None  #: its number on that topic; None: the only one
+
+    def reads(self, topic: Topic) -> bool:
+        """Whether messages of a topic are read."""
+        return topic.has_joint_states and self.topic in {None, topic.name}
+
+    def __str__(self) -> str:
+        topic = self.topic or "the topic"
+        if self.publisher is None:
+            return topic
+        return f"{topic} (publisher {self.publisher})"
+
+
+def _sources(
+    path: Path, wanted: ImportDescription, columns: tuple[Column, ...]
+) -> dict[_ColumnSource, tuple[Column, ...]]:
+    """Return the columns of each source, in their order.
+
+    Raises:
+        TableUnfit: two sections have one column from different sources.
+    """
+    usual = _ColumnSource(wanted.topic, wanted.publisher)
+    source_of: dict[Column, _ColumnSource] = {}
+    for section in wanted.published():
+        own = _ColumnSource(section.topic or usual.topic, section.publisher or usual.publisher)
+        for file, column in section.places:
+            parts = Path(file).parts
+            if parts != path.parts[-len(parts) :]:
+                continue
+            if source_of.setdefault(column, own) != own:
+                found = f"column {column!r} from {source_of[column]} and from {own}"
+                raise _unfit(
+                    path,
+                    found,
+                    "one source of each column",
+                    "correct `topic` and `publisher` of its sections",
+                )
+    found_columns: dict[_ColumnSource, list[Column]] = {}
+    for column in columns:
+        found_columns.setdefault(source_of.get(column, usual), []).append(column)
+    return {source: tuple(own) for source, own in found_columns.items()}
+
+
+def _require_one_topic(path: Path, source: _ColumnSource, topics: dict[str, bool]) -> None:
+    """Refuse a bag without the topic of a source, or with several that it may be.
+
+    Args:
+        path: of the bag.
+        source: whose topic is sought.
+        topics: those of the bag, and whether their joint states were read.
+    """
+    used = [topic for topic, chosen in topics.items() if chosen and source.topic in {None, topic}]
     if not used:
-        found = f"topics {', '.join(topics)}" if topics else "no message"
-        raise _unfit(path, found, f"{wanted.topic or 'a topic'} of type {JOINTS_SCHEMA}", "is this the right bag?")
+        if topics:
+            found = f"topics {', '.join(topics)}"
+        else:
+            found = "no message"
+        raise _unfit(
+            path,
+            found,
+            f"{source.topic or 'a topic'} of type {JOINTS_SCHEMA}",
+            "is this the right bag?",
+        )
     if len(used) > 1:
-        remedy = "choose one in the import description: `topic: NAME`"
-        raise _unfit(path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy)
-    return rows.table(columns, time, wanted.keep)
+        remedy = (
+            "choose one in the import description: `topic: NAME`; where positions and efforts are "
+            "on different ones, `topic` under `position` and `current`"
+        )
+        raise _unfit(
+            path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy
+        )
+
+
+def _joined(
+    path: Path,
+    parts: dict[_ColumnSource, Table],
+    columns: tuple[Column, ...],
+    time: TimeColumn | None,
+    keep: KeptPart | None,
+) -> Table:
+    """Join columns of several sources by their stamps, which must be the same but for the ends.
+
+    Raises:
+        TableUnfit: stamps differ: nothing is interpolated between messages.
+    """
+    stamps_ns = {source: _exact_ns(table) for source, table in parts.items()}
+    first_ns = max(int(stamps[0]) for stamps in stamps_ns.values())
+    last_ns = min(int(stamps[-1]) for stamps in stamps_ns.values())
+    reference, *others = parts
+    values: dict[Column, FloatArray] = {}
+    shared_ns = _between(stamps_ns[reference], first_ns, last_ns)
+    for source in others:
+        own_ns = _between(stamps_ns[source], first_ns, last_ns)
+        if not len(shared_ns) or not np.array_equal(own_ns, shared_ns):
+            raise _not_joined(path, {one: stamps_ns[one] for one in (reference, source)})
+    remarks: list[str] = []
+    for source, table in parts.items():
+        is_shared = (stamps_ns[source] >= first_ns) & (stamps_ns[source] <= last_ns)
+        values |= {column: table.take((column,))[is_shared] for column in table.columns}
+        remarks += table.remarks
+        left_out = int(np.count_nonzero(~is_shared))
+        if left_out:
+            remarks.append(
+                "left out, as other columns have none there: "
+                f"{counted(left_out, 'stamp')} of {source}"
+            )
+    clock = stamps_of_ns(shared_ns.tolist())
+    rows = slice(None)
+    if keep is not None:
+        if keep.is_by_time:
+            rows = rows_in_time(clock, keep)
+        else:
+            rows = keep.rows
+        require_kept(path, len(shared_ns), rows)
+    first_row, _, _ = rows.indices(len(shared_ns))
+    kept = np.hstack([values[column] for column in columns])[rows]
+    clock = stamps_of_ns(shared_ns[rows].tolist())
+    stamps = None if time is None else clock
+    return Table(
+        path,
+        columns,
+        kept,
+        digest_of(kept, clock),
+        stamps,
+        first_row=first_row,
+        remarks=tuple(remarks),
+    )
+
+
+def _exact_ns(table: Table) -> IntArray:
+    """Return the stamps of a table in nanoseconds, shape (k,)."""
+    stamps = table.stamps
+    if stamps is None:
+        raise ValueError("a table without stamps")
+    return np.rint(1e9 * stamps.time_s).astype(np.int64) + stamps.first_ns
+
+
+def _between(stamps_ns: IntArray, first_ns: int, last_ns: int) -> IntArray:
+    return stamps_ns[(stamps_ns >= first_ns) & (stamps_ns <= last_ns)]
+
+
+def _not_joined(path: Path, stamps_ns: dict[_ColumnSource, IntArray]) -> TableUnfit:
+    """Make the error for two sources without the same stamps."""
+    described = []
+    for source, own_ns in stamps_ns.items():
+        if len(own_ns) > 1:
+            step_s = 1e-9 * float(np.median(np.diff(own_ns)))
+        else:
+            step_s = 0.0
+        described.append(f"{counted(len(own_ns), 'stamp')} each {step_s:.6g} s on {source}")
+    first, second = stamps_ns.values()
+    common = len(np.intersect1d(first, second))
+    return _unfit(
+        path,
+        f"{' and '.join(described)}, {common} of them the same",
+        "messages of the same stamps",
+        "nothing is interpolated between messages: record them with one stamp, or write each field "
+        "to a CSV file with rows of the same instants, and name the files by `file` of `position` "
+        "and `current`",
+    )
 
 
 def _files(path: Path) -> list[Path]:
@@ -86,7 +274,8 @@ def _files(path: Path) -> list[Path]:
 
 
 def _require_parts(folder: Path, files: list[Path]) -> None:
-    """Refuse a folder that lacks a file which the recorder names: without it, the recording would end early.
+    """Refuse a folder that lacks a file which the recorder names:
+    without it, the recording would end early.
 
     Raises:
         TableUnfit: a file is not there.
@@ -100,12 +289,14 @@ def _require_parts(folder: Path, files: list[Path]) -> None:
             str(folder),
             found=f"no {', '.join(missing)}, which {METADATA} names",
             expected=f"all {counted(len(named), 'file')} of the bag",
-            remedy=f"copy the folder again; if the file was removed on purpose, take its name out of {METADATA}",
+            remedy="copy the folder again; if the file was removed on purpose, take its name out "
+            f"of {METADATA}",
         )
 
 
 def _named_parts(metadata: Path) -> list[str]:
-    """Return the files of a bag by its metadata, none if there are none; the rest of it is not read.
+    """Return the files of a bag by its metadata, none if there are none;
+    the rest of it is not read.
 
     It may hold megabytes of quality of service, which no reader of YAML bounds.
     """
@@ -133,7 +324,10 @@ def _part(file: Path) -> tuple[int, str]:
 
 
 def _unfit(
-    path: Path, found: str, expected: str, remedy: str = "correct `columns` in the import description"
+    path: Path,
+    found: str,
+    expected: str,
+    remedy: str = "correct `columns` in the import description",
 ) -> TableUnfit:
     return TableUnfit(str(path), found=found, expected=expected, remedy=remedy)
 
@@ -147,54 +341,88 @@ def _field_and_joint(path: Path, column: Column) -> tuple[str, str]:
 
 @dataclass(slots=True)
 class _Publisher:
-    """Messages that one node may have published: they have one frame, one set of joints and the same fields."""
+    """Messages that one node may have published:
+    they have one frame, one set of joints and the same fields.
+    """
 
     number: int  #: from 1, in the order of their first messages
     node: str  #: its name, where the bag has it
     frame: str | None  #: None where the header is empty
     joints: frozenset[str]
     fields: tuple[str, ...]  #: with values
+    channel: int  #: among those of the topic
+    first_ns: int  #: time of the recording of its first message
+    last_ns: int  #: and of its last
     messages: int = 0
 
     def may_be(self, other: _Publisher) -> bool:
-        """Whether one node may be both: it leaves out the header of some messages."""
+        """Whether one node may be both: it leaves out the header of some messages,
+        or has channels after each other.
+        """
         if self.node != other.node:
             return False
+        if self.channel != other.channel:
+            is_apart = self.last_ns < other.first_ns or other.last_ns < self.first_ns
+            return is_apart and self.frame == other.frame and self.fields == other.fields
         has_header = self.frame is not None and other.frame is not None
         return not has_header and self.fields == other.fields
 
     def __str__(self) -> str:
         fields = " and ".join(self.fields) or "no values"
-        frame = "without a header" if self.frame is None else f"frame {self.frame!r}"
+        if self.frame is None:
+            frame = "without a header"
+        else:
+            frame = f"frame {self.frame!r}"
         joints = ", ".join(sorted(self.joints))
         node = f"{self.node}, " if self.node else ""
-        return f"{self.number}: {node}{fields} of {joints}, {frame}, {counted(self.messages, 'message')}"
+        if self.channel > 1:
+            node += f"channel {self.channel}, "
+        return (
+            f"{self.number}: {node}{fields} of {joints}, {frame}, "
+            f"{counted(self.messages, 'message')}"
+        )
 
 
 SEPARATE = (
-    "no message has all fields, and messages of different publishers are not joined: write each field to a CSV file, "
-    "with rows of the same instants, and name the files by `file` of `position` and `current`"
+    "no message has all fields: where those of one instant have one stamp, choose the publisher of "
+    "each section, as in `position: {{..., publisher: {position}}}` and `current: {{..., "
+    "publisher: {effort}}}`; else write each field to a CSV file, with rows of the same instants, "
+    "and name the files by `file` of `position` and `current`"
 )
 FEWEST_OF_A_PUBLISHER = 10  #: Messages by which its rhythm is known
-EVEN_SHARE = 0.05  #: Largest difference of a step from the usual one in an even row of stamps, as a share of it
-CENTRED_SHARE = 0.35  #: Offset of a second row, as a share of the step, above which it may be every other stamp of one
+#: Largest difference of a step from the usual one in an even row of stamps, as a share of it
+EVEN_SHARE = 0.05
+#: Offset of a second row, as a share of the step, above which it may be every other stamp of one
+CENTRED_SHARE = 0.35
 MOSTLY = 0.95  #: Share of the steps that are even in such a row
-SINCE_1970_NS = 10**18  #: Stamps from here on, 2001, are times of day; earlier ones are since some start
+#: Stamps from here on, 2001, are times of day; earlier ones are since some start
+SINCE_1970_NS = 10**18
 UNDECIDED = 1000  #: Messages with a stamp of 0 that wait for a later one, which says what 0 means
 
 
 class _Rows:
     """Rows of joint states: a message begins one, or completes that of its stamp.
 
-    A stamp of 0 is the first instant of a clock that starts at 0, as simulation time does, or the stamp that a
-    publisher left out. The first other stamp of the bag tells the two apart.
+    A stamp of 0 is the first instant of a clock that starts at 0, as simulation time does, or the
+    stamp that a publisher left out. The first other stamp of the bag tells the two apart.
     """
 
-    def __init__(self, path: Path, columns: tuple[tuple[str, str], ...], publisher: int | None) -> None:
-        """Store the columns, each with field and joint, and the publisher that is chosen."""
+    def __init__(
+        self,
+        path: Path,
+        columns: tuple[tuple[str, str], ...],
+        publisher: int | None,
+        rhythm: int | None,
+    ) -> None:
+        """Store the columns, each with field and joint, and what is chosen:
+        a publisher, and a row of even stamps.
+        """
         self._path = path
         self._chosen = publisher
-        self._publishers: dict[tuple[str, str | None, frozenset[str], tuple[str, ...]], _Publisher] = {}
+        self._rhythm = rhythm
+        self._publishers: dict[
+            tuple[str, int, str | None, frozenset[str], tuple[str, ...]], _Publisher
+        ] = {}
         self._zero_is_a_time: bool | None = None  # None until a stamp has shown it
         self._undecided: list[tuple[JointState, int]] = []  # with the time of their recording
         self._columns = columns
@@ -202,10 +430,11 @@ class _Rows:
         self._values = array("d")
         self._present = bytearray()
         self._begun: dict[int, int] = {}  # incomplete rows by their stamp
-        self._places: dict[tuple[str, ...], list[tuple[str, int, int]]] = {}  # field, index and column, by the names
+        # Field, index and column, by the names
+        self._places: dict[tuple[str, ...], list[tuple[str, int, int]]] = {}
         self._unstamped = 0
 
-    def add(self, state: JointState, log_time_ns: int, node: str) -> None:
+    def add(self, state: JointState, log_time_ns: int, topic: Topic) -> None:
         """Add a message; one without a stamp is taken at the time of its recording.
 
         Raises:
@@ -215,7 +444,12 @@ class _Rows:
         if state.names not in self._places:
             if len(set(state.names)) < len(state.names):
                 twice = next(name for name in state.names if state.names.count(name) > 1)
-                raise _unfit(self._path, f"joint {twice} twice in one message", "each joint once", "mend its publisher")
+                raise _unfit(
+                    self._path,
+                    f"joint {twice} twice in one message",
+                    "each joint once",
+                    "mend its publisher",
+                )
             self._places[state.names] = [
                 (field, state.names.index(joint), column)
                 for column, (field, joint) in enumerate(self._columns)
@@ -223,8 +457,9 @@ class _Rows:
             ]
         if not self._places[state.names]:
             return  # joints of something else
-        publisher = self._publisher_of(state, node)
+        publisher = self._publisher_of(state, log_time_ns, topic)
         publisher.messages += 1
+        publisher.last_ns = max(publisher.last_ns, log_time_ns)
         if self._chosen not in {None, publisher.number}:
             return
         if self._zero_is_a_time is None:
@@ -237,13 +472,25 @@ class _Rows:
             self._decide(zero_is_a_time=state.stamp_ns < SINCE_1970_NS)
         self._take(state, log_time_ns)
 
-    def _publisher_of(self, state: JointState, node: str) -> _Publisher:
+    def _publisher_of(self, state: JointState, log_time_ns: int, topic: Topic) -> _Publisher:
         fields = tuple(field for field in FIELDS if getattr(state, field))
         joints = frozenset(state.names)
-        frame = None if not state.frame and state.stamp_ns == 0 else state.frame
-        key = (node, frame, joints, fields)
+        if not state.frame and state.stamp_ns == 0:
+            frame = None
+        else:
+            frame = state.frame
+        key = (topic.publisher, topic.channel, frame, joints, fields)
         if key not in self._publishers:
-            self._publishers[key] = _Publisher(len(self._publishers) + 1, node, frame, joints, fields)
+            self._publishers[key] = _Publisher(
+                number=len(self._publishers) + 1,
+                node=topic.publisher,
+                frame=frame,
+                joints=joints,
+                fields=fields,
+                channel=topic.channel,
+                first_ns=log_time_ns,
+                last_ns=log_time_ns,
+            )
         return self._publishers[key]
 
     def _decide(self, *, zero_is_a_time: bool) -> None:
@@ -274,8 +521,12 @@ class _Rows:
         for field, index, column in places:
             numbers: tuple[float, ...] = getattr(state, field)
             if index >= len(numbers):
-                found = f"a message with {len(state.names)} names and {len(numbers)} values of {field}"
-                raise _unfit(self._path, found, "one value a joint", "does this controller publish it?")
+                found = (
+                    f"a message with {len(state.names)} names and {len(numbers)} values of {field}"
+                )
+                raise _unfit(
+                    self._path, found, "one value a joint", "does this controller publish it?"
+                )
             self._values[row * width + column] = numbers[index]
             self._present[row * width + column] = 1
         if all(self._present[row * width : (row + 1) * width]):
@@ -285,7 +536,8 @@ class _Rows:
         """Refuse joints that several nodes publish, and fields that no node publishes.
 
         Raises:
-            TableUnfit: several publish the same joints, the chosen one is not there, or a field has no values.
+            TableUnfit: several publish the same joints, the chosen one is not there, or a field has
+                no values.
         """
         known = list(self._publishers.values())
         if self._chosen is not None:
@@ -308,57 +560,95 @@ class _Rows:
             fullest = self._fullest(sharing)
             is_full = {field for field, _ in self._columns} <= set(fullest.fields)
             choose = (
-                f"choose one in the import description, as in `publisher: {fullest.number}`, or record again without "
-                "the others"
+                f"choose one in the import description, as in `publisher: {fullest.number}`, or "
+                "record again without the others"
             )
             raise _unfit(
                 self._path,
-                f"{len(sharing)} publishers of the same joints on one topic: {'; '.join(map(str, sharing))}",
+                f"{len(sharing)} publishers of the same joints on one topic: "
+                f"{'; '.join(map(str, sharing))}",
                 "one publisher of each joint",
-                choose if is_full else SEPARATE,
+                choose if is_full else self._choice_of_each_field(),
             )
         for one in known:
-            lacking = [field for field, joint in self._columns if joint in one.joints and field not in one.fields]
+            lacking = [
+                field
+                for field, joint in self._columns
+                if joint in one.joints and field not in one.fields
+            ]
             if lacking:
                 found = f"messages with {len(one.joints)} names and 0 values of {lacking[0]}"
-                is_elsewhere = any(lacking[0] in other.fields for other in self._publishers.values())
-                remedy = SEPARATE if is_elsewhere else "does this controller publish it?"
+                is_elsewhere = any(
+                    lacking[0] in other.fields for other in self._publishers.values()
+                )
+                if is_elsewhere:
+                    remedy = self._choice_of_each_field()
+                else:
+                    remedy = "does this controller publish it?"
                 raise _unfit(self._path, found, "one value a joint", remedy)
+
+    def _choice_of_each_field(self) -> str:
+        """Return the advice for positions and efforts of different publishers."""
+        numbers = {"position": 1, "effort": 2}
+        for one in reversed(self._publishers.values()):
+            numbers |= dict.fromkeys(one.fields, one.number)
+        return SEPARATE.format(position=numbers["position"], effort=numbers["effort"])
 
     def _fullest(self, publishers: list[_Publisher]) -> _Publisher:
         """Return the publisher with most of the fields that are read, then with most messages."""
         fields = {field for field, _ in self._columns}
         return max(publishers, key=lambda one: (len(fields & set(one.fields)), one.messages))
 
-    def table(self, columns: tuple[Column, ...], time: TimeColumn | None, part: KeptPart | None) -> Table:
+    def table(
+        self, columns: tuple[Column, ...], time: TimeColumn | None, part: KeptPart | None
+    ) -> Table:
         """Return the complete rows of the part that is kept.
 
         Raises:
-            TableUnfit: a joint is missing in every row or between complete ones, or a number is not finite.
+            TableUnfit: a joint is missing in every row or between complete ones, or a number is not
+                finite.
         """
         self._decide(zero_is_a_time=self._zero_is_a_time is True)
         self._require_one_publisher()
         width = len(self._columns)
         present = np.frombuffer(self._present, dtype=np.bool_).reshape(-1, width)
         values = np.frombuffer(self._values).reshape(-1, width)
-        kept = self._kept(part)
+        stamp_ns = self._stamp_ns
+        if self._rhythm is not None:
+            is_chosen = self._chosen_rhythm(self._rhythm)
+            present = present[is_chosen]
+            values = values[is_chosen]
+            stamp_ns = array("q", np.asarray(stamp_ns)[is_chosen].tolist())
+        kept = self._kept(stamp_ns, part)
         present = present[kept]
         values = values[kept]
-        stamp_ns = self._stamp_ns[kept]
+        stamp_ns = stamp_ns[kept]
         is_number = present & ~np.isnan(values)
         self._require_joints(columns, present, is_number)
         whole = np.flatnonzero(is_number.all(axis=1))
-        inside = slice(whole[0], whole[-1] + 1) if whole.size else slice(0, 1)
+        if whole.size:
+            inside = slice(whole[0], whole[-1] + 1)
+        else:
+            inside = slice(0, 1)
         if not whole.size or len(whole) < len(is_number[inside]):
             row = int(np.argmin(is_number[inside].all(axis=1))) + inside.start
             raise self._incomplete_row(columns, stamp_ns[row], present[row], is_number[row])
         remarks = self._remarks(present, is_number, inside)
         clock = stamps_of_ns(stamp_ns[inside])
-        self._require_one_rhythm(clock.time_s)
+        if self._rhythm is None:
+            self._require_one_rhythm(clock.time_s)
         stamps = None if time is None else clock
         digest = digest_of(values[inside], clock)
         first_row = kept.start + inside.start
-        table = Table(self._path, columns, values[inside], digest, stamps, first_row=first_row, remarks=remarks)
+        table = Table(
+            self._path,
+            columns,
+            values[inside],
+            digest,
+            stamps,
+            first_row=first_row,
+            remarks=remarks,
+        )
         return require_finite(table)
 
     def _require_one_rhythm(self, time_s: FloatArray) -> None:
@@ -372,33 +662,74 @@ class _Rows:
             return
         raise _unfit(
             self._path,
-            f"stamps of two publishers of the same joints: {found.first} messages each {found.first_step_s:.6g} s, and "
-            f"{found.second} messages each {found.second_step_s:.6g} s between them",
+            f"stamps of two publishers of the same joints: 1: {found.first} messages each "
+            f"{found.first_step_s:.6g} s; 2: {found.second} messages each "
+            f"{found.second_step_s:.6g} s between them",
             "one publisher of each joint",
-            "record again with one of the two nodes stopped, or give one of them another topic or `frame_id`: then "
-            "`topic` or `publisher` of the import description chooses it",
+            "choose one in the import description, as in `rhythm: 1`; better, record again with "
+            "one of the two nodes stopped, or give one of them another topic or `frame_id`",
         )
 
-    def _kept(self, part: KeptPart | None) -> slice:
+    def _chosen_rhythm(self, number: int) -> BoolArray:
+        """Return which rows are of the publisher that is chosen by its rhythm, shape (k,).
+
+        Raises:
+            TableUnfit: there are no two rhythms, or a lost or late stamp leaves open which messages
+                are of which.
+        """
+        if self._stamp_ns:
+            time_s = stamps_of_ns(self._stamp_ns).time_s
+        else:
+            time_s = np.empty(0)
+        found = interleaved(time_s)
+        if found is None:
+            raise _unfit(
+                self._path,
+                f"`rhythm: {number}`, and no two even rows of stamps",
+                "stamps of two publishers, each of which stamps evenly",
+                "leave `rhythm` out of the import description",
+            )
+        rows = (found.is_first, ~found.is_first)
+        is_even = all(_share_of_usual_steps(time_s[one]) == 1.0 for one in rows)
+        if not is_even:
+            raise _unfit(
+                self._path,
+                f"`rhythm: {number}`, and stamps of two publishers with steps that are not even",
+                "two rows of stamps that are even to the last one",
+                "a message is lost or late, so that stamps do not say of which publisher some are: "
+                "record again with one of the two nodes stopped",
+            )
+        return rows[number - 1]
+
+    def _kept(self, stamp_ns: Sequence[int], part: KeptPart | None) -> slice:
         """Return the rows of the part that is kept."""
-        count = len(self._stamp_ns)
+        count = len(stamp_ns)
         rows = slice(None) if part is None else part.rows
         if part is not None and part.is_by_time and count:
-            rows = rows_in_time(stamps_of_ns(self._stamp_ns), part)
+            rows = rows_in_time(stamps_of_ns(stamp_ns), part)
         if part is not None:
             require_kept(self._path, count, rows)
         return slice(*rows.indices(count))
 
-    def _require_joints(self, columns: tuple[Column, ...], present: BoolArray, is_number: BoolArray) -> None:
+    def _require_joints(
+        self, columns: tuple[Column, ...], present: BoolArray, is_number: BoolArray
+    ) -> None:
         """Refuse joints that no message has, and fields that are never a number."""
         absent = [str(columns[number]) for number in np.flatnonzero(~present.any(axis=0))]
         if absent:
-            joints = sorted({name for names in self._places for name in names})
-            raise _unfit(self._path, f"joints {', '.join(joints) or 'none'}", f"those of {', '.join(absent)}")
+            found: set[str] = set()
+            for names in self._places:
+                found.update(names)
+            joints = sorted(found)
+            raise _unfit(
+                self._path, f"joints {', '.join(joints) or 'none'}", f"those of {', '.join(absent)}"
+            )
         empty = [str(columns[number]) for number in np.flatnonzero(~is_number.any(axis=0))]
         if empty:
             remedy = "does this controller measure it? name a field that it publishes"
-            raise _unfit(self._path, f"nan in every message for {', '.join(empty)}", "numbers", remedy)
+            raise _unfit(
+                self._path, f"nan in every message for {', '.join(empty)}", "numbers", remedy
+            )
 
     def _incomplete_row(
         self, columns: tuple[Column, ...], stamp_ns: int, present: BoolArray, is_number: BoolArray
@@ -411,15 +742,16 @@ class _Rows:
                 self._path,
                 f"no {', '.join(absent)} {at}",
                 "all joints in messages of the same stamp",
-                "messages are missing, or joints are stamped apart: record a topic that has all joints in each message",
+                "messages are missing, or joints are stamped apart: record a topic that has all "
+                "joints in each message",
             )
         empty = [str(columns[number]) for number in np.flatnonzero(~is_number)]
         return _unfit(
             self._path,
             f"nan for {', '.join(empty)} {at}",
             "numbers, but for the begin and the end of the bag",
-            "samples are never invented: import what is before it and what is behind it by `keep`, as recordings of "
-            "their own",
+            "samples are never invented: import what is before it and what is behind it by `keep`, "
+            "as recordings of their own",
         )
 
     def _remarks(self, present: BoolArray, is_number: BoolArray, inside: slice) -> tuple[str, ...]:
@@ -431,9 +763,14 @@ class _Rows:
         lacking = int(np.count_nonzero(is_outside & ~has_joints))
         empty = int(np.count_nonzero(is_outside & has_joints))
         if lacking:
-            remarks.append(f"left out, as joints are missing at the ends of the bag: {counted(lacking, 'stamp')}")
+            remarks.append(
+                "left out, as joints are missing at the ends of the bag: "
+                f"{counted(lacking, 'stamp')}"
+            )
         if empty:
-            remarks.append(f"left out, as values are nan at the ends of the bag: {counted(empty, 'stamp')}")
+            remarks.append(
+                f"left out, as values are nan at the ends of the bag: {counted(empty, 'stamp')}"
+            )
         if self._unstamped:
             unstamped = counted(self._unstamped, "message")
             remarks.append(f"{unstamped} without a stamp: the time of the recording is used")
@@ -443,7 +780,7 @@ class _Rows:
         return tuple(remarks)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Interleaved:
     """Two even rows of stamps, one between the other."""
 
@@ -451,17 +788,20 @@ class Interleaved:
     first_step_s: float
     second: int
     second_step_s: float
+    is_first: BoolArray  #: which of the stamps are of the first row, in their order, shape (k,)
 
 
 def interleaved(time_s: FloatArray) -> Interleaved | None:
     """Return what two publishers left, each of which stamps evenly; None for the stamps of one.
 
-    One publisher may be uneven, but what is left when an even row of its stamps is taken out is not even as well.
+    One publisher may be uneven, but what is left when an even row of its stamps is taken out is not
+    even as well.
 
     Args:
         time_s: stamps in the order of the messages, shape (k,).
     """
-    ordered_s = np.sort(time_s)
+    order = np.argsort(time_s, kind="stable")
+    ordered_s = time_s[order]
     if len(ordered_s) < 4 * FEWEST_OF_A_PUBLISHER:
         return None
     steps_s = np.diff(ordered_s)
@@ -483,7 +823,11 @@ def interleaved(time_s: FloatArray) -> Interleaved | None:
                 shorter_s = float(np.quantile(steps_s, 0.25))
                 if is_same_rate and shorter_s > CENTRED_SHARE * first_step_s:
                     continue  # one loop that is early and late in turn
-                return Interleaved(len(first_s), first_step_s, len(second_s), second_step_s)
+                in_order_of_messages = np.empty(len(order), dtype=np.bool_)
+                in_order_of_messages[order] = is_first
+                return Interleaved(
+                    len(first_s), first_step_s, len(second_s), second_step_s, in_order_of_messages
+                )
     return None
 
 
@@ -501,9 +845,16 @@ def _even_row(time_s: FloatArray, step_s: float, start: int) -> BoolArray:
 
 def _is_even(time_s: FloatArray) -> bool:
     """Whether most steps are the usual one, over all of the time."""
-    steps_s = np.diff(time_s)
+    return _share_of_usual_steps(time_s) >= MOSTLY
+
+
+def _share_of_usual_steps(time_s: FloatArray) -> float:
+    """Share of the steps that are the usual one; zero where that is none."""
+    steps_s = np.diff(np.sort(time_s))
     usual_s = float(np.median(steps_s))
-    return usual_s > 0.0 and bool(np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s) >= MOSTLY)
+    if usual_s <= 0.0:
+        return 0.0
+    return float(np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s))
 
 
 def _require_possible(time_ns: int) -> None:

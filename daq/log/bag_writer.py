@@ -1,7 +1,8 @@
 """Write a log as a rosbag2 folder: a bag in MCAP and its `metadata.yaml`, with all numbers in SI.
 
-`metadata.yaml` is of version 5, which ROS 2 reads from Humble on. Topics are reliable and volatile, but for the robot's
-description: like `robot_state_publisher`, it keeps the last message for late subscribers.
+`metadata.yaml` is of version 5, which ROS 2 reads from Humble on. Topics are reliable and volatile,
+but for the robot's description: like `robot_state_publisher`, it keeps the last message for late
+subscribers.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ from ident.calibration import Calibration
 from ident.model.model import DriveTrain
 
 VELOCITY_S = 0.02  #: Time over which a velocity is the mean, as in a log's own joint states
-_RELIABLE, _VOLATILE, _TRANSIENT_LOCAL, _KEEP_LAST, _AUTOMATIC = 1, 2, 1, 1, 1  # values of rmw's enumerations
+# Values of rmw's enumerations
+_RELIABLE, _VOLATILE, _TRANSIENT_LOCAL, _KEEP_LAST, _AUTOMATIC = 1, 2, 1, 1, 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,17 +54,20 @@ class BagWritten:
     messages: dict[str, int]  #: number of messages by topic
     duration_s: float  #: from the first to the last message [s]
     partial: bool  #: the log was never finished
-    valid: bool  #: whether the recorder marked the run valid, and its cycles and time steps are even
+    #: whether the recorder marked the run valid, and its cycles and time steps are even
+    valid: bool
     reason: str  #: why not
 
 
 def export_bag(path: Path, out: Path, calibration: Calibration | None = None) -> BagWritten:
-    """Write a bag from a log: joint states and currents at every SYNC, events, slow readings, the URDF.
+    """Write a bag from a log: joint states and currents at every SYNC, events, slow readings,
+    the URDF.
 
     Args:
         path: log to read.
         out: folder to make; must not exist.
-        calibration: of the log's cell; its gains give the effort of the joint states. None: no effort.
+        calibration: of the log's cell; its gains give the effort of the joint states. None: no
+            effort.
 
     Raises:
         UsageError: a file or folder of that name exists.
@@ -72,26 +77,42 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
     """
     if out.exists():
         raise UsageError(
-            str(out), found="a file or folder of that name", expected="none", remedy="choose another --out"
+            str(out),
+            found="a file or folder of that name",
+            expected="none",
+            remedy="choose another --out",
         )
     log = read_log(path)
     cell = log.head.cell(path)
-    found = None if calibration is None else mismatch_of_calibration(calibration, cell)
+    if calibration is None:
+        found = None
+    else:
+        found = mismatch_of_calibration(calibration, cell)
     if found is not None:
         raise ConfigurationInconsistent(
-            str(path), found=found.found, expected=found.expected, remedy="give a calibration of this cell"
+            str(path),
+            found=found.found,
+            expected=found.expected,
+            remedy="give a calibration of this cell",
         )
-    ordered = [] if calibration is None else [gain.value for gain in calibration.gains]
+    if calibration is None:
+        ordered = []
+    else:
+        ordered = [gain.value for gain in calibration.gains]
     messages = sorted(_messages(log, cell, ordered), key=lambda message: message[0])
     counts = Counter(topic for _, topic, _ in messages)
-    first_ns, last_ns = messages[0][0], messages[-1][0]
-    unfinished, name = out.with_name(out.name + ".part"), f"{out.name}_0.mcap"
+    first_ns = messages[0][0]
+    last_ns = messages[-1][0]
+    unfinished = out.with_name(out.name + ".part")
+    name = f"{out.name}_0.mcap"
     try:
         unfinished.mkdir()
         try:
             with (unfinished / name).open("wb") as stream:
                 _write(Writer(stream, compression=CompressionType.ZSTD), messages)
-            (unfinished / "metadata.yaml").write_text(_metadata(name, counts, first_ns, last_ns), encoding="utf-8")
+            (unfinished / "metadata.yaml").write_text(
+                _metadata(name, counts, first_ns, last_ns), encoding="utf-8"
+            )
             unfinished.rename(out)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)  # once renamed, it is gone
@@ -103,20 +124,28 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
     watch = MotionWatch(cell, log.head)
     watch.take(log.samples)
     verdict = watch.verdict(checks, log.statistics, lambda: (log.samples,))
-    return BagWritten(dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict)
+    return BagWritten(
+        dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict
+    )
 
 
 def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[int, str, bytes]]:
     """Yield stamp [ns], topic and CDR bytes of every message."""
-    samples, scale = log.samples, scaling(cell, log.head.readback)
+    samples = log.samples
+    scale = scaling(cell, log.head.readback)
     position = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
     velocity = mean_velocity(position, samples.time_ns)
     current = samples.current_raw * scale.current_per_unit
-    effort = joint_effort(cell, current, gains) if len(gains) else np.empty((len(current), 0))
+    if len(gains):
+        effort = joint_effort(cell, current, gains)
+    else:
+        effort = np.empty((len(current), 0))
     prefix = joint_state_prefix(joint_names(cell))
     stamps = samples.time_ns.tolist()
     yield stamps[0], URDF_TOPIC, text_bytes(cell.urdf)
-    rows = zip(stamps, position.tolist(), velocity.tolist(), effort.tolist(), current.tolist(), strict=True)
+    rows = zip(
+        stamps, position.tolist(), velocity.tolist(), effort.tolist(), current.tolist(), strict=True
+    )
     for time_ns, *state, ampere in rows:
         yield time_ns, JOINTS_TOPIC, joint_state_bytes(prefix, time_ns, *state)
         yield time_ns, CURRENTS_TOPIC, currents_bytes(time_ns, ampere)
@@ -127,16 +156,20 @@ def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[in
 
 
 def mean_velocity(position: FloatArray, time_ns: IntArray) -> FloatArray:
-    """Mean velocity over VELOCITY_S about each sample, shorter at the ends [rad/s or m/s], shape (k, n).
+    """Mean velocity over VELOCITY_S about each sample, shorter at the ends [rad/s or m/s],
+    shape (k, n).
 
     Args:
         position: [rad or m], shape (k, n).
         time_ns: increasing [ns], shape (k,).
     """
-    half_ns, last = round(0.5e9 * VELOCITY_S), len(time_ns) - 1
+    half_ns = round(0.5e9 * VELOCITY_S)
+    last = len(time_ns) - 1
     index = np.arange(last + 1)
     before = np.minimum(np.searchsorted(time_ns, time_ns - half_ns), np.maximum(index - 1, 0))
-    after = np.maximum(np.searchsorted(time_ns, time_ns + half_ns, side="right") - 1, np.minimum(index + 1, last))
+    after = np.maximum(
+        np.searchsorted(time_ns, time_ns + half_ns, side="right") - 1, np.minimum(index + 1, last)
+    )
     elapsed_s = np.maximum(time_ns[after] - time_ns[before], 1) * 1e-9
     return np.asarray((position[after] - position[before]) / elapsed_s[:, None])
 
@@ -160,7 +193,9 @@ def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:
         if topic not in channels:
             schema = SCHEMA_OF[topic]
             if schema not in schemas:
-                schemas[schema] = writer.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
+                schemas[schema] = writer.register_schema(
+                    schema, "ros2msg", DEFINITIONS[schema].encode()
+                )
             metadata = {"offered_qos_profiles": "".join(f"{line}\n" for line in _qos(topic))}
             channels[topic] = writer.register_channel(topic, "cdr", schemas[schema], metadata)
         writer.add_message(channels[topic], time_ns, data, time_ns)
@@ -185,7 +220,11 @@ def _qos(topic: str) -> list[str]:
 
 def _metadata(name: str, counts: Counter[str], first_ns: int, last_ns: int) -> str:
     """Return the text of `metadata.yaml`."""
-    span = [f"nanoseconds: {last_ns - first_ns}", f"nanoseconds_since_epoch: {first_ns}", f"{sum(counts.values())}"]
+    span = [
+        f"nanoseconds: {last_ns - first_ns}",
+        f"nanoseconds_since_epoch: {first_ns}",
+        f"{sum(counts.values())}",
+    ]
     lines = [
         "rosbag2_bagfile_information:",
         "  version: 5",

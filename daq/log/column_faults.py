@@ -1,7 +1,9 @@
-"""Readings that are none in the columns of a foreign recording, judged as in a log (`ident.data.channel_faults`).
+"""Readings that are none in the columns of a foreign recording,
+judged as in a log (`ident.data.channel_faults`).
 
-It is made where the numbers are as the file has them: a spline to a uniform clock would spread a glitch. Where the rows
-stay as they are, the log keeps them, and a fit fills in what it finds there; else the import does.
+It is made where the numbers are as the file has them: a spline to a uniform clock would spread a
+glitch. Where the rows stay as they are, the log keeps them, and a fit fills in what it finds there;
+else the import does.
 """
 
 from __future__ import annotations
@@ -34,7 +36,9 @@ class UsedRows:
 
     def place_of(self, fault: ChannelFault) -> str:
         """Name the number at which a fault begins, and its axis."""
-        section = self.wanted.position if fault.quantity is ChannelKind.POSITION else self.wanted.current
+        section = (
+            self.wanted.position if fault.quantity is ChannelKind.POSITION else self.wanted.current
+        )
         place = section_place(section, self.files, int(self.row[fault.first]), fault.axis)
         return f"{place}, axis {self.cell.axes[fault.axis].name}"
 
@@ -56,8 +60,8 @@ def sound_columns(position: FloatArray, current: FloatArray, used: UsedRows) -> 
         used: the rows that are used.
 
     Raises:
-        TableUnfit: readings are none, and nothing mends them. Positions that go on displaced are left to
-            `require_mendable`, after the limits of the robot.
+        TableUnfit: readings are none, and nothing mends them. Positions that go on displaced are
+            left to `require_mendable`, after the limits of the robot.
     """
     is_counter = used.wanted.position.unit is PositionUnit.COUNTS
     read = position[used.row]
@@ -70,9 +74,13 @@ def sound_columns(position: FloatArray, current: FloatArray, used: UsedRows) -> 
     mended_position[used.row] = mended(read, faults, used.rate_hz, time=used.time_s)
     if is_counter:
         # The counter of 32 bits goes on at its other end.
-        mended_position = np.rint(mended_position).astype(np.int64).astype(np.int32).astype(np.float64)
+        mended_position = (
+            np.rint(mended_position).astype(np.int64).astype(np.int32).astype(np.float64)
+        )
     mended_current = current.copy()
-    mended_current[used.row] = mended(own_current, faults, used.rate_hz, quantity=ChannelKind.CURRENT, time=used.time_s)
+    mended_current[used.row] = mended(
+        own_current, faults, used.rate_hz, quantity=ChannelKind.CURRENT, time=used.time_s
+    )
     return SoundColumns(mended_position, mended_current, faults)
 
 
@@ -90,7 +98,9 @@ def require_mendable(faults: Sequence[ChannelFault], used: UsedRows, *, displace
     refused = refused_fault(faults, displaced=displaced)
     if refused is not None:
         place = used.place_of(refused)
-        raise TableUnfit(place, found=found(refused), expected=expected(refused), remedy=remedy(refused))
+        raise TableUnfit(
+            place, found=found(refused), expected=expected(refused), remedy=remedy(refused)
+        )
 
 
 def fault_remarks(faults: Sequence[ChannelFault], used: UsedRows) -> Iterator[str]:

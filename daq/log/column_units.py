@@ -1,7 +1,8 @@
-"""Units that a CSV file states for its columns, in a line below the header or in the names, against the description.
+"""Units that a CSV file states for its columns, in a line below the header or in the names,
+against the description.
 
-A unit is a kind of quantity and a scale. Two units contradict each other where both are known and the kind or the scale
-differ; a unit that is not known says nothing.
+A unit is a kind of quantity and a scale. Two units contradict each other where both are known and
+the kind or the scale differ; a unit that is not known says nothing.
 """
 
 from __future__ import annotations
@@ -12,11 +13,19 @@ from dataclasses import dataclass
 from math import pi
 from pathlib import Path
 
-from daq.config.import_description import Column, ImportDescription, ScaledColumns, Section, TimeColumn
+from daq.config.import_description import (
+    Column,
+    ImportDescription,
+    ScaledColumns,
+    Section,
+    TimeColumn,
+)
 from daq.errors import TableUnfit
 
 NEAR_FACTOR = 10.0
-"""Largest ratio of a factor to that of its two units: it may hold a gauge's scale, or rms beside amplitude."""
+"""Largest ratio of a factor to that of its two units:
+it may hold a gauge's scale, or rms beside amplitude.
+"""
 _IN_BRACKETS = re.compile(r"\[([^\[\]]+)\]\s*$")
 
 
@@ -88,7 +97,10 @@ UNITS = {
     "w": ColumnUnit("power", 1.0),
     "hz": ColumnUnit("frequency", 1.0),
 }
-"""Known units in lower case. Effective and peak amperes are the same here: few files tell which they hold."""
+"""Known units in lower case.
+
+Effective and peak amperes are the same here: few files tell which they hold.
+"""
 TWINS = {"rad": "m", "deg": "mm", "rad/s": "m/s", "deg/s": "mm/s"}
 """Unit of the prismatic axes of a robot that has both, by that of the description."""
 
@@ -113,7 +125,9 @@ class Expected:
     factor: float | None  #: None where the section has none
 
 
-def expected_units(path: Path, wanted: ImportDescription, time: TimeColumn | None) -> Iterator[Expected]:
+def expected_units(
+    path: Path, wanted: ImportDescription, time: TimeColumn | None
+) -> Iterator[Expected]:
     """Yield the columns of a file that have a unit by the description.
 
     Args:
@@ -148,7 +162,9 @@ def _with_twin(unit: str) -> tuple[str, ...]:
 
 
 def _factor_of(section: ScaledColumns, axis: int) -> float | None:
-    """Return the factor of an axis; None where it is stated by names, which the file does not have."""
+    """Return the factor of an axis; None where it is stated by names,
+    which the file does not have.
+    """
     factor = section.factor
     if isinstance(factor, float):
         return factor
@@ -174,7 +190,8 @@ def check_unit(place: str, stated: str, expected: Expected, *, in_name: bool = F
         place: of the unit, for messages.
         stated: the unit in the file.
         expected: what the description says of the column.
-        in_name: it is in the column's name, where letters may mean something else than a quantity of another kind.
+        in_name: it is in the column's name, where letters may mean something else than a quantity
+            of another kind.
 
     Raises:
         TableUnfit: both units are known, and they contradict each other.
@@ -188,15 +205,24 @@ def check_unit(place: str, stated: str, expected: Expected, *, in_name: bool = F
     if any(_agree(unit, one, expected) for one in allowed if one is not None):
         return
     has_factor = expected.factor is not None
-    by_factor = f", with the factor {expected.factor:g}" if has_factor else ""
-    corrections = f"the unit or `factor` of `{expected.key}`" if has_factor else f"the unit of `{expected.key}`"
+    if has_factor:
+        by_factor = f", with the factor {expected.factor:g}"
+    else:
+        by_factor = ""
+    if has_factor:
+        corrections = f"the unit or `factor` of `{expected.key}`"
+    else:
+        corrections = f"the unit of `{expected.key}`"
     if expected.key in {"torque", "temperature"}:
         corrections = f"`{expected.key}`"
     raise TableUnfit(
         place,
-        found=f"unit {bare_unit(stated)!r} in {'the name of the column' if in_name else 'the line of units'}",
-        expected=f"{expected.texts[0]!r}, the unit of `{expected.key}` in the import description{by_factor}",
-        remedy=f"if the file is right, correct {corrections} or the column there; if not, correct the unit in the file",
+        found=f"unit {bare_unit(stated)!r} in "
+        f"{'the name of the column' if in_name else 'the line of units'}",
+        expected=f"{expected.texts[0]!r}, the unit of `{expected.key}` in the import "
+        f"description{by_factor}",
+        remedy=f"if the file is right, correct {corrections} or the column there; if not, correct "
+        "the unit in the file",
     )
 
 
@@ -232,7 +258,7 @@ def check_units(
         expected: what the description says of the columns.
 
     Raises:
-        TableUnfit: a unit contradicts the description.
+        TableUnfit: a unit contradicts the description, or the line of units the name of its column.
     """
     for one in expected:
         index = _index(one.column, names)
@@ -242,8 +268,29 @@ def check_units(
         in_name = name_unit(names[index])
         if fields is not None:
             check_unit(at, fields[index], one)
+            if in_name is not None:
+                _require_alike(at, fields[index], in_name)
         elif in_name is not None:
             check_unit(at, in_name, one, in_name=True)
+
+
+def _require_alike(place: str, in_line: str, in_name: str) -> None:
+    """Refuse a unit in the line of units beside another one of the same quantity in the column's
+    name.
+
+    Letters in a name may mean something else than a quantity of another kind.
+    """
+    stated = column_unit_of(in_line)
+    named = column_unit_of(in_name)
+    if stated is None or named is None or stated.kind != named.kind or stated == named:
+        return
+    raise TableUnfit(
+        place,
+        found=f"unit {bare_unit(in_line)!r} in the line of units, and {bare_unit(in_name)!r} in "
+        "the name of the column",
+        expected="one unit of a column",
+        remedy="correct the one that is wrong in the file",
+    )
 
 
 def _index(column: Column, names: Sequence[str]) -> int | None:

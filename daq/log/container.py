@@ -1,8 +1,10 @@
-"""Read the records of an MCAP file and the messages in its chunks; every byte is covered by a checksum.
+"""Read the records of an MCAP file and the messages in its chunks;
+every byte is covered by a checksum.
 
-The file may be truncated, damaged or malicious: every length is compared with the size of the file before memory is
-allocated, and a record is parsed only from its own bytes. The `mcap` package parses single records here; its readers do
-not serve, because they trust lengths inside records and do not check attachments.
+The file may be truncated, damaged or malicious: every length is compared with the size of the file
+before memory is allocated, and a record is parsed only from its own bytes. The `mcap` package
+parses single records here; its readers do not serve, because they trust lengths inside records and
+do not check attachments.
 """
 
 from __future__ import annotations
@@ -22,7 +24,17 @@ from lz4.frame import LZ4FrameDecompressor
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    Schema,
+)
 from numpy.typing import NDArray
 
 from daq.config.yaml_file import IN_ORDER, kind_of_file
@@ -48,11 +60,16 @@ HEAD_BYTES = 9  #: Kind and length before every record
 LARGEST_RECORD = 64 * 2**20  #: [bytes]; our chunks hold 200 ms
 LARGEST_CHUNK = 64 * 2**20
 LARGEST_RATIO = 200
-"""Largest ratio of unpacked bytes to the size of the file, to bound the memory; our logs have 2 to 20."""
+"""Largest ratio of unpacked bytes to the size of the file, to bound the memory;
+our logs have 2 to 20.
+"""
 
-RECORDS, BYTES_A_RECORD = 500_000, 4
-"""Records that are read one by one, not as an array: so many, and one for so many bytes of the file. Ours need more
-bytes each; without a bound, megabytes of equal events take gigabytes and minutes."""
+RECORDS = 500_000
+BYTES_A_RECORD = 4
+"""Records that are read one by one, not as an array: so many, and one for so many bytes of the
+file. Ours need more bytes each; without a bound, megabytes of equal events take gigabytes and
+minutes.
+"""
 BYTES_A_UNIT = 64  #: An event of so many bytes counts as another record: its text is kept
 
 RecordArray = NDArray[np.void]  #: Records with samples, of `sample_dtype`
@@ -69,7 +86,8 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 class RecordFile:
-    """Iterate over the records of the data section; afterwards `sha256` is the digest of the whole file.
+    """Iterate over the records of the data section;
+    afterwards `sha256` is the digest of the whole file.
 
     During `unfinished`, everything before `whole_bytes` is undamaged.
 
@@ -89,16 +107,18 @@ class RecordFile:
     def __iter__(self) -> Generator[PlacedRecord, None, None]:
         """Yield offset and record, without the records that only index others.
 
-        The file is open until the last record, or until the generator is closed: who may stop before the end, as at an
-        error, closes it. An error that is kept would otherwise keep the file open.
+        The file is open until the last record, or until the generator is closed: who may stop
+        before the end, as at an error, closes it. An error that is kept would otherwise keep the
+        file open.
         """
         yield from self._opened(self._records)
 
     def unfinished(self) -> Generator[PlacedRecord, None, None]:
-        """Yield the records before the damage of a file without a valid end, then raise an error with its place.
+        """Yield the records before the damage of a file without a valid end,
+        then raise an error with its place.
 
-        Such a file has only the checksums of chunks and attachments, so an unknown kind of record counts as damage. A
-        whole data section ends the iteration without an error.
+        Such a file has only the checksums of chunks and attachments, so an unknown kind of record
+        counts as damage. A whole data section ends the iteration without an error.
         """
         yield from self._opened(self._unfinished_records)
 
@@ -131,19 +151,28 @@ class RecordFile:
             opcode = head[0]
             length = _length(head)
             if length > LARGEST_RECORD:
-                raise self.corrupt(offset, f"a record of {length} bytes", f"at most {LARGEST_RECORD}")
+                raise self.corrupt(
+                    offset, f"a record of {length} bytes", f"at most {LARGEST_RECORD}"
+                )
             body = stream.read(length)
             if len(body) < length:
                 raise self._truncated(offset + HEAD_BYTES + len(body), offset)
             if opcode == Opcode.DATA_END:
-                self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
+                self._check_crc(
+                    offset,
+                    "data section",
+                    _parse(DataEnd.read, body, self, offset).data_section_crc,
+                    crc,
+                )
                 return
             crc = zlib.crc32(body, zlib.crc32(head, crc))
             if opcode == Opcode.MESSAGE_INDEX:
                 if length < 6 or length != 6 + int.from_bytes(body[2:6], "little"):
                     raise self.corrupt(offset, "a broken index", "one of the chunk before it")
             elif opcode not in _PARSERS:
-                raise self.corrupt(offset, f"a record of kind {opcode:#04x}", "one of a data section")
+                raise self.corrupt(
+                    offset, f"a record of kind {opcode:#04x}", "one of a data section"
+                )
             yield from self._record(offset, opcode, body)
             self.whole_bytes += HEAD_BYTES + length
 
@@ -168,7 +197,12 @@ class RecordFile:
             digest.update(head)
             digest.update(body)
             if in_data and opcode == Opcode.DATA_END:
-                self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
+                self._check_crc(
+                    offset,
+                    "data section",
+                    _parse(DataEnd.read, body, self, offset).data_section_crc,
+                    crc,
+                )
                 crc = 0
                 in_data = False
             elif in_data:
@@ -176,7 +210,9 @@ class RecordFile:
                 yield from self._record(offset, opcode, body)
             elif opcode == Opcode.FOOTER:
                 crc = zlib.crc32(body[:16], zlib.crc32(head, crc))
-                self._check_crc(offset, "summary", _parse(Footer.read, body, self, offset).summary_crc, crc)
+                self._check_crc(
+                    offset, "summary", _parse(Footer.read, body, self, offset).summary_crc, crc
+                )
             else:
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
             offset += HEAD_BYTES + length
@@ -204,7 +240,10 @@ class RecordFile:
             else:
                 found = f"first bytes {start!r}"
             raise LogForeign(
-                str(self.path), found=found, expected="a log (MCAP)", remedy=f"is this the right file? {IN_ORDER}"
+                str(self.path),
+                found=found,
+                expected="a log (MCAP)",
+                remedy=f"is this the right file? {IN_ORDER}",
             )
 
     def _check_end(self, stream: BinaryIO, size: int) -> None:
@@ -215,15 +254,21 @@ class RecordFile:
     def _truncated(self, size: int, good: int | None) -> LogTruncated:
         return LogTruncated(
             str(self.path),
-            found=f"{size} bytes without the closing mark" + ("" if good is None else f", whole records up to {good}"),
+            found=f"{size} bytes without the closing "
+            "mark" + ("" if good is None else f", whole records up to {good}"),
             expected="a finished log",
-            remedy="the recorder was killed or the copy is incomplete: copy it again, or use `drivegain salvage`",
+            remedy="the recorder was killed or the copy is incomplete: copy it again, or use "
+            "`drivegain salvage`",
         )
 
     def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
-        # 0 means "not computed" in MCAP; our logs always have one, and without it a flipped bit would pass for data.
+        # 0 means "not computed" in MCAP; our logs always have one, and without it a flipped bit
+        # would pass for data.
         if stored == 0 or stored != computed:
-            found = "no checksum" if stored == 0 else f"checksum {stored:#010x} and contents of {computed:#010x}"
+            if stored == 0:
+                found = "no checksum"
+            else:
+                found = f"checksum {stored:#010x} and contents of {computed:#010x}"
             raise self.corrupt(offset, f"{what} with {found}", "contents that match their checksum")
 
     def corrupt(self, offset: int, found: str, expected: str) -> LogCorrupt:
@@ -232,12 +277,15 @@ class RecordFile:
             f"{self.path}, byte {offset}",
             found=found,
             expected=expected,
-            remedy="the file was damaged after it was written; copy it again from where it was recorded",
+            remedy="the file was damaged after it was written; copy it again from where it "
+            "was recorded",
         )
 
     def foreign(self, found: str, expected: str) -> LogForeign:
         """Make the error for an MCAP file that is not a log of a cell."""
-        return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
+        return LogForeign(
+            str(self.path), found=found, expected=expected, remedy="is this a log of a cell?"
+        )
 
     def spend(self, offset: int, kept_bytes: int = 0) -> None:
         """Count a record that is read by itself, with the bytes of it that are kept.
@@ -253,7 +301,8 @@ class RecordFile:
         """Yield kind, start and end of each record of a chunk.
 
         Raises:
-            LogCorrupt: one is longer than the chunk, or there are more than a recording of this size has.
+            LogCorrupt: one is longer than the chunk, or there are more than a recording of this
+                size has.
         """
         start = 0
         while start < len(data):
@@ -276,7 +325,9 @@ class RecordFile:
             raise self.corrupt(offset, f"a chunk of {size} bytes", f"at most {LARGEST_CHUNK}")
         self._allowance -= size
         if self._allowance < 0:
-            raise self.corrupt(offset, f"chunks that unfold to {LARGEST_RATIO} times the file", "a recording")
+            raise self.corrupt(
+                offset, f"chunks that unfold to {LARGEST_RATIO} times the file", "a recording"
+            )
         if chunk.compression not in {"zstd", "lz4", ""}:
             raise LogForeign(
                 str(self.path),
@@ -289,7 +340,9 @@ class RecordFile:
             if chunk.compression == "zstd":
                 claimed = zstandard.frame_content_size(data)
                 if claimed > size:
-                    raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as declared")
+                    raise self.corrupt(
+                        offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as declared"
+                    )
                 data = self._zstd.decompress(data, max_output_size=size)
             elif chunk.compression == "lz4":
                 data = LZ4FrameDecompressor().decompress(data, max_length=size)
@@ -306,22 +359,29 @@ def _length(head: bytes) -> int:
     return int.from_bytes(head[1:], "little")
 
 
-def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFile, offset: int) -> Record:
+def _parse(
+    read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFile, offset: int
+) -> Record:
     """Parse a record from its own bytes only."""
     stream = BytesIO(body)
     try:
         return read(ReadDataStream(stream))
     except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:
-        raise file.corrupt(offset, f"a broken record ({type(error).__name__})", "an MCAP record") from error
+        raise file.corrupt(
+            offset, f"a broken record ({type(error).__name__})", "an MCAP record"
+        ) from error
 
 
 _MESSAGE_HEAD_BYTES = HEAD_BYTES + 22  #: Kind, length, channel, sequence and two times
 _QUANTITIES = {topic: quantity for quantity, topic in READING_TOPICS.items()}
-_READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)  #: Topics that a fit needs; the others are for viewers
+#: Topics that a fit needs; the others are for viewers
+_READ = (SAMPLES_TOPIC, EVENTS_TOPIC, *_QUANTITIES)
 
 
 class ChunkContents:
-    """Reader of chunks, one after the other: schemas and channels, samples as one array, events one by one."""
+    """Reader of chunks, one after the other:
+    schemas and channels, samples as one array, events one by one.
+    """
 
     def __init__(self, file: RecordFile) -> None:
         self.events: list[CellEvent] = []  #: of all chunks so far, in the order of the log
@@ -331,7 +391,8 @@ class ChunkContents:
         self._topics: dict[int, str] = {}
 
     def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, RecordArray]]:
-        """Yield the samples of a chunk, all at once if it holds nothing else; its events and readings are collected.
+        """Yield the samples of a chunk, all at once if it holds nothing else;
+        its events and readings are collected.
 
         Args:
             offset: offset of the chunk in the file, for messages.
@@ -344,7 +405,9 @@ class ChunkContents:
         samples: list[bytes] = []
         for opcode, start, end in self._file.records_inside(offset, data):
             if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                self.define(_parse(_PARSERS[opcode], data[start + HEAD_BYTES : end], self._file, offset))
+                self.define(
+                    _parse(_PARSERS[opcode], data[start + HEAD_BYTES : end], self._file, offset)
+                )
             if opcode != Opcode.MESSAGE:
                 continue
             channel = int.from_bytes(data[start + HEAD_BYTES : start + HEAD_BYTES + 2], "little")
@@ -362,12 +425,16 @@ class ChunkContents:
                 try:
                     self.events.append(event_from_bytes(body))
                 except (ValueError, struct.error) as error:
-                    raise self._file.corrupt(offset, f"a broken event ({error})", EVENTS_SCHEMA) from error
+                    raise self._file.corrupt(
+                        offset, f"a broken event ({error})", EVENTS_SCHEMA
+                    ) from error
             elif topic in _QUANTITIES:
                 try:
                     self.readings.append(reading_from_bytes(body, _QUANTITIES[topic]))
                 except (ValueError, struct.error) as error:
-                    raise self._file.corrupt(offset, f"a broken reading ({error})", READING_SCHEMA) from error
+                    raise self._file.corrupt(
+                        offset, f"a broken reading ({error})", READING_SCHEMA
+                    ) from error
         if samples:
             axes = self._axes(offset, len(samples[0]))
             dtype = sample_dtype(axes)
@@ -376,7 +443,9 @@ class ChunkContents:
             yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
 
     def _samples_alike(self, offset: int, data: bytes, start: int, end: int) -> RecordArray | None:
-        """Return the rest of a chunk as one array, if it holds nothing but samples as the first one of them."""
+        """Return the rest of a chunk as one array, if it holds nothing but samples as the first one
+        of them.
+        """
         dtype = sample_dtype(self._axes(offset, end - start))
         if (len(data) - start) % dtype.itemsize:
             return None
@@ -394,11 +463,15 @@ class ChunkContents:
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             schema = self._schemas.get(record.schema_id)
-            expected = SCHEMA_OF[record.topic] if record.topic in _READ else None
+            if record.topic in _READ:
+                expected = SCHEMA_OF[record.topic]
+            else:
+                expected = None
             name = schema.name if schema else "no schema"
             if expected and (record.message_encoding != "cdr" or name != expected):
                 raise self._file.foreign(
-                    f"{record.topic} as {name} in {record.message_encoding!r}", f"{expected} in 'cdr'"
+                    f"{record.topic} as {name} in {record.message_encoding!r}",
+                    f"{expected} in 'cdr'",
                 )
             self._topics[record.id] = record.topic
 
@@ -407,4 +480,6 @@ class ChunkContents:
         for axes in range(1, LARGEST_AXES + 1):
             if sample_dtype(axes).itemsize == size:
                 return axes
-        raise self._file.corrupt(offset, f"a sample of {size - HEAD_BYTES} bytes", f"1 to {LARGEST_AXES} axes")
+        raise self._file.corrupt(
+            offset, f"a sample of {size - HEAD_BYTES} bytes", f"1 to {LARGEST_AXES} axes"
+        )

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.arguments import A_PATH, checks_arguments, of_kind, optional
 from daq.config.cell import DEGREE, Cell, model_of
 from daq.config.same_cell import Correction, correction_of
 from daq.errors import CurrentSaturated, LogIncomplete, LogsDiffer, PositionImplausible, RunInvalid
@@ -31,9 +32,11 @@ from ident.plausible import format_at_limit
 
 _LOG = logging.getLogger("drivegain")
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
-LARGEST_SATURATED = 0.1  #: Largest share of an axis's samples with an active limit; these samples are masked
+#: Largest share of an axis's samples with an active limit; these samples are masked
+LARGEST_SATURATED = 0.1
 BESIDE_S = 0.005  #: Distance from a torque within which the current belongs to it
-NEARBY_S = 0.01, 0.03  #: Distances from it at which the current has another noise, but hardly another value
+#: Distances from it at which the current has another noise, but hardly another value
+NEARBY_S = 0.01, 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,16 +45,21 @@ class SiScaling:
 
     rad_per_count: FloatArray  #: motor angle of a count [rad], shape (n,)
     to_joint: FloatArray  #: R⁻¹, shape (n, n)
-    offset_rad: FloatArray  #: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,)
+    #: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,)
+    offset_rad: FloatArray
     current_per_unit: FloatArray  #: unit of the current reference (A) per raw unit, shape (n,)
 
     def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
-        """Return joint positions [rad or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)"""
+        """Return joint positions [rad or m] of motor counts, shape (..., n):
+        q = R⁻¹ q_motor + offset (paper eq. 24)
+        """
         motor_rad = counts * self.rad_per_count
         return motor_rad @ self.to_joint.T + self.offset_rad
 
     def joints_known(self, answered: BoolArray) -> BoolArray:
-        """Return whether every motor that moves a joint answered, shape (..., n), from the answers of the motors."""
+        """Return whether every motor that moves a joint answered, shape (..., n),
+        from the answers of the motors.
+        """
         size = np.abs(self.to_joint)
         moves = size > 1e-12 * size.max()
         return np.asarray(~(~answered @ moves.T), dtype=np.bool_)
@@ -97,14 +105,18 @@ def scaling(cell: Cell, readback: Readback) -> SiScaling:
     )
 
 
-def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+@checks_arguments(path=A_PATH, cell=optional(of_kind(Cell)), lossy=of_kind(LossyLogs))
+def load_run(
+    path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED
+) -> tuple[Run, Cell]:
     """Read a log as a run, with the cell in the log or another description of it.
 
-    A given description has to be of the same cell (`daq.config.same_cell`), and also replaces the mass of the payload
-    that the log records; `Run.recording` says what it corrects. Warns of a partial log, of accepted losses, and of a
-    run slower than planned.
+    A given description has to be of the same cell (`daq.config.same_cell`), and also replaces the
+    mass of the payload that the log records; `Run.recording` says what it corrects. Warns of a
+    partial log, of accepted losses, and of a run slower than planned.
 
     Raises:
+        UsageError: an argument is of another type.
         LogsDiffer: the given description is of another cell.
         DataError: the log cannot be read, or its samples cannot be used.
         ident.CurrentUnsigned: drives report the size of the current only.
@@ -114,11 +126,14 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
     log = read_log(path)
     if log.partial:
         _LOG.warning(
-            "%s is PARTIAL: salvaged from a recording that was never finished; nothing of it is written back", path
+            "%s is PARTIAL: salvaged from a recording that was never finished; nothing of it is "
+            "written back",
+            path,
         )
     if (speed := log.head.run.speed) < 1.0:
         _LOG.warning(
-            "%s was recorded at %g %% of the plan's speed: it identifies gains and inertias less well than planned",
+            "%s was recorded at %g %% of the plan's speed: it identifies gains and inertias less "
+            "well than planned",
             path,
             100.0 * speed,
         )
@@ -131,7 +146,8 @@ def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = Loss
 
 
 def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
-    """Return a run with the payload's mass of a given description, and the record of what that corrects.
+    """Return a run with the payload's mass of a given description,
+    and the record of what that corrects.
 
     Raises:
         LogsDiffer: the description lacks the payload of the run.
@@ -146,9 +162,11 @@ def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
             names = ", ".join(f"{name} on {mounting}" for name, mounting in declared)
             raise LogsDiffer(
                 run.name,
-                found=f"payload {payload.name} on {payload.mounting}, which the given description does not have",
+                found=f"payload {payload.name} on {payload.mounting}, which the given description "
+                "does not have",
                 expected=f"one of its payloads: {names or 'it has none'}",
-                remedy="keep name and mounting of the payload; its mass and tolerance may be corrected",
+                remedy="keep name and mounting of the payload; its mass and tolerance may be "
+                "corrected",
             )
     if correction is None or run.recording is None:
         return run
@@ -168,13 +186,16 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         CyclesLost: SYNC cycles are missing.
         ClockImplausible: the time stamps show another rate, or one of them is early or late.
         CurrentSaturated: a limit was active in more than a tenth of an axis's samples.
-        PositionImplausible: positions far outside the joint limits, a step or a speed that no motor makes, or readings
-            of a position that are none and that nothing mends (`ident.data.channel_faults`).
+        PositionImplausible: positions far outside the joint limits, a step or a speed that no motor
+            makes, or readings of a position that are none and that nothing mends
+            (`ident.data.channel_faults`).
         CurrentImplausible: likewise of a current, or it is an outlier.
         LogIncomplete: cell and log do not belong together.
         ident.CurrentUnsigned: drives report the size of the current only.
     """
-    name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
+    name = log.path.stem
+    samples = log.samples
+    rate_hz = log.head.run.rate_hz
     only_losses = reports_only_losses(log.statistics.reason)
     accepted = lossy is LossyLogs.ACCEPTED and not log.statistics.valid and only_losses
     if accepted:
@@ -186,9 +207,11 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     elif not log.statistics.valid:
         raise RunInvalid(
             str(log.path),
-            found=f"a run that its recorder marked invalid ({log.statistics.reason or 'no reason given'})",
+            found="a run that its recorder marked invalid "
+            f"({log.statistics.reason or 'no reason given'})",
             expected="a valid run",
-            remedy="record it again" + ("; or use it anyway with --accept-losses" if only_losses else ""),
+            remedy="record it again"
+            + ("; or use it anyway with --accept-losses" if only_losses else ""),
         )
     checks = SampleChecks(log.path)
     checks.take(samples)
@@ -196,7 +219,9 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     if lost is not None:
         raise lost
     scale = scaling(cell, log.head.readback)
-    position_rad = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
+    position_rad = scale.joint_position(
+        continuous_counts(samples.position_counts, log.head.readback)
+    )
     limited = limit_active(cell, samples.statusword)
     share = limited.mean(axis=0)
     worst = int(np.argmax(share))
@@ -204,7 +229,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     if 100.0 * share[worst] > largest_percent:
         raise CurrentSaturated(
             f"{log.path}, axis {cell.axes[worst].name}",
-            found=f"a limit active in {format_at_limit(100.0 * share[worst], largest_percent, 1)} % of the samples",
+            found=f"a limit active in {format_at_limit(100.0 * share[worst], largest_percent, 1)} "
+            "% of the samples",
             expected=f"at most {largest_percent:g} %",
             remedy="plan slower moves, or a smaller payload",
         )
@@ -217,7 +243,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     fault = motion_fault(str(log.path), cell, rate_hz, position_rad, current, known, faults)
     if fault is not None:
         raise fault
-    run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
+    run = log.head.run
+    drives = [axis.drive for axis in log.head.readback.axes]
     converted = Run(
         name=name,
         time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
@@ -251,16 +278,23 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
 
 
 def limit_active(cell: Cell, statusword: NDArray[np.uint16]) -> BoolArray:
-    """Return whether a limit of each axis's current was active, shape (k, n), from its statuswords, shape (k, n)."""
+    """Return whether a limit of each axis's current was active, shape (k, n), from its statuswords,
+    shape (k, n).
+    """
     masks = []
     for axis in cell.axes:
-        bit = None if axis.profile is None else axis.profile.saturation_bit
+        if axis.profile is None:
+            bit = None
+        else:
+            bit = axis.profile.saturation_bit
         masks.append(0 if bit is None else 1 << bit)
     return np.asarray(statusword & np.array(masks, dtype=np.uint16) != 0, dtype=np.bool_)
 
 
 def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:
-    """Return whether each axis answered in each cycle, shape (k, n), from the bits of those that did not."""
+    """Return whether each axis answered in each cycle, shape (k, n),
+    from the bits of those that did not.
+    """
     return np.asarray(missing[:, None] >> np.arange(axes, dtype=np.uint32) & 1 == 0, dtype=np.bool_)
 
 
@@ -273,16 +307,20 @@ def continuous_counts(position_counts: RawArray, readback: Readback) -> IntArray
 def _serial(drive: Mapping[str, Any]) -> int | None:
     """Serial number of an amplifier (1018h:04, 32 bits); None if it reported none."""
     serial = drive.get("serial")
-    return serial if type(serial) is int and 0 <= serial < 2**32 else None
+    if type(serial) is int and 0 <= serial < 2**32:
+        return serial
+    return None
 
 
 def moves(events: tuple[CellEvent, ...], time_ns: IntArray) -> IntArray | None:
     """Return the number of the move of each sample, shape (k,); None in a log without moves.
 
-    A move lasts until the next one starts, so the standstill between two moves belongs to the first. Samples before
-    the first start belong to the first move.
+    A move lasts until the next one starts, so the standstill between two moves belongs to the
+    first. Samples before the first start belong to the first move.
     """
-    starts = sorted((event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START)
+    starts = sorted(
+        (event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START
+    )
     if not starts:
         return None
     number: IntArray
@@ -290,8 +328,12 @@ def moves(events: tuple[CellEvent, ...], time_ns: IntArray) -> IntArray | None:
     return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
 
 
-def readings_by_axis(readings: Iterable[SlowReading], quantity: Quantity) -> dict[int, tuple[IntArray, FloatArray]]:
-    """Return times [ns] and values of the readings of a quantity, in the order of time, by the index of their axis."""
+def readings_by_axis(
+    readings: Iterable[SlowReading], quantity: Quantity
+) -> dict[int, tuple[IntArray, FloatArray]]:
+    """Return times [ns] and values of the readings of a quantity, in the order of time,
+    by the index of their axis.
+    """
     found = defaultdict(list)
     for reading in readings:
         if reading.quantity is quantity:
@@ -304,9 +346,11 @@ def readings_by_axis(readings: Iterable[SlowReading], quantity: Quantity) -> dic
 
 
 def temperatures(log: Log) -> FloatArray | None:
-    """Return the temperature of each axis at each sample [°C], shape (k, n); None in a log without any.
+    """Return the temperature of each axis at each sample [°C], shape (k, n);
+    None in a log without any.
 
-    It is interpolated between readings, and constant before the first and after the last; NaN for an axis without.
+    It is interpolated between readings, and constant before the first and after the last; NaN for
+    an axis without.
     """
     readings = readings_by_axis(log.readings, Quantity.TEMPERATURE)
     if not readings:
@@ -318,11 +362,15 @@ def temperatures(log: Log) -> FloatArray | None:
     return found
 
 
-def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray) -> tuple[TorqueChannel, ...]:
-    """Return each axis's own torque beside its current, one channel an axis; none in a log without torques.
+def torque_channels(
+    log: Log, cell: Cell, current: FloatArray, valid: BoolArray
+) -> tuple[TorqueChannel, ...]:
+    """Return each axis's own torque beside its current, one channel an axis;
+    none in a log without torques.
 
-    The current is the mean over BESIDE_S around the reading, because an SDO shows only within some milliseconds when
-    the drive read its torque; the current nearby is the mean over NEARBY_S before and after it.
+    The current is the mean over BESIDE_S around the reading, because an SDO shows only within some
+    milliseconds when the drive read its torque; the current nearby is the mean over NEARBY_S before
+    and after it.
 
     Args:
         log: with the readings.
@@ -333,9 +381,11 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
     readings = readings_by_axis(log.readings, Quantity.TORQUE)
     if not readings:
         return ()
-    time_ns, rate_hz = log.samples.time_ns, log.head.run.rate_hz
+    time_ns = log.samples.time_ns
+    rate_hz = log.head.run.rate_hz
     half = round(BESIDE_S * rate_hz)
-    near, far = max(half + 1, round(NEARBY_S[0] * rate_hz)), max(half + 2, round(NEARBY_S[1] * rate_hz))
+    near = max(half + 1, round(NEARBY_S[0] * rate_hz))
+    far = max(half + 2, round(NEARBY_S[1] * rate_hz))
     sums = np.zeros((2, len(current) + 1, len(cell.axes)))
     np.cumsum((current, valid), axis=1, out=sums[:, 1:])
     channels = []
@@ -344,10 +394,15 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
         at_ns, values = readings.get(axis, none)
         row = np.searchsorted(time_ns, at_ns - round(0.5e9 / rate_hz))
         inside = (row >= far) & (row + far < len(time_ns))
-        row, at_ns = row[inside], at_ns[inside]
+        row = row[inside]
+        at_ns = at_ns[inside]
         beside, before, after = (
             (sums[:, last, axis] - sums[:, first, axis]) / (last - first)
-            for first, last in ((row - half, row + half + 1), (row - far, row - near), (row + near + 1, row + far + 1))
+            for first, last in (
+                (row - half, row + half + 1),
+                (row - far, row - near),
+                (row + near + 1, row + far + 1),
+            )
         )
         whole = beside[1] + before[1] + after[1] == 3.0
         channels.append(
@@ -361,7 +416,9 @@ def torque_channels(log: Log, cell: Cell, current: FloatArray, valid: BoolArray)
     return tuple(channels)
 
 
-def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArray | None = None) -> None:
+def check_limits(
+    name: str, position_rad: FloatArray, cell: Cell, valid: BoolArray | None = None
+) -> None:
     """Refuse positions that no joint of this cell can have.
 
     Args:
@@ -374,28 +431,41 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArr
         PositionImplausible: a joint is outside its limits by more than 5 % of its range.
     """
     for index, axis in enumerate(cell.axes):
-        column = position_rad[:, index] if valid is None else position_rad[valid[:, index], index]
+        if valid is None:
+            column = position_rad[:, index]
+        else:
+            column = position_rad[valid[:, index], index]
         lower, upper = axis.limits.position
         margin = LIMIT_MARGIN * (upper - lower)
         if column.size and (column.min() < lower - margin or column.max() > upper + margin):
             unit = axis.unit
-            confused = "degrees were taken for radians" if unit is DEGREE else "mm were taken for m"
+            if unit is DEGREE:
+                confused = "degrees were taken for radians"
+            else:
+                confused = "mm were taken for m"
             remedy = (
-                f"most likely {confused} (or counts for either); else check motor or joint side, ratio and zero offset"
+                f"most likely {confused} (or counts for either); else check motor or joint side, "
+                "ratio and zero offset"
             )
             least = lower - margin - float(column.min())
             most = upper + margin - float(column.max())
             if least <= most:  # as many as the joint can make, from another zero
-                key = "zero_offset_deg" if unit is DEGREE else "zero_offset_mm"
+                if unit is DEGREE:
+                    key = "zero_offset_deg"
+                else:
+                    key = "zero_offset_mm"
                 remedy = (
-                    f"most likely the zero is wrong: moved by {least / unit.si:+.0f} to {most / unit.si:+.0f} "
-                    f"{unit.name}, these positions are within the limits; correct `{key}` of {axis.name} in the cell "
-                    "file, or the zero in the controller; else check motor or joint side, ratio and units"
+                    f"most likely the zero is wrong: moved by {least / unit.si:+.0f} to "
+                    f"{most / unit.si:+.0f} {unit.name}, these positions are within the limits; "
+                    f"correct `{key}` of {axis.name} in the cell file, or the zero in the "
+                    "controller; else check motor or joint side, ratio and units"
                 )
             raise PositionImplausible(
                 f"{name}, axis {axis.name}",
-                found=f"joint positions from {column.min() / unit.si:.5g} to {unit.spell(column.max())}",
-                expected=f"{lower / unit.si:.5g} to {unit.spell(upper)}, the limits in the cell configuration",
+                found=f"joint positions from {column.min() / unit.si:.5g} to "
+                f"{unit.spell(column.max())}",
+                expected=f"{lower / unit.si:.5g} to {unit.spell(upper)}, the limits in the cell "
+                "configuration",
                 remedy=remedy,
             )
 
@@ -403,14 +473,21 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArr
 def unwrapped(counts: RawArray, before: tuple[RawArray, IntArray] | None = None) -> IntArray:
     """Unwrap the positions of a 32 bit encoder counter, shape (k, n).
 
-    A jump of more than half the range between two samples is a wrap: no motor makes 2³¹ counts in one period.
+    A jump of more than half the range between two samples is a wrap: no motor makes 2³¹ counts in
+    one period.
 
     Args:
         counts: positions of k samples, shape (k, n).
-        before: raw and unwrapped position of the sample before them, shape (n,) each; None at the start of a log.
+        before: raw and unwrapped position of the sample before them, shape (n,) each; None at the
+            start of a log.
     """
-    last, total = (counts[0], counts[0].astype(np.int64)) if before is None else before
-    # The difference in 32 bits is the step of less than half the range, whether the counter wrapped or not.
+    if before is None:
+        last = counts[0]
+        total = counts[0].astype(np.int64)
+    else:
+        last, total = before
+    # The difference in 32 bits is the step of less than half the range, whether the counter wrapped
+    # or not.
     words = np.concatenate((last[None, :], counts)).astype(np.int32).view(np.uint32)
     steps = np.diff(words, axis=0).view(np.int32)
     return np.asarray(total + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)

@@ -1,12 +1,16 @@
-"""A CSV file as lines: its header, its line of units, its rows of numbers, and what is none of these.
+"""A CSV file as lines: its header, its line of units, its rows of numbers,
+and what is none of these.
 
-Lines that are empty, or begin with the sign of a comment, are left out before and after the rows. Among the rows they
-may part two recordings, so there they are refused, unless the import description says what they are.
+Lines that are empty, or begin with the sign of a comment, are left out before and after the rows.
+Among the rows they may part two recordings, so there they are refused, unless the import
+description says what they are.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
+import io
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -23,9 +27,10 @@ from daq.log.column_units import check_units, column_unit_of, expected_units
 from daq.log.table import unreadable
 
 LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of it
-LARGEST_JUMP = 3.0  #: Largest step to a last number that may be cut off, in multiples of the largest step before it
+#: Largest step to a last number that may be cut off, in multiples of the largest step before it
+LARGEST_JUMP = 3.0
 COMMENT_SIGNS = ("#", "%", "//")  #: Of lines before and after the rows
-SHOWN = 40  #: Characters of a line in a message
+EXCERPT_CHARACTERS = 40  #: Characters of a line in a message
 MINUS = "\u2212"  #: The minus sign of typography, which spreadsheets write
 MISSING = frozenset(("", "nan", "+nan", "-nan", "inf", "+inf", "-inf", "na", "n/a", "null", "none"))
 """Words for a number that is not there, in lower case: a line with them is a row."""
@@ -36,31 +41,32 @@ class CsvLines:
     """A CSV file as lines."""
 
     path: Path  #: path of the file
-    table: CsvLayout  #: its layout
+    layout: CsvLayout  #: delimiter, decimal sign and header
     names: tuple[str, ...]  #: column names from the header; empty without one
     rows: tuple[str, ...]  #: lines of numbers
-    numbers: Sequence[int]  #: of the line of each row, from 1
+    line_numbers: Sequence[int]  #: of each row, from 1
     first_row: int  #: rows that were cut off before the first one
 
     def fields(self, row: str) -> list[str]:
-        """Split a line into fields without quotes and white space; a delimiter between quotes belongs to its field.
+        """Split a line into fields without quotes and white space;
+        a delimiter between quotes belongs to its field.
 
         Raises:
             csv.Error: a quote is not closed.
         """
-        return split_fields(row, self.table.delimiter)
+        return split_fields(row, self.layout.delimiter)
 
-    def place(self, row: int, index: int) -> str:
+    def field_place(self, row: int, index: int) -> str:
         """Name a field in a message: `run.csv:42, column i3`."""
-        return f"{self.line(row)}, column {self.names[index] if self.names else index + 1}"
+        return f"{self.row_place(row)}, column {self.names[index] if self.names else index + 1}"
 
-    def line(self, row: int) -> str:
+    def row_place(self, row: int) -> str:
         """Name the line of a row in a message: `run.csv:42`."""
-        return f"{self.path}:{self.numbers[row]}"
+        return f"{self.path}:{self.line_numbers[row]}"
 
-    def number(self, text: str) -> float:
+    def to_number(self, text: str) -> float:
         """Read a field; NaN if it is no number."""
-        return read_number(text, self.table.decimal)
+        return read_number(text, self.layout.decimal)
 
     def index(self, column: Column) -> int:
         """Return the place of a column.
@@ -73,7 +79,10 @@ class CsvLines:
             if column <= width:
                 return column - 1
             raise TableUnfit(
-                str(self.path), found=f"{width} columns", expected=f"a column {column}", remedy="columns count from 1"
+                str(self.path),
+                found=f"{width} columns",
+                expected=f"a column {column}",
+                remedy="columns count from 1",
             )
         if self.names.count(column) == 1:
             return self.names.index(column)
@@ -84,18 +93,30 @@ class CsvLines:
             remedy="correct `columns` in the import description",
         )
 
-    def part(self, rows: slice) -> CsvLines:
+    def select_rows(self, rows: slice) -> CsvLines:
         """Return some of the rows."""
         first, _, _ = rows.indices(len(self.rows))
         kept = self.rows[rows]
-        return CsvLines(self.path, self.table, self.names, kept, self.numbers[rows], self.first_row + first)
+        return CsvLines(
+            self.path,
+            self.layout,
+            self.names,
+            kept,
+            self.line_numbers[rows],
+            self.first_row + first,
+        )
 
 
 def split_fields(row: str, delimiter: str) -> list[str]:
     """Split a line into fields; see `CsvLines.fields`."""
     if '"' not in row:
-        return row.split() if delimiter == " " else [part.strip() for part in row.split(delimiter)]
-    text = " ".join(row.split()) if delimiter == " " else row.strip(" ")
+        if delimiter == " ":
+            return row.split()
+        return [part.strip() for part in row.split(delimiter)]
+    if delimiter == " ":
+        text = " ".join(row.split())
+    else:
+        text = row.strip(" ")
     reader = csv.reader([text], delimiter=delimiter, skipinitialspace=True, strict=True)
     return [part.strip() for part in next(reader)]
 
@@ -122,30 +143,42 @@ def read_lines(
         time: the time column, if it is in this file.
 
     Raises:
-        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row, or has another number of fields;
-            its line of units contradicts the import description.
+        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row, or has
+            another number of fields; its line of units contradicts the import description.
     """
     try:
         data = read_regular(path, LARGEST_BYTES)
     except OSError as error:
         raise unreadable(path, error, "a CSV file") from error
-    text, *remarks = _decoded(path, data)
+    text, *remarks = _decode(path, data)
     has_last_end = text.endswith(("\n", "\r"))
-    file = _Parts(path, wanted.table, text.splitlines())
-    named = [column for column in (*columns, *([] if time is None else [time.column])) if isinstance(column, str)]
-    start, names = file.head(named)
-    units_line = file.units_line(start, names, columns)
+    # The line ends of editors; `splitlines` also parts a line at a form feed and at ends of
+    # Unicode's.
+    all_lines = [line.removesuffix("\n") for line in io.StringIO(text, newline=None)]
+    file = _RawLines(path, wanted.table, all_lines)
+    named = [
+        column
+        for column in (*columns, *([] if time is None else [time.column]))
+        if isinstance(column, str)
+    ]
+    start, names = file.find_header(named)
+    header_number = start
+    units_line = file.units_line(start, names, columns, time)
     expected = tuple(expected_units(path, wanted, time))
     if units_line is None:
-        check_units(f"{path}:{start}", None, names, expected)
+        check_units(f"{path}:{header_number}", None, names, expected)
     else:
         check_units(f"{path}:{units_line + 1}", file.fields(units_line), names, expected)
         start = units_line + 1
-        remarks.append(f"line {start} was taken for the units of the columns: {file.shown(units_line)}")
-    end = file.end(start)
-    beyond = [number for number in range(end, len(file.lines)) if file.lines[number].strip()]
-    if beyond:
-        remarks.append(f"left out after the rows: {counted(len(beyond), 'line')}, {file.shown(beyond[0])}")
+        remarks.append(
+            f"line {start} was taken for the units of the columns: {file.excerpt(units_line)}"
+        )
+    end = file.end_of_rows(start)
+    footer = [number for number in range(end, len(file.lines)) if file.lines[number].strip()]
+    if footer:
+        remarks.append(
+            f"left out after the rows: {counted(len(footer), 'line')}, {file.excerpt(footer[0])}"
+        )
     numbers, skipped = file.row_numbers(start, end, has_time=wanted.time is not None)
     remarks += skipped
     rows = slice(None) if wanted.keep is None else wanted.keep.rows
@@ -158,16 +191,16 @@ def read_lines(
     if any(MINUS in file.lines[number] for number in kept):
         remarks.append("the minus sign U+2212 was read as -")
     lines = CsvLines(path, wanted.table, names, rows_kept, [number + 1 for number in kept], first)
-    _check_header(lines, start)
+    _check_header(lines, header_number)
     _check_shape(lines, len(names))
-    is_last = not beyond and kept[-1] == end - 1
+    is_last = not footer and kept[-1] == end - 1
     if is_last and not has_last_end and len(kept) > 1:
-        _check_last(lines)
+        _check_last_number(lines)
         remarks.append("the last line has no end of line; its numbers are complete and were taken")
     return lines, tuple(f"{path.name}: {remark}" for remark in remarks)
 
 
-def _without_rows(file: _Parts, start: int, rows: int, wanted: ImportDescription) -> TableUnfit:
+def _without_rows(file: _RawLines, start: int, rows: int, wanted: ImportDescription) -> TableUnfit:
     """Make the error for a file without rows, or without those that are kept."""
     lines = len(file.lines)
     found = f"{lines} lines, of which {min(start, lines)} before the numbers"
@@ -175,52 +208,58 @@ def _without_rows(file: _Parts, start: int, rows: int, wanted: ImportDescription
     if rows and wanted.keep is not None:
         found = f"{counted(rows, 'row')} of numbers, none of them in `keep`"
         remedy = "correct `keep` in the import description"
-    return TableUnfit(str(file.path), found=found, expected="a line of numbers for each sample", remedy=remedy)
+    return TableUnfit(
+        str(file.path), found=found, expected="a line of numbers for each sample", remedy=remedy
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class _Parts:
-    """All lines of a file, and which of them are what."""
+class _RawLines:
+    """All lines of a file, and which of them are header, units, rows and footer."""
 
     path: Path
-    table: CsvLayout
+    layout: CsvLayout
     lines: list[str]
 
     def fields(self, number: int) -> list[str]:
         """Split a line; one field where a quote is not closed."""
         try:
-            return split_fields(self.lines[number], self.table.delimiter)
+            return split_fields(self.lines[number], self.layout.delimiter)
         except csv.Error:
             return [self.lines[number]]
 
-    def shown(self, number: int) -> str:
+    def excerpt(self, number: int) -> str:
         """Return a line for a message."""
-        return repr(self.lines[number][:SHOWN])
+        return repr(self.lines[number][:EXCERPT_CHARACTERS])
 
     def is_comment(self, number: int) -> bool:
         """Whether a line begins with the sign of a comment."""
-        signs = COMMENT_SIGNS if self.table.comment is None else (*COMMENT_SIGNS, self.table.comment)
+        signs = (
+            COMMENT_SIGNS if self.layout.comment is None else (*COMMENT_SIGNS, self.layout.comment)
+        )
         return self.lines[number].lstrip().startswith(signs)
 
     def is_row(self, number: int) -> bool:
         """Whether a line has a number."""
-        return any(math.isfinite(read_number(field, self.table.decimal)) for field in self.fields(number))
+        return any(
+            math.isfinite(read_number(field, self.layout.decimal)) for field in self.fields(number)
+        )
 
-    def head(self, named: Iterable[str]) -> tuple[int, tuple[str, ...]]:
+    def find_header(self, named: Iterable[str]) -> tuple[int, tuple[str, ...]]:
         """Return the first line behind the header, and its names.
 
-        A header may begin with the sign of a comment: it is the line that has the names that are looked for, or the
-        last one before the rows.
+        A header may begin with the sign of a comment: it is the line that has the names that are
+        looked for, or the last one before the rows.
         """
-        start = self._behind_delimiter_line(self.table.skip_rows)
+        start = self._skip_delimiter_line(self.layout.skip_rows)
         wanted = set(named)
         first = start
         while first < len(self.lines):
             is_skipped = not self.lines[first].strip() or self.is_comment(first)
-            if not is_skipped or (self.table.header and self._is_header(first, wanted)):
+            if not is_skipped or (self.layout.header and self._is_header(first, wanted)):
                 break
             first += 1
-        if not self.table.header:
+        if not self.layout.header:
             return first, ()
         if first >= len(self.lines):
             return first, ()
@@ -233,17 +272,25 @@ class _Parts:
     def _is_header(self, number: int, wanted: set[str]) -> bool:
         if not self.lines[number].strip():
             return False
-        has_names = bool(wanted) and (wanted <= set(self.fields(number)) or wanted <= set(self._without_sign(number)))
-        follows = number + 1 < len(self.lines) and self.is_row(number + 1) and not self.is_comment(number + 1)
+        has_names = bool(wanted) and (
+            wanted <= set(self.fields(number)) or wanted <= set(self._without_sign(number))
+        )
+        follows = (
+            number + 1 < len(self.lines)
+            and self.is_row(number + 1)
+            and not self.is_comment(number + 1)
+        )
         return has_names or follows
 
     def _without_sign(self, number: int) -> list[str]:
         text = self.lines[number].lstrip()
         for sign in COMMENT_SIGNS:
             text = text.removeprefix(sign)
-        return split_fields(text.strip(), self.table.delimiter) if '"' not in text else []
+        if '"' not in text:
+            return split_fields(text.strip(), self.layout.delimiter)
+        return []
 
-    def _behind_delimiter_line(self, number: int) -> int:
+    def _skip_delimiter_line(self, number: int) -> int:
         """Return the line behind `sep=;`, by which a spreadsheet names the delimiter."""
         if number >= len(self.lines):
             return number
@@ -251,34 +298,44 @@ class _Parts:
         if not text.lower().startswith("sep=") or len(text) > len("sep=x"):
             return number
         stated = self.lines[number].strip(' "\r\n')[len("sep=") :]
-        if stated and stated != self.table.delimiter:
+        if stated and stated != self.layout.delimiter:
             raise TableUnfit(
                 f"{self.path}:{number + 1}",
                 found=f"`sep={stated}`, which names the delimiter of the file",
-                expected=f"{self.table.delimiter!r}, the `delimiter` under `table` of the import description",
+                expected=f"{self.layout.delimiter!r}, the `delimiter` under `table` of the import "
+                "description",
                 remedy=f"write `delimiter: {stated!r}` there",
             )
         return number + 1
 
-    def units_line(self, start: int, names: tuple[str, ...], columns: Sequence[Column]) -> int | None:
+    def units_line(
+        self, start: int, names: tuple[str, ...], columns: Sequence[Column], time: TimeColumn | None
+    ) -> int | None:
         """Return the line of units below the header, None without one.
 
-        Its fields are no numbers, and at least one of those that are read is a unit.
+        Its fields are no numbers, and at least one of those that are read, that of the time among
+        them, is a unit.
         """
         number = start
-        while number < len(self.lines) and (not self.lines[number].strip() or self.is_comment(number)):
+        while number < len(self.lines) and (
+            not self.lines[number].strip() or self.is_comment(number)
+        ):
             number += 1
         if not names or number >= len(self.lines):
             return None
         fields = self.fields(number)
         if len(fields) != len(names) or self.is_row(number):
             return None
-        read = [fields[index] for index in _indices(columns, names)]
+        read = [fields[index] for index in _present_indices(columns, names)]
         if any(field.lower() in MISSING for field in read):
             return None
-        return number if any(column_unit_of(field) is not None for field in read) else None
+        if time is not None:
+            read += [fields[index] for index in _present_indices([time.column], names)]
+        if any(column_unit_of(field) is not None for field in read):
+            return number
+        return None
 
-    def end(self, start: int) -> int:
+    def end_of_rows(self, start: int) -> int:
         """Return the line behind the last row: empty lines and comments after it are no rows."""
         end = len(self.lines)
         while end > start and (not self.lines[end - 1].strip() or self.is_comment(end - 1)):
@@ -286,7 +343,8 @@ class _Parts:
         return end
 
     def row_numbers(self, start: int, end: int, *, has_time: bool) -> tuple[list[int], list[str]]:
-        """Return the numbers of the lines that are rows or ought to be, from 0, and remarks on those that are not.
+        """Return the numbers of the lines that are rows or ought to be, from 0,
+        and remarks on those that are not.
 
         Args:
             start, end: first line behind the head, and behind the last row.
@@ -294,37 +352,48 @@ class _Parts:
         """
         while start < end and (not self.lines[start].strip() or self.is_comment(start)):
             start += 1
-        sign = self.table.comment
-        comments = [number for number in range(start, end) if sign and self.lines[number].lstrip().startswith(sign)]
+        sign = self.layout.comment
+        comments = [
+            number
+            for number in range(start, end)
+            if sign and self.lines[number].lstrip().startswith(sign)
+        ]
         empty = [number for number in range(start, end) if not self.lines[number].strip()]
         remarks = []
         left_out = set(comments)
         if not has_time:
             self._require_no_commented_row(comments)
         if comments:
-            remarks.append(f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows")
-        is_doubled = len(empty) > 1 and all(later - number == 2 for number, later in pairwise(empty))
+            remarks.append(
+                f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows"
+            )
+        is_doubled = len(empty) > 1 and all(
+            later - number == 2 for number, later in pairwise(empty)
+        )
         if empty and (has_time or (is_doubled and 2 * len(empty) + 1 >= end - start)):
             left_out |= set(empty)
             remarks.append(f"left out: {counted(len(empty), 'empty line')} among the rows")
         return [number for number in range(start, end) if number not in left_out], remarks
 
     def _require_no_commented_row(self, comments: Sequence[int]) -> None:
-        """Refuse a row that is commented out: at a stated rate, all that follow would move by a sample."""
-        sign = self.table.comment or ""
+        """Refuse a row that is commented out:
+        at a stated rate, all that follow would move by a sample.
+        """
+        sign = self.layout.comment or ""
         for number in comments:
             text = self.lines[number].lstrip().removeprefix(sign).strip()
             if '"' in text or not text:
                 continue
-            fields = split_fields(text, self.table.delimiter)
-            values = [read_number(field, self.table.decimal) for field in fields]
+            fields = split_fields(text, self.layout.delimiter)
+            values = [read_number(field, self.layout.decimal) for field in fields]
             if len(values) > 1 and all(map(math.isfinite, values)):
                 raise TableUnfit(
                     f"{self.path}:{number + 1}",
-                    found=f"{self.shown(number)}, a row of numbers that is commented out, at a rate without stamps",
+                    found=f"{self.excerpt(number)}, a row of numbers that is commented out, at a "
+                    "rate without stamps",
                     expected="every sample, as `rate_hz` gives each row its time",
-                    remedy="take the sign of the comment away, name a column of stamps by `time`, or import what is "
-                    "before it and what is behind it by `keep`",
+                    remedy="take the sign of the comment away, name a column of stamps by `time`, "
+                    "or import what is before it and what is behind it by `keep`",
                 )
 
     def check_quotes(self, numbers: Sequence[int]) -> None:
@@ -333,17 +402,17 @@ class _Parts:
             if '"' not in self.lines[number]:
                 continue
             try:
-                split_fields(self.lines[number], self.table.delimiter)
+                split_fields(self.lines[number], self.layout.delimiter)
             except csv.Error as error:
                 raise TableUnfit(
                     f"{self.path}:{number + 1}",
-                    found=f"a quote that does not enclose a whole field, in {self.shown(number)}",
+                    found=f"a quote that does not enclose a whole field, in {self.excerpt(number)}",
                     expected="quotes around whole fields, closed on the same line",
                     remedy="export the table without quotes, or without that column",
                 ) from error
 
 
-def _indices(columns: Sequence[Column], names: tuple[str, ...]) -> list[int]:
+def _present_indices(columns: Sequence[Column], names: tuple[str, ...]) -> list[int]:
     """Return the places of the columns that are there."""
     found = []
     for column in columns:
@@ -355,42 +424,82 @@ def _indices(columns: Sequence[Column], names: tuple[str, ...]) -> list[int]:
     return found
 
 
-def _decoded(path: Path, data: bytes) -> tuple[str, ...]:
-    """Return the text, and a remark if it is not UTF-8."""
-    bom = data.startswith((b"\xff\xfe", b"\xfe\xff"))
+def _decode(path: Path, data: bytes) -> tuple[str, ...]:
+    """Return the text, and a remark if it is not UTF-8.
+
+    Raises:
+        TableUnfit: it is no text, with the place of the first byte that shows it.
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return _decode_utf16(path, data)
+    mark = codecs.BOM_UTF8 if data.startswith(codecs.BOM_UTF8) else b""
     try:
-        decoded = (data.decode("utf-16"), "read as UTF-16") if bom else (data.decode("utf-8-sig"),)
-        place, kind = decoded[0].find("\0"), "NUL"
+        text = data[len(mark) :].decode("utf-8")
     except UnicodeDecodeError as error:
-        decoded, place, kind = (data.decode("cp1252", "replace"), "no UTF-8; read as Windows-1252"), -1, "no UTF-8"
-        if bom or "\0" in decoded[0] or "\ufffd" in decoded[0]:
-            place, kind = error.start, "no UTF-16" if bom else "no UTF-8"
-    if place >= 0:
-        raise TableUnfit(
-            str(path),
-            found=f"byte {place} is {kind}",
-            expected="text in UTF-8, UTF-16 with a byte order mark, or Windows-1252",
-            remedy="is this a CSV file? if so, save it as UTF-8",
-        )
-    return decoded
+        text = data.decode("cp1252", "replace")
+        if mark or "\0" in text or "\ufffd" in text:
+            raise _no_text(path, len(mark) + error.start, "no UTF-8") from error
+        return text, "no UTF-8; read as Windows-1252"
+    nul = data.find(b"\0")
+    if nul >= 0:
+        raise _no_text(path, nul, "NUL")
+    return (text,)
 
 
-def _check_header(file: CsvLines, start: int) -> None:
-    """Refuse a header of numbers, the first row of a file without one; columns may be called 0, 1, 2 and so on."""
+def _decode_utf16(path: Path, data: bytes) -> tuple[str, ...]:
+    """Return the text of a file with the byte order mark of UTF-16, and a remark."""
+    mark = data[: len(codecs.BOM_UTF16_LE)]
+    if mark == codecs.BOM_UTF16_LE:
+        encoding = "utf-16-le"
+    else:
+        encoding = "utf-16-be"
+    try:
+        text = data[len(mark) :].decode(encoding)
+    except UnicodeDecodeError as error:
+        raise _no_text(path, len(mark) + error.start, "no UTF-16") from error
+    nul = text.find("\0")
+    if nul >= 0:
+        before = text[:nul].encode(encoding)
+        raise _no_text(path, len(mark) + len(before), "NUL")
+    return text, "read as UTF-16"
+
+
+def _no_text(path: Path, place: int, kind: str) -> TableUnfit:
+    """Make the error for a file with a byte, counted from 0, that no text has."""
+    return TableUnfit(
+        str(path),
+        found=f"byte {place} is {kind}",
+        expected="text in UTF-8, UTF-16 with a byte order mark, or Windows-1252",
+        remedy="is this a CSV file? if so, save it as UTF-8",
+    )
+
+
+def _check_header(file: CsvLines, line_number: int) -> None:
+    """Refuse a header of numbers, the first row of a file without one;
+    columns may be called 0, 1, 2 and so on.
+    """
     names = file.names
-    values = [file.number(name) for name in names]
-    is_counted = len(values) > 1 and values[0] in (0.0, 1.0) and all(b - a == 1.0 for a, b in pairwise(values))
+    values = [file.to_number(name) for name in names]
+    is_counted = (
+        len(values) > 1
+        and values[0] in (0.0, 1.0)
+        and all(b - a == 1.0 for a, b in pairwise(values))
+    )
     if values and np.isfinite(values).all() and not is_counted:
         raise TableUnfit(
-            f"{file.path}:{start}",
-            found=f"a header of numbers, {', '.join(names[:3])}" + (" ..." if len(names) > 3 else ""),
+            f"{file.path}:{line_number}",
+            found="a header of numbers, "
+            f"{', '.join(names[:3])}" + (" ..." if len(names) > 3 else ""),
             expected="names of columns",
-            remedy="if the file has no header, write `header: false` under `table` and columns as numbers from 1",
+            remedy="if the file has no header, write `header: false` under `table` and columns as "
+            "numbers from 1",
         )
 
 
 def _check_shape(file: CsvLines, named: int) -> None:
-    """Refuse lines that are no rows, rows of another number of fields, and a last row that was cut off."""
+    """Refuse lines that are no rows, rows of another number of fields,
+    and a last row that was cut off.
+    """
     counts = np.array([len(file.fields(row)) for row in file.rows])
     usual = named or Counter(counts.tolist()).most_common(1)[0][0]
     wrong = np.flatnonzero(counts != usual)
@@ -400,24 +509,27 @@ def _check_shape(file: CsvLines, named: int) -> None:
     if wrong.size and (wrong[0] != last or counts[last] > usual or last == 0):
         first = int(wrong[0])
         raise TableUnfit(
-            file.line(first),
+            file.row_place(first),
             found=f"{counts[first]} columns",
             expected=f"{usual}, as in {'the header' if named else 'most lines'}",
             remedy="check the delimiter in the import description, and the export",
         )
     if wrong.size or (not file.fields(file.rows[last])[-1] and file.fields(file.rows[0])[-1]):
         raise TableUnfit(
-            file.line(last),
-            found=f"a last line {file.rows[last][-SHOWN:]!r} of {counts[last]} fields",
+            file.row_place(last),
+            found=f"a last line {file.rows[last][-EXCERPT_CHARACTERS:]!r} of {counts[last]} fields",
             expected=f"{usual} complete fields",
-            remedy=f"the file ends early; export or copy it again, or leave that line out by {_keep_to(file, last)}",
+            remedy="the file ends early; export or copy it again, or leave that line out by "
+            f"{_keep_to(file, last)}",
         )
 
 
 def _require_row(file: CsvLines, row: int) -> None:
-    """Refuse a line without any number: an empty one, a comment, a remark of the program that wrote it."""
+    """Refuse a line without any number: an empty one, a comment,
+    a remark of the program that wrote it.
+    """
     text = file.rows[row]
-    is_row = any(math.isfinite(file.number(field)) for field in file.fields(text))
+    is_row = any(math.isfinite(file.to_number(field)) for field in file.fields(text))
     is_comment = text.lstrip().startswith(COMMENT_SIGNS)
     # A last line of one torn field may be the begin of a number.
     is_torn = row == len(file.rows) - 1 and not any(character.isalpha() for character in text)
@@ -425,15 +537,21 @@ def _require_row(file: CsvLines, row: int) -> None:
         return
     word = text.split()[0] if text.split() else ""
     sign = next((one for one in COMMENT_SIGNS if word.startswith(one)), word[:4])
-    leave_out = f", or write `comment: {sign!r}` under `table` of the import description" if sign else ""
+    if sign:
+        leave_out = f", or write `comment: {sign!r}` under `table` of the import description"
+    else:
+        leave_out = ""
     empty = "" if sign else "an empty line, "
-    parts = f"`keep: {{to_row: {file.first_row + row}}}`" if row else "`keep`"
+    if row:
+        parts = f"`keep: {{to_row: {file.first_row + row}}}`"
+    else:
+        parts = "`keep`"
     raise TableUnfit(
-        file.line(row),
-        found=f"{empty}{text[:SHOWN]!r}, a line that is no row of numbers",
+        file.row_place(row),
+        found=f"{empty}{text[:EXCERPT_CHARACTERS]!r}, a line that is no row of numbers",
         expected="rows of numbers alone, after the header",
-        remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two recordings, import what is "
-        f"before it by {parts}, and what is behind it by `from_row`",
+        remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two "
+        f"recordings, import what is before it by {parts}, and what is behind it by `from_row`",
     )
 
 
@@ -442,18 +560,23 @@ def _keep_to(file: CsvLines, row: int) -> str:
     return f"`keep: {{to_row: {file.first_row + row}}}`"
 
 
-def _check_last(file: CsvLines) -> None:
-    """Refuse a last number that may lack digits: one with fewer decimals than all others, or one that jumps."""
+def _check_last_number(file: CsvLines) -> None:
+    """Refuse a last number that may lack digits:
+    one with fewer decimals than all others, or one that jumps.
+    """
     ends = [file.fields(row)[-1] for row in file.rows]
-    values = np.array([file.number(end) for end in ends])
-    decimals = [len(end.partition(file.table.decimal)[2]) for end in ends]
+    values = np.array([file.to_number(end) for end in ends])
+    decimals = [len(end.partition(file.layout.decimal)[2]) for end in ends]
     steps = np.abs(np.diff(values))
     jumps = len(steps) > 1 and steps[-1] > LARGEST_JUMP * steps[:-1].max()
-    if np.isfinite(values[:-1]).all() and (decimals[-1] < min(decimals[:-1]) or jumps or not math.isfinite(values[-1])):
+    if np.isfinite(values[:-1]).all() and (
+        decimals[-1] < min(decimals[:-1]) or jumps or not math.isfinite(values[-1])
+    ):
         last = len(file.rows) - 1
         raise TableUnfit(
-            file.line(last),
+            file.row_place(last),
             found=f"a last number {ends[-1]!r} without an end of line, after {ends[-2]!r}",
             expected="a number with all its digits",
-            remedy=f"the file ends early: export or copy it again, or leave that line out by {_keep_to(file, last)}",
+            remedy="the file ends early: export or copy it again, or leave that line out by "
+            f"{_keep_to(file, last)}",
         )

@@ -34,18 +34,22 @@ from daq.log.table import (
 from ident.arrays import FloatArray
 
 DAY_NS = 86_400 * 10**9
-FEWEST_BACK = 3  #: Steps back of a column that is no time; a restart of a clock or two is told by its row
+#: Steps back of a column that is no time; a restart of a clock or two is told by its row
+FEWEST_BACK = 3
 LARGEST_BACK_SHARE = 0.1  #: Likewise, as a share of the rows
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
 _CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9})\d*)?")
 
 
-def read_csv(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
+def read_csv(
+    path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None
+) -> Table:
     """Read columns of a CSV file in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
 
     Raises:
-        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row or has another number of fields,
-            a column is missing, or a field is not a finite number or time.
+        TableUnfit: the file cannot be read, has no rows, ends early, a line is no row or has
+            another number of fields, a column is missing, or a field is not a finite number or
+            time.
     """
     lines, remarks = read_lines(path, wanted, columns, time)
     stamps = None
@@ -57,14 +61,16 @@ def read_csv(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
         if wanted.keep is not None and wanted.keep.is_by_time:
             rows = rows_in_time(stamps, wanted.keep)
             require_kept(path, len(lines.rows), rows)
-            lines = lines.part(rows)
+            lines = lines.select_rows(rows)
             stamps = cut_stamps(stamps, rows)
     beside = None
     if time is None and wanted.time is not None and lines.names.count(str(wanted.time.column)) == 1:
         beside, _ = _stamps_of(lines, wanted.time)
     values = _numbers(lines, columns)
     digest = sha256("\n".join(lines.rows).encode())
-    return Table(path, columns, values, digest, stamps, lines.numbers, lines.first_row, remarks, beside)
+    return Table(
+        path, columns, values, digest, stamps, lines.line_numbers, lines.first_row, remarks, beside
+    )
 
 
 def _stamps_of(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, ...]]:
@@ -79,15 +85,21 @@ def _stamps_of(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, ...
 
 
 def _require_stamps(file: CsvLines, time: TimeColumn, stamps: Stamps) -> None:
-    """Refuse a column of another quantity, which goes back again and again, and name those that go on as time does."""
+    """Refuse a column of another quantity, which goes back again and again,
+    and name those that go on as time does.
+    """
     back = int(np.count_nonzero(np.diff(stamps.time_s) < 0.0))
     if back < LARGEST_BACK_SHARE * len(file.rows) or back < FEWEST_BACK:
         return
     candidates = [str(column) for column in _increasing(file)]
-    named = f"`time`: {{column: {candidates[0]}}}" if len(candidates) == 1 else "`column` of `time`"
+    if len(candidates) == 1:
+        named = f"`time`: {{column: {candidates[0]}}}"
+    else:
+        named = "`column` of `time`"
     raise TableUnfit(
         f"{file.path}, column {time.column}",
-        found=f"numbers that go back at {back} of {len(file.rows)} rows: this is no column of stamps",
+        found=f"numbers that go back at {back} of {len(file.rows)} rows: this is no column "
+        "of stamps",
         expected=f"a column that only grows; here: {', '.join(candidates) or 'none'}",
         remedy=f"correct {named} in the import description, or state `rate_hz` in its place",
     )
@@ -98,7 +110,7 @@ def _increasing(file: CsvLines) -> list[Column]:
     fields = [file.fields(row) for row in file.rows]
     found: list[Column] = []
     for index in range(len(fields[0])):
-        values = np.array([file.number(row[index]) for row in fields])
+        values = np.array([file.to_number(row[index]) for row in fields])
         if np.isfinite(values).all() and (np.diff(values) > 0.0).all():
             found.append(file.names[index] if file.names else index + 1)
     return found
@@ -106,13 +118,16 @@ def _increasing(file: CsvLines) -> list[Column]:
 
 def _stamps(file: CsvLines, time: TimeColumn, values: FloatArray) -> tuple[Stamps, tuple[str, ...]]:
     """Return the stamps of a column of numbers; those since 1970 are read again, digit by digit."""
-    check_reach(values * time.unit.seconds, lambda row: f"{file.line(row)}, column {time.column}")
+    check_reach(
+        values * time.unit.seconds, lambda row: f"{file.row_place(row)}, column {time.column}"
+    )
     if abs(values[0]) * time.unit.seconds < ABSOLUTE_S:
         time_s, remarks = without_wraps(values * time.unit.seconds, counter_wraps())
         if remarks:
             return stamps_of_numbers(time_s, TimeUnit.SECOND), remarks
         return stamps_of_numbers(values, time.unit), ()
-    to_ns, index = Decimal(10) ** (9 - time.unit.digits), file.index(time.column)
+    to_ns = Decimal(10) ** (9 - time.unit.digits)
+    index = file.index(time.column)
     texts = (file.fields(row)[index].replace(",", ".") for row in file.rows)
     return stamps_of_ns([round(Decimal(text) * to_ns) for text in texts]), ()
 
@@ -121,24 +136,28 @@ def _dates(file: CsvLines, time: TimeColumn) -> Stamps:
     """Return the stamps of a column of dates and times with a zone (ISO 8601)."""
     expected = "a date and time with its zone, as 2026-03-01T08:00:00.004+01:00 or ...Z"
     remedy = (
-        "correct `unit` of `time` in the import description, or add the zone to the file; `unit: clock` reads times "
-        "without a zone"
+        "correct `unit` of `time` in the import description, or add the zone to the file; `unit: "
+        "clock` reads times without a zone"
     )
     stamp_ns = _texts_ns(file, time, _date_ns, expected, remedy)
     seconds = np.array([1e-9 * date_ns for date_ns in stamp_ns])
-    check_reach(seconds, lambda row: f"{file.line(row)}, column {time.column}")
+    check_reach(seconds, lambda row: f"{file.row_place(row)}, column {time.column}")
     return stamps_of_ns(stamp_ns)
 
 
 def _times_of_day(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, ...]]:
     """Return the stamps of a column of times of day, since the midnight before the first one."""
-    expected = "a time of day of 24 hours, as 08:00:00.004, or a date before it, as 2026-03-01 08:00:00.004"
+    expected = (
+        "a time of day of 24 hours, as 08:00:00.004, or a date before it, as 2026-03-01 "
+        "08:00:00.004"
+    )
     remedy = "correct `unit` of `time` in the import description, or export the times so"
     stamp_ns = _texts_ns(file, time, _clock_ns, expected, remedy)
     midnight_ns = stamp_ns[0] - stamp_ns[0] % DAY_NS
     since_ns = [one - midnight_ns for one in stamp_ns]
     has_date = max(stamp_ns) >= DAY_NS
-    wraps = () if has_date else (MIDNIGHT,)  # a date that goes back is a wrong clock, or another run
+    # A date that goes back is a wrong clock, or another run
+    wraps = () if has_date else (MIDNIGHT,)
     time_s, remarks = without_wraps(np.array(since_ns) * 1e-9, wraps)
     if remarks:
         return stamps_of_numbers(time_s, TimeUnit.SECOND), remarks
@@ -159,14 +178,16 @@ def _texts_ns(
         text = file.fields(row)[index]
         one_ns = read(text)
         if one_ns is None:
-            place = f"{file.line(number)}, column {time.column}"
+            place = f"{file.row_place(number)}, column {time.column}"
             raise TableUnfit(place, found=repr(text), expected=expected, remedy=remedy)
         stamp_ns.append(one_ns)
     return stamp_ns
 
 
 def _clock_ns(text: str) -> int | None:
-    """Nanoseconds of a time of day since its midnight, or of a date and time since 1970; None for any other text."""
+    """Nanoseconds of a time of day since its midnight, or of a date and time since 1970;
+    None for any other text.
+    """
     match = _CLOCK.fullmatch(text)
     if match is None:
         return None
@@ -217,7 +238,7 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
     numbers = array("d")
     for row in file.rows:
         fields = file.fields(row)
-        numbers.extend([file.number(fields[index]) for index in indices])
+        numbers.extend([file.to_number(fields[index]) for index in indices])
     values = np.asarray(numbers).reshape(len(file.rows), len(indices))
     wrong = np.argwhere(~np.isfinite(values))
     if wrong.size:
@@ -225,7 +246,12 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
         index = indices[column]
         text = file.fields(file.rows[number])[index]
         remedy = _remedy(file, number, text, values)
-        raise TableUnfit(file.place(number, index), found=repr(text), expected="a finite number", remedy=remedy)
+        raise TableUnfit(
+            file.field_place(number, index),
+            found=repr(text),
+            expected="a finite number",
+            remedy=remedy,
+        )
     _check_points(file, indices)
     for index, own in zip(indices, values.T, strict=True):
         _check_thousands(file, index, own)
@@ -233,8 +259,10 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
 
 
 def _check_points(file: CsvLines, indices: list[int]) -> None:
-    """Refuse a point in a number under a decimal comma: it may group thousands, or be decimal after all."""
-    if file.table.decimal != ",":
+    """Refuse a point in a number under a decimal comma:
+    it may group thousands, or be decimal after all.
+    """
+    if file.layout.decimal != ",":
         return
     for number, row in enumerate(file.rows):
         if "." not in row:
@@ -243,33 +271,45 @@ def _check_points(file: CsvLines, indices: list[int]) -> None:
         for index in indices:
             if "." in fields[index]:
                 raise TableUnfit(
-                    file.place(number, index),
+                    file.field_place(number, index),
                     found=f"{fields[index]!r}, with a point",
-                    expected="a number with a decimal comma alone, as `table` of the import description has it",
-                    remedy="if points group thousands, export the numbers without them; if they are decimal, write "
+                    expected="a number with a decimal comma alone, as `table` of the import "
+                    "description has it",
+                    remedy="if points group thousands, export the numbers without them; if they "
+                    "are decimal, write "
                     '`decimal: "."`',
                 )
 
 
 def _check_thousands(file: CsvLines, index: int, values: FloatArray) -> None:
-    """Refuse a column in which the decimal sign must group thousands: 987 beside 1.234, and never 1.2 or 0.987."""
+    """Refuse a column in which the decimal sign must group thousands:
+    987 beside 1.234, and never 1.2 or 0.987.
+    """
     if np.abs(values).max() >= 1000.0 or not (values % 1.0).any():
         return
     thousands = 1000.0 * values
-    if (np.abs(thousands - np.rint(thousands)) > 1e-6).any():  # more than three digits: most columns end here
+    # More than three digits: most columns end here
+    if (np.abs(thousands - np.rint(thousands)) > 1e-6).any():
         return
     texts = [file.fields(row)[index] for row in file.rows]
-    sign = re.escape(file.table.decimal)
-    grouped, plain = re.compile(rf"[-+]?[1-9]\d{{0,2}}{sign}\d{{3}}"), re.compile(r"[-+]?\d{1,3}")
+    sign = re.escape(file.layout.decimal)
+    grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}{sign}\d{{3}}")
+    plain = re.compile(r"[-+]?\d{1,3}")
     first = next((number for number, text in enumerate(texts) if grouped.fullmatch(text)), None)
     beside = next((text for text in texts if plain.fullmatch(text) and text.strip("+-0")), None)
-    if first is None or beside is None or not all(grouped.fullmatch(text) or plain.fullmatch(text) for text in texts):
+    if (
+        first is None
+        or beside is None
+        or not all(grouped.fullmatch(text) or plain.fullmatch(text) for text in texts)
+    ):
         return
     raise TableUnfit(
-        file.place(first, index),
-        found=f"{texts[first]!r} beside {beside!r}: three digits behind every {file.table.decimal!r} of the column",
+        file.field_place(first, index),
+        found=f"{texts[first]!r} beside {beside!r}: three digits behind every "
+        f"{file.layout.decimal!r} of the column",
         expected="numbers whose thousands are not grouped",
-        remedy="export them without grouping; if these are decimals, export all numbers with the same three",
+        remedy="export them without grouping; if these are decimals, export all numbers with the "
+        "same three",
     )
 
 
@@ -282,15 +322,21 @@ def _remedy(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
         text: of the field.
         values: of the columns that are read, shape (k, n).
     """
-    if file.table.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", text):
-        grouped = "; if commas group thousands, export the numbers without them" if text[-4:-3] == "," else ""
+    if file.layout.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", text):
+        if text[-4:-3] == ",":
+            grouped = "; if commas group thousands, export the numbers without them"
+        else:
+            grouped = ""
         return 'write `decimal: ","` under `table` in the import description' + grouped
-    if row == 0 and not file.table.header:
-        return "if this line is a header, write `header: true` under `table` in the import description"
+    if row == 0 and not file.layout.header:
+        return (
+            "if this line is a header, write `header: true` under `table` in the import description"
+        )
     if _ISO.fullmatch(text) or _CLOCK.fullmatch(text):
         return (
-            "if this is the time, write `unit: clock` under `time` in the import description: a time of day, without "
-            "a date and its zone, so that nothing is known of the order of runs; `unit: iso8601` reads both"
+            "if this is the time, write `unit: clock` under `time` in the import description: a "
+            "time of day, without a date and its zone, so that nothing is known of the order of "
+            "runs; `unit: iso8601` reads both"
         )
     return _remedy_for_a_line(file, row, text, values)
 
@@ -300,17 +346,17 @@ def _remedy_for_a_line(file: CsvLines, row: int, text: str, values: FloatArray) 
     if file.names and file.fields(file.rows[row]) == list(file.names):
         before = file.first_row + row
         return (
-            "the header is there once more: import what is before it by "
-            f"`keep: {{to_row: {before}}}`, and what is behind it by `keep: {{from_row: {before + 2}}}`"
+            "the header is there once more: import what is before it by `keep: {to_row: "
+            f"{before}}}`, and what is behind it by `keep: {{from_row: {before + 2}}}`"
         )
     if row == 0 and set(file.names).intersection(file.fields(file.rows[row])):
         return (
-            "this is a second header, with the names in another order or with other names: nothing says which of the "
-            "two is right; delete the wrong one from the file"
+            "this is a second header, with the names in another order or with other names: nothing "
+            "says which of the two is right; delete the wrong one from the file"
         )
     if row == 0 and text.lower() not in MISSING and not any(np.isfinite(values[0])):
         return (
-            "if this line is no row (units, a second header), leave it out: "
-            f"`keep: {{from_row: {file.first_row + 2}}}` in the import description"
+            "if this line is no row (units, a second header), leave it out: `keep: {from_row: "
+            f"{file.first_row + 2}}}` in the import description"
         )
     return cut_advice(values, file.first_row)

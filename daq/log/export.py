@@ -1,4 +1,6 @@
-"""Export a log as a table for other programs: one row for each SYNC, with SI and raw columns, in bounded memory."""
+"""Export a log as a table for other programs:
+one row for each SYNC, with SI and raw columns, in bounded memory.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ class Exported:
     columns: tuple[str, ...]  #: names of the columns
     rows: int  #: number of rows
     partial: bool  #: the log was never finished
-    valid: bool  #: whether the recorder marked the run valid, and its cycles and time steps are even
+    #: whether the recorder marked the run valid, and its cycles and time steps are even
+    valid: bool
     reason: str  #: why not
 
 
@@ -60,7 +63,8 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     Raises:
         UsageError: a file of that name exists.
         OutputFailed: the file system refuses.
-        ConfigurationMissing: the package for the format is missing; the message names the extra to install.
+        ConfigurationMissing: the package for the format is missing; the message names the extra to
+            install.
         LogUnreadable: the log is damaged or contradicts itself; nothing is written.
     """
     require_new_table(out, kind)
@@ -76,7 +80,8 @@ def require_new_table(out: Path, kind: TableFormat) -> None:
 
     Raises:
         UsageError: a file of that name exists.
-        ConfigurationMissing: the package for the format is missing; the message names the extra to install.
+        ConfigurationMissing: the package for the format is missing; the message names the extra to
+            install.
     """
     if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
         raise ConfigurationMissing(
@@ -87,11 +92,16 @@ def require_new_table(out: Path, kind: TableFormat) -> None:
         )
     if out.exists():
         raise UsageError(
-            str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
+            str(out),
+            found="a file of that name",
+            expected="none",
+            remedy="choose another --out, or move it away",
         )
 
 
-def write_table(out: Path, kind: TableFormat, blocks: Iterable[Columns]) -> tuple[tuple[str, ...], int]:
+def write_table(
+    out: Path, kind: TableFormat, blocks: Iterable[Columns]
+) -> tuple[tuple[str, ...], int]:
     """Write a table block by block; the file appears when it is whole.
 
     Args:
@@ -110,7 +120,8 @@ def write_table(out: Path, kind: TableFormat, blocks: Iterable[Columns]) -> tupl
     unfinished = out.with_name(out.name + ".part")
     try:
         with ExitStack() as stack:
-            # The rest of an earlier export, or a link that would be followed: the writers make a new file ("x").
+            # The rest of an earlier export, or a link that would be followed: the writers make a
+            # new file ("x").
             unfinished.unlink(missing_ok=True)
             stack.callback(unfinished.unlink, missing_ok=True)
             with _WRITERS[kind](unfinished) as write:
@@ -127,7 +138,10 @@ def write_table(out: Path, kind: TableFormat, blocks: Iterable[Columns]) -> tupl
 
 
 def tables(
-    reader: LogReader, cell: Cell, events: tuple[CellEvent, ...], readings: tuple[SlowReading, ...] = ()
+    reader: LogReader,
+    cell: Cell,
+    events: tuple[CellEvent, ...],
+    readings: tuple[SlowReading, ...] = (),
 ) -> Iterator[Columns]:
     """Convert the samples to columns, a block at a time.
 
@@ -135,7 +149,8 @@ def tables(
         reader: reader of the log, not yet iterated over.
         cell: cell of the log.
         events: events of the whole log, for the numbers of the moves.
-        readings: torques and temperatures of the whole log; each is in the row of the last SYNC before it.
+        readings: torques and temperatures of the whole log; each is in the row of the last SYNC
+            before it.
 
     Raises:
         LogUnreadable: the log is damaged, or cell and log do not belong together.
@@ -153,9 +168,14 @@ def tables(
     for block, following in pairwise(chain(reader, (None,))):
         assert block is not None  # None follows the last one
         begin_ns = end_ns
-        end_ns = inf if following is None else int(following.time_ns[0])
+        if following is None:
+            end_ns = inf
+        else:
+            end_ns = int(following.time_ns[0])
         scale = scaling(cell, reader.head.readback)
-        is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
+        is_counter = np.array(
+            [axis.position_rad_per_count is None for axis in reader.head.readback.axes]
+        )
         if last is None:
             first_ns = int(block.time_ns[0])
         counted = unwrapped(block.position_counts, last)
@@ -163,8 +183,19 @@ def tables(
         counts = np.where(is_counter, counted, block.position_counts)
         joints = scale.joint_position(counts)
         yield {
-            **_columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns),
-            **{name: _in_rows(block.time_ns, *found, begin_ns, end_ns) for name, found in slow.items()},
+            **_columns(
+                cell,
+                block,
+                counts,
+                joints,
+                scale.current_per_unit,
+                moves(events, block.time_ns),
+                first_ns,
+            ),
+            **{
+                name: _in_rows(block.time_ns, *found, begin_ns, end_ns)
+                for name, found in slow.items()
+            },
         }
 
 
@@ -203,16 +234,19 @@ def current_unit(axis: CellAxis) -> str:
 
 
 def column_names(cell: Cell) -> list[str]:
-    """Name of each axis in the columns; names that become equal get the axis's number: `A+` and `A-` are `A_1`, `A_2`.
+    """Name of each axis in the columns; names that become equal get the axis's number:
+    `A+` and `A-` are `A_1`, `A_2`.
 
     Where that is an axis of the cell too, all names begin with their number.
     """
     plain = [re.sub(r"\W+", "_", name) for name in cell.axis_names]
     numbered = [f"{name}{number}" for number, name in enumerate(plain, start=1)]
-    named = [one if plain.count(one) == 1 else other for one, other in zip(plain, numbered, strict=True)]
-    return (
-        named if len(set(named)) == len(named) else [f"{number}_{name}" for number, name in enumerate(plain, start=1)]
-    )
+    named = [
+        one if plain.count(one) == 1 else other for one, other in zip(plain, numbered, strict=True)
+    ]
+    if len(set(named)) == len(named):
+        return named
+    return [f"{number}_{name}" for number, name in enumerate(plain, start=1)]
 
 
 _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temperature_degC"}
@@ -221,7 +255,8 @@ _SLOW_COLUMNS = {Quantity.TORQUE: "motor_torque_Nm", Quantity.TEMPERATURE: "temp
 def _in_rows(
     time_ns: IntArray, reading_ns: IntArray, readings: FloatArray, begin_ns: float, end_ns: float
 ) -> FloatArray:
-    """Put the readings from one time to another into the rows of a block, shape (k,); rows without one are NaN.
+    """Put the readings from one time to another into the rows of a block, shape (k,);
+    rows without one are NaN.
 
     Args:
         time_ns: of the rows, shape (k,).
@@ -239,7 +274,9 @@ def _in_rows(
 
 @contextmanager
 def _csv(path: Path) -> Iterator[Write]:
-    """Write a header and rows with comma, decimal point and LF (RFC 4180 except for the end of line)."""
+    """Write a header and rows with comma, decimal point and LF (RFC 4180 except for the end of
+    line).
+    """
     with path.open("x", encoding="utf-8", newline="\n") as stream:
         begun = False
 
@@ -249,7 +286,10 @@ def _csv(path: Path) -> Iterator[Write]:
                 stream.write(",".join(columns) + "\n")
                 begun = True
             # repr of a float is the shortest text that reads back as the same number.
-            texts = [["" if isnan(value) else repr(value) for value in column.tolist()] for column in columns.values()]
+            texts = [
+                ["" if isnan(value) else repr(value) for value in column.tolist()]
+                for column in columns.values()
+            ]
             stream.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
 
         yield write
@@ -266,9 +306,13 @@ def _parquet(path: Path) -> Iterator[Write]:
 
         def write(columns: Columns) -> None:
             nonlocal writer
-            table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
+            table = arrow.table(
+                {name: np.ascontiguousarray(column) for name, column in columns.items()}
+            )
             if writer is None:
-                writer = stack.enter_context(parquet.ParquetWriter(stream, table.schema, compression="zstd"))
+                writer = stack.enter_context(
+                    parquet.ParquetWriter(stream, table.schema, compression="zstd")
+                )
             writer.write_table(table)
 
         yield write

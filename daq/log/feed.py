@@ -1,10 +1,12 @@
-"""The feed of a recording: every sample and event for consoles that may be slow, and a stop that is acknowledged.
+"""The feed of a recording: every sample and event for consoles that may be slow,
+and a stop that is acknowledged.
 
-A recorder publishes its samples and events and never waits. Each packet of a Unix SEQPACKET socket is sent without
-blocking: where a console does not read, packets are dropped, the console sees from their numbers how many, and the
-recording goes on. A second socket takes the stop, so that it works while the curves are stalled. `drivegain monitor`
-has a feed of the same kind at another address, without a stop. All are in Linux's abstract namespace: they leave no
-file and end with the process. Only processes of the same user, or of root, are served.
+A recorder publishes its samples and events and never waits. Each packet of a Unix SEQPACKET socket
+is sent without blocking: where a console does not read, packets are dropped, the console sees from
+their numbers how many, and the recording goes on. A second socket takes the stop, so that it works
+while the curves are stalled. `drivegain monitor` has a feed of the same kind at another address,
+without a stop. All are in Linux's abstract namespace: they leave no file and end with the process.
+Only processes of the same user, or of root, are served.
 """
 
 from __future__ import annotations
@@ -36,19 +38,27 @@ from drivers.errors import POWERED, WHILE, stop_notes, text_of
 from drivers.messages import CellEvent, Sample
 
 BATCH_S = 0.02  #: Time of the samples in one packet
-SEND_BUFFER_BYTES = 1 << 20  #: Asked of the kernel, which may give less: seconds of samples for a console that pauses
+#: Asked of the kernel, which may give less: seconds of samples for a console that pauses
+SEND_BUFFER_BYTES = 1 << 20
 EVENTS_KEPT = 200  #: Events that a console gets which comes late
 BACKLOG = 128  #: Clients that may connect before the next is accepted; beyond, they are refused
 WAITER_ENDS_S = 3.0  #: Time for the thread that waits to end
-ACCEPT_AGAIN_S = 0.1  #: Time after which a client is accepted that could not be, as by a process without descriptors
-STOP, ACCEPTED = b"stop\n", b"accepted\n"
+#: Time after which a client is accepted that could not be, as by a process without descriptors
+ACCEPT_AGAIN_S = 0.1
+STOP = b"stop\n"
+ACCEPTED = b"accepted\n"
 LARGEST_PACKET = 1 << 18  #: [bytes]
 LARGEST_CONSOLES = 8  #: Served at the same time, and clients of the stop that have not asked yet
 
-SAMPLES, TEXT = 0, 1
-"""Kinds of packets: samples, or a JSON object with some of the keys run, events, bus_load, quick, result and end."""
+SAMPLES = 0
+TEXT = 1
+"""Kinds of packets: samples, or a JSON object with some of the keys run, events, bus_load, quick,
+result and end.
+"""
 HEAD = struct.Struct("<BQQIIH")
-"""Kind; number of the packet; of the run so far its samples, lost cycles and missing answers; samples in the packet."""
+"""Kind; number of the packet; of the run so far its samples, lost cycles and missing answers;
+samples in the packet.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,20 +71,29 @@ class RunFacts:
     rate_hz: float  #: of the samples
     moves: int  #: in the plan
     rad_per_count: list[float]  #: motor angle of a count [rad]
-    current_per_unit: list[float]  #: current of a raw unit, in the current's unit of the gains; NaN where unknown
+    #: current of a raw unit, in the current's unit of the gains; NaN where unknown
+    current_per_unit: list[float]
     to_joint: list[list[float]]  #: R⁻¹, shape (n, n)
     offset_rad: list[float]  #: joint positions at zero counts [rad; m of a prismatic joint]
     payload: str | None  #: name in the cell file
-    bus_load: dict[str, float]  #: computed mean load of each bus at this rate, as a share; empty for a monitor
+    #: computed mean load of each bus at this rate, as a share; empty for a monitor
+    bus_load: dict[str, float]
 
     @property
     def scaling(self) -> SiScaling:
         """Factors from raw numbers to SI."""
-        return SiScaling(*map(np.array, (self.rad_per_count, self.to_joint, self.offset_rad, self.current_per_unit)))
+        return SiScaling(
+            *map(
+                np.array,
+                (self.rad_per_count, self.to_joint, self.offset_rad, self.current_per_unit),
+            )
+        )
 
 
 class FeedUnfit(ValueError):
-    """A packet that this version does not understand: its program is of another version, or no recorder."""
+    """A packet that this version does not understand:
+    its program is of another version, or no recorder.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +132,18 @@ class QuickGain:
 
 @dataclass(frozen=True, slots=True)
 class QuickLook:
-    """What a quick linear estimate says of the gains after a move. It is for the eye and decides nothing."""
+    """What a quick linear estimate says of the gains after a move.
+
+    It is for the eye and decides nothing.
+    """
 
     block: str  #: that is being recorded
     move: int  #: finished moves of the block
     moves: int  #: in its plan
     motion_s: float  #: motion that the estimate is made from [s]
     is_held_out: bool = False  #: the moves of this block do not count
-    gains: list[QuickGain] = field(default_factory=list)  #: the worst first; empty where nothing is known yet
+    #: the worst first; empty where nothing is known yet
+    gains: list[QuickGain] = field(default_factory=list)
     missing: str = ""  #: why nothing is known yet
     why: str = ""  #: why the worst gain takes longest
     left_s: float = 0.0  #: motion until every gain is at its target, if σ falls as 1/√time [s]
@@ -170,7 +193,10 @@ def read_packet(packet: bytes, axes: int | None) -> Packet:
             message = _MESSAGE.validate_json(packet[HEAD.size :])
             fits = _fits(message, axes)
         else:
-            rows = None if axes is None else np.frombuffer(packet, packet_dtype(axes), offset=HEAD.size)
+            if axes is None:
+                rows = None
+            else:
+                rows = np.frombuffer(packet, packet_dtype(axes), offset=HEAD.size)
             fits = kind == SAMPLES and (rows is None or len(rows) == count > 0)
     except (struct.error, ValueError) as error:
         raise FeedUnfit("it sends packets that this version does not understand") from error
@@ -182,7 +208,11 @@ def read_packet(packet: bytes, axes: int | None) -> Packet:
 def _fits(message: Message, axes: int | None) -> bool:
     run = message.run
     count = axes if run is None else len(run.axes)
-    lists: list[list[float]] = [] if run is None else [run.rad_per_count, run.current_per_unit, run.offset_rad]
+    lists: list[list[float]]
+    if run is None:
+        lists = []
+    else:
+        lists = [run.rad_per_count, run.current_per_unit, run.offset_rad]
     matrix: list[list[float]] = [] if run is None else run.to_joint
     return (
         all(len(one) == count for one in (*lists, *matrix))
@@ -231,7 +261,9 @@ def facts_of_recorder(cell_file: Path, within_s: float) -> RunFacts | None:
 
 
 def packet_struct(axes: int) -> struct.Struct:
-    """Return the layout of a sample in a packet: cycle, time, missing, positions, currents, statuswords."""
+    """Return the layout of a sample in a packet:
+    cycle, time, missing, positions, currents, statuswords.
+    """
     return struct.Struct(f"<QqI{axes}i{axes}i{axes}H")
 
 
@@ -264,20 +296,26 @@ def interrupt_main_thread() -> None:
 
 
 class Feed:
-    """Context manager that publishes the runs of one program; methods other than `__enter__` never raise or wait.
+    """Context manager that publishes the runs of one program;
+    methods other than `__enter__` never raise or wait.
 
-    Where its addresses are taken, by another program on this cell, nothing is published and `remark` says so.
+    Where its addresses are taken, by another program on this cell, nothing is published and
+    `remark` says so.
     """
 
-    def __init__(self, cell_file: Path, stop: Callable[[], None] | None = interrupt_main_thread) -> None:
+    def __init__(
+        self, cell_file: Path, stop: Callable[[], None] | None = interrupt_main_thread
+    ) -> None:
         """Store the arguments.
 
         Args:
             cell_file: of the cell; consoles of the same file find the feed.
-            stop: does what a stop asks for, in another thread than the caller's; None for a monitor, which takes none.
+            stop: does what a stop asks for, in another thread than the caller's; None for a
+                monitor, which takes none.
         """
         self.remark = ""
-        self._names, self._stop = socket_names(cell_file), stop
+        self._names = socket_names(cell_file)
+        self._stop = stop
         self._listening: list[socket.socket] = []
         self._new: deque[socket.socket] = deque()
         self._consoles: list[socket.socket] = []
@@ -290,14 +328,21 @@ class Feed:
         self._looks: deque[QuickLook] = deque(maxlen=1)  # of another thread; the newest is enough
         self._quick: dict[str, Any] | None = None
         self._packed: list[bytes] = []
-        self._layout, self._batch = packet_struct(0), 1
+        self._layout = packet_struct(0)
+        self._batch = 1
         self._waiter: threading.Thread | None = None
         self._ended = threading.Event()
 
     def __enter__(self) -> Feed:
         """Begin to listen for consoles and stops, in a thread that waits."""
-        names, packets, stream = self._names, socket.SOCK_SEQPACKET, socket.SOCK_STREAM
-        places = ((names.monitor, packets),) if self._stop is None else ((names.feed, packets), (names.stop, stream))
+        names = self._names
+        packets = socket.SOCK_SEQPACKET
+        stream = socket.SOCK_STREAM
+        places = (
+            ((names.monitor, packets),)
+            if self._stop is None
+            else ((names.feed, packets), (names.stop, stream))
+        )
         try:
             for name, kind in places:
                 listener = socket.socket(socket.AF_UNIX, kind)
@@ -308,15 +353,22 @@ class Feed:
         except OSError as error:
             for listener in self._listening:
                 listener.close()
-            self.remark = f"no console can watch: {error.strerror or error}; is another program on this cell?"
+            self.remark = (
+                f"no console can watch: {error.strerror or error}; is another program on this cell?"
+            )
             return self
-        self._waiter = threading.Thread(target=self._wait, args=(selector,), name="drivegain feed", daemon=True)
+        self._waiter = threading.Thread(
+            target=self._wait, args=(selector,), name="drivegain feed", daemon=True
+        )
         self._waiter.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
         ended = end_of(error)
-        with suppress(Exception):  # samples that cannot be sent must not hide the error that ended the run
+        # Samples that cannot be sent must not hide the error that ended the run
+        with suppress(Exception):
             self._flush()
         self._send({"end": ended})
         self._ended.set()
@@ -333,8 +385,11 @@ class Feed:
 
     def begin(self, run: RunFacts, statistics: Callable[[], RunStatistics]) -> None:
         """Begin a run; the statistics are those of its log so far."""
-        self._run, self._statistics, self._result = run, statistics, None
-        self._layout, self._batch = packet_struct(len(run.axes)), max(1, round(BATCH_S * run.rate_hz))
+        self._run = run
+        self._statistics = statistics
+        self._result = None
+        self._layout = packet_struct(len(run.axes))
+        self._batch = max(1, round(BATCH_S * run.rate_hz))
         self._events.clear()
         self._looks.clear()
         self._quick = None
@@ -365,7 +420,9 @@ class Feed:
         self._send({"events": [shown]})
 
     def measured(self, bus_load: dict[str, float]) -> None:
-        """Publish the load that a monitor has measured on each bus, as a share, with the longest bit stuffing."""
+        """Publish the load that a monitor has measured on each bus, as a share,
+        with the longest bit stuffing.
+        """
         self._send({"bus_load": bus_load})
 
     def look(self, look: QuickLook) -> None:
@@ -383,7 +440,8 @@ class Feed:
         self._publish_look()
         if not self._packed:
             return
-        packed, self._packed = self._packed, []
+        packed = self._packed
+        self._packed = []
         self._send_to_all(SAMPLES, b"".join(packed), len(packed))
 
     def _publish_look(self) -> None:
@@ -396,7 +454,8 @@ class Feed:
         self._send_to_all(TEXT, json.dumps(message).encode(), 0)
 
     def _send_to_all(self, kind: int, content: bytes, samples: int) -> None:
-        # Consoles that came meanwhile first get what they missed; all packets are sent by this thread alone.
+        # Consoles that came meanwhile first get what they missed; all packets are sent by this
+        # thread alone.
         while self._new:
             if len(self._consoles) >= LARGEST_CONSOLES:
                 self._new.popleft().close()
@@ -412,13 +471,18 @@ class Feed:
                 }
                 self._put(fresh, self._head(TEXT, 0) + json.dumps(past).encode())
         self._number += 1
-        packet = self._head(kind, samples) + content if self._consoles else b""
+        if self._consoles:
+            packet = self._head(kind, samples) + content
+        else:
+            packet = b""
         for console in tuple(self._consoles):
             self._put(console, packet)
 
     def _head(self, kind: int, samples: int) -> bytes:
         so_far = self._statistics()
-        return HEAD.pack(kind, self._number, so_far.samples, so_far.lost_cycles, sum(so_far.missing), samples)
+        return HEAD.pack(
+            kind, self._number, so_far.samples, so_far.lost_cycles, sum(so_far.missing), samples
+        )
 
     def _put(self, console: socket.socket, packet: bytes) -> None:
         try:
@@ -432,7 +496,8 @@ class Feed:
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
         """Accept consoles and stops until the listeners are shut down."""
-        # Clients of the stop that have not asked yet are waited for all at once: a silent one delays no other.
+        # Clients of the stop that have not asked yet are waited for all at once: a silent one
+        # delays no other.
         asking: deque[socket.socket] = deque()
         with ExitStack() as closing:
             closing.enter_context(selector)
@@ -451,7 +516,8 @@ class Feed:
                     try:
                         connection, _ = ready.accept()
                     except OSError:
-                        # No descriptor is free, or the client is gone: the next one, and a stop, must be served still.
+                        # No descriptor is free, or the client is gone: the next one, and a stop,
+                        # must be served still.
                         if not self._ended.wait(ACCEPT_AGAIN_S):
                             continue
                         for silent in asking:
@@ -461,7 +527,9 @@ class Feed:
                         connection.close()
                     elif ready is self._listening[0]:
                         with suppress(OSError):
-                            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+                            connection.setsockopt(
+                                socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES
+                            )
                         self._new.append(connection)
                     else:
                         asking.append(connection)
@@ -488,7 +556,8 @@ SHOWN = (f"{WHILE}stopping", POWERED)  #: Notes of an error that a console shows
 
 
 def end_of(error: BaseException | None) -> dict[str, Any]:
-    """Describe how a program ended: whether all axes are known to be stopped, and the error in words.
+    """Describe how a program ended: whether all axes are known to be stopped,
+    and the error in words.
 
     It never raises: it describes the error that a stop was made for, and must not take its place.
     """
@@ -503,5 +572,8 @@ def end_of(error: BaseException | None) -> dict[str, Any]:
 
 def _in_words(error: BaseException) -> str:
     """Return the text of an error, or what it is where it has none."""
-    usual = "stopped" if isinstance(error, KeyboardInterrupt) else type(error).__name__
+    if isinstance(error, KeyboardInterrupt):
+        usual = "stopped"
+    else:
+        usual = type(error).__name__
     return text_of(error) or usual

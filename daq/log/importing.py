@@ -1,8 +1,9 @@
 """Convert files of other controllers to logs.
 
-A log holds int32. If the files hold angles, the count of each axis is the smallest power of two with which the largest
-value still fits. The rounding error, half a count, is then at most 4.7e-10 of that value, and a power of two scales
-without a rounding error of its own: raw = round(value / count).
+A log holds int32. If the files hold angles, the count of each axis is the smallest power of two
+with which the largest value still fits. The rounding error, half a count, is then at most 4.7e-10
+of that value, and a power of two scales without a rounding error of its own: raw = round(value /
+count).
 """
 
 from __future__ import annotations
@@ -65,9 +66,13 @@ from ident.data.channel_faults import ChannelFault
 from ident.model.bodies import Payload
 
 FEWEST_ROWS = 3  #: Rows of a recording; fewer have neither a rate nor a motion
-TORQUE_HZ, TEMPERATURE_HZ = 20.0, 1.0
-"""Rates at which the controller's own torque and temperatures are kept: enough for a slope and for a warm-up."""
-UNIX_NS = range(10**18, 3 * 10**18)  #: Stamps from 2001 to 2065 are since 1970; any others since some start
+TORQUE_HZ = 20.0
+TEMPERATURE_HZ = 1.0
+"""Rates at which the controller's own torque and temperatures are kept:
+enough for a slope and for a warm-up.
+"""
+#: Stamps from 2001 to 2065 are since 1970; any others since some start
+UNIX_NS = range(10**18, 3 * 10**18)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +94,9 @@ def import_recording(
     cell_path: Path | None = None,
     holdout: Path | None = None,
 ) -> Imported:
-    """Convert the files that a description names to a log. The same input gives the same bytes: no clock is read.
+    """Convert the files that a description names to a log.
+
+    The same input gives the same bytes: no clock is read.
 
     Args:
         description: the import description.
@@ -125,7 +132,8 @@ def import_recording(
         software=software,
         started_wall_ns=started_wall_ns,
         started_monotonic_ns=started_wall_ns,
-        origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
+        origin="imported as "
+        f"{wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
         timing=timing,
     )
     slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
@@ -139,7 +147,8 @@ def import_recording(
         of_holdout = samples.write(holdout, rows[first:])
         try:
             statistics = samples.write(out, rows[:first])
-        except BaseException:  # an interrupt, too: one log without the other would look like a whole import
+        # An interrupt, too: one log without the other would look like a whole import.
+        except BaseException:
             holdout.unlink()
             raise
     remarks = [remark for file in files.values() for remark in file.remarks]
@@ -149,14 +158,22 @@ def import_recording(
 
 
 def _require_name_of_holdout(wanted: ImportDescription, holdout: Path | None) -> None:
-    """Refuse a description with a held-out part that has no name, and a name without such a part."""
+    """Refuse a description with a held-out part that has no name,
+    and a name without such a part.
+    """
     if (wanted.holdout is None) == (holdout is None):
         return
     raise UsageError(
         f"import description {wanted.name!r}",
-        found="`holdout`, and no name for the log of that part" if holdout is None else "no `holdout`",
-        expected="a name for the second log" if holdout is None else "`holdout: {from_s: SECONDS}`, the begin of it",
-        remedy="give `--holdout FILE`" if holdout is None else f"add it to the description, or leave out {holdout}",
+        found="`holdout`, and no name for the log of that part"
+        if holdout is None
+        else "no `holdout`",
+        expected="a name for the second log"
+        if holdout is None
+        else "`holdout: {from_s: SECONDS}`, the begin of it",
+        remedy="give `--holdout FILE`"
+        if holdout is None
+        else f"add it to the description, or leave out {holdout}",
     )
 
 
@@ -197,14 +214,18 @@ class _LogSamples:
         step_ns = 1e9 / self.run.rate_hz
         content = LogContent.of(self.cell, self._run_of(rows), self.files, self.kept.readback)
         # A crash of an import loses no sample, so no clock is needed to flush in time.
-        with LogWriter(out, content, self.kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+        with LogWriter(
+            out, content, self.kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False
+        ) as log:
             silent = (0,) * len(self.cell.axes)
             counts = self.kept.counts[rows.start : rows.stop].tolist()
             current_raw = self.kept.current_raw[rows.start : rows.stop].tolist()
             for cycle, row in enumerate(rows):
                 time_ns = self.started_ns + round(row * step_ns)
                 log.readings(_readings(self.slow, row, time_ns))
-                log.write(Sample(cycle, time_ns, tuple(counts[cycle]), tuple(current_raw[cycle]), silent))
+                log.write(
+                    Sample(cycle, time_ns, tuple(counts[cycle]), tuple(current_raw[cycle]), silent)
+                )
             log.conclude(valid=True)
         return log.statistics
 
@@ -213,7 +234,10 @@ class _LogSamples:
         if len(rows) == len(self.kept.counts):
             return self.run
         later_ns = round(rows.start * 1e9 / self.run.rate_hz)
-        wall_ns = self.run.started_wall_ns + later_ns if self.run.started_wall_ns else 0
+        if self.run.started_wall_ns:
+            wall_ns = self.run.started_wall_ns + later_ns
+        else:
+            wall_ns = 0
         timing = self.run.timing
         if timing is not None and timing.started_s is not None:
             timing = replace(timing, started_s=timing.started_s + later_ns * 1e-9)
@@ -280,7 +304,10 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
     sound = sound_columns(position, current, used)
     kept = _converted(wanted, cell, position[row], current, clock)
     joint_rad = kept.joint_rad
-    subject = str(table.path) if len(wanted.position.files) == 1 else f"import description {wanted.name!r}"
+    if len(wanted.position.files) == 1:
+        subject = str(table.path)
+    else:
+        subject = f"import description {wanted.name!r}"
     check_limits(subject, joint_rad, cell)
     check_motion(subject, joint_rad, cell)
     check_steps(wanted, files, joint_rad, rate_hz, clock, cell)
@@ -297,7 +324,11 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
 
 
 def _converted(
-    wanted: ImportDescription, cell: Cell, position: FloatArray, current: FloatArray, clock: Clock | None
+    wanted: ImportDescription,
+    cell: Cell,
+    position: FloatArray,
+    current: FloatArray,
+    clock: Clock | None,
 ) -> Converted:
     """Convert positions of the rows that are used, and currents of all rows."""
     counts, count_rad = _counts(wanted, cell, position, clock)
@@ -305,13 +336,18 @@ def _converted(
     raw, unit = quantise(on_clock(current, clock) * np.array(factors))
     readback = Readback(
         tuple(
-            AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
+            AxisReadback(
+                axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i])
+            )
             for i, axis in enumerate(cell.axes)
         )
     )
     scale = scaling(cell, readback)
-    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its wraps.
-    joint_rad = scale.joint_position(unwrapped(counts.astype(np.int32)) if count_rad is None else counts)
+    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its
+    # wraps.
+    joint_rad = scale.joint_position(
+        unwrapped(counts.astype(np.int32)) if count_rad is None else counts
+    )
     return Converted(counts, raw, readback, scale, joint_rad)
 
 
@@ -319,12 +355,18 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     """Read every file of the description with the reader of its kind."""
     part = wanted.keep
     if part is not None and part.is_by_time and wanted.rate_hz is not None:
-        wanted = wanted.model_copy(update={"keep": _part_of_rows(rows_at_rate(wanted.rate_hz, part))})
+        wanted = wanted.model_copy(
+            update={"keep": _part_of_rows(rows_at_rate(wanted.rate_hz, part))}
+        )
     read: dict[str, Table] = {}
-    # The file with the stamps comes first: where times are kept, it says which rows of the others these are.
+    # The file with the stamps comes first: where times are kept, it says which rows of the others
+    # these are.
     files = wanted.files()
     for name in sorted(files, key=lambda one: wanted.time is None or one != wanted.time.file):
-        time = wanted.time if wanted.time is not None and wanted.time.file == name else None
+        if wanted.time is not None and wanted.time.file == name:
+            time = wanted.time
+        else:
+            time = None
         path = data / name
         table = reader_of(path)(path, wanted, files[name], time)
         read[name] = table
@@ -335,7 +377,9 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     if len({len(file.values) for file in tables.values()}) > 1:
         raise TableUnfit(
             ", ".join(str(file.path) for file in tables.values()),
-            found=" and ".join(f"{len(file.values)} rows in {name}" for name, file in tables.items()),
+            found=" and ".join(
+                f"{len(file.values)} rows in {name}" for name, file in tables.items()
+            ),
             expected="as many in each",
             remedy="one of them ends early, or they are of different runs; export them again",
         )
@@ -360,9 +404,15 @@ def _part_of_rows(rows: slice) -> KeptPart:
 
 
 def _slow(
-    wanted: ImportDescription, cell: Cell, files: dict[str, Table], clock: Clock | None, rate_hz: float
+    wanted: ImportDescription,
+    cell: Cell,
+    files: dict[str, Table],
+    clock: Clock | None,
+    rate_hz: float,
 ) -> list[tuple[Quantity, int, FloatArray]]:
-    """Return torques of the motors [Nm] and temperatures [°C] at every sample, each with its period in samples."""
+    """Return torques of the motors [Nm] and temperatures [°C] at every sample,
+    each with its period in samples.
+    """
     found = []
     if (torque := wanted.torque) is not None:
         factors = np.array(torque.factors(cell.axis_names))
@@ -376,7 +426,9 @@ def _slow(
     return found
 
 
-def _readings(slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns: int) -> Iterator[SlowReading]:
+def _readings(
+    slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns: int
+) -> Iterator[SlowReading]:
     """Yield the slow readings of a sample, where one of their periods begins."""
     for quantity, every, values in slow:
         if cycle % every == 0:
@@ -384,8 +436,12 @@ def _readings(slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns:
                 yield SlowReading(time_ns, axis, quantity, value)
 
 
-def _start(wanted: ImportDescription, files: dict[str, Table], clock: Clock | None) -> tuple[int, int, Timing | None]:
-    """Return the first stamp of the log and the time of day [ns; 0 where unknown], and the timing with the former."""
+def _start(
+    wanted: ImportDescription, files: dict[str, Table], clock: Clock | None
+) -> tuple[int, int, Timing | None]:
+    """Return the first stamp of the log and the time of day [ns;
+    0 where unknown], and the timing with the former.
+    """
     if wanted.time is None or clock is None:
         return 0, 0, None
     file = files[wanted.time.file]
@@ -393,7 +449,11 @@ def _start(wanted: ImportDescription, files: dict[str, Table], clock: Clock | No
     first_ns = file.stamps.first_ns
     if first_ns < 0:
         return 0, 0, clock.timing
-    return first_ns, first_ns if first_ns in UNIX_NS else 0, replace(clock.timing, started_s=first_ns * 1e-9)
+    return (
+        first_ns,
+        first_ns if first_ns in UNIX_NS else 0,
+        replace(clock.timing, started_s=first_ns * 1e-9),
+    )
 
 
 def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -415,10 +475,11 @@ def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
 def _counts(
     wanted: ImportDescription, cell: Cell, position: FloatArray, clock: Clock | None
 ) -> tuple[IntArray, FloatArray | None]:
-    """Return motor counts and the motor angle of a count [rad], None if the counts are the encoder's.
+    """Return motor counts and the motor angle of a count [rad],
+    None if the counts are the encoder's.
 
-    Between two samples the encoder's count is not a whole number: resampled counts are stored as angles, much finer,
-    so that they are not rounded a second time.
+    Between two samples the encoder's count is not a whole number: resampled counts are stored as
+    angles, much finer, so that they are not rounded a second time.
     """
     resampled = clock is not None and clock.timing.resampled
     if wanted.position.unit is PositionUnit.COUNTS:
@@ -437,22 +498,32 @@ def _counts(
 def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
     if wanted.payload is None:
         return None
-    matches = [p for p in cell.payloads if p.name == wanted.payload and wanted.mounting in {None, p.mounting}]
+    matches = [
+        p
+        for p in cell.payloads
+        if p.name == wanted.payload and wanted.mounting in {None, p.mounting}
+    ]
     if len(matches) == 1:
         return matches[0].payload
     known = ", ".join(f"{p.name} at {p.mounting}" for p in cell.payloads) or "none"
     raise ConfigurationInconsistent(
         f"import description {wanted.name!r}",
-        found=f"payload {wanted.payload!r}" + (f", mounting {wanted.mounting!r}" if wanted.mounting else ""),
+        found=f"payload {wanted.payload!r}"
+        + (f", mounting {wanted.mounting!r}" if wanted.mounting else ""),
         expected=f"one of the cell's ({known})",
         remedy="`payload: NAME` and, if needed, `mounting: NAME`, as in the cell file",
     )
 
 
 def _check_columns(wanted: ImportDescription, description: Path) -> None:
-    """Refuse a column that is read as two quantities, or as that of two axes: one of them would be made up."""
+    """Refuse a column that is read as two quantities, or as that of two axes:
+    one of them would be made up.
+    """
     read: dict[tuple[Path, str], str] = {}
-    timed = [] if wanted.time is None else [("time.column", wanted.time.file, wanted.time.column)]
+    if wanted.time is None:
+        timed = []
+    else:
+        timed = [("time.column", wanted.time.file, wanted.time.column)]
     for key, section in wanted.sections():
         places = enumerate(section.places)
         timed += [(f"{key}.columns[{index}]", file, column) for index, (file, column) in places]
@@ -491,7 +562,8 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 f"{description}: {key}.factor",
                 found=str(section.factor),
                 expected=f"one for each of {', '.join(cell.axis_names)}",
-                remedy="write a number for all axes, a list in their order, or a mapping from their names",
+                remedy="write a number for all axes, a list in their order, or a mapping from "
+                "their names",
             )
     units = wanted.current.units(cell.axis_names)
     if units is None:
@@ -499,7 +571,8 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             f"{description}: current.unit",
             found=str(wanted.current.unit),
             expected=f"one for each of {', '.join(cell.axis_names)}",
-            remedy="write a unit for all axes, a list in their order, or a mapping from their names",
+            remedy="write a unit for all axes, a list in their order, or a mapping from "
+            "their names",
         )
     for axis, unit in zip(cell.axes, units, strict=True):
         if axis.gain_unit not in {f"Nm/{unit}", f"N/{unit}"}:
@@ -509,7 +582,9 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
-    if wanted.position.unit is PositionUnit.COUNTS and any(a.counts_per_revolution is None for a in cell.axes):
+    if wanted.position.unit is PositionUnit.COUNTS and any(
+        a.counts_per_revolution is None for a in cell.axes
+    ):
         raise ConfigurationInconsistent(
             f"{description}: position.unit",
             found="counts, and axes without counts_per_revolution",
@@ -522,7 +597,8 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
         if moved is not None and moved.unit in lengths and (turning or moved.side is Side.MOTOR):
             raise ConfigurationInconsistent(
                 f"{description}: {key}.unit",
-                found=f"{moved.unit.value}, while {'axis ' + turning[0] if turning else 'a motor'} turns",
+                found=f"{moved.unit.value}, while "
+                f"{'axis ' + turning[0] if turning else 'a motor'} turns",
                 expected="rad or deg (m or mm for the prismatic axes among them), or counts",
                 remedy="correct the unit; convert the columns of the file to it",
             )
@@ -530,12 +606,20 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
 
 
 def in_order_of_axes(wanted: ImportDescription, axis_names: Sequence[str]) -> ImportDescription:
-    """Return a description with units and factors in the order of the axes, where it has them by name."""
+    """Return a description with units and factors in the order of the axes,
+    where it has them by name.
+    """
     changed: dict[str, Section] = {}
     units = wanted.current.units(axis_names)
-    current = wanted.current if units is None else replace(wanted.current, unit=units)
+    if units is None:
+        current = wanted.current
+    else:
+        current = replace(wanted.current, unit=units)
     for key, section in (("current", current), ("torque", wanted.torque)):
-        factors = None if section is None else section.factors(axis_names)
+        if section is None:
+            factors = None
+        else:
+            factors = section.factors(axis_names)
         if section is not None and factors is not None:
             changed[key] = replace(section, factor=factors)
     return wanted.model_copy(update=changed)
@@ -556,11 +640,18 @@ _HEADS: dict[bytes, Reader] = {
     b"MATLAB ": read_mat,
     b"\x89HDF\r\n": read_mat,
 }
-_SUFFIXES: dict[str, Reader] = {".mcap": read_bag, ".db3": read_bag, ".bag": read_bag, ".mat": read_mat}
+_SUFFIXES: dict[str, Reader] = {
+    ".mcap": read_bag,
+    ".db3": read_bag,
+    ".bag": read_bag,
+    ".mat": read_mat,
+}
 
 
 def reader_of(path: Path) -> Reader:
-    """Return the reader of a file, or of a folder with the parts of a bag; the name decides if the content does not."""
+    """Return the reader of a file, or of a folder with the parts of a bag;
+    the name decides if the content does not.
+    """
     if path.is_dir():
         return read_bag
     head = first_bytes(path)
@@ -568,11 +659,14 @@ def reader_of(path: Path) -> Reader:
     return by_content or _SUFFIXES.get(path.suffix.lower(), read_csv)
 
 
-def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str]) -> ImportDescription:
+def with_columns(
+    wanted: ImportDescription, data: Path, axis_names: Sequence[str]
+) -> ImportDescription:
     """Return a description with a column for each axis, where it names all of them at once.
 
-    The columns of a bag may be joints; the section says which field is meant. A single column may be a whole field
-    (`position`: its joints are called as the axes) or a whole matrix of a MATLAB file (`q`: a column for each axis).
+    The columns of a bag may be joints; the section says which field is meant. A single column may
+    be a whole field (`position`: its joints are called as the axes) or a whole matrix of a MATLAB
+    file (`q`: a column for each axis).
 
     Raises:
         TableUnfit: a file is of a format that is not read, or a temperature is sought in a bag.
@@ -588,7 +682,8 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
                 str(data / section.files[0]),
                 found="`temperature` from a ROS 2 bag",
                 expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
-                remedy="leave `temperature` out of the import description, or name a CSV or MATLAB file with it",
+                remedy="leave `temperature` out of the import description, or name a CSV or MATLAB "
+                "file with it",
             )
         places = section.places
         if len(places) == 1 < len(axis_names):
@@ -607,7 +702,9 @@ def with_columns(wanted: ImportDescription, data: Path, axis_names: Sequence[str
 def _of_all_axes(
     place: tuple[str, Column], readers: Mapping[str, Reader], axis_names: Sequence[str]
 ) -> tuple[tuple[str, Column], ...]:
-    """Return the place of each axis, where one column may name all of them: a field of a bag, or a matrix."""
+    """Return the place of each axis, where one column may name all of them:
+    a field of a bag, or a matrix.
+    """
     file, column = place
     if readers[file] is read_bag and column in FIELDS:
         return tuple((file, f"{column}.{axis}") for axis in axis_names)
@@ -619,11 +716,15 @@ def _of_all_axes(
 def _of_field(column: Column, field: str) -> str:
     """Return the column of a bag that a joint, or a field and a joint, name."""
     name = str(column)
-    return name if name.partition(".")[0] in FIELDS else f"{field}.{name}"
+    if name.partition(".")[0] in FIELDS:
+        return name
+    return f"{field}.{name}"
 
 
 def _check_torque(wanted: ImportDescription, bags: Set[str]) -> None:
-    """Refuse torques from the columns, or from the field of a bag, of the currents: their slope would be made up."""
+    """Refuse torques from the columns, or from the field of a bag, of the currents:
+    their slope would be made up.
+    """
     if wanted.torque is None:
         return
     read = {_source(place, bags) for place in wanted.current.places}

@@ -1,8 +1,10 @@
-"""Numbers that no robot moves by, in a recording of our own as in an import: one judgement for both.
+"""Numbers that no robot moves by, in a recording of our own as in an import:
+one judgement for both.
 
-Readings that are none are found by `ident.data.channel_faults`, without a description of the robot. With its limits, a
-step between two samples may be one that no motor makes, and a wrong scale makes every speed impossible; an outlier of
-the currents is none. Each function returns what it found, with the axis and the sample.
+Readings that are none are found by `ident.data.channel_faults`, without a description of the robot.
+With its limits, a step between two samples may be one that no motor makes, and a wrong scale makes
+every speed impossible; an outlier of the currents is none. Each function returns what it found,
+with the axis and the sample.
 """
 
 from __future__ import annotations
@@ -19,20 +21,36 @@ from ident.data.channel_faults import ChannelFault, ChannelKind, refused_fault
 from ident.data.fault_text import expected, found, remedy
 
 LARGEST_OUTLIER = 1000.0
-"""Largest current, in multiples of the 99th percentile of its column; a real peak is some ten times that."""
+"""Largest current, in multiples of the 99th percentile of its column;
+a real peak is some ten times that.
+"""
 SPEED_MARGIN = 3.0
-"""Largest speed, in multiples of the joint's velocity limit, which is often a guess; a wrong rate is off by more."""
+"""Largest speed, in multiples of the joint's velocity limit, which is often a guess;
+a wrong rate is off by more.
+"""
 SPEED_PERCENTILE = 99.9
-"""Percentile of a run's speeds that is compared with the limit: a few outliers do not mean a wrong rate."""
-STEP_NOISE, STEP_PERCENTILE, STEP_OUTLIER = 10.0, 95.0, 5.0
-"""A step between two samples is refused beyond SPEED_MARGIN, by this multiple of the typical change of a step (noise,
-coarse encoders), if it is this multiple of that percentile of all steps: a wrong rate makes all of them larger."""
-NOISE_SHARE, NOISE_CHANGES, SPARSE_NOISE = 0.01, 20, 0.005
-"""Where fewer samples than this share, or than this number, change their step at all, as of an axis at rest, the
-changes may be the glitch itself: as noise they then count up to this share of the joint's range."""
-GLITCH_SAMPLES, ABSURD = 10, 1e6
-"""An outlier has at most so many samples above a tenth of it, where a short motion has more; or it is so many times the
-99th percentile, which no current is."""
+"""Percentile of a run's speeds that is compared with the limit:
+a few outliers do not mean a wrong rate.
+"""
+STEP_NOISE = 10.0
+STEP_PERCENTILE = 95.0
+STEP_OUTLIER = 5.0
+"""A step between two samples is refused beyond SPEED_MARGIN, by this multiple of the typical change
+of a step (noise, coarse encoders), if it is this multiple of that percentile of all steps: a wrong
+rate makes all of them larger.
+"""
+NOISE_SHARE = 0.01
+NOISE_CHANGES = 20
+SPARSE_NOISE = 0.005
+"""Where fewer samples than this share, or than this number, change their step at all, as of an axis
+at rest, the changes may be the glitch itself: as noise they then count up to this share of the
+joint's range.
+"""
+GLITCH_SAMPLES = 10
+ABSURD = 1e6
+"""An outlier has at most so many samples above a tenth of it, where a short motion has more;
+or it is so many times the 99th percentile, which no current is.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +76,8 @@ def impossible_current(current: FloatArray) -> Impossible | None:
     size = np.abs(current)
     usual = np.percentile(size, 99.0, axis=0)
     others = usual[usual > 0.0]
-    # An axis whose current is almost always zero is compared with the other one of the smallest current.
+    # An axis whose current is almost always zero is compared with the other one of the smallest
+    # current.
     least = float(others.min()) if others.size else 0.0
     for axis, own in enumerate(usual.tolist()):
         column = size[:, axis]
@@ -74,7 +93,8 @@ def impossible_current(current: FloatArray) -> Impossible | None:
 
 
 def impossible_speed(joint_rad: FloatArray, rate_hz: float, cell: Cell) -> Impossible | None:
-    """Return the first axis that is too fast over many samples, far above the noise; None without one.
+    """Return the first axis that is too fast over many samples, far above the noise;
+    None without one.
 
     Args:
         joint_rad: positions of the joints [rad; m of a prismatic joint], shape (k, n).
@@ -86,7 +106,9 @@ def impossible_speed(joint_rad: FloatArray, rate_hz: float, cell: Cell) -> Impos
     for index, axis in enumerate(cell.axes):
         limit = axis.limits.velocity
         if fastest[index] > SPEED_MARGIN * limit:
-            found = f"{axis.unit.spell(float(fastest[index]))}/s over {step} samples at {rate_hz:g} Hz"
+            found = (
+                f"{axis.unit.spell(float(fastest[index]))}/s over {step} samples at {rate_hz:g} Hz"
+            )
             return Impossible(index, 0, found, _speed_limit(axis))
     return None
 
@@ -112,13 +134,18 @@ def impossible_step(joint_rad: FloatArray, rate_hz: float, cell: Cell) -> Imposs
         noise = _step_noise(changes[:, index], upper - lower)
         largest = SPEED_MARGIN * axis.limits.velocity / rate_hz + noise
         if size > max(largest, STEP_OUTLIER * usual):
-            found = f"a step of {axis.unit.spell(size)} in one sample, {axis.unit.spell(size * rate_hz)}/s"
+            found = (
+                f"a step of {axis.unit.spell(size)} in one sample, "
+                f"{axis.unit.spell(size * rate_hz)}/s"
+            )
             return Impossible(index, step + 1, found, _speed_limit(axis))
     return None
 
 
 def _step_noise(changes: FloatArray, range_rad: float) -> float:
-    """Largest step that noise or a coarse encoder makes [rad or m], from the changes of an axis's steps, shape (k,)."""
+    """Largest step that noise or a coarse encoder makes [rad or m],
+    from the changes of an axis's steps, shape (k,).
+    """
     typical = changes[changes > 0.0]
     if not typical.size:
         return 0.0
@@ -131,11 +158,16 @@ def _step_noise(changes: FloatArray, range_rad: float) -> float:
 def _speed_limit(axis: CellAxis) -> str:
     limit = axis.unit.spell(axis.limits.velocity)
     largest = axis.unit.spell(SPEED_MARGIN * axis.limits.velocity)
-    return f"at most {largest}/s, {SPEED_MARGIN:g} times {limit}/s, the limit in the cell configuration"
+    return (
+        f"at most {largest}/s, {SPEED_MARGIN:g} times {limit}/s, the limit in the cell "
+        "configuration"
+    )
 
 
 def _speed_samples(joint_rad: FloatArray, rate_hz: float) -> int:
-    """Samples over which a speed is measured: a tenth of a second, and at most a tenth of the run."""
+    """Samples over which a speed is measured:
+    a tenth of a second, and at most a tenth of the run.
+    """
     return max(1, min(round(0.1 * rate_hz), len(joint_rad) // 10))
 
 
@@ -169,8 +201,8 @@ def between_answers(joint_rad: FloatArray, answered: BoolArray) -> FloatArray:
 
 
 _GLITCH = (
-    "record again, and check the encoder, its cable and the object that the drive sends; a counter of fewer than 32 "
-    "bits that wraps is read as a step"
+    "record again, and check the encoder, its cable and the object that the drive sends; a counter "
+    "of fewer than 32 bits that wraps is read as a step"
 )
 
 
@@ -204,14 +236,19 @@ def motion_fault(
         return timed.error(PositionImplausible, _axis_of(step, name, cell), _GLITCH)
     speed = impossible_speed(known_rad, rate_hz, cell)
     if speed is not None:
-        check = "check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the cell file"
+        check = (
+            "check `drive_train.ratio`, `counts_per_revolution` and the velocity limit in the "
+            "cell file"
+        )
         return speed.error(PositionImplausible, _axis_of(speed, name, cell), check)
     displaced = refused_fault(faults, displaced=True)
     if displaced is not None:
         return fault_error(displaced, name, cell)
     outlier = impossible_current(current)
     if outlier is not None:
-        timed = replace(outlier, found=f"a current of {outlier.found}, at {outlier.row / rate_hz:.6g} s")
+        timed = replace(
+            outlier, found=f"a current of {outlier.found}, at {outlier.row / rate_hz:.6g} s"
+        )
         check = "record again, and check the object that the drive sends as its current"
         return timed.error(CurrentImplausible, _axis_of(outlier, name, cell), check)
     return None

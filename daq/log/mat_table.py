@@ -1,10 +1,11 @@
 """Read MATLAB files of format 5 (`save -v6`, `save -v7`) as tables.
 
-A column is named as the variable, or `struct.field`; a matrix adds the number of its column, counted from 1: `q.1`,
-`run.q.1`. The longer side of a matrix is time.
+A column is named as the variable, or `struct.field`; a matrix adds the number of its column,
+counted from 1: `q.1`, `run.q.1`. The longer side of a matrix is time.
 
-The file may be truncated, damaged or malicious: only the named variables are unpacked, every length is compared with
-the bytes that are there, nothing is followed deeper than the fields of a struct, and no object is ever built.
+The file may be truncated, damaged or malicious: only the named variables are unpacked, every length
+is compared with the bytes that are there, nothing is followed deeper than the fields of a struct,
+and no object is ever built.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit
+from daq.errors import TableUnfit, first_few
 from daq.files import read_regular
 from daq.log.table import (
     Stamps,
@@ -43,15 +44,31 @@ from daq.log.table import (
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no larger ones
-LARGEST_RATIO = 200  #: Largest ratio of an unpacked variable to its packed bytes, beyond SMALL_BYTES
+#: Largest ratio of an unpacked variable to its packed bytes, beyond SMALL_BYTES
+LARGEST_RATIO = 200
 SMALL_BYTES = 64 * 2**20
 _HEADER_BYTES = 128
 _PEEK_BYTES = 4096  #: Class, dimensions and name of a variable are in its first bytes
 
 # Types of elements and classes of arrays, by their numbers in the format.
-_MATRIX, _COMPRESSED = 14, 15
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_STRUCT, _OPAQUE, _FLOATS, _INTEGERS = 2, 17, (6, 7), range(8, 16)
+_MATRIX = 14
+_COMPRESSED = 15
+_TYPES = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
+_STRUCT = 2
+_OPAQUE = 17
+_FLOATS = (6, 7)
+_INTEGERS = range(8, 16)
 _KINDS = {
     1: "a cell array", 3: "an object", 4: "text", 5: "a sparse matrix", 16: "a function",
     17: "an object (a table, timetable, timeseries, datetime or duration)",
@@ -59,12 +76,14 @@ _KINDS = {
 _COMPLEX = 0x0800
 
 
-def read_mat(path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None) -> Table:
+def read_mat(
+    path: Path, wanted: ImportDescription, columns: tuple[Column, ...], time: TimeColumn | None
+) -> Table:
     """Read columns of a MATLAB file.
 
     Raises:
-        TableUnfit: the file cannot be read, is of another format, a variable is missing or holds no real numbers, or
-            the columns are of different lengths.
+        TableUnfit: the file cannot be read, is of another format, a variable is missing or holds no
+            real numbers, or the columns are of different lengths.
     """
     if time is not None and time.unit.is_text:
         raise TableUnfit(
@@ -79,7 +98,10 @@ def read_mat(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     if len({len(numbers) for numbers in found}) > 1:
         raise TableUnfit(
             str(path),
-            found=", ".join(f"{len(numbers)} values in {name}" for name, numbers in zip(names, found, strict=True)),
+            found=", ".join(
+                f"{len(numbers)} values in {name}"
+                for name, numbers in zip(names, found, strict=True)
+            ),
             expected="as many in each",
             remedy="are they of one run? the longer side of a matrix is taken for time",
         )
@@ -93,7 +115,15 @@ def read_mat(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     remarks: tuple[str, ...] = ()
     if time is not None:
         stamps = found[-1][rows]
-        require_finite(Table(path, (time.column,), stamps.astype(np.float64)[:, None], "", first_row=rows.start or 0))
+        require_finite(
+            Table(
+                path,
+                (time.column,),
+                stamps.astype(np.float64)[:, None],
+                "",
+                first_row=rows.start or 0,
+            )
+        )
         clock, remarks = _stamps(path, stamps, time)
         if part is not None and part.is_by_time:
             rows = rows_in_time(clock, part)
@@ -103,7 +133,9 @@ def read_mat(path: Path, wanted: ImportDescription, columns: tuple[Column, ...],
     values = np.empty((end - first_row, len(columns)))
     for index in range(len(columns)):
         values[:, index] = found[index][rows]
-    table = Table(path, columns, values, digest_of(values, clock), clock, first_row=first_row, remarks=remarks)
+    table = Table(
+        path, columns, values, digest_of(values, clock), clock, first_row=first_row, remarks=remarks
+    )
     return require_finite(table)
 
 
@@ -114,7 +146,9 @@ def _stamps(path: Path, values: NDArray[Any], time: TimeColumn) -> tuple[Stamps,
     check_reach(seconds, lambda row: f"{path}, row {row + 1}, column {time.column}")
     whole_s, remarks = without_wraps(seconds, counter_wraps())
     if remarks:
-        return stamps_of_numbers(whole_s, TimeUnit.SECOND), tuple(f"{path.name}: {remark}" for remark in remarks)
+        return stamps_of_numbers(whole_s, TimeUnit.SECOND), tuple(
+            f"{path.name}: {remark}" for remark in remarks
+        )
     if values.dtype.kind in "iu":
         return stamps_of_ns((values.astype(np.int64) * factor).tolist()), ()
     return stamps_of_numbers(values.astype(np.float64), time.unit), ()
@@ -152,7 +186,10 @@ class _Array:
 
     def __str__(self) -> str:
         size = "×".join(map(str, self.shape))
-        return _KINDS.get(self.kind, f"{size} struct" if self.kind == _STRUCT else size + " complex" * self.imaginary)
+        return _KINDS.get(
+            self.kind,
+            f"{size} struct" if self.kind == _STRUCT else size + " complex" * self.imaginary,
+        )
 
 
 class _MatFile:
@@ -168,7 +205,9 @@ class _MatFile:
             raise self._broken(error) from error
 
     def _found(self, data: memoryview) -> Iterator[tuple[str, tuple[_Array, memoryview | None]]]:
-        """Name, array and packed bytes of each variable; an array that is packed lacks its body yet."""
+        """Name, array and packed bytes of each variable;
+        an array that is packed lacks its body yet.
+        """
         at = 0
         while at < len(data):
             kind, body, at = self._element(data, at)
@@ -189,7 +228,10 @@ class _MatFile:
             TableUnfit: it is not there, or holds no real numbers.
         """
         parts = str(column).split(".")
-        number = int(parts.pop()) if len(parts) > 1 and re.fullmatch("[0-9]{1,9}", parts[-1]) else None
+        if len(parts) > 1 and re.fullmatch("[0-9]{1,9}", parts[-1]):
+            number = int(parts.pop())
+        else:
+            number = None
         name = ".".join(parts)
         if name not in self._read:
             try:
@@ -201,7 +243,10 @@ class _MatFile:
         if number is None and width == 1:
             number = 1
         if number is None or not 1 <= number <= width:
-            known = f"{name}.1" if width == 1 else f"{name}.1 to {name}.{width}"
+            if width == 1:
+                known = f"{name}.1"
+            else:
+                known = f"{name}.1 to {name}.{width}"
             raise self._unfit(f"column {column}, and {name} has {width} columns", f"one of {known}")
         return values[:, number - 1]
 
@@ -218,12 +263,17 @@ class _MatFile:
             array = fields[parts[1]]
         elif array.kind == _STRUCT or len(parts) > 1:
             found = f"{name}, where {parts[0]} is {array}"
-            raise self._unfit(found, "VARIABLE, or STRUCT.FIELD of one struct, and .NUMBER for a column of a matrix")
+            raise self._unfit(
+                found,
+                "VARIABLE, or STRUCT.FIELD of one struct, and .NUMBER for a column of a matrix",
+            )
         if array.kind not in (*_FLOATS, *_INTEGERS) or array.imaginary:
             raise self._unfit(f"{name}, {array}", "real numbers")
         sides = [side for side in array.shape if side != 1]
         if not sides or len(sides) > 2 or 0 in sides:
-            raise self._unfit(f"{name} of size {array}", "a column for each axis, a row for each sample")
+            raise self._unfit(
+                f"{name} of size {array}", "a column for each axis, a row for each sample"
+            )
         kind, data, _ = self._element(array.body, 0)
         values = np.frombuffer(data, dtype=self._order + _TYPES.get(kind, "V1"))
         if values.dtype.kind == "V" or len(values) != prod(sides):
@@ -231,7 +281,9 @@ class _MatFile:
         table = values.reshape(sides[0], -1, order="F")
         table = table if table.shape[0] >= table.shape[1] else table.T
         exact = (
-            array.kind in _INTEGERS and table.dtype.kind in "iu" and (table.dtype != np.uint64 or table.max() < 2**63)
+            array.kind in _INTEGERS
+            and table.dtype.kind in "iu"
+            and (table.dtype != np.uint64 or table.max() < 2**63)
         )
         return table.astype(np.int64 if exact else np.float64)
 
@@ -266,7 +318,8 @@ class _MatFile:
             return "", _Array(_FLOATS[0], (0, 0), imaginary=False, body=body)
         _, flags, at = self._element(body, 0)
         (word,) = struct.unpack_from(self._order + "I", flags)
-        kind, shape = word & 0xFF, ()
+        kind = word & 0xFF
+        shape = ()
         if kind != _OPAQUE:
             _, sides, at = self._element(body, at)
             shape = struct.unpack(f"{self._order}{len(sides) // 4}i", sides)
@@ -276,15 +329,20 @@ class _MatFile:
     def _element(self, data: memoryview, at: int) -> tuple[int, memoryview, int]:
         """Return type and content of the element at an offset, and the offset of the next one."""
         kind, size = struct.unpack_from(self._order + "II", data, at)
-        start, following = at + 8, at + 8 + size + (0 if kind == _COMPRESSED else -size % 8)
-        if kind >> 16:  # a small element: its size is in the upper half, its content in the second word
+        start = at + 8
+        following = at + 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+        # A small element: its size is in the upper half, its content in the second word
+        if kind >> 16:
             kind, size, start, following = kind & 0xFFFF, kind >> 16, at + 4, at + 8
         if start + size > len(data):
             raise ValueError(f"{len(data) - start} bytes of an element of {size}")
         return kind, data[start : start + size], following
 
     def _unfit(self, found: str, expected: str) -> TableUnfit:
-        remedy = "correct `columns` in the import description, or save plain matrices: save('run.mat', 'q', 'i', '-v7')"
+        remedy = (
+            "correct `columns` in the import description, or save plain matrices: "
+            "save('run.mat', 'q', 'i', '-v7')"
+        )
         return TableUnfit(str(self._path), found=found, expected=expected, remedy=remedy)
 
     def _broken(self, error: Exception) -> TableUnfit:
@@ -303,4 +361,4 @@ def _text(data: memoryview) -> str:
 def _listed(arrays: dict[str, _Array], before: str = "") -> str:
     """Name up to twelve arrays with their sizes."""
     names = [f"{before}{name} ({array})" for name, array in arrays.items()]
-    return ", ".join(names[:12] + [f"{len(names) - 12} more"] * (len(names) > 12)) or "none"
+    return first_few(names, 12, separator=", ") or "none"

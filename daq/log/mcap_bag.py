@@ -1,4 +1,6 @@
-"""Read ROS 2 bags in MCAP: their messages, the joint states in them, and the name of a file that is no log of ours."""
+"""Read ROS 2 bags in MCAP: their messages, the joint states in them,
+and the name of a file that is no log of ours.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,10 @@ class Topic:
 
     name: str  #: as publishers know it
     has_joint_states: bool  #: in CDR
-    publisher: str = ""  #: name of the node, where the bag has it (ROS 1)
+    #: name of the node, where the bag has it (ROS 1, or MCAP converted from it)
+    publisher: str = ""
+    #: among those of the same name in its file, from 1: a writer may give each publisher its own
+    channel: int = 1
 
 
 class BagMessage(NamedTuple):
@@ -41,7 +46,9 @@ class BagMessage(NamedTuple):
 
 
 class McapBag(RecordFile):
-    """A bag in MCAP, which is laxer than a log of ours: checksums are optional, and messages need no chunks."""
+    """A bag in MCAP, which is laxer than a log of ours:
+    checksums are optional, and messages need no chunks.
+    """
 
     def __init__(self, path: Path, source: Path | None = None) -> None:
         """Store the path, and where the content is if not there."""
@@ -61,7 +68,9 @@ class McapBag(RecordFile):
             yield from self._messages(records)
 
     def unfinished_messages(self) -> Generator[BagMessage, None, None]:
-        """Yield the messages before the damage of a file without a valid end, then raise as `messages`."""
+        """Yield the messages before the damage of a file without a valid end,
+        then raise as `messages`.
+        """
         with closing(self.unfinished()) as records:
             yield from self._messages(records)
 
@@ -72,7 +81,11 @@ class McapBag(RecordFile):
                 if isinstance(record, Message):
                     topic = self.topics.get(record.channel_id)
                     if topic is None:
-                        raise self.corrupt(offset, f"a message of channel {record.channel_id}", "a channel before it")
+                        raise self.corrupt(
+                            offset,
+                            f"a message of channel {record.channel_id}",
+                            "a channel before it",
+                        )
                     yield BagMessage(offset, topic, record.log_time, record.data)
                 elif isinstance(record, Attachment | Metadata):
                     self.has_entries = True
@@ -83,7 +96,20 @@ class McapBag(RecordFile):
                 elif isinstance(record, Channel):
                     schema = self._schemas.get(record.schema_id)
                     is_joints = schema is not None and schema.name == JOINTS_SCHEMA
-                    self.topics[record.id] = Topic(record.topic, is_joints and record.message_encoding == "cdr")
+                    has_joint_states = is_joints and record.message_encoding == "cdr"
+                    others = [
+                        number
+                        for number, topic in self.topics.items()
+                        if topic.name == record.topic
+                    ]
+                    known = self.topics.get(record.id)
+                    # The index at the end repeats the channels.
+                    if known is None:
+                        channel = len(others) + 1
+                    else:
+                        channel = known.channel
+                    node = record.metadata.get("callerid", "")
+                    self.topics[record.id] = Topic(record.topic, has_joint_states, node, channel)
 
     def _inside(self, offset: int, chunk: Chunk) -> Iterator[McapRecord]:
         data = self.unpack(offset, chunk)
@@ -106,8 +132,13 @@ class McapBag(RecordFile):
 
     def _truncated(self, size: int, good: int | None) -> LogTruncated:
         error = super()._truncated(size, good)
-        remedy = "the recorder was killed or the copy is incomplete: copy it again, or repair it with `mcap recover`"
-        return LogTruncated(error.subject, found=error.found, expected="a finished bag", remedy=remedy)
+        remedy = (
+            "the recorder was killed or the copy is incomplete: copy it again, or repair it "
+            "with `mcap recover`"
+        )
+        return LogTruncated(
+            error.subject, found=error.found, expected="a finished bag", remedy=remedy
+        )
 
 
 def unpack_message(data: bytes) -> bytes:
@@ -139,11 +170,13 @@ class JointState:
     names: tuple[str, ...]  #: names of n joints
     position: tuple[float, ...]  #: [rad; m for a prismatic joint], shape (n,)
     velocity: tuple[float, ...]  #: per second, shape (n,)
-    effort: tuple[float, ...]  #: [Nm; N for a prismatic joint], or what the publisher takes it for, shape (n,)
+    #: [Nm; N for a prismatic joint], or what the publisher takes it for, shape (n,)
+    effort: tuple[float, ...]
 
 
 def joint_state_from_cdr(data: bytes) -> JointState:
-    """Decode a message (OMG CDR as DDS transports it: four bytes of encapsulation, then the fields, each aligned).
+    """Decode a message (OMG CDR as DDS transports it:
+    four bytes of encapsulation, then the fields, each aligned).
 
     Raises:
         ValueError: it is not one, or ends early.
@@ -151,7 +184,8 @@ def joint_state_from_cdr(data: bytes) -> JointState:
     order = {b"\x00\x00": ">", b"\x00\x01": "<"}.get(data[:2])
     if order is None:
         raise ValueError(f"encapsulation {data[:2].hex()}")
-    body, at = data[4:], 8
+    body = data[4:]
+    at = 8
 
     def unsigned() -> int:
         nonlocal at
@@ -184,13 +218,17 @@ def joint_state_from_cdr(data: bytes) -> JointState:
         if count > len(body):
             raise ValueError(f"{count} names in {len(body)} bytes")
         names = tuple([text() for _ in range(count)])
-        return JointState(seconds * 1_000_000_000 + nanoseconds, frame, names, numbers(), numbers(), numbers())
+        return JointState(
+            seconds * 1_000_000_000 + nanoseconds, frame, names, numbers(), numbers(), numbers()
+        )
     except struct.error as error:
         raise ValueError(f"a message of {len(data)} bytes ({error})") from error
 
 
 def foreign_recording(path: Path) -> LogForeign | None:
-    """Return the error for an MCAP file of another program; None if it may be a log of ours, or no MCAP file."""
+    """Return the error for an MCAP file of another program;
+    None if it may be a log of ours, or no MCAP file.
+    """
     bag = McapBag(path)
     joints: tuple[str, ...] = ()
     with suppress(LogUnreadable, ValueError), closing(bag.unfinished_messages()) as messages:
@@ -201,14 +239,21 @@ def foreign_recording(path: Path) -> LogForeign | None:
     if SAMPLES_TOPIC in topics:
         return None
     if not topics:
-        return None if bag.has_entries else _foreign_beginning(path, bag.library)
+        if bag.has_entries:
+            return None
+        return _foreign_beginning(path, bag.library)
     states = [topic for topic, has in topics.items() if has]
     found = f"a bag of {bag.library or 'another program'} with " + (
-        f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}" if states else ", ".join(topics)
+        f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}"
+        if states
+        else ", ".join(topics)
     )
     remedy = f"`drivegain import` reads bags with {JOINTS_SCHEMA}"
     if states:
-        remedy = "import it: `drivegain import`, with the joints as `columns` (configs/imports/tx40.yaml)"
+        remedy = (
+            "import it: `drivegain import`, with the joints as `columns` "
+            "(configs/imports/tx40.yaml)"
+        )
     return LogForeign(str(path), found=found, expected="a log of drivegain", remedy=remedy)
 
 
@@ -216,13 +261,15 @@ OWN_LIBRARY = "drivegain"  #: Begin of the library's name in logs of ours
 
 
 def _foreign_beginning(path: Path, library: str) -> LogForeign | None:
-    """Return the error for a file that ends before its first message, if another library began it."""
+    """Return the error for a file that ends before its first message,
+    if another library began it.
+    """
     if not library or library.startswith(OWN_LIBRARY):
         return None
     return LogForeign(
         str(path),
         found=f"the begin of a bag of {library}, without a whole message",
         expected="a log of drivegain",
-        remedy="the copy is incomplete, or its recorder was killed: copy it again, or repair it with `mcap recover`; "
-        f"then `drivegain import` reads bags with {JOINTS_SCHEMA}",
+        remedy="the copy is incomplete, or its recorder was killed: copy it again, or repair it "
+        f"with `mcap recover`; then `drivegain import` reads bags with {JOINTS_SCHEMA}",
     )

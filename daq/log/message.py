@@ -1,8 +1,9 @@
 """The messages of a log: their ROS 2 definitions and their CDR bytes.
 
-CDR (OMG DDSI-RTPS, XCDR1): four bytes of encapsulation, then the fields in order, each aligned to its own size, counted
-from behind the encapsulation. A sequence is its length and its elements; a string ends with NUL, which counts. With a
-given number of axes an AxisSamples message has a constant size, so numpy reads a chunk of them at once.
+CDR (OMG DDSI-RTPS, XCDR1): four bytes of encapsulation, then the fields in order, each aligned to
+its own size, counted from behind the encapsulation. A sequence is its length and its elements; a
+string ends with NUL, which counts. With a given number of axes an AxisSamples message has a
+constant size, so numpy reads a chunk of them at once.
 """
 
 from __future__ import annotations
@@ -17,11 +18,16 @@ from numpy.typing import NDArray
 
 from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 
-SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/joint_states"
-SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"
+SAMPLES_TOPIC = "/cell/samples"
+EVENTS_TOPIC = "/cell/events"
+JOINTS_TOPIC = "/joint_states"
+SAMPLES_SCHEMA = "drivegain_msgs/msg/AxisSamples"
+EVENTS_SCHEMA = "drivegain_msgs/msg/CellEvent"
 JOINTS_SCHEMA = "sensor_msgs/msg/JointState"
-CURRENTS_TOPIC, CURRENTS_SCHEMA = "/cell/currents", "drivegain_msgs/msg/AxisCurrents"
-URDF_TOPIC, URDF_SCHEMA = "/robot_description", "std_msgs/msg/String"
+CURRENTS_TOPIC = "/cell/currents"
+CURRENTS_SCHEMA = "drivegain_msgs/msg/AxisCurrents"
+URDF_TOPIC = "/robot_description"
+URDF_SCHEMA = "std_msgs/msg/String"
 READING_TOPICS = {Quantity.TORQUE: "/cell/torque", Quantity.TEMPERATURE: "/cell/temperature"}
 """Topics of the slow readings; a log without such readings has no such topic."""
 READING_SCHEMA = "drivegain_msgs/msg/AxisReading"
@@ -63,7 +69,8 @@ builtin_interfaces/Time stamp     # of the SYNC, since 1970
 float64[] current_a               # [A; where the cell's gain is in another unit, what it is multiplied by]
 """
     + _TIME,
-    URDF_SCHEMA: "string data                       # the robot's URDF: lengths in m, angles in rad\n",
+    URDF_SCHEMA: "string data                       # the robot's URDF: lengths in m, "
+    "angles in rad\n",
     JOINTS_SCHEMA: """\
 std_msgs/Header header            # stamp of the SYNC, since 1970
 string[] name                     # joints of the URDF, in the order of the axes
@@ -121,7 +128,9 @@ def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
 
 @functools.cache
 def sample_dtype(axes: int) -> np.dtype[np.void]:
-    """Return the numpy type of an MCAP record (opcode, length, 22 bytes of header) with an AxisSamples message."""
+    """Return the numpy type of an MCAP record (opcode, length, 22 bytes of header)
+    with an AxisSamples message.
+    """
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
         ("opcode", "u1"),
         ("length", "<u8"),
@@ -154,7 +163,9 @@ def event_bytes(event: CellEvent) -> bytes:
     axis = WHOLE_CELL if event.axis is None else event.axis
     head = _EVENT.pack(_ENCAPSULATION, *divmod(event.time_ns, 1_000_000_000), axis)
     kind = _string(event.kind.value)
-    return head + kind + b"\0" * (-len(kind) % 4) + struct.pack("<I", event.code) + _string(event.text)
+    return (
+        head + kind + b"\0" * (-len(kind) % 4) + struct.pack("<I", event.code) + _string(event.text)
+    )
 
 
 def event_from_bytes(data: bytes) -> CellEvent:
@@ -176,7 +187,9 @@ def event_from_bytes(data: bytes) -> CellEvent:
 
 def reading_bytes(reading: SlowReading) -> bytes:
     """Encode one slow reading; the topic names its quantity."""
-    return _READING.pack(_ENCAPSULATION, *divmod(reading.time_ns, 1_000_000_000), reading.axis, reading.value)
+    return _READING.pack(
+        _ENCAPSULATION, *divmod(reading.time_ns, 1_000_000_000), reading.axis, reading.value
+    )
 
 
 def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
@@ -201,7 +214,8 @@ def _time_ns(seconds: int, nanoseconds: int) -> int:
 
 
 def _string(text: str) -> bytes:
-    # Bytes of a file name that are no UTF-8 are in its text as lone surrogates; an error may name such a file.
+    # Bytes of a file name that are no UTF-8 are in its text as lone surrogates; an error may name
+    # such a file.
     data = text.replace("\0", " ").encode("utf-8", "backslashreplace") + b"\0"
     return struct.pack("<I", len(data)) + data
 
@@ -217,7 +231,9 @@ def _string_from(data: bytes, start: int) -> tuple[str, int]:
 
 
 def joint_state_prefix(names: Sequence[str]) -> bytes:
-    """Encode the fields of a JointState between its stamp and its positions: they are the same for every message."""
+    """Encode the fields of a JointState between its stamp and its positions:
+    they are the same for every message.
+    """
     # The stamp before them is 8 bytes long, so alignment counts from here too.
     data = bytearray(_string(""))  # frame_id
     data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(names))
@@ -227,7 +243,11 @@ def joint_state_prefix(names: Sequence[str]) -> bytes:
 
 
 def joint_state_bytes(
-    prefix: bytes, time_ns: int, position: Sequence[float], velocity: Sequence[float], effort: Sequence[float] = ()
+    prefix: bytes,
+    time_ns: int,
+    position: Sequence[float],
+    velocity: Sequence[float],
+    effort: Sequence[float] = (),
 ) -> bytes:
     """Encode a JointState.
 
@@ -252,7 +272,9 @@ def text_bytes(text: str) -> bytes:
 
 
 def _doubles_bytes(time_ns: int, prefix: bytes, *sequences: Sequence[float]) -> bytes:
-    """Encode a stamp, other fields and sequences of float64, aligned; an empty one has no element to be aligned."""
+    """Encode a stamp, other fields and sequences of float64, aligned;
+    an empty one has no element to be aligned.
+    """
     data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)) + prefix)
     for values in sequences:
         data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))

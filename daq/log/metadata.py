@@ -1,4 +1,6 @@
-"""Metadata and readback of a log: how it was recorded, the answers of the amplifiers, and the outcome."""
+"""Metadata and readback of a log: how it was recorded, the answers of the amplifiers,
+and the outcome.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,18 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 
 T = TypeVar("T")
 
-RUN, STATISTICS, READBACK = "drivegain.run", "drivegain.statistics", "readback.json"
+RUN = "drivegain.run"
+STATISTICS = "drivegain.statistics"
+READBACK = "readback.json"
 """Names of two metadata records and an attachment."""
 RECORDED = "recorded"  #: Origin of a log that is no import; `salvage` adds to it
 LARGEST_COUNT = 2**64  #: Largest number of cycles, which are uint64 in the log
 CLOCK_NS = range(-(2**63), 2**63)  #: Times and differences of clocks, which are int64 [ns]
 RATES_HZ = (1e-3, 1e6)  #: Slowest and fastest sampling rate
 VERSION = "1"  #: Version of the log contract; a reader refuses any other
-SEAL = "crc32"  #: Entry with the checksum of the others. Outside chunks, a log without its end has no other checksum.
+#: Entry with the checksum of the others. Outside chunks, a log without its end has no other
+#: checksum.
+SEAL = "crc32"
 
 
 _Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
@@ -32,7 +38,9 @@ _Clock = Annotated[int, Field(ge=CLOCK_NS.start, lt=CLOCK_NS.stop)]
 
 
 class Role(Enum):
-    """Whether a payload was mounted; not the use of the log in a fit (`ident.calibration.Source.role`)."""
+    """Whether a payload was mounted; not the use of the log in a fit
+    (`ident.calibration.Source.role`).
+    """
 
     UNLOADED = "unloaded"
     LOADED = "loaded"
@@ -40,19 +48,24 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Time stamps of an imported recording, and the uniform clock that its log has (`daq.log.resampling`)."""
+    """Time stamps of an imported recording, and the uniform clock that its log has
+    (`daq.log.resampling`).
+    """
 
     rows: _Count  #: rows of the file
     rate_hz: FiniteFloat  #: rate of the log [Hz]
     usual_step_s: FiniteFloat  #: median step between stamps [s]
     longest_step_s: FiniteFloat  #: longest step [s]
     jitter_s: FiniteFloat  #: standard deviation of the steps, missing samples apart [s]
-    drift_s: FiniteFloat  #: largest distance of a stamp from a uniform clock that starts with the first one [s]
+    #: largest distance of a stamp from a uniform clock that starts with the first one [s]
+    drift_s: FiniteFloat
     missing: _Count  #: samples that are missing between the first and the last; interpolated
     resampled: bool  #: whether the samples were moved to a uniform clock
     duplicates: _Count = 0  #: rows left out because they repeat the one before
-    close: _Count = 0  #: samples left out because they are too close to the one before to give a speed
-    started_s: FiniteFloat | None = None  #: first stamp by the file's clock [s]; None before zero, as of a trigger's
+    #: samples left out because they are too close to the one before to give a speed
+    close: _Count = 0
+    #: first stamp by the file's clock [s]; None before zero, as of a trigger's
+    started_s: FiniteFloat | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,18 +78,23 @@ class RunInfo:
     operator: str  #: person responsible for the recording
     software: str  #: name and version of the recorder
     started_wall_ns: int  #: Unix time of the start [ns]
-    started_monotonic_ns: int  #: the monotonic clock at the same moment [ns]; the difference reveals a clock jump
+    #: the monotonic clock at the same moment [ns]; the difference reveals a clock jump
+    started_monotonic_ns: int
     origin: str = RECORDED  #: RECORDED, or the sources of an import
     speed: float = 1.0  #: speed of the moves as a share of the plan's; 1 except for a first run
     #: Mass of the payload as weighed for this recording [kg]; None if it was not entered.
     entered_kg: float | None = None
-    controller_sha256: str | None = None  #: digest of the controller's file at the start; None without one
-    timing: Timing | None = None  #: time stamps of an import; None without stamps, and for a recording
+    #: digest of the controller's file at the start; None without one
+    controller_sha256: str | None = None
+    #: time stamps of an import; None without stamps, and for a recording
+    timing: Timing | None = None
 
     @property
     def has_clock(self) -> bool:
         """Whether the samples have the time at which they were taken, not only their order."""
-        return self.origin.startswith(RECORDED) or (self.timing is not None and self.timing.started_s is not None)
+        return self.origin.startswith(RECORDED) or (
+            self.timing is not None and self.timing.started_s is not None
+        )
 
     @property
     def role(self) -> Role:
@@ -85,7 +103,9 @@ class RunInfo:
 
     @property
     def wall_minus_monotonic_ns(self) -> int:
-        """Offset between the stamps of the samples and the monotonic clock of the recording computer [ns]."""
+        """Offset between the stamps of the samples and the monotonic clock of the recording
+        computer [ns].
+        """
         return self.started_wall_ns - self.started_monotonic_ns
 
 
@@ -99,8 +119,8 @@ class RunStatistics:
     valid: bool  #: whether the recorder considers the run usable
     reason: str = ""  #: why not
     partial: bool = False  #: the log was salvaged from a recording that was never finished
-    #: Difference of the two clocks at the end [ns]; compared with the start it reveals a changed wall clock. None in
-    #: salvaged and imported logs.
+    #: Difference of the two clocks at the end [ns]; compared with the start it reveals a changed
+    #: wall clock. None in salvaged and imported logs.
     wall_minus_monotonic_ns: _Clock | None = None
 
 
@@ -119,7 +139,9 @@ class Loss(Enum):
 
     @property
     def masked(self) -> bool:
-        """Whether the samples carry the axis in `missing`; the recorder could not interpret the others."""
+        """Whether the samples carry the axis in `missing`;
+        the recorder could not interpret the others.
+        """
         return self not in (Loss.DUPLICATE, Loss.SURPLUS, Loss.SKIPPED_PERIODS)
 
 
@@ -160,19 +182,25 @@ def run_record(info: RunInfo) -> dict[str, str]:
 
 
 def run_from_record(record: Mapping[str, str]) -> RunInfo:
-    """Decode `run_record`; logs of earlier versions lack speed, second weighing, controller and timing.
+    """Decode `run_record`; logs of earlier versions lack speed, second weighing,
+    controller and timing.
 
     Raises:
         KeyError: an entry is missing.
         ValueError: an entry is invalid.
     """
     if record["version"] != VERSION:
-        raise ValueError(f"version {record['version']!r:.40} of the log contract; this software reads {VERSION}")
+        raise ValueError(
+            f"version {record['version']!r:.40} of the log contract; this software reads {VERSION}"
+        )
     payload = None
     if Role(record["role"]) is Role.LOADED:
         known = _validated(dict[str, FiniteFloat], record["payload_known"])
         if not known.keys() <= set(LINK_PARAMETERS) or known.get("m", 1.0) <= 0.0:
-            raise ValueError(f"known payload {record['payload_known']!r:.80}: expected parameters with a mass above 0")
+            raise ValueError(
+                f"known payload {record['payload_known']!r:.80}: expected parameters "
+                "with a mass above 0"
+            )
         try:
             payload = Payload(record["payload"], record["mounting"], known)
         except ModelError as error:
@@ -186,9 +214,12 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
     entered = record.get("payload_entered_kg", "")
     if entered and not 0.0 < float(entered) < math.inf:
         raise ValueError(f"mass of the payload as entered {entered!r:.40}")
-    wall_ns, monotonic_ns = int(record["started_wall_ns"]), int(record["started_monotonic_ns"])
+    wall_ns = int(record["started_wall_ns"])
+    monotonic_ns = int(record["started_monotonic_ns"])
     if wall_ns < 0 or wall_ns not in CLOCK_NS or monotonic_ns not in CLOCK_NS:
-        raise ValueError(f"start times {record['started_wall_ns']!r:.40}, {record['started_monotonic_ns']!r:.40}")
+        raise ValueError(
+            f"start times {record['started_wall_ns']!r:.40}, {record['started_monotonic_ns']!r:.40}"
+        )
     return RunInfo(
         run_id=record["run_id"],
         rate_hz=rate_hz,
@@ -238,7 +269,9 @@ def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
     }
     statistics = _validated(RunStatistics, json.dumps(tree))
     if max(statistics.missing, default=0) > statistics.samples:
-        raise ValueError(f"{max(statistics.missing)} answers missing in {statistics.samples} samples")
+        raise ValueError(
+            f"{max(statistics.missing)} answers missing in {statistics.samples} samples"
+        )
     return statistics
 
 
@@ -248,8 +281,11 @@ def _validated(kind: type[T], data: str | bytes) -> T:
         return TypeAdapter(kind).validate_json(data, strict=True)
     except ValidationError as error:
         first = error.errors()[0]
-        place, expected = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Input should be ")
-        raise ValueError(f"{place or 'the whole'} is {first['input']!r:.40}, expected {expected}") from error
+        place = ".".join(map(str, first["loc"]))
+        expected = first["msg"].removeprefix("Input should be ")
+        raise ValueError(
+            f"{place or 'the whole'} is {first['input']!r:.40}, expected {expected}"
+        ) from error
 
 
 def sealed(record: Mapping[str, str]) -> dict[str, str]:
@@ -258,14 +294,17 @@ def sealed(record: Mapping[str, str]) -> dict[str, str]:
 
 
 def unsealed(record: Mapping[str, str]) -> dict[str, str]:
-    """Return the entries of a sealed record; records of earlier versions have no seal and are returned unchecked.
+    """Return the entries of a sealed record;
+    records of earlier versions have no seal and are returned unchecked.
 
     Raises:
         ValueError: the checksum does not match.
     """
     entries = {key: value for key, value in record.items() if key != SEAL}
     if record.get(SEAL, _checksum(entries)) != _checksum(entries):
-        raise ValueError(f"entries of checksum {_checksum(entries)}, sealed with {record[SEAL]!r:.40}")
+        raise ValueError(
+            f"entries of checksum {_checksum(entries)}, sealed with {record[SEAL]!r:.40}"
+        )
     return entries
 
 
@@ -281,7 +320,8 @@ class AxisReadback:
     """Answers of the amplifier of one axis."""
 
     name: str  #: name of the axis
-    current_per_unit: _Quantum  #: unit of the reference (A) per raw unit, from the profile's formula and objects
+    #: unit of the reference (A) per raw unit, from the profile's formula and objects
+    current_per_unit: _Quantum
     #: Motor angle of a count [rad]; None for 2π / counts per revolution of the cell.
     position_rad_per_count: _Quantum | None = None
     #: Identity, serial number, rated current, PDO mapping and whatever else the amplifier reported.
@@ -295,7 +335,9 @@ class Readback:
     axes: Annotated[tuple[AxisReadback, ...], Field(min_length=1)]
 
 
-def readback_of_drives(names: Sequence[str], ampere_per_unit: Sequence[float], answers: Mapping[str, Any]) -> Readback:
+def readback_of_drives(
+    names: Sequence[str], ampere_per_unit: Sequence[float], answers: Mapping[str, Any]
+) -> Readback:
     """Make the readback of a prepared network.
 
     Args:

@@ -1,6 +1,8 @@
-"""Judge the motion in a log wherever a log is called valid: at the end of its recording, by `info`, by the exports.
+"""Judge the motion in a log wherever a log is called valid:
+at the end of its recording, by `info`, by the exports.
 
-A fit refuses a log that no robot moves by (`daq.log.impossible.motion_fault`); what is said of a log before agrees.
+A fit refuses a log that no robot moves by (`daq.log.impossible.motion_fault`); what is said of a
+log before agrees.
 """
 
 from __future__ import annotations
@@ -56,7 +58,9 @@ def motion_reason(
     return f"{axis}: {fault.found}"
 
 
-OVERLAP = 200  #: Samples of a block that are judged with the next one, too: more than what a fault is compared with
+#: Samples of a block that are judged with the next one, too: more than what a fault is compared
+#: with
+OVERLAP = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,15 +81,19 @@ class _Samples:
 
     def last(self, count: int) -> _Samples:
         """Return so many of the last samples."""
-        return _Samples(self.position_counts[-count:], self.current_raw[-count:], self.missing[-count:])
+        return _Samples(
+            self.position_counts[-count:], self.current_raw[-count:], self.missing[-count:]
+        )
 
 
 class MotionWatch:
-    """Finds block by block, in bounded memory, the logs of which all samples have to be judged: few have a fault.
+    """Finds block by block, in bounded memory, the logs of which all samples have to be judged:
+    few have a fault.
 
-    What it does not suspect, `motion_fault` does not refuse: a speed over many samples has a step as fast among them,
-    the 99th percentile of a current is at least the smallest one of the blocks, a fault of a channel begins or ends in
-    one of them, and a current that lost its sign goes through most of its range in a step.
+    What it does not suspect, `motion_fault` does not refuse: a speed over many samples has a step
+    as fast among them, the 99th percentile of a current is at least the smallest one of the blocks,
+    a fault of a channel begins or ends in one of them, and a current that lost its sign goes
+    through most of its range in a step.
     """
 
     def __init__(self, cell: Cell, head: LogHead) -> None:
@@ -112,7 +120,9 @@ class MotionWatch:
         if self._tail is not None:
             samples = samples.after(self._tail)
         self._tail = samples.last(OVERLAP)
-        position_rad = self._scale.joint_position(continuous_counts(samples.position_counts, self._readback))
+        position_rad = self._scale.joint_position(
+            continuous_counts(samples.position_counts, self._readback)
+        )
         speeds = np.abs(np.diff(position_rad, axis=0)) * self._rate_hz / self._limits
         if speeds.size:
             self._fastest = max(self._fastest, float(speeds.max()))
@@ -126,10 +136,15 @@ class MotionWatch:
         self._current_step = np.maximum(self._current_step, steps.max(axis=0, initial=0.0))
         if not self._is_faulty:
             known = self._scale.joints_known(answers(samples.missing, len(self._limits)))
-            self._is_faulty = bool(find_faults(position_rad, current, self._rate_hz, self._cell.ratio, known))
+            self._is_faulty = bool(
+                find_faults(position_rad, current, self._rate_hz, self._cell.ratio, known)
+            )
 
     def verdict(
-        self, checks: SampleChecks, statistics: RunStatistics, again: Callable[[], Iterable[SampleBlock]]
+        self,
+        checks: SampleChecks,
+        statistics: RunStatistics,
+        again: Callable[[], Iterable[SampleBlock]],
     ) -> tuple[bool, str]:
         """Return whether the log is valid by its recorder, its cycles and its motion, and why not.
 
@@ -141,12 +156,19 @@ class MotionWatch:
         valid, reason = checks.verdict(self._rate_hz, statistics)
         outlier = self._peak > LARGEST_OUTLIER * self._usual
         through = self._current_step > 0.5 * (self._highest - self._lowest)
-        is_suspected = self._is_faulty or self._fastest > SPEED_MARGIN or bool(np.any(outlier | through))
+        is_suspected = (
+            self._is_faulty or self._fastest > SPEED_MARGIN or bool(np.any(outlier | through))
+        )
         if not valid or not is_suspected:
             return valid, reason
         samples = joined(again())
         found = motion_reason(
-            self._cell, self._readback, self._rate_hz, samples.position_counts, samples.current_raw, samples.missing
+            self._cell,
+            self._readback,
+            self._rate_hz,
+            samples.position_counts,
+            samples.current_raw,
+            samples.missing,
         )
         return not found, found or reason
 
@@ -173,7 +195,9 @@ def judge_log(path: Path) -> tuple[LogReader, Cell, tuple[bool, str]]:
 
 
 class RecordedMotion:
-    """Positions and currents of a recording, by which it is judged at its end: 8 bytes for each sample of an axis."""
+    """Positions and currents of a recording, by which it is judged at its end:
+    8 bytes for each sample of an axis.
+    """
 
     def __init__(self, axes: int) -> None:
         """Store the number of axes."""

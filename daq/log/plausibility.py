@@ -1,8 +1,8 @@
 """Refuse numbers of a foreign recording that no robot moves by: a wrong unit, rate or column.
 
-Each check names the file, the column or axis, what was found, and the setting of the import description to correct. A
-step, a speed or a current is judged as in a recording of our own (`daq.log.impossible`), and so are readings that are
-none (`daq.log.column_faults`).
+Each check names the file, the column or axis, what was found, and the setting of the import
+description to correct. A step, a speed or a current is judged as in a recording of our own
+(`daq.log.impossible`), and so are readings that are none (`daq.log.column_faults`).
 """
 
 from __future__ import annotations
@@ -37,10 +37,13 @@ from ident.errors import CurrentUnsigned
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
 LARGEST_UNSIGNED = 2**32 - 1
-FEWEST_DIFFERENT = 3  #: Values of a column that is compared with others; a line at rest may be zero on two axes
+#: Values of a column that is compared with others; a line at rest may be zero on two axes
+FEWEST_DIFFERENT = 3
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
 SLOW_SHARE = 0.1
-"""Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
+"""Share of the velocity limits; if no joint is ever faster,
+the real rate may be ten times the declared one.
+"""
 LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
 TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
 VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
@@ -65,11 +68,14 @@ def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) 
                 section_place(section, files, row, column),
                 found=f"{values[row, column]:g}, as {key}",
                 expected=f"from {least:g} to {largest:g}",
-                remedy="correct the number, or the columns or the factor of that section in the import description",
+                remedy="correct the number, or the columns or the factor of that section in the "
+                "import description",
             )
 
 
-def check_counts(position: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]) -> None:
+def check_counts(
+    position: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]
+) -> None:
     """Refuse counts that are no whole numbers of 32 bits."""
     wrong = np.argwhere((position != np.rint(position)) | (np.abs(position) > LARGEST_RAW))
     if wrong.size:
@@ -82,8 +88,11 @@ def check_counts(position: FloatArray, wanted: ImportDescription, files: Mapping
         )
 
 
-def signed_counts(position: FloatArray, wanted: ImportDescription) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return counts with a sign where a column has them of 32 bits without: the same counter, read as a drive does.
+def signed_counts(
+    position: FloatArray, wanted: ImportDescription
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return counts with a sign where a column has them of 32 bits without:
+    the same counter, read as a drive does.
 
     Args:
         position: as the file has it, shape (rows, n).
@@ -99,7 +108,9 @@ def signed_counts(position: FloatArray, wanted: ImportDescription) -> tuple[Floa
         is_unsigned = counts.min() >= 0.0 and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED
         if is_unsigned:
             signed[counts > LARGEST_RAW, index] -= LARGEST_UNSIGNED + 1.0
-            remarks.append(f"column {column}: counts of 32 bits without a sign, read as counts with one")
+            remarks.append(
+                f"column {column}: counts of 32 bits without a sign, read as counts with one"
+            )
     return signed, tuple(remarks)
 
 
@@ -111,7 +122,8 @@ def counting_signs(reversed_axes: Sequence[str], axes: Sequence[str]) -> FloatAr
 def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
     """Convert positions or velocities to rad or m, shape (k, n).
 
-    On the joint side a prismatic axis is in mm where others are in degrees; on the motor side everything is an angle.
+    On the joint side a prismatic axis is in mm where others are in degrees; on the motor side
+    everything is an angle.
     """
     if columns.unit not in {PositionUnit.DEG, PositionUnit.MM, VelocityUnit.DEG, VelocityUnit.MM}:
         return values
@@ -127,7 +139,9 @@ def check_velocity(
     joint_rad: FloatArray,
     rate_hz: float,
 ) -> None:
-    """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S: it needs no derivative."""
+    """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S:
+    it needs no derivative.
+    """
     if (velocity := wanted.velocity) is None:
         return
     of_file = section_values(velocity, files) * counting_signs(velocity.reversed, cell.axis_names)
@@ -141,16 +155,19 @@ def check_velocity(
     still = np.array([STILL * axis.limits.velocity for axis in cell.axes]) * step / rate_hz
     error, size = (np.sqrt(np.mean(values**2, axis=0)) for values in (expected - moved, moved))
     for index in np.flatnonzero(error > velocity.tolerance * size + still).tolist():
-        way, stated_way = moved[:, index], expected[:, index]
+        way = moved[:, index]
+        stated_way = expected[:, index]
         ratio = float(way @ stated_way) / max(float(stated_way @ stated_way), 1e-300)
         file, column = velocity.places[index]
         raise TableUnfit(
             f"{files[file].path}, column {column}, axis {cell.axes[index].name}",
-            found=f"positions that move {ratio:.3g} times as fast as this velocity says, and differ from it by "
+            found=f"positions that move {ratio:.3g} times as fast as this velocity says, and "
+            "differ from it by "
             f"{100.0 * float(error[index]) / max(float(size[index]), 1e-300):.3g} %",
-            expected=f"velocities that agree with the positions to {100.0 * velocity.tolerance:g} %",
-            remedy="check `unit` and `side` of both, the order of their columns, and the rate or the unit of the time; "
-            "or leave `velocity` out",
+            expected="velocities that agree with the positions to "
+            f"{100.0 * velocity.tolerance:g} %",
+            remedy="check `unit` and `side` of both, the order of their columns, and the rate or "
+            "the unit of the time; or leave `velocity` out",
         )
 
 
@@ -172,14 +189,17 @@ def require_changing(
         if is_constant and np.ptp(position[:, index]):
             raise TableUnfit(
                 f"{files[file].path}, column {column}",
-                found=f"{current[0, index]:g} in every row" if current[0, index] else "zero in every row",
+                found=f"{current[0, index]:g} in every row"
+                if current[0, index]
+                else "zero in every row",
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )
 
 
 def require_own_columns(section: Section, values: FloatArray, files: Mapping[str, Table]) -> None:
-    """Refuse the same numbers for two axes: a copy of a column, or of a file, has the place of another one.
+    """Refuse the same numbers for two axes:
+    a copy of a column, or of a file, has the place of another one.
 
     Args:
         section: with the columns.
@@ -201,34 +221,48 @@ def require_own_columns(section: Section, values: FloatArray, files: Mapping[str
         later = section.places[index]
         raise TableUnfit(
             f"{files[later[0]].path}, column {later[1]}",
-            found=f"the same number as column {earlier[1]} of {earlier[0]} in all {len(column)} rows",
+            found=f"the same number as column {earlier[1]} of {earlier[0]} in all "
+            f"{len(column)} rows",
             expected="a column of its own for each axis: no two axes read alike to the last digit",
-            remedy="one of them is a copy: export the axis again, and correct `file` or `columns` in the description",
+            remedy="one of them is a copy: export the axis again, and correct `file` or `columns` "
+            "in the description",
         )
 
 
-def check_current(current: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]) -> None:
-    """Refuse outliers: one absurd number would make the count of its column so coarse that the others become zero."""
+def check_current(
+    current: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]
+) -> None:
+    """Refuse outliers: one absurd number would make the count of its column so coarse that the
+    others become zero.
+    """
     found = impossible_current(current)
     if found is not None:
         place = section_place(wanted.current, files, found.row, found.axis)
-        remedy = "samples are never invented: cut the recording there, by `keep`, or export it again"
+        remedy = (
+            "samples are never invented: cut the recording there, by `keep`, or export it again"
+        )
         raise found.error(TableUnfit, place, remedy)
 
 
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
-    """Refuse implausible speeds. A wrong rate scales them all; over many samples they are far above the noise."""
+    """Refuse implausible speeds.
+
+    A wrong rate scales them all; over many samples they are far above the noise.
+    """
     found = impossible_speed(joint_rad, rate_hz, cell)
     if found is not None:
-        remedy = "most likely rate_hz is too high, or the unit of the time column or of the positions is another"
+        remedy = (
+            "most likely rate_hz is too high, or the unit of the time column or of the "
+            "positions is another"
+        )
         raise found.error(TableUnfit, f"{name}, axis {cell.axes[found.axis].name}", remedy)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     share = float((fastest_speeds(joint_rad, rate_hz) / limits).max())
     if share < SLOW_SHARE:
         _LOG.warning(
-            "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the rate of the recording "
-            "right? A rate that is too low falsifies inertias without any other sign, and moves that slow do not "
-            "identify them.",
+            "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the "
+            "rate of the recording right? A rate that is too low falsifies inertias without any "
+            "other sign, and moves that slow do not identify them.",
             name,
             rate_hz,
             100.0 * share,
@@ -243,7 +277,8 @@ def check_steps(
     clock: Clock | None,
     cell: Cell,
 ) -> None:
-    """Refuse a step between two samples that no motor makes: a lost or doubled row, an angle or a counter that wraps.
+    """Refuse a step between two samples that no motor makes:
+    a lost or doubled row, an angle or a counter that wraps.
 
     Args:
         wanted: with the columns of the positions.
@@ -258,21 +293,28 @@ def check_steps(
         return
     row = found.row
     if clock is not None:
-        row = int(clock.row[min(np.searchsorted(clock.time_s, clock.tick_s[row]), len(clock.row) - 1)])
+        row = int(
+            clock.row[min(np.searchsorted(clock.time_s, clock.tick_s[row]), len(clock.row) - 1)]
+        )
     raise found.error(
         TableUnfit,
-        f"{section_place(wanted.position, files, row, found.axis)}, axis {cell.axes[found.axis].name}",
-        "cut the recording there, by `keep` of the import description, or export it again; a column that wraps (at 360 "
-        "degrees, at a turn of the motor, as a counter) has to be made continuous; in a bag, do two nodes publish the "
-        "same joints on the topic?",
+        f"{section_place(wanted.position, files, row, found.axis)}, axis "
+        f"{cell.axes[found.axis].name}",
+        "cut the recording there, by `keep` of the import description, or export it again; a "
+        "column that wraps (at 360 degrees, at a turn of the motor, as a counter) has to be made "
+        "continuous; in a bag, do two nodes publish the same joints on the topic?",
     )
 
 
 def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
-    """Refuse runs without motion: radians taken for degrees shrink it 57 times, which limits do not reveal."""
+    """Refuse runs without motion: radians taken for degrees shrink it 57 times,
+    which limits do not reveal.
+    """
     ranges = [axis.limits.position[1] - axis.limits.position[0] for axis in cell.axes]
     share = np.ptp(joint_rad, axis=0) / np.array(ranges)
-    still = [axis.name for axis, range_share in zip(cell.axes, share, strict=True) if range_share == 0.0]
+    still = [
+        axis.name for axis, range_share in zip(cell.axes, share, strict=True) if range_share == 0.0
+    ]
     if len(still) == len(cell.axes):
         raise PositionImplausible(
             name,
@@ -282,7 +324,8 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
         )
     if still:
         _LOG.warning(
-            "warning: %s: the position of %s never changes; if it moved, check its encoder or its column",
+            "warning: %s: the position of %s never changes; if it moved, check its encoder or "
+            "its column",
             name,
             " and ".join(still),
         )
@@ -291,12 +334,16 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
             name,
             found=f"motion over at most {100.0 * share.max():.2g} % of any joint's range",
             expected=f"at least {100.0 * SMALLEST_MOTION:g} % on one joint",
-            remedy="most likely radians were taken for degrees, or joint for motor side; correct the description",
+            remedy="most likely radians were taken for degrees, or joint for motor side; correct "
+            "the description",
         )
 
 
-def warn_of_unsigned(name: str, joint_rad: FloatArray, current_a: FloatArray, rate_hz: float, cell: Cell) -> None:
-    """Warn of currents without their sign: the log can be read; a fit takes it only if the motion explains them.
+def warn_of_unsigned(
+    name: str, joint_rad: FloatArray, current_a: FloatArray, rate_hz: float, cell: Cell
+) -> None:
+    """Warn of currents without their sign: the log can be read;
+    a fit takes it only if the motion explains them.
 
     Args:
         name: of the recording.
@@ -308,4 +355,6 @@ def warn_of_unsigned(name: str, joint_rad: FloatArray, current_a: FloatArray, ra
     try:
         require_signed_currents(run, cell.ratio, cell.axis_names)
     except CurrentUnsigned as error:
-        _LOG.warning("warning: %s; a fit refuses this log unless the motion explains the current", error)
+        _LOG.warning(
+            "warning: %s; a fit refuses this log unless the motion explains the current", error
+        )

@@ -1,4 +1,6 @@
-"""Read a log into arrays: every chunk of samples is one `frombuffer`, without a Python loop over messages."""
+"""Read a log into arrays: every chunk of samples is one `frombuffer`,
+without a Python loop over messages.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,18 @@ import numpy as np
 from mcap.records import Attachment, Chunk, Header, Metadata
 from numpy.typing import NDArray
 
+from daq.arguments import A_PATH, checks_arguments
 from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.config.yaml_file import MAX_BYTES
-from daq.errors import ClockImplausible, CyclesLost, DataError, LogIncomplete, LogMissing, LogUnreadable
+from daq.errors import (
+    ClockImplausible,
+    CyclesLost,
+    DataError,
+    LogIncomplete,
+    LogMissing,
+    LogUnreadable,
+)
 from daq.log.container import UNFINISHED, ChunkContents, PlacedRecord, RecordArray, RecordFile
 from daq.log.mcap_bag import foreign_recording
 from daq.log.message import ENCAPSULATION_WORD, LARGEST_AXES, SAMPLES_TOPIC, RawArray
@@ -39,8 +49,12 @@ BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in 
 LARGEST_ENTRIES = 1000  #: Attachments and metadata of a log; those of the shipped cells are a dozen
 LARGEST_METADATA = 2**20  #: Characters of one metadata record; ours have a few hundred
 STEP_TOLERANCE = 0.5
-"""Largest deviation of a time step, as a share of the period. From half a period on it could be another cycle."""
-RATE_TOLERANCE = 0.01  #: Largest relative difference between the requested rate and that of the time stamps
+"""Largest deviation of a time step, as a share of the period.
+
+From half a period on it could be another cycle.
+"""
+#: Largest relative difference between the requested rate and that of the time stamps
+RATE_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,9 +95,11 @@ class Log:
     head: LogHead  #: everything before the samples
     samples: SampleBlock  #: all samples
     events: tuple[CellEvent, ...]  #: in the order of the log
-    readings: tuple[SlowReading, ...]  #: torques and temperatures read beside the samples, in the order of the log
+    #: torques and temperatures read beside the samples, in the order of the log
+    readings: tuple[SlowReading, ...]
     statistics: RunStatistics  #: the recorder's summary at the end
-    partial: bool  #: the end of the recording is unknown: it was salvaged, or never got its final name
+    #: the end of the recording is unknown: it was salvaged, or never got its final name
+    partial: bool
 
 
 class SampleChecks:
@@ -93,13 +109,15 @@ class SampleChecks:
         """Store the path, for messages."""
         self.samples = 0  #: number of samples
         self.lost_cycles = 0  #: cycles missing between them
-        self.missing = np.zeros(LARGEST_AXES, dtype=np.int64)  #: samples without an answer, for each axis
+        #: samples without an answer, for each axis
+        self.missing = np.zeros(LARGEST_AXES, dtype=np.int64)
         self.widths: set[int] = set()  #: numbers of axes of the samples
         self._path = path
         self._highest = np.zeros(0, dtype=np.uint64)
         self._last = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.int64)
         self._first_ns = 0
-        self._gaps, self._first_gap = 0, ""
+        self._gaps = 0
+        self._first_gap = ""
         self._steps: dict[int, str] = {}  # the shortest and the longest [ns], with their cycles
 
     def take(self, block: SampleBlock) -> None:
@@ -111,12 +129,17 @@ class SampleChecks:
         self.samples += len(block.cycle)
         self.widths.add(block.position_counts.shape[1])
         if (missing := block.missing[block.missing != 0]).size:
-            self.missing += [np.count_nonzero(missing >> np.uint32(axis) & 1) for axis in range(LARGEST_AXES)]
+            self.missing += [
+                np.count_nonzero(missing >> np.uint32(axis) & 1) for axis in range(LARGEST_AXES)
+            ]
         highest = np.maximum.accumulate(np.concatenate((self._highest, block.cycle)))
         advance = np.diff(highest)
         self.lost_cycles += sum(advance[advance > 1].tolist()) - int(np.count_nonzero(advance > 1))
         self._highest = highest[-1:]
-        cycle, time_ns = (np.concatenate(pair) for pair in zip(self._last, (block.cycle, block.time_ns), strict=True))
+        cycle, time_ns = (
+            np.concatenate(pair)
+            for pair in zip(self._last, (block.cycle, block.time_ns), strict=True)
+        )
         self._last = cycle[-1:], time_ns[-1:]
         if len(cycle) < 2:
             return
@@ -126,7 +149,9 @@ class SampleChecks:
         self._gaps += gaps.size
         step_ns = np.diff(time_ns)
         for place in (int(np.argmin(step_ns)), int(np.argmax(step_ns))):
-            self._steps.setdefault(int(step_ns[place]), f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}")
+            self._steps.setdefault(
+                int(step_ns[place]), f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}"
+            )
         self._steps = {step: self._steps[step] for step in (min(self._steps), max(self._steps))}
 
     @property
@@ -137,7 +162,9 @@ class SampleChecks:
     def contradiction(
         self, head: LogHead, statistics: RunStatistics, readings: Iterable[SlowReading]
     ) -> LogIncomplete | None:
-        """Return the error for a log whose parts contradict each other; None for a sound one, lossy or not."""
+        """Return the error for a log whose parts contradict each other;
+        None for a sound one, lossy or not.
+        """
         axes = len(head.readback.axes)
         missing = tuple(self.missing[:axes].tolist())
         widths = ", ".join(map(str, sorted(self.widths)))
@@ -160,7 +187,11 @@ class SampleChecks:
                 f"{self.lost_cycles} lost cycles",
                 f"{statistics.lost_cycles}, as its recorder counted",
             ),
-            (len(statistics.missing) == axes, f"losses of {len(statistics.missing)} axes", f"{axes}"),
+            (
+                len(statistics.missing) == axes,
+                f"losses of {len(statistics.missing)} axes",
+                f"{axes}",
+            ),
             (
                 missing == statistics.missing,
                 f"{list(missing)} missing answers of its axes",
@@ -169,12 +200,17 @@ class SampleChecks:
         )
         for agrees, found, expected in pairs:
             if not agrees:
-                remedy = "another tool may have cut or changed the log; take the original, or record again"
+                remedy = (
+                    "another tool may have cut or changed the log; take the original, or "
+                    "record again"
+                )
                 return LogIncomplete(str(self._path), found=found, expected=expected, remedy=remedy)
         return None
 
     def fault(self, rate_hz: float) -> DataError | None:
-        """Return why no fit takes these samples: lost or repeated cycles, uneven time steps, another rate."""
+        """Return why no fit takes these samples:
+        lost or repeated cycles, uneven time steps, another rate.
+        """
         path = str(self._path)
         if self.samples < 2:
             return CyclesLost(path, found="one sample", expected="a run", remedy="record it again")
@@ -183,7 +219,8 @@ class SampleChecks:
                 path,
                 found=f"{self._first_gap} ({self._gaps} gaps)",
                 expected="every SYNC cycle once",
-                remedy="record again with less load on the bus and the computer; lost cycles are never interpolated",
+                remedy="record again with less load on the bus and the computer; lost cycles are "
+                "never interpolated",
             )
         period_ns = 1e9 / rate_hz
         step_ns = max(self._steps, key=lambda step_ns: abs(step_ns - period_ns))
@@ -191,9 +228,11 @@ class SampleChecks:
         if abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns:
             return ClockImplausible(
                 path,
-                found=f"{self._steps[step_ns].format(f'{step_ns * 1e-6:.4g} ms')}, its most uneven step",
+                found=f"{self._steps[step_ns].format(f'{step_ns * 1e-6:.4g} ms')}, its most "
+                "uneven step",
                 expected=f"{period_ns * 1e-6:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
-                remedy="SYNC came late: record again with less load on the computer, or with a longer sync.period_us",
+                remedy="SYNC came late: record again with less load on the computer, or with a "
+                "longer sync.period_us",
             )
         stamped_hz = (self.samples - 1) * 1e9 / (int(self._last[1][0]) - self._first_ns)
         if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
@@ -208,13 +247,16 @@ class SampleChecks:
     def verdict(self, rate_hz: float, statistics: RunStatistics) -> tuple[bool, str]:
         """Return whether the run is valid by its recorder and by its samples, and why not."""
         fault = self.fault(rate_hz) if statistics.valid else None
-        return (statistics.valid, statistics.reason) if fault is None else (False, fault.found)
+        if fault is None:
+            return (statistics.valid, statistics.reason)
+        return (False, fault.found)
 
 
 class LogReader:
     """Read a log once in bounded memory: iterate over blocks, then use the other properties.
 
-    Every verb reads logs here, so all refuse the same ones: damaged ones, and those whose parts contradict each other.
+    Every verb reads logs here, so all refuse the same ones: damaged ones, and those whose parts
+    contradict each other.
 
     Raises (while iterating):
         LogUnreadable: one of its kinds, with the place in the file.
@@ -247,7 +289,8 @@ class LogReader:
             raise foreign from error
 
     def until_damage(self) -> Iterator[SampleBlock]:
-        """Yield the blocks before the damage of a log without a valid end; `damage` is then its description.
+        """Yield the blocks before the damage of a log without a valid end;
+        `damage` is then its description.
 
         Raises:
             LogMissing: the file does not exist.
@@ -262,7 +305,8 @@ class LogReader:
 
     @property
     def contradiction(self) -> LogIncomplete | None:
-        """Error for a log whose samples contradict its recorder's counts or its readback; after the iteration.
+        """Error for a log whose samples contradict its recorder's counts or its readback;
+        after the iteration.
 
         Raises:
             LogIncomplete: the counts or the readback are missing.
@@ -283,16 +327,22 @@ class LogReader:
         """Refuse metadata without a seal: only the end of the file would cover them."""
         for offset, record in records:
             if isinstance(record, Metadata) and SEAL not in record.metadata:
-                raise self._file.corrupt(offset, f"metadata {record.name!r} without a seal", f"an entry {SEAL!r}")
+                raise self._file.corrupt(
+                    offset, f"metadata {record.name!r} without a seal", f"an entry {SEAL!r}"
+                )
             yield offset, record
 
     def _blocks(self, records: Iterable[PlacedRecord]) -> Iterator[SampleBlock]:
-        """Join several chunks to a block: numpy's calls cost more than the 150 samples of one chunk."""
+        """Join several chunks to a block: numpy's calls cost more than the 150 samples of one
+        chunk.
+        """
         waiting: list[RecordArray] = []
         start = 0
         try:
             for offset, chunk in self._sample_chunks(records):
-                if waiting and (chunk.dtype != waiting[0].dtype or sum(map(len, waiting)) >= BLOCK_SAMPLES):
+                if waiting and (
+                    chunk.dtype != waiting[0].dtype or sum(map(len, waiting)) >= BLOCK_SAMPLES
+                ):
                     yield self._block(start, waiting)
                     waiting = []
                 start = start if waiting else offset
@@ -324,20 +374,32 @@ class LogReader:
                 self._chunks.define(record)
 
     def _check_entry(self, offset: int, record: Attachment | Metadata) -> None:
-        """Refuse a second record of a name, of which a reader could take either, and more than a log ever has."""
+        """Refuse a second record of a name, of which a reader could take either,
+        and more than a log ever has.
+        """
         known: Mapping[str, object] = self._attachments
-        kind, size, largest = "attachment", 0, MAX_BYTES
+        kind = "attachment"
+        size = 0
+        largest = MAX_BYTES
         if isinstance(record, Attachment):
             size = len(record.data)
         else:
-            known, kind, largest = self._metadata, "metadata", LARGEST_METADATA
+            known = self._metadata
+            kind = "metadata"
+            largest = LARGEST_METADATA
             size = sum(len(key) + len(value) for key, value in record.metadata.items())
         if record.name in known:
-            raise self._file.corrupt(offset, f"a second {kind} {record.name!r:.80}", "one of each name")
+            raise self._file.corrupt(
+                offset, f"a second {kind} {record.name!r:.80}", "one of each name"
+            )
         if len(self._attachments) + len(self._metadata) >= LARGEST_ENTRIES:
-            raise self._file.corrupt(offset, f"more than {LARGEST_ENTRIES} attachments and metadata", "a log of a cell")
+            raise self._file.corrupt(
+                offset, f"more than {LARGEST_ENTRIES} attachments and metadata", "a log of a cell"
+            )
         if size > largest:
-            raise self._file.corrupt(offset, f"{kind} {record.name!r:.80} of {size} bytes", f"at most {largest}")
+            raise self._file.corrupt(
+                offset, f"{kind} {record.name!r:.80} of {size} bytes", f"at most {largest}"
+            )
 
     @property
     def digest(self) -> str:
@@ -378,13 +440,19 @@ class LogReader:
 
     def _block(self, offset: int, chunks: list[RecordArray]) -> SampleBlock:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
-        records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
+        records = np.frombuffer(
+            b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype
+        )
         axes = records["position_counts"].shape[1]
         lengths = np.stack([records[name] for name in ("positions", "currents", "statuswords")])
         if (lengths != axes).any() or (records["encapsulation"] != ENCAPSULATION_WORD).any():
-            raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
+            raise self._file.corrupt(
+                offset, "samples of another layout", f"little-endian CDR of {axes} axes"
+            )
         if (records["seconds"] < 0).any() or (records["nanoseconds"] >= 1_000_000_000).any():
-            raise self._file.corrupt(offset, "samples from before 1970 or of a second that is too long", "Unix time")
+            raise self._file.corrupt(
+                offset, "samples from before 1970 or of a second that is too long", "Unix time"
+            )
         block = SampleBlock(
             cycle=records["cycle"].astype(np.uint64),
             time_ns=records["seconds"].astype(np.int64) * 1_000_000_000 + records["nanoseconds"],
@@ -397,16 +465,24 @@ class LogReader:
         return block
 
     def _incomplete(self, error: Exception, expected: str) -> LogIncomplete:
-        found = f"none ({error.args[0]!r})" if isinstance(error, KeyError) else str(error)
+        if isinstance(error, KeyError):
+            found = f"none ({error.args[0]!r})"
+        else:
+            found = str(error)
         return LogIncomplete(
-            str(self.path), found=found, expected=expected, remedy="record or import the run again with this software"
+            str(self.path),
+            found=found,
+            expected=expected,
+            remedy="record or import the run again with this software",
         )
 
 
+@checks_arguments(path=A_PATH)
 def read_log(path: Path | str) -> Log:
     """Read a whole log.
 
     Raises:
+        UsageError: the argument is no path.
         LogUnreadable: one of its kinds, with the place in the file.
     """
     path = Path(path)
@@ -429,11 +505,15 @@ def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:
     waiting = list(blocks)
     columns = {name: [getattr(block, name) for block in waiting] for name in SampleBlock.__slots__}
     waiting.clear()  # so that a long log is not in memory twice
-    return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
+    return SampleBlock(
+        **{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__}
+    )
 
 
 class LossyLogs(Enum):
-    """Whether to use a log that its recorder marked invalid because of losses that are masked (`Loss.masked`)."""
+    """Whether to use a log that its recorder marked invalid because of losses that are masked
+    (`Loss.masked`).
+    """
 
     REFUSED = "refused"
     ACCEPTED = "accepted"

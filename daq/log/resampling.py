@@ -1,8 +1,9 @@
 """Sample times: judge the stamps of a recording, and resample it to a uniform clock.
 
-Everything after a log assumes evenly spaced samples, as central differences do. A stamp is the time of its sample:
-positions at the ticks of a uniform clock come from a cubic spline through the samples, currents from straight lines
-between them. Where the stamps show a uniform clock, the samples stay as they are.
+Everything after a log assumes evenly spaced samples, as central differences do. A stamp is the time
+of its sample: positions at the ticks of a uniform clock come from a cubic spline through the
+samples, currents from straight lines between them. Where the stamps show a uniform clock, the
+samples stay as they are.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy  # loads scipy.interpolate when it is first used: half of the time of an import without a spline
+
+# Loads scipy.interpolate when it is first used: half of the time of an import without a spline
+import scipy
 
 from daq.config.import_description import RATES_HZ, TimeColumn
 from daq.errors import TableUnfit
@@ -18,21 +21,36 @@ from daq.log.metadata import Timing
 from daq.log.table import Table
 from ident.arrays import BoolArray, FloatArray, IntArray
 
-EVEN = 1e-3  #: Largest distance of a stamp from a uniform clock that leaves the samples as they are [periods]
-COARSE = 1.5  #: Spread of the rounded stamps of a uniform clock [units of their last digit]: 1, and what the fit adds
-NEAR = 0.25  #: Steps this near to whole numbers of the usual one mean that samples are missing, not late [usual steps]
-CLOSEST = 0.1  #: Shortest step between two samples [usual steps]; a spline through closer ones amplifies their noise
-RATE_CHANGE, RATE_NOISE = 0.1, 6.0
-"""Largest change of the rate within a recording, beyond so many deviations of what jitter does to the mean of a window.
-A controller samples at one rate: stamps of another are of a clock that drifts, and scale velocities and inertias."""
+#: Largest distance of a stamp from a uniform clock that leaves the samples as they are [periods]
+EVEN = 1e-3
+#: Spread of the rounded stamps of a uniform clock [units of their last digit]: 1, and what the fit
+#: adds
+COARSE = 1.5
+#: Steps this near to whole numbers of the usual one mean that samples are missing, not late [usual
+#: steps]
+NEAR = 0.25
+#: Shortest step between two samples [usual steps]; a spline through closer ones amplifies their
+#: noise
+CLOSEST = 0.1
+RATE_CHANGE = 0.1
+RATE_NOISE = 6.0
+"""Largest change of the rate within a recording, beyond so many deviations of what jitter does to
+the mean of a window. A controller samples at one rate: stamps of another are of a clock that
+drifts, and scale velocities and inertias.
+"""
 RATE_WINDOWS, SHORTEST_WINDOW = 20, 50  #: Windows of a recording, and the fewest steps of one
-SLOWEST, QUICKEST = 0.5, 2.0
-"""Rates that may be stated, in multiples of the data's: far below, noise folds into the band of the motion."""
+SLOWEST = 0.5
+QUICKEST = 2.0
+"""Rates that may be stated, in multiples of the data's:
+far below, noise folds into the band of the motion.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clock:
-    """Sample times of the rows of a recording that are used, and the ticks that they are resampled to."""
+    """Sample times of the rows of a recording that are used,
+    and the ticks that they are resampled to.
+    """
 
     row: IntArray  #: rows of the file that are used, shape (k,)
     time_s: FloatArray  #: their stamps since the first one [s], increasing, shape (k,)
@@ -40,13 +58,17 @@ class Clock:
     timing: Timing  #: what the stamps showed
 
     def positions(self, values: FloatArray) -> FloatArray:
-        """Return positions at the ticks, shape (m, n), by a cubic spline through those of the rows, shape (k, n)."""
+        """Return positions at the ticks, shape (m, n), by a cubic spline through those of the rows,
+        shape (k, n).
+        """
         if not self.timing.resampled:
             return values
         return scipy.interpolate.CubicSpline(self.time_s, values)(self.tick_s)
 
     def currents(self, values: FloatArray) -> FloatArray:
-        """Return currents at the ticks, shape (m, n), by straight lines between those of the rows, shape (k, n)."""
+        """Return currents at the ticks, shape (m, n), by straight lines between those of the rows,
+        shape (k, n).
+        """
         if not self.timing.resampled:
             return values
         return np.column_stack([np.interp(self.tick_s, self.time_s, column) for column in values.T])
@@ -54,13 +76,16 @@ class Clock:
 
 def on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
     """Move columns of the file, shape (rows, n), to the samples of the log, shape (k, n)."""
-    return values if clock is None else clock.currents(values[clock.row])
+    if clock is None:
+        return values
+    return clock.currents(values[clock.row])
 
 
 def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
     """Return the clock of a recording.
 
-    Rows that repeat the one before, stamp and all, are left out; so are samples CLOSEST to the one before.
+    Rows that repeat the one before, stamp and all, are left out; so are samples CLOSEST to the one
+    before.
 
     Args:
         table: the file with the stamps.
@@ -68,9 +93,9 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
         numbers: everything that is imported, shape (k, c).
 
     Raises:
-        TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers; a step is longer than
-            `largest_gap_periods`; the rate is outside RATES_HZ, or changes by more than RATE_CHANGE; or the stated rate
-            is far from that of the stamps.
+        TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers; a step
+            is longer than `largest_gap_periods`; the rate is outside RATES_HZ, or changes by more
+            than RATE_CHANGE; or the stated rate is far from that of the stamps.
     """
     assert table.stamps is not None  # its reader was asked for them
     row = np.flatnonzero(_distinct(table, wanted, numbers))
@@ -78,15 +103,22 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
     duplicates = len(numbers) - len(row)
     step_s = np.diff(time_s, prepend=-np.inf)
     far = step_s >= CLOSEST * np.median(step_s)
-    row, time_s = row[far], time_s[far]
+    row = row[far]
+    time_s = time_s[far]
     if len(row) < 3:
         raise TableUnfit(
             str(table.path),
             found=f"{len(row)} different time stamps in {len(numbers)} rows",
             expected="one for each sample",
-            remedy="correct `column` and `unit` of `time` in the import description, or give rate_hz instead",
+            remedy="correct `column` and `unit` of `time` in the import description, or give "
+            "rate_hz instead",
         )
-    timing = replace(check_stamps(time_s), rows=len(numbers), duplicates=duplicates, close=int(np.count_nonzero(~far)))
+    timing = replace(
+        check_stamps(time_s),
+        rows=len(numbers),
+        duplicates=duplicates,
+        close=int(np.count_nonzero(~far)),
+    )
     if not RATES_HZ[0] * (1.0 - EVEN) <= timing.rate_hz <= RATES_HZ[1] * (1.0 + EVEN):
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
@@ -109,8 +141,8 @@ def check_stamps(time_s: FloatArray) -> Timing:
         time_s: stamps since the first one [s], increasing, shape (k,) with k > 1.
 
     Returns:
-        the timing. Its rate is that of the usual step where every step is nearly a whole number of them, else the mean
-        rate.
+        the timing. Its rate is that of the usual step where every step is nearly a whole number of
+        them, else the mean rate.
     """
     step_s = np.diff(time_s)
     periods, usual_s = _periods(step_s)
@@ -130,7 +162,9 @@ def check_stamps(time_s: FloatArray) -> Timing:
 
 
 def _periods(step_s: FloatArray) -> tuple[FloatArray, float]:
-    """Return each step in usual steps, shape (k,), all ones where they are not nearly whole; and the usual step [s]."""
+    """Return each step in usual steps, shape (k,), all ones where they are not nearly whole;
+    and the usual step [s].
+    """
     usual_s = float(np.median(step_s))
     periods = np.rint(step_s / usual_s)
     whole = np.all((periods >= 1.0) & (np.abs(step_s / usual_s - periods) < NEAR))
@@ -138,7 +172,9 @@ def _periods(step_s: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
-    """Refuse stamps whose rate drifts or jumps; jitter and missing samples leave its mean over a window alone."""
+    """Refuse stamps whose rate drifts or jumps;
+    jitter and missing samples leave its mean over a window alone.
+    """
     step_s = np.diff(time_s)
     period_s = step_s / _periods(step_s)[0]
     width = max(SHORTEST_WINDOW, len(period_s) // RATE_WINDOWS)
@@ -147,21 +183,25 @@ def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
         return
     windows = period_s[: count * width].reshape(count, width)
     mean_s = windows.mean(axis=1)
-    noise = RATE_NOISE * float(np.median(windows.std(axis=1))) / (np.sqrt(width) * float(mean_s.mean()))
+    noise = (
+        RATE_NOISE * float(np.median(windows.std(axis=1))) / (np.sqrt(width) * float(mean_s.mean()))
+    )
     if mean_s.max() / mean_s.min() - 1.0 > RATE_CHANGE + noise:
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
-            found=f"stamps at {1.0 / mean_s.max():.4g} to {1.0 / mean_s.min():.4g} Hz in parts of the recording",
+            found=f"stamps at {1.0 / mean_s.max():.4g} to {1.0 / mean_s.min():.4g} Hz in parts of "
+            "the recording",
             expected=f"one rate, to {100.0 * RATE_CHANGE:g} %",
-            remedy="if these are times of arrival, give rate_hz instead of time; else import the parts of one rate as "
-            "recordings of their own",
+            remedy="if these are times of arrival, give rate_hz instead of time; else import the "
+            "parts of one rate as recordings of their own",
         )
 
 
 def _is_uniform(time_s: FloatArray) -> bool:
     """Whether stamps show a uniform clock: exactly, or rounded to a decimal digit.
 
-    Rounding makes steps of two kinds, one unit of the digit apart, and moves every stamp by less than one unit.
+    Rounding makes steps of two kinds, one unit of the digit apart, and moves every stamp by less
+    than one unit.
     """
     index = np.arange(len(time_s)) - 0.5 * (len(time_s) - 1)
     period_s = float(index @ time_s / (index @ index))
@@ -175,18 +215,25 @@ def _is_uniform(time_s: FloatArray) -> bool:
     return False
 
 
-def _at_rate(table: Table, wanted: TimeColumn, rate_hz: float, time_s: FloatArray, timing: Timing) -> Timing:
-    """Return the timing with a stated rate; samples stay as they are if it agrees to half a period over the file."""
+def _at_rate(
+    table: Table, wanted: TimeColumn, rate_hz: float, time_s: FloatArray, timing: Timing
+) -> Timing:
+    """Return the timing with a stated rate; samples stay as they are if it agrees to half a period
+    over the file.
+    """
     if not SLOWEST <= rate_hz / timing.rate_hz <= QUICKEST:
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
             found=f"stamps at {timing.rate_hz:.6g} Hz",
-            expected=f"a rate near the stated {rate_hz:g} Hz: at least half and at most twice as large",
+            expected=f"a rate near the stated {rate_hz:g} Hz: at least half and at most "
+            "twice as large",
             remedy="correct `rate_hz` or `unit` of `time` in the import description",
         )
     ahead = float(time_s[-1]) * abs(rate_hz - timing.rate_hz)  # periods at the last stamp
     drift_s = max(timing.drift_s, ahead / rate_hz)
-    return replace(timing, rate_hz=rate_hz, drift_s=drift_s, resampled=timing.resampled or ahead >= 0.5)
+    return replace(
+        timing, rate_hz=rate_hz, drift_s=drift_s, resampled=timing.resampled or ahead >= 0.5
+    )
 
 
 def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArray:
@@ -205,13 +252,15 @@ def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArra
             expected="stamps that increase",
             remedy="were two recordings joined? import each by `keep` of the import description"
             if back_s
-            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of time; in a bag, do "
-            "two nodes publish the same joints on the topic?",
+            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of "
+            "time; in a bag, do two nodes publish the same joints on the topic?",
         )
     return np.concatenate(([True], ~repeated))
 
 
-def _check_gaps(table: Table, wanted: TimeColumn, row: IntArray, time_s: FloatArray, timing: Timing) -> None:
+def _check_gaps(
+    table: Table, wanted: TimeColumn, row: IntArray, time_s: FloatArray, timing: Timing
+) -> None:
     """Refuse gaps: nothing is known of the motion in them."""
     step_s = np.diff(time_s)
     gaps = np.flatnonzero(step_s > wanted.largest_gap_periods * timing.usual_step_s * (1.0 + EVEN))
@@ -221,7 +270,9 @@ def _check_gaps(table: Table, wanted: TimeColumn, row: IntArray, time_s: FloatAr
             table.place(int(row[first + 1]), wanted.column),
             found=f"{step_s[first]:.6g} s after the sample before"
             + (f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""),
-            expected=f"at most {wanted.largest_gap_periods:g} times the usual {timing.usual_step_s:.6g} s",
-            remedy="samples are missing: import the parts before and after it as two recordings, by `keep`, or allow "
-            "the gap with `largest_gap_periods` of `time`; if these are times of arrival, give rate_hz instead of time",
+            expected=f"at most {wanted.largest_gap_periods:g} times the usual "
+            f"{timing.usual_step_s:.6g} s",
+            remedy="samples are missing: import the parts before and after it as two recordings, "
+            "by `keep`, or allow the gap with `largest_gap_periods` of `time`; if these are times "
+            "of arrival, give rate_hz instead of time",
         )

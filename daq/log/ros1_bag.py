@@ -1,4 +1,6 @@
-"""Read ROS 1 bags: the package `rosbags`, of the extra `ros1`, walks through the file and makes CDR of its messages."""
+"""Read ROS 1 bags: the package `rosbags`, of the extra `ros1`,
+walks through the file and makes CDR of its messages.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,16 @@ from daq.log.mcap_bag import BagMessage, Topic
 from daq.log.message import JOINTS_SCHEMA
 
 ROS_1_MAGIC = b"#ROSBAG V"
-_DAMAGE = (AssertionError, EOFError, LookupError, ArithmeticError, RuntimeError, TypeError, ValueError, MemoryError)
+_DAMAGE = (
+    AssertionError,
+    EOFError,
+    LookupError,
+    ArithmeticError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    MemoryError,
+)
 """What the library raises of a damaged file, besides its own errors and those of `struct`."""
 
 
@@ -56,10 +67,15 @@ class Ros1Bag:
                     yield BagMessage(number, topic, time_ns, content)
         except OSError as error:
             raise LogMissing(
-                str(self.path), found=reason_of(error), expected="a ROS 1 bag", remedy="check the name"
+                str(self.path),
+                found=reason_of(error),
+                expected="a ROS 1 bag",
+                remedy="check the name",
             ) from error
         except (reading.ReaderError, serde.SerdeError, struct.error, *_DAMAGE) as error:
-            raise self._broken(str(self.path), f"{error}" or type(error).__name__, "a ROS 1 bag") from error
+            raise self._broken(
+                str(self.path), f"{error}" or type(error).__name__, "a ROS 1 bag"
+            ) from error
 
     def corrupt(self, place: int, found: str, expected: str) -> LogCorrupt:
         """Make the error for a message."""
@@ -81,9 +97,13 @@ def _bound(chunks: dict[int, Any]) -> None:
     for position, chunk in chunks.items():
         name = getattr(chunk.decompressor, "__module__", "")
         if name == "bz2":
-            chunks[position] = chunk._replace(decompressor=partial(unpack_chunk, bz2.BZ2Decompressor))
+            chunks[position] = chunk._replace(
+                decompressor=partial(unpack_chunk, bz2.BZ2Decompressor)
+            )
         elif name.startswith("lz4"):
-            chunks[position] = chunk._replace(decompressor=partial(unpack_chunk, lz4.frame.LZ4FrameDecompressor))
+            chunks[position] = chunk._replace(
+                decompressor=partial(unpack_chunk, lz4.frame.LZ4FrameDecompressor)
+            )
 
 
 def unpack_chunk(kind: Callable[[], Any], data: bytes) -> bytes:
@@ -95,5 +115,7 @@ def unpack_chunk(kind: Callable[[], Any], data: bytes) -> bytes:
     unpack = kind()
     content: bytes = unpack.decompress(data, LARGEST_CHUNK)
     if not unpack.eof:
-        raise ValueError(f"a chunk of {len(data)} bytes that ends early, or unfolds to more than {LARGEST_CHUNK}")
+        raise ValueError(
+            f"a chunk of {len(data)} bytes that ends early, or unfolds to more than {LARGEST_CHUNK}"
+        )
     return content

@@ -38,13 +38,16 @@ class Salvaged:
     """Result of a salvage."""
 
     log: Path  #: the new file
-    statistics: RunStatistics  #: of the new file; partial, and valid as far as samples and events show
+    #: of the new file; partial, and valid as far as samples and events show
+    statistics: RunStatistics
     duration_s: float  #: duration of the samples [s]
     left_out_bytes: int  #: size of the damaged file from the first damaged byte
     damage: str  #: description of the damage; empty if only the end of the file is missing
 
 
-def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _samples: None) -> Salvaged:
+def salvage(
+    damaged: Path, out: Path, progress: Callable[[int], None] = lambda _samples: None
+) -> Salvaged:
     """Write everything before the damage of a log to a new log. The damaged file is only read.
 
     Args:
@@ -71,7 +74,9 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
             for _ in LogReader(damaged):
                 pass
             expected = "a damaged or unfinished one"
-            raise UsageError(str(damaged), found="a whole log", expected=expected, remedy="use it as it is")
+            raise UsageError(
+                str(damaged), found="a whole log", expected=expected, remedy="use it as it is"
+            )
     reader = LogReader(damaged)
     blocks = reader.until_damage()
     first = next(blocks, None)
@@ -85,7 +90,9 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent.of(cell, run, head.files, head.readback)
     # A crash loses only this new file, so no clock is needed to flush in time.
-    with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False) as log:
+    with LogWriter(
+        out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False
+    ) as log:
         _copy(reader, chain((first,), blocks), log, cell, progress)
     size = damaged.stat().st_size
     damage = "" if reader.damage is None else f"{reader.damage.subject}: {reader.damage.found}"
@@ -94,7 +101,11 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
 
 
 def _copy(
-    reader: LogReader, blocks: Iterable[SampleBlock], log: LogWriter, cell: Cell, progress: Callable[[int], None]
+    reader: LogReader,
+    blocks: Iterable[SampleBlock],
+    log: LogWriter,
+    cell: Cell,
+    progress: Callable[[int], None],
 ) -> None:
     known_events = known_readings = 0
     axes = len(cell.axes)
@@ -117,17 +128,31 @@ def _copy(
         watch.take(block)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
         for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
-            log.write(Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing))
+            log.write(
+                Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing)
+            )
         progress(log.statistics.samples)
     if reader.concluded:
         contradiction = reader.contradiction
-        found = [] if contradiction is None else [f"{contradiction.found}; expected {contradiction.expected}"]
-        found = [reader.statistics.reason or "no reason given"] if not reader.statistics.valid else found
+        found = (
+            []
+            if contradiction is None
+            else [f"{contradiction.found}; expected {contradiction.expected}"]
+        )
+        found = (
+            [reader.statistics.reason or "no reason given"]
+            if not reader.statistics.valid
+            else found
+        )
     else:  # no verdict of the recorder: that of the losses and faults in samples and events
         counted = log.statistics
         found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
         found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
-        found += [f"{event.kind.value} ({event.text})" for event in reader.events if event.kind not in _HARMLESS][:3]
+        found += [
+            f"{event.kind.value} ({event.text})"
+            for event in reader.events
+            if event.kind not in _HARMLESS
+        ][:3]
     judged = RunStatistics(0, 0, (), valid=not found, reason=", ".join(found))
     verdict = watch.verdict(reader.checks, judged, lambda: LogReader(reader.path).until_damage())
     log.conclude(*verdict, partial=True)
@@ -157,5 +182,8 @@ def _refuse_running(damaged: Path) -> None:
 
 def _nothing_saved(damaged: Path, found: str) -> LogIncomplete:
     return LogIncomplete(
-        str(damaged), found=found, expected="at least one sample", remedy="nothing can be saved: record the run again"
+        str(damaged),
+        found=found,
+        expected="at least one sample",
+        remedy="nothing can be saved: record the run again",
     )

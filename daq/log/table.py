@@ -1,7 +1,7 @@
 """A table of samples as numbers: what every reader of a foreign file hands to the import.
 
-A reader is a function of the file, the import description, and the columns and the time column that the description
-names in that file. It returns a `Table`, or raises `TableUnfit`.
+A reader is a function of the file, the import description, and the columns and the time column that
+the description names in that file. It returns a `Table`, or raises `TableUnfit`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.import_description import Column, ImportDescription, KeptPart, Section, TimeColumn, TimeUnit
+from daq.config.import_description import (
+    Column,
+    ImportDescription,
+    KeptPart,
+    Section,
+    TimeColumn,
+    TimeUnit,
+)
 from daq.errors import TableUnfit, counted, reason_of
 from ident.arrays import FloatArray
 
@@ -43,9 +50,11 @@ class Table:
     values: FloatArray  #: finite numbers, shape (k, len(columns))
     digest: str  #: of the rows (sha256, hex)
     stamps: Stamps | None = None  #: of the time column; None if it is not in this file
-    line_numbers: Sequence[int] | None = None  #: line of each row, from 1; None where rows have no lines
+    #: line of each row, from 1; None where rows have no lines
+    line_numbers: Sequence[int] | None = None
     first_row: int = 0  #: rows of the file that were cut off before the first one
-    remarks: tuple[str, ...] = ()  #: oddities of the file that were mended, for the person who imports it
+    #: oddities of the file that were mended, for the person who imports it
+    remarks: tuple[str, ...] = ()
     #: Of a column that is called as the time column of another file; None without one.
     stamps_beside: Stamps | None = None
 
@@ -61,7 +70,8 @@ class Table:
 
 
 def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
-    """Compare the rows of two files that both have stamps: a row of one belongs to the same row of the other.
+    """Compare the rows of two files that both have stamps:
+    a row of one belongs to the same row of the other.
 
     Args:
         timed: with the stamps that are used.
@@ -71,12 +81,17 @@ def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
         a remark where one of them begins later, by a clock of its own.
 
     Raises:
-        TableUnfit: the steps differ, so that a row is missing in one of them, or dates say that they are of other
-            times.
+        TableUnfit: the steps differ, so that a row is missing in one of them, or dates say that
+            they are of other times.
     """
     mine = timed.stamps
     others = other.stamps_beside
-    if mine is None or others is None or len(mine.time_s) != len(others.time_s) or len(mine.time_s) < 2:
+    if (
+        mine is None
+        or others is None
+        or len(mine.time_s) != len(others.time_s)
+        or len(mine.time_s) < 2
+    ):
         return ()
     half_step_s = 0.5 * float(np.median(np.diff(mine.time_s)))
     apart = np.flatnonzero(np.abs(mine.time_s - others.time_s) > half_step_s)
@@ -84,9 +99,11 @@ def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
         row = int(apart[0])
         raise TableUnfit(
             other.place(row, "time"),
-            found=f"{others.time_s[row]:.6g} s since its first row, and {mine.time_s[row]:.6g} s in {timed.path.name}",
+            found=f"{others.time_s[row]:.6g} s since its first row, and {mine.time_s[row]:.6g} s "
+            f"in {timed.path.name}",
             expected="rows of the same instants in both files",
-            remedy="a row is missing in one of them, or they are of different runs; export them again",
+            remedy="a row is missing in one of them, or they are of different runs; export "
+            "them again",
         )
     later_s = 1e-9 * (others.first_ns - mine.first_ns)
     if abs(later_s) <= half_step_s:
@@ -95,11 +112,16 @@ def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
     if 1e-9 * min(mine.first_ns, others.first_ns) > ABSOLUTE_S:
         raise TableUnfit(
             str(other.path),
-            found=f"stamps that begin {later_s:.6g} s after those of {timed.path.name}, by the same clock",
+            found=f"stamps that begin {later_s:.6g} s after those of {timed.path.name}, by the "
+            "same clock",
             expected="rows of the same instants in both files",
-            remedy="the files are of different times: export the same part of each, or keep it by `keep`",
+            remedy="the files are of different times: export the same part of each, or keep it "
+            "by `keep`",
         )
-    return (f"{name}: its stamps begin {later_s:.6g} s after those of {timed.path.name}: rows count as simultaneous",)
+    return (
+        f"{name}: its stamps begin {later_s:.6g} s after those of {timed.path.name}: rows "
+        "count as simultaneous",
+    )
 
 
 def section_values(section: Section, files: Mapping[str, Table]) -> FloatArray:
@@ -205,7 +227,10 @@ def cut_advice(values: FloatArray, first_row: int) -> str:
         ends.append(f"from_row: {first_row + first + 1}")
     if last < len(sound):
         ends.append(f"to_row: {first_row + last}")
-    setting = f"`keep: {{{', '.join(ends)}}}`" if ends and sound.any() else "`keep`"
+    if ends and sound.any():
+        setting = f"`keep: {{{', '.join(ends)}}}`"
+    else:
+        setting = "`keep`"
     cut = f"cut the recording there, by {setting} of the import description"
     return f"samples are never invented: {cut}, or export it again"
 
@@ -280,7 +305,8 @@ MIDNIGHT = Wrap(86400.0, "times of day that pass midnight")
 
 
 def without_wraps(time_s: FloatArray, wraps: Sequence[Wrap]) -> tuple[FloatArray, tuple[str, ...]]:
-    """Make stamps continuous that begin anew, as a counter of 32 bits does; others stay as they are.
+    """Make stamps continuous that begin anew, as a counter of 32 bits does;
+    others stay as they are.
 
     Each step back must be nearly a whole period: with it, the step is as long as the others.
 

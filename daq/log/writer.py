@@ -51,8 +51,10 @@ from daq.log.metadata import (
 from drivers.messages import CellEvent, Sample, SlowReading
 
 FLUSH_NS = 150_000_000
-"""Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
-for the cycle on the bus and the chunk that is being packed."""
+"""Time between two flushes, recorded or wall time, whichever ends first [ns].
+
+A kill may cost 200 ms: the rest is for the cycle on the bus and the chunk that is being packed.
+"""
 JOINT_STATE_NS = 20_000_000  #: Time between two joint states, over which their velocity is the mean
 CHUNK_BYTES = 4 * 2**20  #: Never reached between two flushes; a chunk ends with one
 
@@ -68,7 +70,9 @@ class LogContent:
     urdf: str = ""  #: text of the URDF, its held joints fixed, for viewers; empty without one
 
     @classmethod
-    def of(cls, cell: Cell, run: RunInfo, files: Mapping[str, bytes], readback: Readback) -> LogContent:
+    def of(
+        cls, cell: Cell, run: RunInfo, files: Mapping[str, bytes], readback: Readback
+    ) -> LogContent:
         """The start of a log of a cell."""
         return cls(run, files, readback, joint_names(cell), cell.urdf)
 
@@ -76,12 +80,13 @@ class LogContent:
 class LogWriter:
     """Context manager that writes one log.
 
-    The log is `PATH.part` until the block ends without an error; then it is finished, synced and renamed. After an
-    error the `.part` keeps everything up to that moment, or is removed if the log can be made again.
+    The log is `PATH.part` until the block ends without an error; then it is finished, synced and
+    renamed. After an error the `.part` keeps everything up to that moment, or is removed if the log
+    can be made again.
 
     Raises (on entry and later):
-        UsageError: the log, or a `.part` of the same name, already exists. At the end: a file of that name has
-            appeared; the `.part` is then the whole log.
+        UsageError: the log, or a `.part` of the same name, already exists. At the end: a file of
+            that name has appeared; the `.part` is then the whole log.
         OutputFailed: the file system refuses.
     """
 
@@ -140,7 +145,8 @@ class LogWriter:
                 str(self.part),
                 found="an unfinished log of that name",
                 expected="none",
-                remedy="its recorder still runs or was killed; move the file away to keep its samples",
+                remedy="its recorder still runs or was killed; move the file away to keep "
+                "its samples",
             ) from error
         except OSError as error:
             raise self._failed(error) from error
@@ -165,11 +171,14 @@ class LogWriter:
         try:
             data = sample_bytes(self._layout, sample)
         except struct.error as error:
-            raise ValueError(f"{sample} does not fit a log of {self._axes} axes: {error}") from error
+            raise ValueError(
+                f"{sample} does not fit a log of {self._axes} axes: {error}"
+            ) from error
         self._count(sample)
         wall_ns = self._clock_ns()
         if self._samples == 1:
-            self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
+            self._flushed_recorded_ns = sample.time_ns
+            self._flushed_wall_ns = wall_ns
             self._joint_state_due_ns = sample.time_ns
         elif (
             self._samples == 2  # the first one by itself: a log that has begun can be salvaged
@@ -177,10 +186,13 @@ class LogWriter:
             or wall_ns - self._flushed_wall_ns >= FLUSH_NS
         ):
             self.flush()
-            self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
+            self._flushed_recorded_ns = sample.time_ns
+            self._flushed_wall_ns = wall_ns
         try:
             channel = self._channel(SAMPLES_TOPIC)
-            self._mcap.add_message(channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF)
+            self._mcap.add_message(
+                channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF
+            )
         except OSError as error:
             raise self._failed(error) from error
         if sample.time_ns >= self._joint_state_due_ns:
@@ -189,13 +201,18 @@ class LogWriter:
 
     def _hold_state(self, sample: Sample) -> None:
         """Append what viewers show of a sample, in SI."""
-        time_ns, position = sample.time_ns, self._joint_position(sample.position_counts)
+        time_ns = sample.time_ns
+        position = self._joint_position(sample.position_counts)
         before_ns, before = self._joint_state_before or (time_ns, position)
         elapsed_s = max(time_ns - before_ns, 1) * 1e-9
         velocity = [(now - then) / elapsed_s for now, then in zip(position, before, strict=True)]
         self._joint_state_before = time_ns, position
-        current = [raw * unit for raw, unit in zip(sample.current_raw, self._ampere_per_unit, strict=True)]
-        self._hold(JOINTS_TOPIC, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity))
+        current = [
+            raw * unit for raw, unit in zip(sample.current_raw, self._ampere_per_unit, strict=True)
+        ]
+        self._hold(
+            JOINTS_TOPIC, time_ns, joint_state_bytes(self._prefix, time_ns, position, velocity)
+        )
         self._hold(CURRENTS_TOPIC, time_ns, currents_bytes(time_ns, current))
 
     def event(self, event: CellEvent) -> None:
@@ -212,7 +229,12 @@ class LogWriter:
             self.reading(reading)
 
     def conclude(
-        self, valid: bool, reason: str = "", *, partial: bool = False, wall_minus_monotonic_ns: int | None = None
+        self,
+        valid: bool,
+        reason: str = "",
+        *,
+        partial: bool = False,
+        wall_minus_monotonic_ns: int | None = None,
     ) -> None:
         """Set the outcome; without it the log is not valid.
 
@@ -226,12 +248,18 @@ class LogWriter:
     @property
     def statistics(self) -> RunStatistics:
         """Statistics so far."""
-        return replace(self._conclusion, samples=self._samples, lost_cycles=self._lost, missing=tuple(self._missing))
+        return replace(
+            self._conclusion,
+            samples=self._samples,
+            lost_cycles=self._lost,
+            missing=tuple(self._missing),
+        )
 
     def flush(self) -> None:
         """Write everything to the file.
 
-        Samples get chunks of their own, so that a reader takes a whole chunk at once; the rest follows in another.
+        Samples get chunks of their own, so that a reader takes a whole chunk at once; the rest
+        follows in another.
         """
         try:
             self._mcap.flush()
@@ -243,7 +271,10 @@ class LogWriter:
             raise self._failed(error) from error
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
     ) -> None:
         """Finish and rename after success; keep the `.part` after an error, which propagates."""
         try:
@@ -261,7 +292,9 @@ class LogWriter:
             if error is not None:  # it came first, and it may carry notes about the stop
                 error.add_note(f"the log keeps less than it could: {failure}")
                 return
-            raise (failure if isinstance(failure, OutputFailed) else self._failed(failure)) from failure
+            raise (
+                failure if isinstance(failure, OutputFailed) else self._failed(failure)
+            ) from failure
         finally:
             if not self._keeps_part:
                 self.part.unlink(missing_ok=True)  # after a success it has the name of the log
@@ -278,8 +311,8 @@ class LogWriter:
                     str(self.path),
                     found="a file of that name, which was not there when the recording began",
                     expected="none",
-                    remedy=f"nothing was replaced: the whole recording is {self.part}; give it another name without "
-                    f"{UNFINISHED}, or move the other file away",
+                    remedy=f"nothing was replaced: the whole recording is {self.part}; give it "
+                    f"another name without {UNFINISHED}, or move the other file away",
                 ) from error
             self.part.rename(self.path)
         else:
@@ -296,10 +329,16 @@ class LogWriter:
         )
         self._mcap.start(profile="ros2", library=self._content.run.software)
         started_ns = self._content.run.started_wall_ns
-        for name, data in {**self._content.files, READBACK: readback_bytes(self._content.readback)}.items():
-            self._mcap.add_attachment(started_ns, started_ns, name, "application/octet-stream", data)
+        for name, data in {
+            **self._content.files,
+            READBACK: readback_bytes(self._content.readback),
+        }.items():
+            self._mcap.add_attachment(
+                started_ns, started_ns, name, "application/octet-stream", data
+            )
         self._mcap.add_metadata(RUN, sealed(run_record(self._content.run)))
-        for topic in (SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC, CURRENTS_TOPIC):  # also those without a message
+        # Also those without a message
+        for topic in (SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC, CURRENTS_TOPIC):
             self._channel(topic)
         if self._content.urdf:
             self._hold(URDF_TOPIC, started_ns, text_bytes(self._content.urdf))
@@ -330,9 +369,12 @@ class LogWriter:
         remedy = "nothing was written; free space or rights, or choose another folder"
         if self._keeps_part:
             remedy = (
-                "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves it); "
-                "free space and record again"
+                "what was recorded until then stays in that file, which no fit reads (`drivegain "
+                "salvage` saves it); free space and record again"
             )
         return OutputFailed(
-            str(self.part), found=reason_of(error), expected="a folder that can be written, with room", remedy=remedy
+            str(self.part),
+            found=reason_of(error),
+            expected="a folder that can be written, with room",
+            remedy=remedy,
         )

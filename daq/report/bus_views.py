@@ -1,4 +1,6 @@
-"""A bus and its axes: the nodes that `drivegain scan` finds, the state that `drivegain monitor` shows, the currents."""
+"""A bus and its axes: the nodes that `drivegain scan` finds,
+the state that `drivegain monitor` shows, the currents.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ class ErrorCodeReport(ErrorCodeEntry):
 
 
 class PredictedCurrent(Report):
-    """Current of one axis by a calibration, half a second ago, filtered as in the fit [unit of the gain's current]."""
+    """Current of one axis by a calibration, half a second ago,
+    filtered as in the fit [unit of the gain's current].
+    """
 
     measured: Figure
     """null at standstill, or where the scale of the current is unknown"""
@@ -194,7 +198,9 @@ class ScanReport(Report):
     warnings: list[str]
     """what record would warn of, such as a gain that is near √2 times the drive's"""
     cell_fault: str
-    """why every other verb refuses the cell file, apart from the profiles in `remarks`; empty where none does"""
+    """why every other verb refuses the cell file, apart from the profiles in `remarks`;
+    empty where none does
+    """
 
 
 def error_code_report(found: ErrorCode) -> ErrorCodeReport:
@@ -240,20 +246,25 @@ def scan_view(report: ScanReport) -> Iterator[RenderableType]:
         if node.axis:
             name = f"{printable(node.axis)} (node {node.node_id})"
         if node.enabled:
-            yield Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red")
+            yield Text(
+                f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red"
+            )
         yield from (Text(f"{name}: {printable(remark)}", "yellow") for remark in node.remarks)
     for axis, fault in report.faults.items():
-        yield Text(f"The fault of {printable(axis)} was reset; it has no power. It was {printable(fault)}.")
+        yield Text(
+            f"The fault of {printable(axis)} was reset; it has no power. It was {printable(fault)}."
+        )
     if any(node.in_fault for node in report.nodes):
         yield Text(
-            "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the last run (`drivegain "
-            "explain-emcy`) shows the cause. Remove it, then reset the fault with --reset-faults; nothing moves.",
+            "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the "
+            "last run (`drivegain explain-emcy`) shows the cause. Remove it, then reset the fault "
+            "with --reset-faults; nothing moves.",
             "yellow",
         )
     yield from (Text(printable(text), "yellow") for text in (*report.mistyped, *report.warnings))
     if report.cell_fault:
         yield Text(
-            f"The drives were found by the wiring alone; every other command refuses the cell file: "
+            "The drives were found by the wiring alone; every other command refuses the cell file: "
             f"{printable(report.cell_fault)}",
             "yellow",
         )
@@ -262,7 +273,9 @@ def scan_view(report: ScanReport) -> Iterator[RenderableType]:
 def scanned_nodes(
     cell: Wired, found: Sequence[FoundNode], bus: str, misfits: Mapping[str, str] | None = None
 ) -> list[ScannedNode]:
-    """Return the nodes of one bus, configured or found; `misfits` describes objects that a drive lacks, by axis."""
+    """Return the nodes of one bus, configured or found;
+    `misfits` describes objects that a drive lacks, by axis.
+    """
     axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None}
     configured = {node_id for node_id, axis in axes.items() if axis.bus == bus}
     nodes = {node.node_id: node for node in found}
@@ -273,7 +286,11 @@ def scanned_nodes(
 
 
 def _scanned_node(
-    bus: str, node_id: int, home: WiredAxis | None, node: FoundNode | None, misfits: Mapping[str, str]
+    bus: str,
+    node_id: int,
+    home: WiredAxis | None,
+    node: FoundNode | None,
+    misfits: Mapping[str, str],
 ) -> ScannedNode:
     """Return one node; `home` is the axis that has its number, on this bus or on another."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
@@ -295,7 +312,10 @@ def _scanned_node(
     in_fault = node is not None and node.state in FAULTY
     verdict = _verdict(home, axis, node, misfit)
     if in_fault:
-        verdict = "in fault" if verdict == "ok" else f"{verdict}, in fault"
+        if verdict == "ok":
+            verdict = "in fault"
+        else:
+            verdict = f"{verdict}, in fault"
     return ScannedNode.of(
         node,
         identity,
@@ -318,7 +338,9 @@ def _state(statusword: int | None) -> dict[str, str | bool | None]:
     return {"state": str(state), "enabled": state in ENABLED}
 
 
-def _verdict(home: WiredAxis | None, axis: WiredAxis | None, node: FoundNode | None, misfit: str) -> str:
+def _verdict(
+    home: WiredAxis | None, axis: WiredAxis | None, node: FoundNode | None, misfit: str
+) -> str:
     """Return what is to be said first of a node, its fault apart."""
     if node is None:
         return "missing"
@@ -350,8 +372,8 @@ def _foreign_verdict(home: WiredAxis | None) -> str:
 
 
 OTHER_DRIVE = (
-    "this is another drive than the cell file describes, and `record` refuses it: check the wiring; if the drive was "
-    "exchanged, enter its `identity` in the cell file and calibrate again"
+    "this is another drive than the cell file describes, and `record` refuses it: check the "
+    "wiring; if the drive was exchanged, enter its `identity` in the cell file and calibrate again"
 )
 
 
@@ -372,7 +394,19 @@ _POWER = {True: "ENABLED", False: "off", None: "?"}
 
 def scan_table(nodes: Sequence[ScannedNode]) -> Table:
     """Table of the nodes; first what decides whether a recording can start, then the identity."""
-    headings = ("bus", "node", "axis", "power", "verdict", "state", "vendor", "product", "serial", "NMT", "name")
+    headings = (
+        "bus",
+        "node",
+        "axis",
+        "power",
+        "verdict",
+        "state",
+        "vendor",
+        "product",
+        "serial",
+        "NMT",
+        "name",
+    )
     # A single bus needs no column.
     first = 1
     if len({node.bus for node in nodes}) > 1:
@@ -409,7 +443,10 @@ def monitor_report(cell: Cell, watched: WatchedCell) -> MonitorReport:
         cell=cell.name,
         frames_per_s=sum(map(sum, reading.frames)) / reading.seconds,
         bus_load_percent=max(loads),
-        buses=[MonitoredBus(bus=bus.name, load_percent=load) for bus, load in zip(cell.buses, loads, strict=True)],
+        buses=[
+            MonitoredBus(bus=bus.name, load_percent=load)
+            for bus, load in zip(cell.buses, loads, strict=True)
+        ],
         axes=[_monitored_axis(axis, watched, number) for number, axis in enumerate(cell.axes)],
         events=[event.text for event in watched.events],
         notices=[_notice(cell, event) for event in watched.events],
@@ -467,10 +504,13 @@ def _answer_remarks(axis: AxisReading) -> Iterator[str]:
 _ALARMING = {str(state) for state in (*FAULTY, State.QUICK_STOP_ACTIVE)}
 _SOURCE_TEXT = {
     "overheard": "another master leads this bus; its traffic is read and nothing is sent",
-    "recorder": "drivegain's recorder, or another of its verbs, uses this bus; its traffic is read and nothing is sent",
+    "recorder": "drivegain's recorder, or another of its verbs, uses this bus; its traffic is read "
+    "and nothing is sent",
     "asked": "no other master: the axes are queried, nothing is written",
 }
-_FAULT_UNKNOWN = "the drive names no error code; find the cause, then `drivegain scan CELL --reset-faults`"
+_FAULT_UNKNOWN = (
+    "the drive names no error code; find the cause, then `drivegain scan CELL --reset-faults`"
+)
 
 
 def monitor_view(report: MonitorReport) -> Group:
@@ -511,7 +551,9 @@ def monitor_view(report: MonitorReport) -> Group:
     texts = [f"{printable(bus.bus)} {bus.load_percent:.1f} % at worst" for bus in report.buses]
     loads = ", ".join(texts)
     load = Text(f"{loads}, {report.frames_per_s:.0f} frames/s, SYNC {report.sync_hz:.1f} Hz")
-    return Group(head, table, load, *prediction_view(report), *faults, *map(_notice_text, report.notices))
+    return Group(
+        head, table, load, *prediction_view(report), *faults, *map(_notice_text, report.notices)
+    )
 
 
 def _current_text(axis: MonitoredAxis) -> str:
@@ -569,7 +611,9 @@ def _notice_text(notice: Notice) -> Text:
 
 
 def current_signals(cell: Wired) -> dict[str, str]:
-    """Recorded current of each axis with an amplifier, such as "current reference 6074h:00, rms"."""
+    """Recorded current of each axis with an amplifier, such as "current reference 6074h:00,
+    rms".
+    """
     return {
         axis.name: f"{axis.profile.signal}, amplitude {axis.profile.amplitude.value}"
         for axis in cell.axes
@@ -583,4 +627,7 @@ def load_lines(cell: Cell) -> tuple[str, ...]:
     says = "loaded by"
     if lockstep:
         says = "in lockstep; a real bus would be loaded by"
-    return tuple(f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}" for bus, load in bus_loads(cell))
+    return tuple(
+        f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}"
+        for bus, load in bus_loads(cell)
+    )

@@ -1,6 +1,7 @@
 """The certificate of a calibration: its gains beside the current ones, the limits, and one verdict.
 
-The judgement is that of `drivegain apply`: the same gates, and the same test for a change beyond noise.
+The judgement is that of `drivegain apply`: the same gates, and the same test for a change beyond
+noise.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ class CertifiedGain(Report):
     """in the controller's file; null where it was not read"""
     line: int | None
     old: Figure
-    """current gain, or the nameplate where the controller was not read; of `beside`, the earlier calibration's gain"""
+    """current gain, or the nameplate where the controller was not read;
+    of `beside`, the earlier calibration's gain
+    """
     new: Figure
     std: float
     std_percent: Figure
@@ -102,7 +105,9 @@ class StatusAcceptance(StatusEvent):
 
 
 class CertificateStatus(Report):
-    """State of a calibration by the audit log of its cell, and by the controller's file where it was read."""
+    """State of a calibration by the audit log of its cell,
+    and by the controller's file where it was read.
+    """
 
     state: str
     """written, accepted, not accepted, replaced, not written, or not known"""
@@ -214,11 +219,13 @@ class Certificate:
     comparison: Comparison
     origin: Origin
     rows: tuple[AxisRow, ...]  #: change from the current gain or the nameplate, one an axis
-    #: Comparison with the previous gains, those before the write that is in force; None where there is none of them.
+    #: Comparison with the previous gains, those before the write that is in force; None where there
+    #: is none of them.
     before: Comparison | None = None
     changed: tuple[AxisRow, ...] = ()  #: change by that write, one an axis; empty without it
     earlier: Calibration | None = None  #: another calibration of the cell to compare with
-    #: Change from the earlier calibration, judged with the σ of both, one an axis; empty without one.
+    #: Change from the earlier calibration, judged with the σ of both, one an axis; empty without
+    #: one.
     since: tuple[AxisRow, ...] = ()
 
     @property
@@ -253,7 +260,9 @@ class Certificate:
 
     @property
     def sentence(self) -> str:
-        """The verdict in one sentence, and what to check first; of gains that are in force, who has written them."""
+        """The verdict in one sentence, and what to check first;
+        of gains that are in force, who has written them.
+        """
         check = check_text(self.calibration)
         # A refusal says itself what is wrong.
         if not check or self.verdict is Verdict.REFUSED:
@@ -279,12 +288,17 @@ class Certificate:
             case Verdict.REFUSED:
                 return f"Must not be written: {self._reason}."
             case Verdict.UNCHANGED:
-                return "Nothing to change: no gain differs from the current gain by more than noise."
+                return (
+                    "Nothing to change: no gain differs from the current gain by more than noise."
+                )
             case Verdict.WAITING:
                 remedy = self.comparison.refusals[0].remedy
                 return f"Waits for an operator: {count} change, {furthest}. To do: {remedy}."
             case Verdict.READY:
-                return f"Ready to be written: {count} change by more than noise, {furthest}. Every check passed."
+                return (
+                    f"Ready to be written: {count} change by more than noise, {furthest}. Every "
+                    "check passed."
+                )
         compared = "all agree with the nameplate"
         if differing:
             compared = f"{count} differ from the nameplate by more than noise, {furthest}"
@@ -315,7 +329,9 @@ class Certificate:
         return f"{first.subject}: {found_in_short(first)}, expected {first.expected}{more}"
 
     def _written_sentence(self, write: Event, changed: str) -> str:
-        """Say who has written the gains, how they changed, and which check would refuse them today."""
+        """Say who has written the gains, how they changed,
+        and which check would refuse them today.
+        """
         text = write_text(write)
         sentence = f"{text[0].upper()}{text[1:]}"
         if any(row.significant for row in self.changed):
@@ -339,7 +355,9 @@ def check_text(calibration: Calibration) -> str:
 
 
 def found_in_short(refusal: Refusal) -> str:
-    """Return what a check has found; of a wrong description the first clause, because a CHECK has all of it."""
+    """Return what a check has found; of a wrong description the first clause,
+    because a CHECK has all of it.
+    """
     if refusal.gate is Gate.DESCRIPTION:
         return finding_in_short(refusal.found)
     return refusal.found
@@ -363,11 +381,12 @@ def certify(
         calibration: with its evidence.
         comparison: with the controller or the nameplate.
         earlier: another calibration of the same cell to compare with; None for none.
-        origin: of the calibration; None for one without a session, in a file as drivegain writes it.
+        origin: of the calibration; None for one without a session, in a file as drivegain writes
+            it.
 
     Raises:
-        CalibrationRefused: one of the two has not one error for each gain, or the earlier one is of another cell or of
-            other axes.
+        CalibrationRefused: one of the two has not one error for each gain, or the earlier one is of
+            another cell or of other axes.
     """
     _require_whole(calibration)
     since: tuple[AxisRow, ...] = ()
@@ -401,7 +420,9 @@ def _rows(comparison: Comparison) -> tuple[AxisRow, ...]:
     for change in comparison.changes:
         allowed_percent = comparison.allowed_percent(change)
         drift = judged.get(change.axis, NOT_JUDGED)
-        refusals = tuple(refusal for refusal in comparison.refusals if refusal.subject == change.axis)
+        refusals = tuple(
+            refusal for refusal in comparison.refusals if refusal.subject == change.axis
+        )
         rows.append(AxisRow(change, allowed_percent, drift, refusals))
     return tuple(rows)
 
@@ -524,14 +545,18 @@ def status_text(comparison: Comparison) -> str:
     elif comparison.changed_by_hand:
         parts.append("the file has other gains now")
     if standing.acceptance is not None:
-        parts.append(_acceptance_text(standing.acceptance, is_in_place=comparison.in_force is not None))
+        parts.append(
+            _acceptance_text(standing.acceptance, is_in_place=comparison.in_force is not None)
+        )
     if standing.history.may_lack:
         parts.append(MAY_LACK)
     return f"{'; '.join(parts)} (as of {_when(standing.as_of)})"
 
 
 def _acceptance_text(acceptance: RecordedAcceptance, *, is_in_place: bool) -> str:
-    """Say when new moves accepted the gains; otherwise what failed, and how to undo the write if it is in place."""
+    """Say when new moves accepted the gains;
+    otherwise what failed, and how to undo the write if it is in place.
+    """
     if acceptance.accepted:
         return f"accepted on {_when(acceptance.at)} by {acceptance.who}"
     text = f"NOT ACCEPTED on {_when(acceptance.at)} by {acceptance.who}"
@@ -556,18 +581,23 @@ def _when(at: datetime) -> str:
 
 
 def identity(calibration: Calibration) -> dict[str, str]:
-    """Drives, operator, payload, dates, encoders and software as texts by their names; what is missing is said.
+    """Drives, operator, payload, dates, encoders and software as texts by their names;
+    what is missing is said.
 
     Encoders are there where the robot has more of them than degrees of freedom.
     """
-    recordings = [source.recording for source in calibration.sources if source.recording is not None]
+    recordings = [
+        source.recording for source in calibration.sources if source.recording is not None
+    ]
     operators = sorted({one.operator for one in recordings if one.operator})
     payloads = "; ".join(payload_texts(calibration))
     if payloads and not calibration.gains_fixed:
         # No residual shows a wrong mass: it must be on the sheet that a person signs.
         influences = "; ".join(mass_texts(calibration.payload_mass))
         # Calibrations of earlier versions do not say more.
-        known = influences or "a wrong mass changes every gain, by the same share where nothing else of it is known"
+        known = influences or (
+            "a wrong mass changes every gain, by the same share where nothing else of it is known"
+        )
         payloads = f"{payloads}; {known}"
     period = _period([one.recorded_s for one in recordings if one.recorded_s is not None])
     names = {
@@ -581,16 +611,19 @@ def identity(calibration: Calibration) -> dict[str, str]:
         names["Order of runs"] = order
     if calibration.encoder_misfit is not None:
         names["Encoders"] = encoder_text(calibration.encoder_misfit)
-    names["Fitted"] = f"{minute_text(calibration.created)}, {calibration.software or 'software not known'}"
+    names["Fitted"] = (
+        f"{minute_text(calibration.created)}, {calibration.software or 'software not known'}"
+    )
     return names
 
 
 def order_text(calibration: Calibration) -> str:
-    """In which order bare and loaded runs of the fit were recorded, and what that does to slow changes.
+    """In which order bare and loaded runs of the fit were recorded,
+    and what that does to slow changes.
 
-    Empty where a time is not known, or all runs are of one kind. The means of their places in the order are compared:
-    friction that changes evenly from run to run is the same for both kinds where these are equal. With friction by
-    payload the order does not matter.
+    Empty where a time is not known, or all runs are of one kind. The means of their places in the
+    order are compared: friction that changes evenly from run to run is the same for both kinds
+    where these are equal. With friction by payload the order does not matter.
     """
     timed: list[tuple[float, bool]] = []
     for source in calibration.sources:
@@ -605,7 +638,9 @@ def order_text(calibration: Calibration) -> str:
     if not loaded_places or not bare_places:
         return ""
     listed = ", ".join("loaded" if loaded else "bare" for loaded in is_loaded)
-    by_payload = [parameter for parameter in calibration.parameters if parameter.is_payload_friction]
+    by_payload = [
+        parameter for parameter in calibration.parameters if parameter.is_payload_friction
+    ]
     if sum(parameter.name.startswith("fs") for parameter in by_payload) >= len(calibration.gains):
         return f"{listed}; friction by payload: its change between them moves no gain"
     later = fmean(loaded_places) - fmean(bare_places)
@@ -618,7 +653,9 @@ def order_text(calibration: Calibration) -> str:
 
 
 def payload_texts(calibration: Calibration) -> Iterator[str]:
-    """The mass of each payload as it was entered twice: in the cell file, and from the scale at each recording."""
+    """The mass of each payload as it was entered twice:
+    in the cell file, and from the scale at each recording.
+    """
     mounted: dict[tuple[str, float | None], list[float]] = {}
     for source in calibration.sources:
         if source.payload is not None:
@@ -653,7 +690,9 @@ def _period(times_s: Sequence[float]) -> str:
 def _serials(calibration: Calibration, recordings: Sequence[Recording]) -> str:
     found = []
     for index, gain in enumerate(calibration.gains):
-        serials = dict.fromkeys(one.serials[index] for one in recordings if index < len(one.serials))
+        serials = dict.fromkeys(
+            one.serials[index] for one in recordings if index < len(one.serials)
+        )
         known = [str(serial) for serial in serials if serial is not None]
         if known:
             found.append(f"{gain.axis} {' and '.join(known)}")

@@ -1,4 +1,6 @@
-"""The certificate as a page: one sheet to print and sign, and on the screen what it rests on, folded below."""
+"""The certificate as a page: one sheet to print and sign, and on the screen what it rests on,
+folded below.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,12 @@ from daq.writeback.request import GainChange
 from ident.calibration import AcceptedEffect, Calibration, Source
 from ident.estimators.estimate import RelativeError
 
-_LOOK = {Verdict.REFUSED: "act", Verdict.WAITING: "act", Verdict.UNCHANGED: "quiet", Verdict.NOT_COMPARED: "quiet"}
+_LOOK = {
+    Verdict.REFUSED: "act",
+    Verdict.WAITING: "act",
+    Verdict.UNCHANGED: "quiet",
+    Verdict.NOT_COMPARED: "quiet",
+}
 """CSS class of the verdict; blue without one. Orange asks the reader to act."""
 _SIGN = {
     Verdict.READY: "✓",
@@ -59,7 +66,9 @@ _METHODS = {
 _ROLES = {"holdout": "held out"}
 
 
-def certificate_page(certificate: Certificate, consequence: str = "", details: Sequence[str] = ()) -> str:
+def certificate_page(
+    certificate: Certificate, consequence: str = "", details: Sequence[str] = ()
+) -> str:
     """Build the page.
 
     Args:
@@ -122,11 +131,16 @@ def _next(certificate: Certificate, look: str) -> Iterator[str]:
     if comparison.unread:
         yield paragraph(comparison.unread, f"next {look}")
     elif comparison.command and certificate.verdict in {Verdict.READY, Verdict.WAITING}:
-        yield paragraph(f"To review the change: `{comparison.command}`. With `--yes` it is written.", f"next {look}")
+        yield paragraph(
+            f"To review the change: `{comparison.command}`. With `--yes` it is written.",
+            f"next {look}",
+        )
 
 
 def _warnings(certificate: Certificate) -> Iterator[str]:
-    """Checks to make and actions to take; what a diagnosis says is said once, and checks that failed alike are one."""
+    """Checks to make and actions to take; what a diagnosis says is said once,
+    and checks that failed alike are one.
+    """
     texts = warning_texts(certificate.calibration)
     diagnosed = {one.found for one in certificate.calibration.diagnoses}
     failed: dict[str, list[str]] = {}
@@ -172,14 +186,22 @@ def _interval(row: AxisRow) -> Interval:
     if not math.isfinite(value) or not math.isfinite(half):
         value = math.nan
         half = 0.0
-    return Interval(change.axis, value, half, *row.allowed_percent, f"{_percent(change.change_percent)} %")
+    return Interval(
+        change.axis, value, half, *row.allowed_percent, f"{_percent(change.change_percent)} %"
+    )
 
 
 def _changes(certificate: Certificate) -> str:
     """Gains beside their limits."""
     compared = certificate.compared_with
-    drawn = intervals([_interval(row) for row in certificate.shown], "Change of each gain", f"from the {compared} [%]")
-    caption = f"0 is the {compared}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
+    drawn = intervals(
+        [_interval(row) for row in certificate.shown],
+        "Change of each gain",
+        f"from the {compared} [%]",
+    )
+    caption = (
+        f"0 is the {compared}. Bar: ± 2 σ, often shorter than the dot. Shaded: within the limits."
+    )
     return figure(drawn, caption, f"Change from the {compared}")
 
 
@@ -189,7 +211,10 @@ def _errors(calibration: Calibration) -> Iterator[str]:
     holdout = calibration.holdout_error_percent
     if holdout is None:
         drawing = _error_drawing(calibration, None, calibration.relative_error_percent)
-        caption = f"{caption} No run was held out: the error on data that the fit has not used is not known."
+        caption = (
+            f"{caption} No run was held out: the error on data that the fit has not used is "
+            "not known."
+        )
         yield figure(drawing, caption, "Error on the data of the fit")
         return
     nameplate = calibration.nameplate_holdout_error_percent
@@ -200,7 +225,9 @@ def _errors(calibration: Calibration) -> Iterator[str]:
     yield figure(drawing, caption, "Error on held-out runs")
 
 
-def _error_drawing(calibration: Calibration, before: RelativeError | None, after: RelativeError) -> str:
+def _error_drawing(
+    calibration: Calibration, before: RelativeError | None, after: RelativeError
+) -> str:
     """Draw the error of each axis and of all; `before` is hollow."""
     names = [gain.axis for gain in calibration.gains]
     names.append("all")
@@ -233,7 +260,9 @@ def _limit(allowed: tuple[float, float]) -> str:
 
 def _effects(calibration: Calibration, consequence: str) -> str:
     if not calibration.effects:
-        return section("Effects", paragraph("The calibration holds no effect beyond the declared model."))
+        return section(
+            "Effects", paragraph("The calibration holds no effect beyond the declared model.")
+        )
     body = [_effect(effect, calibration) for effect in calibration.effects]
     if consequence:
         body.append(paragraph(consequence))
@@ -250,8 +279,8 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     name = accepted_text(effect, calibration)
     size = size_text(effect, calibration)
     text = paragraph(
-        f"{effect.axis} has {name}: {size}. {data}, the model "
-        f"without it leaves {before} % of the torque of {effect.axis}, with it {after} %."
+        f"{effect.axis} has {name}: {size}. {data}, the model without it leaves {before} % of the "
+        f"torque of {effect.axis}, with it {after} %."
     )
     if effect.package is not None:
         text += paragraph(f"The effect {effect.name!r} is one of {effect.package}.")
@@ -266,12 +295,16 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
         against = ", against the motion"
     torque = f"{QUANTITY[shown.force]} [{shown.force}]{against}"
     title = f"{effect.axis}: {QUANTITY[shown.force]} that the declared model lacks"
-    drawn = chart((Line(shown.x, shown.torque_nm),), title, (shown.variable, torque), half=shown.half_nm)
+    drawn = chart(
+        (Line(shown.x, shown.torque_nm),), title, (shown.variable, torque), half=shown.half_nm
+    )
     return text + on_screen(figure(drawn, band, title))
 
 
 def _write(certificate: Certificate) -> str:
-    """What was written into the controller's file, or would be; empty for gains that must not be written."""
+    """What was written into the controller's file, or would be;
+    empty for gains that must not be written.
+    """
     comparison = certificate.comparison
     edit = comparison.edit
     if edit is None:
@@ -279,7 +312,9 @@ def _write(certificate: Certificate) -> str:
     place = "/".join(edit.file.parts[-2:])
     if comparison.in_force is not None and certificate.before is not None:
         previous = {one.axis: one.compared_gain for one in certificate.before.changes}
-        rows = [_written_row(one, previous[one.axis], f"{one.current_gain:.9g}") for one in edit.changes]
+        rows = [
+            _written_row(one, previous[one.axis], f"{one.current_gain:.9g}") for one in edit.changes
+        ]
         return part(
             f"What was written into {place}",
             table("", ("axis", "key", "line", "previous gain", "current gain"), rows),
@@ -288,7 +323,10 @@ def _write(certificate: Certificate) -> str:
     if comparison.in_force is not None or certificate.verdict is Verdict.REFUSED:
         return ""
     if not edit.has_effect:
-        return part("What would be written", paragraph(f"Nothing: {edit.file.name} has these gains already."))
+        return part(
+            "What would be written",
+            paragraph(f"Nothing: {edit.file.name} has these gains already."),
+        )
     rows = [_written_row(one, one.current_gain, one.spelling or "-") for one in edit.changes]
     return part(
         f"What would be written into {place}",
@@ -302,18 +340,22 @@ def _written_row(change: GainChange, gain_before: float, after: str) -> tuple[st
 
 
 def _old_comments(edit: FileEdit) -> Iterator[str]:
-    """Say that comments behind the gains are those of the previous gains: a write changes numbers alone."""
+    """Say that comments behind the gains are those of the previous gains:
+    a write changes numbers alone.
+    """
     comments = edit.comments
     if comments:
         axis, text = next(iter(comments.items()))
         yield paragraph(
-            "A write changes numbers only, so comments behind the gains may describe the previous gains. "
-            f"{axis}: “{text}”."
+            "A write changes numbers only, so comments behind the gains may describe the previous "
+            f"gains. {axis}: “{text}”."
         )
 
 
 def _digests(certificate: Certificate) -> str:
-    """Digests of all files that the certificate rests on, for paper: the screen has them in the details."""
+    """Digests of all files that the certificate rests on, for paper:
+    the screen has them in the details.
+    """
     calibration = certificate.calibration
     rows = [("calibration", certificate.origin.sha256)]
     if calibration.configuration_sha256:
@@ -362,7 +404,10 @@ def _since(certificate: Certificate) -> Iterator[str]:
     holdout = calibration.holdout_error_percent
     # `certify` has refused calibrations of other axes, and errors of another number of them.
     if earlier.holdout_error_percent is not None and holdout is not None:
-        caption = "Hollow: earlier. Full: this one. The runs differ, so that only large differences count."
+        caption = (
+            "Hollow: earlier. Full: this one. The runs differ, so that only large "
+            "differences count."
+        )
         drawing = _error_drawing(calibration, earlier.holdout_error_percent, holdout)
         errors = figure(drawing, caption, "Error on held-out runs")
     yield section(
@@ -408,8 +453,9 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
         yield folded(
             "Dependence of the gains on the payload's mass",
             paragraph(
-                "To first order. A wrong mass is in every gain; where the mass is all that is known of the payload, no "
-                "residual shows it. σ by the tolerance of the weighing is not included in σ of the gains."
+                "To first order. A wrong mass is in every gain; where the mass is all that is "
+                "known of the payload, no residual shows it. σ by the tolerance of the weighing is "
+                "not included in σ of the gains."
             ),
             table("", MASS_HEADINGS, mass_rows(calibration), "names"),
         )
@@ -420,10 +466,11 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
     yield folded(
         "Dynamic parameters",
         paragraph(
-            "The number is that of the axis. I: moment of inertia of the link (Ia: of the motor), m: its mass, mx, my, "
-            "mz: mass × centre of mass, fv: viscous friction, fs: dry friction, off: constant torque, m in the middle "
-            "of a name (Iam, fvm, fsm): coupled motors, _loaded at its end: what is added while a payload is mounted. "
-            "A sum is what motion shows of several links together; a name after a colon is a payload."
+            "The number is that of the axis. I: moment of inertia of the link (Ia: of the motor), "
+            "m: its mass, mx, my, mz: mass × centre of mass, fv: viscous friction, fs: dry "
+            "friction, off: constant torque, m in the middle of a name (Iam, fvm, fsm): coupled "
+            "motors, _loaded at its end: what is added while a payload is mounted. A sum is what "
+            "motion shows of several links together; a name after a colon is a payload."
         ),
         table("", ("parameter", "value ± σ", "unit"), value_rows(parameters), "stacked"),
     )
@@ -437,11 +484,9 @@ def _evidence(certificate: Certificate) -> Iterator[str]:
     configuration = calibration.configuration_sha256 or "not known"
     software = calibration.software or "software not known"
     origin = (
-        f"Estimator {method}, {calibration.rows} rows, condition "
-        f"{calibration.condition:.0f}; on the data of the fit the model leaves {left} %. "
-        f"Calibration {certificate.origin.sha256}, configuration "
-        f"{configuration}, made {minute_text(calibration.created)} by "
-        f"{software}."
+        f"Estimator {method}, {calibration.rows} rows, condition {calibration.condition:.0f}; on "
+        f"the data of the fit the model leaves {left} %. Calibration {certificate.origin.sha256}, "
+        f"configuration {configuration}, made {minute_text(calibration.created)} by {software}."
     )
     yield folded(
         "Filters, logs and digests",

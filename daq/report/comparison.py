@@ -1,7 +1,9 @@
-"""A calibration beside the current gains, or beside the nameplate, and its state by the cell's ledger.
+"""A calibration beside the current gains, or beside the nameplate,
+and its state by the cell's ledger.
 
-The judgement is that of `drivegain apply`: the same gates, and the same figures of the history. If the controller was
-not read, the current gains are not known: the gains are compared with the nameplate, and its limit applies.
+The judgement is that of `drivegain apply`: the same gates, and the same figures of the history. If
+the controller was not read, the current gains are not known: the gains are compared with the
+nameplate, and its limit applies.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ OPERATORS = frozenset({Gate.SIGNATURE, Gate.BASE})
 
 
 NO_LEDGER = Standing(
-    None, unknown="no audit log was read; `drivegain certificate CALIBRATION --cell CELL` reads that of the cell"
+    None,
+    unknown="no audit log was read; `drivegain certificate CALIBRATION --cell CELL` reads "
+    "that of the cell",
 )
 """State of a calibration where no cell was given."""
 
@@ -46,7 +50,8 @@ class Comparison:
     refusals: tuple[Refusal, ...]  #: failed checks
     policy: ApplyPolicy  #: limits
     known: Spread = NOTHING  #: σ of the current gains, by the history
-    edit: FileEdit | None = None  #: planned change of the controller's file; None where it was not read
+    #: planned change of the controller's file; None where it was not read
+    edit: FileEdit | None = None
     unread: str = ""  #: why it was not read
     command: str = ""  #: that shows the change and, with --yes, writes it
     standing: Standing = NO_LEDGER  #: of the calibration by the cell's ledger
@@ -62,7 +67,9 @@ class Comparison:
 
     @property
     def in_force(self) -> Event | None:
-        """Write after which the controller has these gains; None where it has others now, or never had these."""
+        """Write after which the controller has these gains;
+        None where it has others now, or never had these.
+        """
         write = self.standing.write
         edit = self.edit
         if write is None or self.standing.ended is not None:
@@ -72,7 +79,9 @@ class Comparison:
         return write
 
     def allowed_percent(self, change: GainChange) -> tuple[float, float]:
-        """Limits of the change of a gain [% of the gain that is compared]; infinite where it has none."""
+        """Limits of the change of a gain [% of the gain that is compared];
+        infinite where it has none.
+        """
         compared = change.compared_gain
         if not compared or not math.isfinite(compared):
             return -math.inf, math.inf
@@ -89,7 +98,9 @@ class Comparison:
         return min(ends), max(ends)
 
 
-def without_controller(calibration: Calibration, unread: str, now: datetime, cell: Cell | None = None) -> Comparison:
+def without_controller(
+    calibration: Calibration, unread: str, now: datetime, cell: Cell | None = None
+) -> Comparison:
     """Compare with the nameplate, and check the gates that need no controller.
 
     Args:
@@ -122,11 +133,17 @@ def changes_from(
 
 
 def compare(
-    cell: Cell, request: Request, command: str = "", *, file: Path | None = None, audit: Path | None = None
+    cell: Cell,
+    request: Request,
+    command: str = "",
+    *,
+    file: Path | None = None,
+    audit: Path | None = None,
 ) -> Comparison:
     """Compare a calibration with the controller's file of a cell, as `apply` would; reads only.
 
-    Without a file that can be read the gains are compared with the nameplate, and the reason is kept.
+    Without a file that can be read the gains are compared with the nameplate, and the reason is
+    kept.
 
     Args:
         cell: from its file.
@@ -150,13 +167,20 @@ def compare(
     if cell.controller is not None and not cell.controller.gains:
         places = zip(cell.axis_names, cell.controller.objects, strict=True)
         listed = ", ".join(f"{axis} {entry.parameter}" for axis, entry in places)
-        unread = f"The drives hold the gains ({listed}), and this page does not open the bus: `{command} --drives`."
-        return replace(without_controller(request.calibration, unread, request.now, cell), standing=standing)
+        unread = (
+            f"The drives hold the gains ({listed}), and this page does not open the bus: "
+            f"`{command} --drives`."
+        )
+        return replace(
+            without_controller(request.calibration, unread, request.now, cell), standing=standing
+        )
     try:
         proposal = propose(FileTarget.of(cell, file), request)
     except DaqError as error:
         unread = f"The controller was not read: {error}."
-        return replace(without_controller(request.calibration, unread, request.now, cell), standing=standing)
+        return replace(
+            without_controller(request.calibration, unread, request.now, cell), standing=standing
+        )
     edit = proposal.edit
     known = query_history(cell, edit.subject, request, edit.changes, audit)
     return Comparison(
@@ -185,7 +209,8 @@ def _standing(cell: Cell, request: Request, file: Path | None, audit: Path | Non
 
 
 def before_write(comparison: Comparison, digest: str) -> Comparison | None:
-    """Compare with the previous gains, those before the write that is in force; None where there is none of them.
+    """Compare with the previous gains, those before the write that is in force;
+    None where there is none of them.
 
     Args:
         comparison: with the controller, whose current gains are those of the calibration.

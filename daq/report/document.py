@@ -1,4 +1,6 @@
-"""What a verb prints under `--json`: one frozen type a document; its JSON and its published schema are made of it."""
+"""What a verb prints under `--json`: one frozen type a document;
+its JSON and its published schema are made of it.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +26,20 @@ Figure = float | None
 class Report(StrictModel):
     """A JSON document, or a part of one; when it is made, numbers that JSON lacks become null.
 
-    A part may be given as the frozen dataclass whose attributes it has. The published schema describes a field by the
-    text below it.
+    A part may be given as the frozen dataclass whose attributes it has. The published schema
+    describes a field by the text below it.
     """
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     @classmethod
     def of(cls, *sources: object, **others: Any) -> Self:
-        """Return the document of an object: `others`, and its attributes for the other fields, by their names.
+        """Return the document of an object: `others`, and its attributes for the other fields,
+        by their names.
 
         Args:
-            sources: the object, or several; the first that has an attribute gives it. One that is None comes after the
-                others: it gives null to what they lack.
+            sources: the object, or several; the first that has an attribute gives it. One that is
+                None comes after the others: it gives null to what they lack.
             others: fields that no source has, or not as the document says them.
         """
         given: dict[str, Any] = {}
@@ -74,14 +77,22 @@ class ErrorReport(Report):
 
 
 def _attributes(kind: type[Report], source: object) -> dict[str, Any]:
-    """Return the attributes of an object that are fields of a document; null for each of them without an object."""
+    """Return the attributes of an object that are fields of a document;
+    null for each of them without an object.
+    """
     if source is None:
-        return dict.fromkeys(name for name, field in kind.model_fields.items() if field.is_required())
-    return {name: _plain(getattr(source, name)) for name in kind.model_fields if hasattr(source, name)}
+        return dict.fromkeys(
+            name for name, field in kind.model_fields.items() if field.is_required()
+        )
+    return {
+        name: _plain(getattr(source, name)) for name in kind.model_fields if hasattr(source, name)
+    }
 
 
 def _plain(value: Any) -> Any:
-    """Return an attribute as documents have it: a path or time as text, a tuple or array as a list."""
+    """Return an attribute as documents have it:
+    a path or time as text, a tuple or array as a list.
+    """
     if hasattr(value, "tolist"):  # an array of numpy, or a number from one
         value = value.tolist()
     if isinstance(value, Enum):
@@ -98,13 +109,19 @@ def _plain(value: Any) -> Any:
 
 
 def json_tree(report: Report) -> dict[str, Any]:
-    """Return a document as mappings, lists, text and numbers; a key with a default is left out where none was given."""
-    tree: dict[str, Any] = json_safe(report.model_dump(mode="json", exclude_unset=True), _with_surrogates)
+    """Return a document as mappings, lists, text and numbers;
+    a key with a default is left out where none was given.
+    """
+    tree: dict[str, Any] = json_safe(
+        report.model_dump(mode="json", exclude_unset=True), _with_surrogates
+    )
     return tree
 
 
 def json_text(report: Report) -> str:
-    """Return a document as JSON with a line end; bytes of file names that are not UTF-8 are spelled out."""
+    """Return a document as JSON with a line end;
+    bytes of file names that are not UTF-8 are spelled out.
+    """
     tree = json_tree(report)
     text = json.dumps(tree, indent=2, ensure_ascii=False, allow_nan=False)
     return spelled_bytes(f"{text}\n")
@@ -127,7 +144,8 @@ def json_safe(value: Any, change: Callable[[str], str] = str) -> Any:
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
 """A byte of a file name that is not UTF-8, as Python reads it; pydantic takes no text with one."""
-_MARK = "\ufdd0"  #: Before the digits of a surrogate while it is in a type: no character, so no text has it
+#: Before the digits of a surrogate while it is in a type: no character, so no text has it
+_MARK = "\ufdd0"
 _MARKED = re.compile(f"{_MARK}([0-9a-f]{{4}})")
 
 

@@ -41,7 +41,8 @@ WORDS = {
     "inertial-coupling": "inertia shared with another joint",
     "hinge": "a cable or hose that pulls beyond some position",
     "cable": "a cable or hose that is shared with another joint",
-    "slack-cable": "a cable or hose that is shared with another joint, and slack in a part of the workspace",
+    "slack-cable": "a cable or hose that is shared with another joint, and slack in a part of the "
+    "workspace",
     "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
     "counterbalance": "a balancer between two links",
     "passive-friction": "friction in a joint without a motor",
@@ -50,7 +51,9 @@ WORDS = {
     "gravity-direction": "another direction of gravity than the cell file says",
     "late-position": "a position that is later than the others",
 }
-"""Words by family; an effect that is not listed has its own (`Effect.phrase`), or is called by its name."""
+"""Words by family; an effect that is not listed has its own (`Effect.phrase`),
+or is called by its name.
+"""
 
 _WHERE = {
     "stribeck": "below about {speed_rad_s:.2g} rad/s",
@@ -65,7 +68,9 @@ _WHERE = {
     "zero-offset": "to be added to its position",
     "counterbalance": "with a lever of {ratio:.2g} of its foot's distance",
 }
-"""Where or how fast an effect acts, by family, from its searched parameters; other families need no such words."""
+"""Where or how fast an effect acts, by family, from its searched parameters;
+other families need no such words.
+"""
 _POINTS = 61
 
 
@@ -75,7 +80,8 @@ class Curve:
 
     x: FloatArray  #: variable, of a velocity its magnitude, shape (k,)
     torque_nm: FloatArray  #: torque that the term adds in the positive direction, shape (k,)
-    half_nm: FloatArray | None  #: two σ of it, shape (k,); None where the calibration has no covariance
+    #: two σ of it, shape (k,); None where the calibration has no covariance
+    half_nm: FloatArray | None
     variable: str  #: name of the variable with its unit
     force: str  #: unit of the torque: Nm, or N along a prismatic joint
     turns: bool  #: whether the torque turns with the direction of motion, as friction does
@@ -86,13 +92,19 @@ class Curve:
         turns = ""
         if self.turns:
             turns = ", against the motion in either direction"
-        return f"between {self.torque_nm.min():+.2g} and {self.torque_nm.max():+.2g} {self.force}{turns}"
+        return (
+            f"between {self.torque_nm.min():+.2g} and {self.torque_nm.max():+.2g} "
+            f"{self.force}{turns}"
+        )
 
 
 def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
     """Describe an effect, to follow "J3 has": `friction that grows with the load`."""
     if is_unnamed(effect):
-        return f"a torque that depends on {variable_text(effect, axes)} and that no named effect explains"
+        return (
+            f"a torque that depends on {variable_text(effect, axes)} and that no named "
+            "effect explains"
+        )
     words = WORDS.get(effect.name) or effect.phrase or f"the effect {effect.name!r}"
     other = other_axis(effect)
     if other is None:
@@ -109,10 +121,18 @@ def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
 
 
 def variable_label(effect: Effect, axes: tuple[str, ...], force: str) -> str:
-    """Name the variable with its unit, in N and metres where the joint's force is in N: `joint position [rad]`."""
+    """Name the variable with its unit, in N and metres where the joint's force is in N:
+    `joint position [rad]`.
+    """
     abscissa = effect.abscissa
-    label = f"{variable_text(effect, axes).removeprefix('the ')} [{abscissa.value.partition(' [')[2]}"
-    if force != "N" or abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT, Abscissa.OTHER_VELOCITY}:
+    label = (
+        f"{variable_text(effect, axes).removeprefix('the ')} [{abscissa.value.partition(' [')[2]}"
+    )
+    if force != "N" or abscissa in {
+        Abscissa.MOTOR_ANGLE,
+        Abscissa.CURRENT,
+        Abscissa.OTHER_VELOCITY,
+    }:
         return label
     return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")
 
@@ -126,20 +146,25 @@ def accepted_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
 
 
 def size_text(accepted: AcceptedEffect, calibration: Calibration) -> str:
-    """Describe the size of an effect ± σ: `coefficient 12.0 ± 0.2 % of the load torque`; no searched parameter's name.
+    """Describe the size of an effect ± σ: `coefficient 12.0 ± 0.2 % of the load torque`;
+    no searched parameter's name.
 
     An effect that this version cannot place has its coefficients alone.
     """
     placed = _placed(accepted, calibration)
     if placed is None:
-        return ", ".join(_sized("coefficient", one, Reported.COEFFICIENTS) for one in accepted.coefficients)
+        return ", ".join(
+            _sized("coefficient", one, Reported.COEFFICIENTS) for one in accepted.coefficients
+        )
     if (curve := curve_of(accepted, calibration)) is not None:
         return curve.text
     return named_size(placed.effect, _in_order(accepted, placed))
 
 
 def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
-    """Describe the size of a named effect from its coefficients, in the order of `effect.coefficients`."""
+    """Describe the size of a named effect from its coefficients,
+    in the order of `effect.coefficients`.
+    """
     names = [column.name for column in effect.coefficients]
     where = _WHERE.get(effect.name, "").format(**effect.settings)
     if not is_shipped(effect):
@@ -151,13 +176,16 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
         sizes = f"amplitude {with_deviation(amplitude, std)} {cosine.unit}"
     elif effect.fits_rotor:
         loss, rest = found
-        # It follows its rest until this is small against σ: where that is large, the sum may be below zero.
+        # It follows its rest until this is small against σ: where that is large, the sum may be
+        # below zero.
         inertia = max(0.0, effect.known_rotor_kg_m2 + rest.value / (loss.value or math.inf))
         std = rest.std / (abs(loss.value) or math.inf)
         rotor = f"beside a rotor of {with_deviation(inertia, std)} kg m²"
         sizes = f"{_sized(names[0], loss, effect.reported)}, {rotor}"
     else:
-        sizes = ", ".join(_sized(name, one, effect.reported) for name, one in zip(names, found, strict=True))
+        sizes = ", ".join(
+            _sized(name, one, effect.reported) for name, one in zip(names, found, strict=True)
+        )
     if where:
         return f"{sizes}, {where}"
     return sizes
@@ -169,19 +197,33 @@ def curve_of(accepted: AcceptedEffect, calibration: Calibration) -> Curve | None
     if placed is None or not isinstance(placed.effect, Smooth | Periodic):
         return None
     effect = placed.effect
-    lower, upper = (effect.lower, effect.upper) if isinstance(effect, Smooth) else (0.0, 2.0 * math.pi)
+    if isinstance(effect, Smooth):
+        lower = effect.lower
+        upper = effect.upper
+    else:
+        lower = 0.0
+        upper = 2.0 * math.pi
     x = np.linspace(lower, upper, _POINTS)
     shapes = effect.shapes(x)
     words = [column.name for column in placed.columns]
-    index = {parameter.name: number for number, parameter in enumerate(calibration.parameters, len(calibration.gains))}
+    index = {
+        parameter.name: number
+        for number, parameter in enumerate(calibration.parameters, len(calibration.gains))
+    }
     half_nm = None
     if (covariance := calibration.covariance) is not None and all(name in index for name in words):
         rows = [index[name] for name in words]
-        half_nm = SHOWN_SIGMAS * np.sqrt(np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes))
+        half_nm = SHOWN_SIGMAS * np.sqrt(
+            np.einsum("pk,pq,qk->k", shapes, covariance[np.ix_(rows, rows)], shapes)
+        )
     folded = isinstance(effect, Smooth) and effect.variable in FOLDED
-    # Of a joint without a motor, which has no gain, a coefficient's unit begins with that of its force.
+    # Of a joint without a motor, which has no gain, a coefficient's unit begins with that of its
+    # force.
     units = [gain.unit for gain in calibration.gains]
-    unit = units[placed.axis] if placed.axis < len(units) else accepted.coefficients[0].unit
+    if placed.axis < len(units):
+        unit = units[placed.axis]
+    else:
+        unit = accepted.coefficients[0].unit
     force = unit.partition("/")[0]
     name, _, unit = variable_label(effect, calibration.places, force).partition(" [")
     name += ", magnitude" if folded else ""
@@ -203,7 +245,8 @@ def _in_order(accepted: AcceptedEffect, placed: PlacedEffect) -> list[Parameter]
 
 
 def _sized(name: str, one: Parameter, reported: Reported) -> str:
-    if reported is Reported.ANGLES and one.unit == "rad":  # a zero of a prismatic joint is in metres
+    # A zero of a prismatic joint is in metres
+    if reported is Reported.ANGLES and one.unit == "rad":
         return f"{name} {with_deviation(math.degrees(one.value), math.degrees(one.std))}°"
     if reported is Reported.SHARE_OF_LOAD:
         return f"{with_deviation(100.0 * one.value, 100.0 * one.std)} % of the load torque"

@@ -1,4 +1,6 @@
-"""A fit in tables, sentences and JSON: gains, errors, what they rest on, and what the data cannot show."""
+"""A fit in tables, sentences and JSON:
+gains, errors, what they rest on, and what the data cannot show.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +111,8 @@ class FoundGravity(Report):
     found_m_s2: list[Figure]
     turn_deg: Figure
     turn_std_deg: Figure
-    #: Other mistakes of the description, with their axes, beside which it was estimated; its σ does not cover them.
+    #: Other mistakes of the description, with their axes, beside which it was estimated; its σ does
+    #: not cover them.
     not_corrected: list[str]
 
 
@@ -157,7 +160,9 @@ class CasesReport(Report):
 
 TLS_APART_SIGMAS = 3.0
 TLS_APART_PERCENT = 2.0
-"""Difference of a gain by the paper's total least squares from that by ml, in σ of ml and relative, that is printed."""
+"""Difference of a gain by the paper's total least squares from that by ml, in σ of ml and relative,
+that is printed.
+"""
 
 
 BodyT = TypeVar("BodyT", bound=CalibrationBody)
@@ -166,15 +171,22 @@ BodyT = TypeVar("BodyT", bound=CalibrationBody)
 def fit_view(
     found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None
 ) -> Iterator[RenderableType]:
-    """Gains and errors, what they rest on, and what the data cannot show; `comparison` is of all estimators."""
+    """Gains and errors, what they rest on, and what the data cannot show;
+    `comparison` is of all estimators.
+    """
     fitted = found.fitted
     axes = fitted.cell.axis_names
     estimate = fitted.estimate
-    title = f"Drive gains of {calibration.cell} by {calibration.method}; change % is from the nameplate"
+    title = (
+        f"Drive gains of {calibration.cell} by {calibration.method}; change % is from the nameplate"
+    )
     yield gain_table(calibration.gains, title=title)
     yield from (Sentence(text, "bold") for text in warning_texts(calibration))
     for effect in calibration.effects:
-        yield Sentence(f"{effect.axis}: {effect.name}, declared in the cell file: {size_text(effect, calibration)}")
+        yield Sentence(
+            f"{effect.axis}: {effect.name}, declared in the cell file: "
+            f"{size_text(effect, calibration)}"
+        )
     if (note := actual_current_note(fitted.cell)) is not None:
         yield Sentence(note)
     if fitted.torque_slopes:
@@ -185,13 +197,17 @@ def fit_view(
         if apart is not None:
             yield Sentence(apart)
     yield ""
-    errors = {"fit": calibration.relative_error_percent, "held out": calibration.holdout_error_percent}
+    errors = {
+        "fit": calibration.relative_error_percent,
+        "held out": calibration.holdout_error_percent,
+    }
     yield error_table("Relative error of the torques [%]", axes, errors)
     filter_ = fitted.identification.conditioning
     yield Sentence(
-        f"{estimate.rows} rows, {len(fitted.final.system.columns)} base parameters and effects, condition "
-        f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
-        f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
+        f"{estimate.rows} rows, {len(fitted.final.system.columns)} base parameters and effects, "
+        f"condition {estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, "
+        f"decimation {filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the "
+        "same filters."
     )
     notes = (
         *sigma_notes(fitted),
@@ -215,10 +231,11 @@ ROUGH_SIGMA = 0.1  #: Relative deviation of σ itself that is said: of less than
 
 
 def sigma_notes(fitted: Fit) -> Iterator[str]:
-    """Say how well σ itself is known, where that is badly: the same plan then gives another σ in each session.
+    """Say how well σ itself is known, where that is badly:
+    the same plan then gives another σ in each session.
 
-    A variance that is estimated from the scatter of N independent pieces has a relative deviation of √(2/(N − 1)); σ,
-    its root, has half of it.
+    A variance that is estimated from the scatter of N independent pieces has a relative deviation
+    of √(2/(N − 1)); σ, its root, has half of it.
     """
     estimate = fitted.estimate
     if estimate.gains_fixed or not estimate.method.is_of_currents:
@@ -233,20 +250,24 @@ def sigma_notes(fitted: Fit) -> Iterator[str]:
         if ratio < LARGEST_FACTOR:
             apart = f"may differ by a factor of {ratio:.1f}"
     yield (
-        f"σ rests on {counted(moves, 'move')} and is itself known to {100.0 * rough:.0f} % only: that of another "
-        f"recording of the same plan {apart}."
+        f"σ rests on {counted(moves, 'move')} and is itself known to {100.0 * rough:.0f} % only: "
+        f"that of another recording of the same plan {apart}."
     )
 
 
 LARGEST_FACTOR = 5.0  #: Between two σ of one plan; beyond, the number means nothing
 
 
-def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudged: Sequence[int] = ()) -> str | None:
-    """Sentence on the gains for which the paper's total least squares differs from ml; None without any.
+def paper_note(
+    axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudged: Sequence[int] = ()
+) -> str | None:
+    """Sentence on the gains for which the paper's total least squares differs from ml;
+    None without any.
 
-    On clean simulated cells at 5 % of noise the two differ by up to 3.3 σ and 1.9 % (`make tls-study`): never by more
-    than both limits, so that a larger difference says something about the model. It does not beside another estimator
-    than ml, which noise may bias, nor where the weights of tls are wrong.
+    On clean simulated cells at 5 % of noise the two differ by up to 3.3 σ and 1.9 % (`make
+    tls-study`): never by more than both limits, so that a larger difference says something about
+    the model. It does not beside another estimator than ml, which noise may bias, nor where the
+    weights of tls are wrong.
 
     Args:
         axes: their names.
@@ -267,12 +288,15 @@ def paper_note(axes: Sequence[str], estimate: Estimate, paper: Estimate, misjudg
     texts = [f"{axes[axis]} {paper.gains[axis]:.4g} ({percent[axis]:+.1f} %)" for axis in far]
     values = ", ".join(texts)
     return (
-        f"The paper's total least squares, which is not used here, finds {values}. With noise alone the two methods "
-        "agree better: an effect that the model lacks may bend these gains (`drivegain residual` looks for it)."
+        f"The paper's total least squares, which is not used here, finds {values}. With noise "
+        "alone the two methods agree better: an effect that the model lacks may bend these gains "
+        "(`drivegain residual` looks for it)."
     )
 
 
-def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None) -> FitReport:
+def fit_report(
+    found: CaseFit, calibration: Calibration, comparison: EstimatorComparison | None
+) -> FitReport:
     """Return a fit: the calibration, what other estimators find, and what the data cannot show."""
     fitted = found.fitted
     axes = fitted.cell.axis_names
@@ -288,7 +312,9 @@ def fit_report(found: CaseFit, calibration: Calibration, comparison: EstimatorCo
         sometimes["torque_channel"] = own_torques(fitted.torque_slopes, calibration.gains)
     if comparison is not None:
         sometimes["comparison"] = [_trial(trial, axes) for trial in comparison.trials]
-    geometry = checked_geometry(fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses)
+    geometry = checked_geometry(
+        fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses
+    )
     verdicts = []
     for gain in needed_verdicts(fitted):
         axis = axes[gain.axis]
@@ -324,7 +350,9 @@ def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[C
     return compared
 
 
-def cases_report(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> CasesReport:
+def cases_report(
+    fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]
+) -> CasesReport:
     """Return the paper's cases and ours; both arguments are by the name of the case."""
     cases = {}
     for case in CASES:
@@ -344,7 +372,9 @@ def _removed(found: CaseFit) -> Sequence[Removal]:
     return found.essential.removed
 
 
-def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
+def cases_view(
+    fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]
+) -> Iterator[RenderableType]:
     """Cases that failed, and the paper's tables."""
     for name, found in fits.items():
         left = found.fitted.identification.training_error.total
@@ -355,7 +385,9 @@ def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTabl
         yield ""
 
 
-def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, RelativeError | None]) -> Table:
+def error_table(
+    title: str, axes: tuple[str, ...], errors: Mapping[str, RelativeError | None]
+) -> Table:
     """Relative error of each axis and of all together, a row for each entry that is known."""
     table = plain_table(("", *axes, "total"), title=title)
     for name, error in errors.items():
@@ -365,14 +397,18 @@ def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, Relative
 
 
 def start_of(fitted: Fit) -> Evidence:
-    """Return the rows under the declared model; the logs are read again only where the rows were not kept."""
+    """Return the rows under the declared model;
+    the logs are read again only where the rows were not kept.
+    """
     if not fitted.steps:
         return fitted.evidence()
     return without_effects(fitted.steps[0].after, fitted.identification.estimate)
 
 
 def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, ...]:
-    """Linear parameters of an effect with their σ, by their short names; empty where the model lacks the effect."""
+    """Linear parameters of an effect with their σ, by their short names;
+    empty where the model lacks the effect.
+    """
     estimate = evidence.estimate
     index = {column.name: number for number, column in enumerate(estimate.unknowns)}
     found = []
@@ -395,30 +431,40 @@ def identifiability_notes(fitted: Fit, influences: Sequence[PayloadMass]) -> Ite
     """
     if fitted.estimate.gains_fixed:
         return
-    drawn = [payload.name for payload in fitted.identification.system.payloads if len(payload.known) > 1]
+    drawn = [
+        payload.name for payload in fitted.identification.system.payloads if len(payload.known) > 1
+    ]
     mistake = (
-        "These data do not show a wrong payload mass, or a wrong value of gravity: either scales all gains alike and "
-        "leaves no residual."
+        "These data do not show a wrong payload mass, or a wrong value of gravity: either scales "
+        "all gains alike and leaves no residual."
     )
     if drawn:
         mistake = (
-            "These data hardly show a wrong payload mass: it changes all gains, and leaves a small residual. A wrong "
-            "value of gravity leaves none."
+            "These data hardly show a wrong payload mass: it changes all gains, and leaves a small "
+            "residual. A wrong value of gravity leaves none."
         )
         yield (
-            f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
-            "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper."
+            f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong "
+            "by some per cent shifts the gains by as much, which σ does not show: compare with "
+            "--known mass, better in the paper."
         )
     masses = ""
     for text in mass_texts(influences):
         masses += f" {text[0].upper()}{text[1:]}."
-    yield f"{mistake}{masses} A gear efficiency that is the same in both directions is part of its gain."
+    yield (
+        f"{mistake}{masses} A gear efficiency that is the same in both directions is part of "
+        "its gain."
+    )
 
 
 def geometry_notes(
-    check: GeometryCheck | None, axes: Sequence[str], robot: Robot, diagnoses: Sequence[Diagnosis] = ()
+    check: GeometryCheck | None,
+    axes: Sequence[str],
+    robot: Robot,
+    diagnoses: Sequence[Diagnosis] = (),
 ) -> Iterator[str]:
-    """Say the direction of gravity, and the zeros that the data do not show; nothing where nothing was tested.
+    """Say the direction of gravity, and the zeros that the data do not show;
+    nothing where nothing was tested.
 
     Args:
         check: beside the fit.
@@ -435,8 +481,9 @@ def geometry_notes(
         others = not_corrected(diagnoses)
         if others:
             yield (
-                f"With the description as it is ({', '.join(others)} not corrected), the torques put gravity {size}: "
-                "its σ does not cover that, so correct it first, and fit again."
+                f"With the description as it is ({', '.join(others)} not corrected), the torques "
+                f"put gravity {size}: its σ does not cover that, so correct it first, and fit "
+                "again."
             )
         else:
             yield f"By the torques, gravity is {size}."
@@ -446,16 +493,23 @@ def geometry_notes(
 
 
 def not_corrected(diagnoses: Sequence[Diagnosis]) -> list[str]:
-    """Name the mistakes of the description, other than gravity, beside which gravity was estimated: `zero-off J2`."""
+    """Name the mistakes of the description, other than gravity, beside which gravity was estimated:
+    `zero-off J2`.
+    """
     of_others = (OF_DESCRIPTION | {CORRECTION_UNCLEAR}) - {"gravity-tilted", GRAVITY_TURNED}
     named = [one for one in diagnoses if one.name in of_others and not one.runs]
     return [" ".join((one.name, *one.axes)) for one in named]
 
 
 def checked_geometry(
-    check: GeometryCheck | None, axes: Sequence[str], robot: Robot, diagnoses: Sequence[Diagnosis] = ()
+    check: GeometryCheck | None,
+    axes: Sequence[str],
+    robot: Robot,
+    diagnoses: Sequence[Diagnosis] = (),
 ) -> CheckedGeometry | None:
-    """Return what the torques say of the description of the robot; None where nothing was tested."""
+    """Return what the torques say of the description of the robot;
+    None where nothing was tested.
+    """
     if check is None:
         return None
     gravity = None
@@ -463,12 +517,18 @@ def checked_geometry(
         turn_deg = np.degrees(check.gravity.turn_rad)
         turn_std_deg = np.degrees(check.gravity.turn_std_rad)
         gravity = FoundGravity.of(
-            check.gravity, turn_deg=turn_deg, turn_std_deg=turn_std_deg, not_corrected=not_corrected(diagnoses)
+            check.gravity,
+            turn_deg=turn_deg,
+            turn_std_deg=turn_std_deg,
+            not_corrected=not_corrected(diagnoses),
         )
     causes = {axes[axis]: zero_hidden_by(robot, axis) for axis in check.hidden_zeros}
     pairs = [(axes[first], axes[second]) for first, second in check.hidden_pairs]
     return CheckedGeometry(
-        gravity=gravity, hidden_zeros=list(causes), hidden_zero_causes=causes, hidden_zero_pairs=pairs
+        gravity=gravity,
+        hidden_zeros=list(causes),
+        hidden_zero_causes=causes,
+        hidden_zero_pairs=pairs,
     )
 
 
@@ -479,8 +539,9 @@ def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:
         return
     if error > DOUBTFUL_PERCENT:
         yield (
-            f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. σ does not cover "
-            "this error: check channels, signs, drive train, gravity and payload against the cell file."
+            f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. σ "
+            "does not cover this error: check channels, signs, drive train, gravity and payload "
+            "against the cell file."
         )
     elif not judged:
         yield f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better."
@@ -489,12 +550,20 @@ def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> Iterator[str]:
         yield from (f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged)
 
 
-def comparison_tables(comparison: EstimatorComparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
-    """Gains by every estimator under the declared filters, and their spread between half and twice the cut-offs."""
+def comparison_tables(
+    comparison: EstimatorComparison, axes: tuple[str, ...]
+) -> tuple[Table, Table]:
+    """Gains by every estimator under the declared filters,
+    and their spread between half and twice the cut-offs.
+    """
     first = comparison.trials[0]
     filters = f"{first.position_cutoff_hz:g} Hz / {first.decimation_cutoff_hz:g} Hz"
-    gains = plain_table(("estimator", *axes, "‖ρ‖/‖Y‖ %"), title=f"Gains by every estimator, filters {filters}")
-    spreads = plain_table(("estimator", *axes), title="Spread of the gains between half and twice these cut-offs [%]")
+    gains = plain_table(
+        ("estimator", *axes, "‖ρ‖/‖Y‖ %"), title=f"Gains by every estimator, filters {filters}"
+    )
+    spreads = plain_table(
+        ("estimator", *axes), title="Spread of the gains between half and twice these cut-offs [%]"
+    )
     for trial in comparison.declared:
         if trial.gains is None:
             gains.add_row(trial.estimator, *("-" for _ in axes), trial.reason)

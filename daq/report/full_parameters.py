@@ -15,20 +15,25 @@ _ROUNDING = 1e-6  #: Share of its σ below which a value is shown as zero
 
 
 def full_parameter_view(calibration: Calibration, found: FullSet) -> Iterator[RenderableType]:
-    """Every standard parameter with its σ and what it rests on, and whether the data agree with the prior."""
+    """Every standard parameter with its σ and what it rests on,
+    and whether the data agree with the prior.
+    """
     yield ""
     yield full_parameter_table(found)
     by_data = sum(one.basis == "data" for one in found.parameters)
     yield Sentence(
-        f"{by_data} of {len(found.parameters)} parameters rest on the data; the others are the prior's, {found.urdf} "
-        f"with a tolerance of {100.0 * found.tolerance:g} %, as far as the data leave them free."
+        f"{by_data} of {len(found.parameters)} parameters rest on the data; the others are the "
+        f"prior's, {found.urdf} with a tolerance of {100.0 * found.tolerance:g} %, as far as the "
+        "data leave them free."
     )
     if found.bounded:
-        yield Sentence("Some values were moved to those of a robot that can exist; σ is that before the move.")
+        yield Sentence(
+            "Some values were moved to those of a robot that can exist; σ is that before the move."
+        )
     if found.contradictions:
         yield Sentence(
-            f"CHECK the prior: {'; '.join(found.contradictions)}. What is marked `prior` is not to be trusted: correct "
-            "the URDF, or give the tolerance that it has.",
+            f"CHECK the prior: {'; '.join(found.contradictions)}. What is marked `prior` is not to "
+            "be trusted: correct the URDF, or give the tolerance that it has.",
             "bold",
         )
     elif found.mass_ratio is not None:
@@ -44,7 +49,9 @@ def full_parameter_view(calibration: Calibration, found: FullSet) -> Iterator[Re
 def full_parameter_table(found: FullSet) -> Table:
     """A line a parameter: its value ± σ, and whether data or prior decide on it."""
     table = plain_table(
-        ("parameter", "value", "± σ", "unit", "by", "prior", "± σ"), title="Full parameters", left=(0, 3, 4)
+        ("parameter", "value", "± σ", "unit", "by", "prior", "± σ"),
+        title="Full parameters",
+        left=(0, 3, 4),
     )
     for one in found.parameters:
         prior = "-"
@@ -57,13 +64,23 @@ def full_parameter_table(found: FullSet) -> Table:
         value = one.value
         if is_rounding:
             value = 0.0
-        table.add_row(terminal_text(one.name), f"{value:.4g}", f"{one.std:.2g}", one.unit, one.basis, prior, prior_std)
+        table.add_row(
+            terminal_text(one.name),
+            f"{value:.4g}",
+            f"{one.std:.2g}",
+            one.unit,
+            one.basis,
+            prior,
+            prior_std,
+        )
     return table
 
 
 def gains_with_prior_table(calibration: Calibration, found: FullSet) -> Table:
     """Gains without and with the prior, and the shift in σ."""
-    table = plain_table(("axis", "gain", "± σ", "with the prior", "± σ", "shift σ"), title="Gains and the prior")
+    table = plain_table(
+        ("axis", "gain", "± σ", "with the prior", "± σ", "shift σ"), title="Gains and the prior"
+    )
     for gain, other in zip(calibration.gains, found.gains, strict=True):
         shift = (other.value - gain.value) / gain.std
         table.add_row(

@@ -14,7 +14,14 @@ from daq.report.picture import BLUE, GREEN, GREY, legend_below, render, single
 from daq.report.text import SHOWN_SIGMAS, plain_table, terminal_text
 from daq.workflow.geometry_diagnoses import UNEXPLAINED, misfit_text
 from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text
-from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Parameter, PayloadMass
+from ident.calibration import (
+    Calibration,
+    EncoderMisfit,
+    Gain,
+    GeometryCorrection,
+    Parameter,
+    PayloadMass,
+)
 from ident.data.torque_channel import TorqueSlope
 from ident.errors import Diagnosis
 
@@ -30,14 +37,17 @@ class OwnTorque(Report):
     readings: int = 0
 
 
-CERTAIN_SIGMAS = 3.0  #: Of the ratio of a drive's own torque to the gain, before a difference is said
+#: Of the ratio of a drive's own torque to the gain, before a difference is said
+CERTAIN_SIGMAS = 3.0
 
 
-def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str) -> bytes:
+def plot_gains(
+    gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str
+) -> bytes:
     """Draw how far each identified gain is from its nameplate, with its uncertainty.
 
-    Gains of different axes differ by an order of magnitude and may be negative, so all are shown in percent.
-    Return a PNG. `truth` is by axis, for a simulated cell only.
+    Gains of different axes differ by an order of magnitude and may be negative, so all are shown in
+    percent. Return a PNG. `truth` is by axis, for a simulated cell only.
     """
     figure, place = single(title, 3.2)
     positions = np.arange(len(gains))
@@ -58,7 +68,14 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     if truth is not None:
         true = [100.0 * (truth[gain.axis] / gain.nameplate - 1.0) for gain in gains]
         # Next to the estimate, so that neither covers the other.
-        place.plot(positions + 0.14, true, "D", color=GREEN, markersize=5, label="truth of the simulated cell")
+        place.plot(
+            positions + 0.14,
+            true,
+            "D",
+            color=GREEN,
+            markersize=5,
+            label="truth of the simulated cell",
+        )
     place.set_xticks(positions, [f"{gain.axis}\n{gain.value:.4g} {gain.unit}" for gain in gains])
     place.set_xlim(-0.6, len(gains) - 0.4)
     place.margins(y=0.15)
@@ -67,8 +84,12 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
     return render(figure)
 
 
-def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
-    """Table of the gains, a row an axis, beside the true ones of a simulated cell; fits a terminal of 80 columns."""
+def gain_table(
+    gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None
+) -> Table:
+    """Table of the gains, a row an axis, beside the true ones of a simulated cell;
+    fits a terminal of 80 columns.
+    """
     true: tuple[str, ...] = ()
     if truth:
         true = ("truth", "error %")
@@ -93,9 +114,11 @@ def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
 
 
 def torque_table(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> Table:
-    """Table of the slopes of the drives' own torque over the current, beside the identified gains; no fit uses them.
+    """Table of the slopes of the drives' own torque over the current, beside the identified gains;
+    no fit uses them.
 
-    A ratio shows how far the torque constant in a drive is from the gain: gear losses, or a wrong entry.
+    A ratio shows how far the torque constant in a drive is from the gain: gear losses, or a wrong
+    entry.
     """
     headings = ("axis", "slope ± σ", "gain ± σ", "slope/gain", "readings", "unit")
     title = "The drives' own torque against the current, not used in the fit"
@@ -110,7 +133,9 @@ def torque_table(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) ->
 
 
 def torque_sentences(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> Iterator[str]:
-    """Say what a slope means that differs from its gain by more than CERTAIN_SIGMAS of their ratio."""
+    """Say what a slope means that differs from its gain by more than CERTAIN_SIGMAS of their
+    ratio.
+    """
     far = []
     for slope, gain in zip(slopes, gains, strict=True):
         if slope is None:
@@ -120,8 +145,9 @@ def torque_sentences(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]
             far.append(f"{gain.axis} ({100.0 * difference:+.1f} %)")
     if far:
         yield (
-            f"The drive's own torque differs from the gain by more than {CERTAIN_SIGMAS:g} σ on {', '.join(far)}: a "
-            "wrong torque constant was entered in the drive, or the gear has losses, which the drive does not see."
+            f"The drive's own torque differs from the gain by more than {CERTAIN_SIGMAS:g} σ on "
+            f"{', '.join(far)}: a wrong torque constant was entered in the drive, or the gear has "
+            "losses, which the drive does not see."
         )
 
 
@@ -139,7 +165,9 @@ def _own_torque(slope: TorqueSlope | None, gain: Gain) -> OwnTorque:
 
 
 def _ratio_std(slope: TorqueSlope, gain: Gain) -> float:
-    """Standard deviation of slope/gain; the two are taken as independent: no fit uses the torque."""
+    """Standard deviation of slope/gain; the two are taken as independent:
+    no fit uses the torque.
+    """
     return math.hypot(slope.std / gain.value, slope.value * gain.std / gain.value**2)
 
 
@@ -147,7 +175,10 @@ def partial_note(calibration: Calibration) -> Iterator[str]:
     """Warn of a calibration from a log that is partial or lost frames."""
     partial = [source.name for source in calibration.sources if source.partial]
     if partial:
-        yield f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it."
+        yield (
+            f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` "
+            "refuses it."
+        )
 
 
 def diagnosis_texts(diagnoses: Iterable[Diagnosis]) -> tuple[str, ...]:
@@ -161,7 +192,9 @@ def warning_texts(calibration: Calibration) -> tuple[str, ...]:
 
 
 def encoder_text(misfit: EncoderMisfit) -> str:
-    """Say how well redundant encoders fit the loops, what would explain their misfit, and which geometry was used."""
+    """Say how well redundant encoders fit the loops, what would explain their misfit,
+    and which geometry was used.
+    """
     described = misfit_text(misfit.described, misfit.unit)
     if not misfit.significant:
         return f"fit the loops of the described geometry within {described}"
@@ -171,13 +204,13 @@ def encoder_text(misfit: EncoderMisfit) -> str:
         noise = f", where their noise is {misfit_text(misfit.noise, misfit.unit)}"
     if misfit.late_encoders:
         return (
-            f"miss the loops by {described}{noise}, explained by {misfit.late_encoders}, which leaves {left}; the "
-            "gains are those of the described geometry"
+            f"miss the loops by {described}{noise}, explained by {misfit.late_encoders}, which "
+            f"leaves {left}; the gains are those of the described geometry"
         )
     if not misfit.corrections:
         return (
-            f"miss the loops by {described}{noise}, which {UNEXPLAINED}; all zeros and lengths together leave {left}; "
-            "the gains are those of the described geometry"
+            f"miss the loops by {described}{noise}, which {UNEXPLAINED}; all zeros and lengths "
+            f"together leave {left}; the gains are those of the described geometry"
         )
     texts = " and ".join(map(_correction_text, misfit.corrections))
     others = ""
@@ -187,20 +220,27 @@ def encoder_text(misfit: EncoderMisfit) -> str:
     if misfit.applied:
         used = "corrected"
     return (
-        f"miss the loops by {described}{noise}, explained by {texts}{others}, which leaves {left}; the gains are those "
-        f"of the {used} geometry"
+        f"miss the loops by {described}{noise}, explained by {texts}{others}, which leaves {left}; "
+        f"the gains are those of the {used} geometry"
     )
 
 
 def _correction_text(one: GeometryCorrection) -> str:
     """Say how far a number of the description is off, as the diagnoses do."""
     if one.kind == "zero":
-        unit, scale = (DEGREES, 180.0 / math.pi) if one.unit == "rad" else (MILLIMETRES, 1e3)
+        if one.unit == "rad":
+            unit = DEGREES
+            scale = 180.0 / math.pi
+        else:
+            unit = MILLIMETRES
+            scale = 1e3
         return zero_off_text(one.joint, scale * one.change, scale * one.std, unit)
     std_mm = max(1e3 * one.std, 5e-5)
     if one.kind == "place":
         size = f"{1e3 * one.change:+.4f} ± {std_mm:.4f} mm"
-        return f"the place of {one.joint} on the base off by {size} in {one.end} (to be added to it)"
+        return (
+            f"the place of {one.joint} on the base off by {size} in {one.end} (to be added to it)"
+        )
     longer = "shorter"
     if one.change > 0.0:
         longer = "longer"
@@ -209,13 +249,17 @@ def _correction_text(one: GeometryCorrection) -> str:
 
 
 def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
-    """Say of each payload how a wrong mass changes the gains, and what its declared tolerance makes of them."""
+    """Say of each payload how a wrong mass changes the gains,
+    and what its declared tolerance makes of them.
+    """
     for one in influences:
         is_proportional = all(round(gain.percent_per_percent, 2) == 1.0 for gain in one.gains)
         wrong = "every gain is wrong by 1 %"
         at_most = ""
         if not is_proportional:
-            listed = ", ".join(f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains)
+            listed = ", ".join(
+                f"{gain.axis} {gain.percent_per_percent:.2f} %" for gain in one.gains
+            )
             wrong = f"the gains are wrong by: {listed}"
             at_most = "at most "
         text = f"if the mass of {one.payload} is wrong by 1 %, {wrong}"
@@ -223,13 +267,20 @@ def mass_texts(influences: Iterable[PayloadMass]) -> Iterator[str]:
             largest = max(abs(gain.percent_per_percent) for gain in one.gains)
             share_percent = 100.0 * one.tolerance_kg / one.mass_kg * largest
             text += (
-                f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, which is {at_most}"
-                f"± {share_percent:.2g} % of every gain, not included in σ"
+                f"; {one.payload} was weighed to {one.mass_kg:g} kg ± {one.tolerance_kg:g} kg, "
+                f"which is {at_most}± {share_percent:.2g} % of every gain, not included in σ"
             )
         yield text
 
 
-MASS_HEADINGS = ("payload", "axis", "gain per kg", "gain % per % of mass", "σ by the tolerance", "unit")
+MASS_HEADINGS = (
+    "payload",
+    "axis",
+    "gain per kg",
+    "gain % per % of mass",
+    "σ by the tolerance",
+    "unit",
+)
 
 
 def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
@@ -248,7 +299,9 @@ def mass_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
 
 def value_rows(parameters: Iterable[Parameter]) -> list[tuple[str, str, str]]:
     """Return rows of a table of parameters: name, value ± σ, unit."""
-    return [(sum_text(one.name), with_deviation(one.value, one.std), one.unit) for one in parameters]
+    return [
+        (sum_text(one.name), with_deviation(one.value, one.std), one.unit) for one in parameters
+    ]
 
 
 _FACTOR = re.compile(r"(?<=[+-] )([0-9.]+(?:e-?[0-9]+)?)\*")
@@ -256,7 +309,9 @@ _FACTOR = re.compile(r"(?<=[+-] )([0-9.]+(?:e-?[0-9]+)?)\*")
 
 
 def sum_text(name: str) -> str:
-    """Write the name of a base parameter for readers: `Izz1 + Ia1 + 0.4318·mx2` for `Izz1 + 1.0*Ia1 + 0.4318*mx2`."""
+    """Write the name of a base parameter for readers:
+    `Izz1 + Ia1 + 0.4318·mx2` for `Izz1 + 1.0*Ia1 + 0.4318*mx2`.
+    """
     return _FACTOR.sub(_factor_text, name)
 
 
@@ -269,7 +324,8 @@ def _factor_text(found: re.Match[str]) -> str:
 def with_deviation(value: float, std: float, sign: str = "") -> str:
     """Write `33.90 ± 0.14`, to the second digit of σ (ISO Guide 98-3, 7.2.6).
 
-    `32.96 (fixed)` where σ is 0, `-` without a value. A `sign` of "+" is written before positive values, too.
+    `32.96 (fixed)` where σ is 0, `-` without a value. A `sign` of "+" is written before positive
+    values, too.
     """
     if not math.isfinite(value):
         return "-"

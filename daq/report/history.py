@@ -1,4 +1,6 @@
-"""A history on the screen, as one JSON object, as a table for a spreadsheet, and as a picture of each gain."""
+"""A history on the screen, as one JSON object, as a table for a spreadsheet,
+and as a picture of each gain.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,17 @@ from daq.ledger.names import drives_of
 from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
 from daq.report.document import Figure, Report
 from daq.report.gains import with_deviation
-from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
+from daq.report.picture import (
+    BLUE,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    legend_below,
+    panels,
+    render,
+    unformatted,
+)
 from daq.report.text import SHOWN_SIGMAS, inert_row, plain_table, printable
 from daq.writeback.file_access import resolve_links
 from ident.calibration import Gain
@@ -79,8 +91,9 @@ class HistoryPoint(Report):
     accepted_at: str | None = None
     accepted_by: str | None = None
     misdated: str | None = None
-    """`created` by the clock of that day, where the order of the audit log shows that it was wrong: `recorded` and
-    `created` are then what that order allows; left out where it was right"""
+    """`created` by the clock of that day, where the order of the audit log shows that it was wrong:
+    `recorded` and `created` are then what that order allows; left out where it was right
+    """
 
 
 class HistoryAxis(Report):
@@ -167,13 +180,24 @@ class HistoryReport(Report):
     audit: AuditReport | None = None
     """with --verify"""
     other_robots: list[str] | None = None
-    """calibrations of another robot with the cell's name, each with what differs; left out where there are none"""
+    """calibrations of another robot with the cell's name, each with what differs;
+    left out where there are none
+    """
+    not_compared: list[str] | None = None
+    """calibrations with other axes or units than the newest one, each with what differs;
+    left out where there are none
+    """
 
 
 def show_history(
-    entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str], console: Console
+    entries: Sequence[Entry],
+    all_series: Sequence[Series],
+    actions: Mapping[str, str],
+    console: Console,
 ) -> None:
-    """The calibrations, a line each, with what was done with each by its digest; then each gain as it is now."""
+    """The calibrations, a line each, with what was done with each by its digest;
+    then each gain as it is now.
+    """
     if not entries:
         console.print("The history is empty: no calibration was applied or entered yet.")
         console.print("To enter one: drivegain history CELL --add CALIBRATION")
@@ -190,25 +214,31 @@ def show_history(
 def _misdated_text(entry: Entry) -> str:
     """Say that a calibration was entered while the clock was wrong."""
     return (
-        f"Calibration {entry.digest[:12]}…: found the date {entry.created_by_clock:%Y-%m-%d}; expected one about "
-        f"{entry.created:%Y-%m-%d}, by the order of the audit log. The clock was wrong then, so it is shown there. The "
-        "files keep their dates; gates judge the age of its logs by them."
+        f"Calibration {entry.digest[:12]}…: found the date {entry.created_by_clock:%Y-%m-%d}; "
+        f"expected one about {entry.created:%Y-%m-%d}, by the order of the audit log. The clock "
+        "was wrong then, so it is shown there. The files keep their dates; gates judge the age of "
+        "its logs by them."
     )
 
 
-def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
+def show_axis(
+    series: Series, all_series: Sequence[Series], actions: Mapping[str, str], console: Console
+) -> None:
     """Every calibration of one gain."""
     console.print(axis_table(series, actions))
     for noted in series.acknowledged:
         console.print(
-            f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: {printable(noted.why)} "
-            f"({printable(noted.who)}, {noted.at:%Y-%m-%d})"
+            f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: "
+            f"{printable(noted.why)} ({printable(noted.who)}, {noted.at:%Y-%m-%d})"
         )
     words = alarm_text(series)
     if words is not None:
         say_alarms(all_series, console)
     elif series.drift is not None:
-        console.print(f"No alarm. The changes scatter {series.dispersion:.2f} times as much as σ of the fits says.")
+        console.print(
+            f"No alarm. The changes scatter {series.dispersion:.2f} times as much as σ "
+            "of the fits says."
+        )
 
 
 def say_alarms(all_series: Sequence[Series], console: Console) -> None:
@@ -220,7 +250,9 @@ def say_alarms(all_series: Sequence[Series], console: Console) -> None:
     for question in questions(all_series):
         console.print(question[0].upper() + question[1:])
     if alarms:
-        console.print('When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"')
+        console.print(
+            'When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"'
+        )
 
 
 def _points_of(series: Series, entry: Entry) -> list[tuple[Series, int, Point]]:
@@ -229,7 +261,9 @@ def _points_of(series: Series, entry: Entry) -> list[tuple[Series, int, Point]]:
     return [(series, index, point) for index, point in points if point.entry.digest == entry.digest]
 
 
-def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str]) -> Table:
+def calibration_table(
+    entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str]
+) -> Table:
     """One row a calibration."""
     headings = ("recorded (UTC)", "calibration", "error %", "largest change", "alarms", "applied")
     table = plain_table(headings, left=(0, 1, 4, 5), wrap=(5,))
@@ -238,7 +272,9 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], ac
         for series in all_series:
             points += _points_of(series, entry)
         alarms = [series.axis for series, index, _ in points if series.alarm_at(index) is not None]
-        changes = [(point.change, point.gain.axis) for _, _, point in points if point.change is not None]
+        changes = [
+            (point.change, point.gain.axis) for _, _, point in points if point.change is not None
+        ]
         largest = "-"
         if changes:
             change, axis = max(changes, key=lambda pair: abs(pair[0].sigmas))
@@ -263,7 +299,9 @@ def history_gain_table(all_series: Sequence[Series]) -> Table:
     table = plain_table(headings, left=(0, 5, 6), wrap=(3,))
     for series in all_series:
         if not series.points:
-            table.add_row(printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit))
+            table.add_row(
+                printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit)
+            )
             continue
         gain = series.points[-1].gain
         count = len(series.points) - series.began
@@ -346,6 +384,8 @@ def history_report(
         others = {"audit": audit_report(checked)}
     if history.other_robots:
         others["other_robots"] = [str(one) for one in history.other_robots]
+    if history.not_compared:
+        others["not_compared"] = [str(one) for one in history.not_compared]
     return HistoryReport.of(
         cell=cell,
         calibrations=len(history.entries),
@@ -378,24 +418,27 @@ def say_verification(found: Verification, console: Console) -> None:
     console.print(f"{found.audit}: {entries}, chain {chain}.")
     if not found.noted:
         console.print(
-            f"No {head_file(found.audit).name} with the digest of the last entry: a missing end of the audit log would "
-            "not be noticed. The next entry writes it again."
+            f"No {head_file(found.audit).name} with the digest of the last entry: a missing end of "
+            "the audit log would not be noticed. The next entry writes it again."
         )
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
-        console.print(f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw.")
+        console.print(
+            f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw."
+        )
     for one in verdict.open_writes:
         begun = one.begun
         console.print(
-            f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
-            f"ended; {printable(begun.subject)} was found {one.content.value}."
+            f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at "
+            f"{begun.at} was never ended; {printable(begun.subject)} was found {one.content.value}."
         )
     for entry in verdict.entries:
         count = entry.details.get(BACKUPS_WITHOUT_LOG)
         if isinstance(count, int):
             console.print(
-                f"Entry {entry.number} began this audit log, although {printable(entry.subject)} had "
-                f"{counted(count, 'backup')} of earlier writes: an earlier log was removed or moved."
+                f"Entry {entry.number} began this audit log, although {printable(entry.subject)} "
+                f"had {counted(count, 'backup')} of earlier writes: an earlier log was removed or "
+                "moved."
             )
     state = "sound"
     if not verdict.holds:
@@ -417,7 +460,9 @@ def audit_report(found: Verification) -> AuditReport:
     unknown_writes = []
     for unknown in found.unknown:
         ended = unknown.ended
-        unknown_writes.append(UnknownWrite.of(ended, file=ended.subject, calibration_sha256=unknown.calibration))
+        unknown_writes.append(
+            UnknownWrite.of(ended, file=ended.subject, calibration_sha256=unknown.calibration)
+        )
     return AuditReport.of(
         verdict,
         file=found.audit,
@@ -430,7 +475,10 @@ def audit_report(found: Verification) -> AuditReport:
     )
 
 
-_WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains restored by the rollback of"}
+_WORDS = {
+    WriteAction.APPLIED: "applied by",
+    WriteAction.ROLLED_BACK: "gains restored by the rollback of",
+}
 """Words for an event after which the gains of a calibration were the current gains."""
 _VERDICTS = {True: "accepted by", False: "NOT ACCEPTED by"}
 """Words for what new moves with these gains have shown."""
@@ -439,9 +487,10 @@ _VERDICTS = {True: "accepted by", False: "NOT ACCEPTED by"}
 def in_force(cell: Cell, history: History) -> str | None:
     """Return the digest of the calibration whose gains are the current gains of this cell.
 
-    The controller's file is read: it may have been edited, or a backup copied back by hand, and a write to another file
-    (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts. None where the
-    file has other numbers than every calibration, or cannot be read.
+    The controller's file is read: it may have been edited, or a backup copied back by hand, and a
+    write to another file (`apply --to`) is not in this controller. Drives are not read; the last
+    write of the history counts. None where the file has other numbers than every calibration, or
+    cannot be read.
     """
     controller = cell.controller
     file = cell.controller_path
@@ -461,13 +510,17 @@ def in_force(cell: Cell, history: History) -> str | None:
     numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
     known = history.in_force(target)
     having = [entry.digest for entry in reversed(history.entries) if _has(entry, numbers)]
-    # Where several have these numbers: the one that the history names, else the one that was written last.
+    # Where several have these numbers: the one that the history names, else the one that was
+    # written last.
     order = (known, *(event.digest for event in reversed(history.events)), *having)
     return next((digest for digest in order if digest in having), None)
 
 
-def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
-    """Return what was done with each calibration in words, by its digest: writes, rollbacks and acceptance.
+def describe_actions(
+    entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None
+) -> dict[str, str]:
+    """Return what was done with each calibration in words, by its digest:
+    writes, rollbacks and acceptance.
 
     Args:
         entries: the calibrations.
@@ -519,7 +572,9 @@ COLUMNS = tuple(HistoryPoint.model_fields)
 
 
 def csv_text(all_series: Sequence[Series]) -> str:
-    """All calibrations of all gains with a header (RFC 4180); no text in it is a formula to a spreadsheet."""
+    """All calibrations of all gains with a header (RFC 4180);
+    no text in it is a formula to a spreadsheet.
+    """
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\r\n")
     writer.writeheader()
@@ -579,7 +634,8 @@ _LAST_DAY = 2_932_896.999
 
 
 def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
-    """Draw gains ± 2σ, those that were written filled, alarms; CUSUM, trend and deviations over their limits.
+    """Draw gains ± 2σ, those that were written filled, alarms;
+    CUSUM, trend and deviations over their limits.
 
     There is at least one series; the kind is png or svg.
     """
@@ -633,7 +689,15 @@ def _draw_gains(place: Axes, series: Series) -> None:
     place.plot(times[applied], values[applied], "o", color=BLUE, markersize=4, label="applied")
     alarms = [series.alarm_at(index) for index in range(len(points))]
     alarmed = np.array([alarm is not None for alarm in alarms], dtype=np.bool_)
-    place.plot(times[alarmed], values[alarmed], "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
+    place.plot(
+        times[alarmed],
+        values[alarmed],
+        "o",
+        color=ORANGE,
+        markerfacecolor="none",
+        markersize=9,
+        label="alarm",
+    )
     for stretch in series.stretches:
         drift = stretch.drift
         ends = times[[stretch.began, stretch.ended - 1]]
@@ -641,12 +705,22 @@ def _draw_gains(place: Axes, series: Series) -> None:
         lower = drift.baseline - half
         upper = drift.baseline + half
         place.fill_between(ends, lower, upper, color=SKY, alpha=0.3, linewidth=0)
-        place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
+        place.plot(
+            ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline"
+        )
         if drift.steady:
             reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
-            place.plot(ends, [drift.baseline, reached], color=ORANGE, linewidth=1.2, label="steady change")
+            place.plot(
+                ends, [drift.baseline, reached], color=ORANGE, linewidth=1.2, label="steady change"
+            )
     for noted in series.acknowledged:
-        place.axvline(_days(noted.since), color=PURPLE, linestyle=":", linewidth=1.2, label="change acknowledged")
+        place.axvline(
+            _days(noted.since),
+            color=PURPLE,
+            linestyle=":",
+            linewidth=1.2,
+            label="change acknowledged",
+        )
     place.set_ylabel(unformatted(f"{series.axis} [{series.unit}]"), fontsize=8)
 
 

@@ -1,8 +1,9 @@
 """Pieces of a page that needs no other file: no address, pictures inside, every text escaped.
 
-The page reads on a phone (16 px; wide tables scroll in a box of their own, those with a verdict stack their cells), on
-paper (the first sheet is one page of A4 or Letter, closed sections are left out) and in dark mode. Colour-blind
-readers can distinguish the colours, and no meaning rests on colour alone.
+The page reads on a phone (16 px; wide tables scroll in a box of their own, those with a verdict
+stack their cells), on paper (the first sheet is one page of A4 or Letter, closed sections are left
+out) and in dark mode. Colour-blind readers can distinguish the colours, and no meaning rests on
+colour alone.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from unicodedata import category
 MARK = '<meta name="generator" content="drivegain">'
 """Text at the beginning of every page, by which an earlier one is recognised."""
 _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
-"""Unicode categories: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
+"""Unicode categories: control, format, surrogates, private, unassigned,
+separators of lines and paragraphs.
+"""
 LIGHT = {
     "paper": "#fff",
     "ink": "#1a1a1a",
@@ -58,11 +61,16 @@ svg .other { stroke: var(--act); stroke-width: 2; stroke-dasharray: 5 3; }
 svg .cloud { stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
 svg .rest { stroke: var(--act); stroke-width: 2.2; stroke-linecap: round; opacity: 0.4; }
 """
-"""Style of the drawings of `daq.report.svg`. A text has an edge in the colour of the paper: no line crosses it."""
+"""Style of the drawings of `daq.report.svg`.
+
+A text has an edge in the colour of the paper: no line crosses it.
+"""
 
 
 def palette(light: Mapping[str, str], dark: Mapping[str, str]) -> str:
-    """Return the style of the colours of a page on the screen, those of every page and some of its own."""
+    """Return the style of the colours of a page on the screen,
+    those of every page and some of its own.
+    """
 
     def variables(colours: Mapping[str, str]) -> str:
         return " ".join(f"--{name}: {colour};" for name, colour in colours.items())
@@ -150,12 +158,15 @@ summary:focus-visible { outline: 3px solid var(--data); }
 
 
 def html_page(title: str, body: Iterable[str]) -> str:
-    """Build a page without script; the pieces of the body come from the functions below, which escape every text."""
+    """Build a page without script; the pieces of the body come from the functions below,
+    which escape every text.
+    """
     return html_document(title, MARK, _STYLE, "\n".join(body))
 
 
 def html_document(title: str, mark: str, style: str, body: str, script: str = "") -> str:
-    """Build a document that opens no address and runs no script but the given one, whatever text the body holds.
+    """Build a document that opens no address and runs no script but the given one,
+    whatever text the body holds.
 
     Args:
         title: plain text.
@@ -246,7 +257,8 @@ def html_list(texts: Iterable[str]) -> str:
     return f"<ul>{''.join(element('li', text) for text in texts)}</ul>"
 
 
-_LONG = 48  #: Characters of a value that takes the width of the paper, where shorter ones take half of it
+#: Characters of a value that takes the width of the paper, where shorter ones take half of it
+_LONG = 48
 
 
 def terms(pairs: Iterable[tuple[str, str]]) -> str:
@@ -261,12 +273,16 @@ def terms(pairs: Iterable[tuple[str, str]]) -> str:
     return f"<dl>{''.join(parts)}</dl>"
 
 
-def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Build a table of plain texts; the first cell of each row is its heading, and its kind is a CSS class.
+def table(
+    caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], kind: str = ""
+) -> str:
+    """Build a table of plain texts; the first cell of each row is its heading,
+    and its kind is a CSS class.
 
-    A column with any cell that is no number is aligned to the left. Kind "words" is for rows that end in a sentence:
-    a phone shows each row as a card. Kind "names" keeps the names of the rows in sight where the table scrolls. Kind
-    "stacked" is for long names and few numbers: a phone shows the numbers below the name.
+    A column with any cell that is no number is aligned to the left. Kind "words" is for rows that
+    end in a sentence: a phone shows each row as a card. Kind "names" keeps the names of the rows in
+    sight where the table scrolls. Kind "stacked" is for long names and few numbers: a phone shows
+    the numbers below the name.
     """
     lines = list(rows)
     styles = []
@@ -291,7 +307,9 @@ def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]], 
 
 
 def _alignment(cells: Iterable[str]) -> str:
-    """Return the attribute of a column with any cell that is no number; empty for one of numbers."""
+    """Return the attribute of a column with any cell that is no number;
+    empty for one of numbers.
+    """
     if all(_NUMBER.fullmatch(cell) for cell in cells):
         return ""
     return ' class="text"'
@@ -324,8 +342,8 @@ def spelled(text: str) -> str:
 def visible_text(text: str) -> str:
     """Spell out invisible characters.
 
-    HTML allows no control characters, and those that reverse the direction of writing (U+202E and others of category
-    Cf) can make a name look like another.
+    HTML allows no control characters, and those that reverse the direction of writing (U+202E and
+    others of category Cf) can make a name look like another.
     """
     return "".join(map(_visible, text))
 

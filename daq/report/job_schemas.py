@@ -1,4 +1,6 @@
-"""What `recalibrate`, `fleet`, `sign` and `demo` print under `--json`, and what a recalibration leaves behind."""
+"""What `recalibrate`, `fleet`, `sign` and `demo` print under `--json`,
+and what a recalibration leaves behind.
+"""
 
 from __future__ import annotations
 

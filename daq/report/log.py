@@ -1,4 +1,6 @@
-"""Logs: what verbs say of those that they write, and the contents as `drivegain info` shows them."""
+"""Logs: what verbs say of those that they write,
+and the contents as `drivegain info` shows them.
+"""
 
 from __future__ import annotations
 
@@ -189,7 +191,9 @@ _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.S
 
 
 def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
-    """Return a finished recording: the log with its losses, warnings about the currents, and the load of the buses."""
+    """Return a finished recording: the log with its losses, warnings about the currents,
+    and the load of the buses.
+    """
     return RecordReport.of(
         recorded.log,
         recorded,
@@ -202,7 +206,9 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
 
 
 def import_report(path: Path, imported: Imported, holdout: Path | None = None) -> ImportReport:
-    """Return the log of an import with its losses, what its time stamps show, and the log of its held-out part."""
+    """Return the log of an import with its losses, what its time stamps show,
+    and the log of its held-out part.
+    """
     held_out = None
     if imported.holdout is not None:
         held_out = HoldoutLog(log=str(holdout), samples=imported.holdout.samples)
@@ -220,7 +226,9 @@ def table_report(log: Path, table: Path, kind: TableFormat, written: Exported) -
 
 
 def bag_report(log: Path, bag: Path, written: BagWritten, *, effort: bool) -> BagReport:
-    """Return the bag that was made of a log; `effort` says whether a calibration gave its joint states efforts."""
+    """Return the bag that was made of a log;
+    `effort` says whether a calibration gave its joint states efforts.
+    """
     return BagReport.of(written, log=log, bag=bag, effort=effort)
 
 
@@ -236,7 +244,8 @@ def info_report(path: Path) -> InfoReport:
     statistics = reader.statistics
     run = head.run
     samples = reader.checks.samples
-    clock_step_s = None  # how far the wall clock was set during the run; it may not have been read at the end
+    # How far the wall clock was set during the run; it may not have been read at the end
+    clock_step_s = None
     if statistics.wall_minus_monotonic_ns is not None:
         clock_step_s = (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
     return InfoReport.of(
@@ -258,7 +267,9 @@ def info_report(path: Path) -> InfoReport:
         valid=valid,
         reason=reason,
         events=[event for event in reader.events if event.kind not in _ROUTINE],
-        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC) if run.started_wall_ns else None,
+        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC)
+        if run.started_wall_ns
+        else None,
         wall_minus_monotonic_s=run.wall_minus_monotonic_ns * 1e-9,
         wall_clock_step_s=clock_step_s,
         attachments={name: len(data) for name, data in sorted(head.files.items())},
@@ -266,9 +277,12 @@ def info_report(path: Path) -> InfoReport:
 
 
 def timing_text(timing: Timing) -> str:
-    """Describe the time stamps of an import in a sentence: `stamps at 90.9 Hz: steps of 12 ms at most, ...`."""
+    """Describe the time stamps of an import in a sentence: `stamps at 90.9 Hz:
+    steps of 12 ms at most, ...`.
+    """
     parts = [
-        f"usual step {1e3 * timing.usual_step_s:.6g} ms, longest {1e3 * timing.longest_step_s:.6g} ms",
+        f"usual step {1e3 * timing.usual_step_s:.6g} ms, longest "
+        f"{1e3 * timing.longest_step_s:.6g} ms",
         f"jitter {1e3 * timing.jitter_s:.3g} ms",
         f"drift {1e3 * timing.drift_s:.3g} ms",
     ]
@@ -285,7 +299,9 @@ def timing_text(timing: Timing) -> str:
 
 
 FOR_PROGRAMS = frozenset({"wall_minus_monotonic_s"})
-"""Keys that a person has no use for: the offset of two clocks, of which `wall_clock_step_s` has the change."""
+"""Keys that a person has no use for: the offset of two clocks,
+of which `wall_clock_step_s` has the change.
+"""
 
 
 def log_lines(description: Mapping[str, Any], width: int) -> Iterator[Text]:

@@ -1,4 +1,6 @@
-"""The model that `drivegain export mjcf` writes, what its numbers rest on, and what it does not hold."""
+"""The model that `drivegain export mjcf` writes, what its numbers rest on,
+and what it does not hold.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ class ChosenParameter(Report):
 
 
 class NotInMjcf(Report):
-    """Standard parameter, or the part of it, that the model lacks: the torque of its column times this is missing."""
+    """Standard parameter, or the part of it, that the model lacks:
+    the torque of its column times this is missing.
+    """
 
     name: str
     value: float
@@ -96,7 +100,9 @@ class MjcfReport(Report):
     """effects that are in stiffness, damping and friction of their joint"""
     effects_left_out: list[str]
     corrections_applied: list[str]
-    """effects that correct the description: the joint frames or the gravity of the model are the corrected ones"""
+    """effects that correct the description:
+    the joint frames or the gravity of the model are the corrected ones
+    """
     mountings_left_out: list[str]
     """payloads that the calibration knows; the model is of the robot without one"""
     closures_left_out: list[str]
@@ -108,7 +114,11 @@ class MjcfReport(Report):
 
 
 def head_remarks(
-    calibration: Calibration, choice: FullChoice, effects: JointEffects, shapes: UrdfShapes, software: str
+    calibration: Calibration,
+    choice: FullChoice,
+    effects: JointEffects,
+    shapes: UrdfShapes,
+    software: str,
 ) -> Iterator[str]:
     """Lines for the head of the model.
 
@@ -119,8 +129,14 @@ def head_remarks(
         shapes: of the robot's URDF.
         software: name and version.
     """
-    yield f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 or later."
-    yield f"Bodies: {choice.chosen_by.value}; torque changed by {choice.torque_change_percent.total:.2g} %"
+    yield (
+        f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 "
+        "or later."
+    )
+    yield (
+        f"Bodies: {choice.chosen_by.value}; torque changed by "
+        f"{choice.torque_change_percent.total:.2g} %"
+    )
     by_prior = _names_by_prior(choice)
     if by_prior:
         yield f"By the prior, not measured: {', '.join(by_prior)}"
@@ -149,7 +165,8 @@ def mjcf_report(
         source: what the model was written from.
         written: the model.
         out: its file.
-        same_configuration: whether the cell file is that of the fit; None where the calibration does not name one.
+        same_configuration: whether the cell file is that of the fit; None where the calibration
+            does not name one.
     """
     return MjcfReport.of(
         choice,
@@ -174,7 +191,9 @@ def mjcf_report(
 
 def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
     """Bodies by joint, actuators, what the bodies rest on, and what the model lacks."""
-    bodies = plain_table(("joint", "mass kg", "centre of mass m", "armature", "damping", "friction"), left=(0,))
+    bodies = plain_table(
+        ("joint", "mass kg", "centre of mass m", "armature", "damping", "friction"), left=(0,)
+    )
     for joint in report.joints:
         bodies.add_row(
             terminal_text(joint.name),
@@ -188,7 +207,10 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
     actuators = plain_table(("actuator", "acts on", "gear", "unit"), left=(0, 1, 3))
     for actuator in report.actuators:
         actuators.add_row(
-            terminal_text(actuator.axis), terminal_text(actuator.acts_on), f"{actuator.gear:.5g}", actuator.unit
+            terminal_text(actuator.axis),
+            terminal_text(actuator.acts_on),
+            f"{actuator.gear:.5g}",
+            actuator.unit,
         )
     yield actuators
     change = report.torque_change_percent.total
@@ -198,8 +220,13 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
         yield "The calibration has no torque: all its parameters are zero."
     else:
         yield f"The torque of these bodies differs from the identified one by {change:.2g} %."
-    by_prior = [parameter.name for parameter in report.parameters if parameter.basis == RestsOn.PRIOR.value]
-    yield printable(f"Bodies: {report.chosen_by}. {len(by_prior)} of {len(report.parameters)} parameters rest on it.")
+    by_prior = [
+        parameter.name for parameter in report.parameters if parameter.basis == RestsOn.PRIOR.value
+    ]
+    yield printable(
+        f"Bodies: {report.chosen_by}. {len(by_prior)} of {len(report.parameters)} "
+        "parameters rest on it."
+    )
     if report.assumed_links:
         names = ", ".join(report.assumed_links)
         yield printable(f"The URDF has no possible inertia behind {names}; a ball was assumed.")
@@ -212,7 +239,10 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
     if report.shapes_left_out:
         yield printable(f"Shapes that are not in the model: {'; '.join(report.shapes_left_out)}.")
     if report.same_configuration is False:
-        yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
+        yield Text(
+            "The cell's configuration has changed since the fit; check the difference.",
+            style="bold",
+        )
 
 
 def _parameters(choice: FullChoice) -> Iterator[ChosenParameter]:

@@ -1,4 +1,6 @@
-"""The tables of the paper, in their form: parameters (1, 3), gains (2, 4) and cross-validation (5 to 8)."""
+"""The tables of the paper, in their form:
+parameters (1, 3), gains (2, 4) and cross-validation (5 to 8).
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,10 @@ from ident.estimators.estimate import RelativeError
 
 NONE = "—"
 ERROR_ROW = "difference from the scale, %"
-SIGMA_NOTE = "%σ by the formulas of the method: eqs. (10) of wls and (23) of tls take rows as independent: too small."
+SIGMA_NOTE = (
+    "%σ by the formulas of the method: eqs. (10) of wls and (23) of tls take rows as "
+    "independent: too small."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +78,12 @@ def case_tables(calibrations: Mapping[str, Calibration]) -> tuple[PaperTable, ..
     return tuple(tables)
 
 
-def parameter_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Build Table 1 or 3: essential parameters with the payload's drawing (first) and with its mass alone (second)."""
+def parameter_table(
+    number: int, first: Calibration, second: Calibration, method: str
+) -> PaperTable:
+    """Build Table 1 or 3: essential parameters with the payload's drawing (first)
+    and with its mass alone (second).
+    """
     ones = {parameter.name: parameter for parameter in first.parameters}
     others = {parameter.name: parameter for parameter in second.parameters}
     rows = []
@@ -85,7 +94,8 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
         difference = None
         if one is not None and other is not None and one.value:
             difference = 100.0 * abs((one.value - other.value) / one.value)
-            # The mean is over the parameters that both identified; one given by the drawing is no comparison.
+            # The mean is over the parameters that both identified; one given by the drawing is no
+            # comparison.
             if one.std > 0.0:
                 differences.append(difference)
         leading, *regrouped = name.split()
@@ -98,8 +108,8 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
     rows.append(("‖ρ‖/‖Y‖", left, "", other_left, "", ""))
     mean = percent(_mean(differences))
     note = (
-        f"%e is the difference from the first value; its mean is {mean} %. "
-        f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units."
+        f"%e is the difference from the first value; its mean is {mean} %. R: other parameters are "
+        f"regrouped with this one. {NONE} for %σ: given. SI units."
     )
     return PaperTable(
         number=number,
@@ -110,8 +120,12 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
     )
 
 
-def paper_gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Build Table 2 or 4: nameplate and identified gains, with the payload's drawing and with its mass alone."""
+def paper_gain_table(
+    number: int, first: Calibration, second: Calibration, method: str
+) -> PaperTable:
+    """Build Table 2 or 4: nameplate and identified gains,
+    with the payload's drawing and with its mass alone.
+    """
     rows: list[tuple[str, ...]] = []
     for one, other in zip(first.gains, second.gains, strict=True):
         nameplate = f"{one.nameplate:.4g}"
@@ -152,8 +166,9 @@ def condition_table(found: CrossValidation) -> PaperTable:
         headings=("", *names),
         rows=(("cond(W)", *conditions),),
         notes=(
-            "The smaller the number, the more evenly the moves show all base parameters. The payload counts as part of "
-            "the last link. `plan` allows 3500, and 1e5 for a closed chain.",
+            "The smaller the number, the more evenly the moves show all base parameters. The "
+            "payload counts as part of the last link. `plan` allows 3500, and 1e5 for a closed "
+            "chain.",
         ),
     )
 
@@ -217,7 +232,9 @@ def mass_tables(found: CrossValidation) -> tuple[PaperTable, ...]:
 
 
 def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -> PaperTable:
-    runs = [run for run in found.weighed if (run.payload.name, run.payload.mounting) == (name, mounting)]
+    runs = [
+        run for run in found.weighed if (run.payload.name, run.payload.mounting) == (name, mounting)
+    ]
     labels: dict[str, None] = {}
     for run in runs:
         labels |= dict.fromkeys(run.masses)
@@ -254,8 +271,8 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     if NAMEPLATE_LABEL in labels and NAMEPLATE_LABEL not in found.calibrations:
         shown[shown.index(NAMEPLATE_LABEL)] = "nameplate"
     explanation = (
-        f"Each column weighs with its own gains: {how}. Gains that find the right mass may still be wrong, because "
-        "errors of several axes can cancel."
+        f"Each column weighs with its own gains: {how}. Gains that find the right mass may still "
+        "be wrong, because errors of several axes can cancel."
     )
     return PaperTable(
         number=number,
@@ -267,7 +284,9 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
 
 
 def paper_page(title: str, tables: Iterable[PaperTable], *, marker: str) -> str:
-    """Markdown page of tables; its first line names the kind of file, so that no other file is overwritten."""
+    """Markdown page of tables; its first line names the kind of file,
+    so that no other file is overwritten.
+    """
     sections = "\n".join(table.markdown() for table in tables)
     return f"<!-- format: {marker} -->\n# {title}\n\n{sections}"
 

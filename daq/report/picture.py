@@ -1,4 +1,7 @@
-"""Shared by the pictures of matplotlib: size, colours, rendering. No pyplot, which keeps figures in a global list."""
+"""Shared by the pictures of matplotlib: size, colours, rendering.
+
+No pyplot, which keeps figures in a global list.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Okabe and Ito, "Color Universal Design" (2008): distinct to colour-blind readers and in grey print.
+# Okabe and Ito, "Color Universal Design" (2008): distinct to colour-blind readers and in grey
+# print.
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
 GREEN = "#009E73"
@@ -20,7 +24,8 @@ SKY = "#56B4E9"
 BLACK = "#000000"
 GREY = "#7F7F7F"
 
-QUANTITY = {"Nm": "torque", "N": "force"}  #: Quantity of a joint, by its unit: N where it is prismatic
+#: Quantity of a joint, by its unit: N where it is prismatic
+QUANTITY = {"Nm": "torque", "N": "force"}
 
 DPI = 130
 _PANEL_IN = (5.6, 2.0)
@@ -28,7 +33,9 @@ _TITLE_AND_LEGEND_IN = 1.1
 
 
 def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
-    """Make a figure of `count` small multiples that share their horizontal axis, filled row by row."""
+    """Make a figure of `count` small multiples that share their horizontal axis,
+    filled row by row.
+    """
     columns = min(columns, count)
     rows = -(-count // columns)
     panel_width_in, panel_height_in = _PANEL_IN
@@ -83,12 +90,16 @@ def legend_below(figure: Figure, *places: Axes) -> None:
 
 
 def render(figure: Figure, kind: str = "png") -> bytes:
-    """Return the content of a file, png or svg; the same figure gives the same bytes: no time, no random names."""
+    """Return the content of a file, png or svg; the same figure gives the same bytes:
+    no time, no random names.
+    """
     from matplotlib import rc_context  # noqa: PLC0415
 
     drawn = io.BytesIO()
     with rc_context({"svg.hashsalt": "drivegain"}):
-        figure.savefig(drawn, format=kind, dpi=DPI, metadata={"Date" if kind == "svg" else "Software": None})
+        figure.savefig(
+            drawn, format=kind, dpi=DPI, metadata={"Date" if kind == "svg" else "Software": None}
+        )
     return drawn.getvalue()
 
 

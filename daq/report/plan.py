@@ -53,9 +53,13 @@ class PlanReport(Report):
     gains: list[PlannedGain]
 
 
-def plan_report(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability) -> PlanReport:
+def plan_report(
+    out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: Identifiability
+) -> PlanReport:
     """Return a plan, with the verdict on the gain of each axis."""
-    gains = [_planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)]
+    gains = [
+        _planned_gain(axis.name, gain) for axis, gain in zip(cell.axes, judged.gains, strict=True)
+    ]
     return PlanReport.of(
         made,
         judged,
@@ -86,8 +90,12 @@ def _planned_gain(axis: str, gain: GainVerdict) -> PlannedGain:
     )
 
 
-def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability, requested_s: float) -> Iterator[str]:
-    """Say which gains are hidden, and what makes weak ones good; σ falls with the square root of the time."""
+def _on_all_gains(
+    cell: Cell, made: Plan, judged: Identifiability, requested_s: float
+) -> Iterator[str]:
+    """Say which gains are hidden, and what makes weak ones good;
+    σ falls with the square root of the time.
+    """
     hidden = judged.sentences(cell.axis_names)
     yield from hidden
     if not hidden and judged.known_preload_rank is not None:
@@ -96,7 +104,10 @@ def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability, requested_s: 
     weak = [gain for gain in judged.gains if gain.verdict is not Visibility.GOOD]
     if not weak:
         return
-    ways = ["a heavier payload", "wider limits of position, speed and acceleration in the cell file"]
+    ways = [
+        "a heavier payload",
+        "wider limits of position, speed and acceleration in the cell file",
+    ]
     worst_percent = max(gain.std_percent for gain in weak)
     longer_s = None
     if math.isfinite(worst_percent):
@@ -108,7 +119,9 @@ def _on_all_gains(cell: Cell, made: Plan, judged: Identifiability, requested_s: 
 
 
 def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
-    """Positions of the joints without a motor that close the loops, to compare with the real robot."""
+    """Positions of the joints without a motor that close the loops,
+    to compare with the real robot.
+    """
     if cell.chain is None:
         return
     robot = experiment.scene.checker.robot
@@ -125,8 +138,8 @@ def _assembly(cell: Cell, experiment: Experiment) -> Iterator[str]:
         return ", ".join(parts)
 
     yield (
-        f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the motors' joints are at "
-        f"{listed(robot.axis_joints)}."
+        f"Assembly pose, to compare with the robot: {listed(robot.passive_joints)} while the "
+        f"motors' joints are at {listed(robot.axis_joints)}."
     )
 
 
@@ -141,17 +154,22 @@ def plan_text(
 ) -> str:
     """Describe a plan in lines for the operator, who looks at its preview, if there is one.
 
-    `requested_s` is the duration that the plan was allowed to have [s]; a longer one is proposed for weak gains.
+    `requested_s` is the duration that the plan was allowed to have [s]; a longer one is proposed
+    for weak gains.
     """
     look = f": {preview} shows the moves"
     if preview is None:
         look = ", or look at it (--preview PAGE)"
     way = "`record` checks the way to its first target from where the robot stands."
     if cell.clearance is None:
-        way = "The way to its first target is not checked: the cell file declares no `workspace` and no `clearance`."
+        way = (
+            "The way to its first target is not checked: the cell file declares no `workspace` "
+            "and no `clearance`."
+        )
     width = max(map(len, (*cell.axis_names, "axis")))
     lines = [
-        f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
+        f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition "
+        f"{made.condition:.0f}",
         f"  {'axis':{width}}  predicted σ  verdict",
     ]
     sentences = []

@@ -1,7 +1,7 @@
 """A plan as a page of its own: the arm moves through it, with swept volume, clearance and speeds.
 
-Lines are the joint chain of the URDF; the bodies are the capsules that the clearance is computed with. The swept volume
-is drawn from the same capsules at every row.
+Lines are the joint chain of the URDF; the bodies are the capsules that the clearance is computed
+with. The swept volume is drawn from the same capsules at every row.
 """
 
 from __future__ import annotations
@@ -28,11 +28,21 @@ from ident.planning.clearance import Box, Capsule, Checker
 #: Time between two rows of a preview, and their largest number
 STEP_S = 0.04
 LARGEST_ROWS = 1500
-MARK = '<meta name="drivegain-plan" content="'  #: Text at the beginning of a page, before the digest of its plan
+#: Text at the beginning of a page, before the digest of its plan
+MARK = '<meta name="drivegain-plan" content="'
 _GRID_M = 0.25  #: Side of a square of the drawn plane z = 0
 HEAD_BYTES = 1024  #: Beginning of a page, in which the digest of its plan is
 _AXES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B58900", "#3B9BD6", "#7F7F7F", "#882255")
-_AXES_DARK = ("#4BA3E3", "#F08A4B", "#2FC298", "#E39BC4", "#E0B73C", "#9AD5FF", "#B5B5B5", "#D77AA8")
+_AXES_DARK = (
+    "#4BA3E3",
+    "#F08A4B",
+    "#2FC298",
+    "#E39BC4",
+    "#E0B73C",
+    "#9AD5FF",
+    "#B5B5B5",
+    "#D77AA8",
+)
 _LIGHT = {"base": "#8a8a8a", "swept": "#b9cbe0", "swept-edge": "#33567f", "footprint": "#a3a3a3"}
 _DARK = {"base": "#8f8f8f", "swept": "#4d6e93", "swept-edge": "#bcd6f2", "footprint": "#6d6d6d"}
 _LIGHT |= {f"axis-{number}": colour for number, colour in enumerate(_AXES)}
@@ -57,7 +67,9 @@ canvas { width: 100%; display: block; } #clearance { height: 9rem; }
 )
 
 
-def preview_page(cell: Cell, moves: Sequence[PlannedMove], checker: Checker, plan: bytes, purpose: str = "") -> str:
+def preview_page(
+    cell: Cell, moves: Sequence[PlannedMove], checker: Checker, plan: bytes, purpose: str = ""
+) -> str:
     """Build the page.
 
     Args:
@@ -194,14 +206,23 @@ def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[s
     known = [(clearance_mm, at_s) for clearance_mm, at_s in rows if clearance_mm is not None]
     if known:
         least_mm, at_s = min(known)
-        yield f"Smallest clearance: {least_mm:.0f} mm, at {at_s:.1f} s; {drawn['minimum_mm']:.0f} mm must be kept."
+        yield (
+            f"Smallest clearance: {least_mm:.0f} mm, at {at_s:.1f} s; {drawn['minimum_mm']:.0f} "
+            "mm must be kept."
+        )
     reach = drawn["reach"]
     extents = zip("xyz", reach["lower_m"], reach["upper_m"], strict=True)
     ranges = ", ".join(f"{name} {low:+.2f} to {high:+.2f}" for name, low, high in extents)
     radius_m = reach["radius_m"]
-    yield f"The moving parts stay within {ranges} m, and within {radius_m:.2f} m of the z axis of the base."
+    yield (
+        f"The moving parts stay within {ranges} m, and within {radius_m:.2f} m of the z axis of "
+        "the base."
+    )
     if (lowest_m := reach["lower_m"][2]) < 0.0:
-        yield f"They come {-lowest_m:.2f} m below z = 0, the plane of the grid: is there a floor or a table?"
+        yield (
+            f"They come {-lowest_m:.2f} m below z = 0, the plane of the grid: is there a floor "
+            "or a table?"
+        )
     declared = cell.clearance is not None and bool(cell.clearance.capsules)
     shape = "a guess from the URDF; the real arm may be thicker"
     if declared:
@@ -211,15 +232,25 @@ def _facts(cell: Cell, checker: Checker, drawn: Mapping[str, Any]) -> Iterator[s
     yield f"The shape of the arm is {shape}."
     bodies = {"obstacle": checker.scene.boxes, "workspace": checker.scene.workspace}
     if missing := [word for word, found in bodies.items() if not found]:
-        yield f"The cell file declares no {' and no '.join(missing)}: tables, cables and people are not on this page."
+        yield (
+            f"The cell file declares no {' and no '.join(missing)}: tables, cables and people "
+            "are not on this page."
+        )
     checked = "nothing checks the way there"
     if cell.clearance is not None:
         checked = "drivegain record checks the way there"
-    yield f"The page starts at the first target. Where the robot stands before is not known here; {checked}."
+    yield (
+        "The page starts at the first target. Where the robot stands before is not known here; "
+        f"{checked}."
+    )
 
 
-def _rows(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time [s], position [rad or m], velocity and number of the move of each row, dwells included."""
+def _rows(
+    cell: Cell, moves: Sequence[PlannedMove]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return time [s], position [rad or m], velocity and number of the move of each row,
+    dwells included.
+    """
     ways = [path_of(cell, np.array(before.target_rad), after) for before, after in pairwise(moves)]
     lengths_s = [way.duration_s + after.dwell_s for way, after in zip(ways, moves[1:], strict=True)]
     began_s = np.cumsum([moves[0].dwell_s, *lengths_s])
@@ -242,7 +273,9 @@ def _rounded(values: FloatArray, decimals: int) -> list[object]:
 
 
 def find_preview(plan: Path) -> Path | None:
-    """Return the page in the folder of a plan that shows exactly its content; None without one that can be read."""
+    """Return the page in the folder of a plan that shows exactly its content;
+    None without one that can be read.
+    """
     with suppress(OSError):
         mark = f'{MARK}{sha256(plan.read_bytes())}"'.encode()
         for page in sorted(plan.parent.glob("*.html")):

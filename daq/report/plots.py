@@ -1,6 +1,8 @@
-"""The pictures of a fit and of a residual as drawings: torques, effects, and the ranking of candidates.
+"""The pictures of a fit and of a residual as drawings:
+torques, effects, and the ranking of candidates.
 
-Each function returns the drawings of a page, one a panel; `daq.report.svg.sheet` makes a file of them.
+Each function returns the drawings of a page, one a panel; `daq.report.svg.sheet` makes a file of
+them.
 """
 
 from __future__ import annotations
@@ -29,8 +31,11 @@ from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import relative_error
 
 
-def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
-    """Draw the torques of a held-out run (paper Fig. 2), the residual before and after each effect, and the gains.
+def draw_fit(
+    fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path
+) -> None:
+    """Draw the torques of a held-out run (paper Fig.
+    2), the residual before and after each effect, and the gains.
 
     `truth` is the true gain by axis, for a simulated cell only.
 
@@ -76,7 +81,8 @@ def draw_torques(final: Evidence, cell: Cell) -> tuple[str, ...]:
     return plot_torques(rows.time_s, measured_nm.T, predicted_nm.T, cell.axis_names, forces=forces)
 
 
-SHOWN_S = 10.0  #: Length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge
+#: Length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge
+SHOWN_S = 10.0
 
 
 def plot_torques(
@@ -87,13 +93,16 @@ def plot_torques(
     *,
     forces: tuple[str, ...],
 ) -> tuple[str, ...]:
-    """Draw τ = V g with the identified gains (wide) and the model's τ (dashed), one panel an axis (paper Fig. 2).
+    """Draw τ = V g with the identified gains (wide) and the model's τ (dashed),
+    one panel an axis (paper Fig. 2).
 
-    The relative error over each panel is that of all of the run, not only of the stretch that is drawn.
+    The relative error over each panel is that of all of the run, not only of the stretch that is
+    drawn.
 
     Args:
         time_s: shape (k,) [s].
-        measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
+        measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row
+            was left out.
         predicted_nm: torque from the model, same shape [forces].
         axes: names of the n axes.
         forces: "Nm" or, along a prismatic joint, "N", for each axis.
@@ -113,7 +122,9 @@ def plot_torques(
 
 
 def drawn_axis(before: Evidence, after: Evidence, placed: PlacedEffect) -> int:
-    """Return the axis of an effect; of one on a joint without a motor, the axis whose residual falls most with it."""
+    """Return the axis of an effect; of one on a joint without a motor,
+    the axis whose residual falls most with it.
+    """
     if placed.axis < after.model.robot.axis_count:
         return placed.axis
     without = _squared_residual(before)
@@ -132,10 +143,14 @@ def _squared_residual(evidence: Evidence) -> FloatArray:
     return squared
 
 
-def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> tuple[str, ...]:
-    """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit.
+def draw_effect(
+    before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell
+) -> tuple[str, ...]:
+    """Draw the residual of an axis before and after an effect was added, on the first held-out run,
+    or of the fit.
 
-    It is that of `drawn_axis`, against the variable and the velocity of the joint that the effect acts on.
+    It is that of `drawn_axis`, against the variable and the velocity of the joint that the effect
+    acts on.
     """
     index = 0
     if after.held_out:
@@ -179,16 +194,17 @@ def plot_residual(
     velocity_rad_s: FloatArray,
     force: str = "Nm",
 ) -> tuple[str, ...]:
-    """Draw the residual of one axis before and after an effect joined the model, in four panels of one scale.
+    """Draw the residual of one axis before and after an effect joined the model,
+    in four panels of one scale.
 
-    First over time, then against the variable that the effect depends on, with the mean of each stretch of it for
-    either direction of motion (missing friction cancels over both): a mean away from zero is torque that the model
-    still lacks.
+    First over time, then against the variable that the effect depends on, with the mean of each
+    stretch of it for either direction of motion (missing friction cancels over both): a mean away
+    from zero is torque that the model still lacks.
 
     Args:
         time_s: shape (k,) [s].
-        before_nm, after_nm: residual torque without and with the effect, shape (k,) [force]; NaN where a row was left
-            out.
+        before_nm, after_nm: residual torque without and with the effect, shape (k,) [force]; NaN
+            where a row was left out.
         variable: variable that the effect depends on, shape (k,).
         variable_label: its name and unit.
         velocity_rad_s: of the axis, shape (k,) [rad/s or m/s].
@@ -212,7 +228,9 @@ def plot_residual(
     return tuple(drawn)
 
 
-def _against(variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray) -> tuple[Line, ...]:
+def _against(
+    variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray
+) -> tuple[Line, ...]:
     """Samples and means over the variable, for either direction of motion."""
     known = np.isfinite(variable) & np.isfinite(residual_nm)
     forwards = known & (velocity_rad_s > 0)
@@ -237,10 +255,13 @@ def _mean_line(variable: FloatArray, residual_nm: FloatArray, kind: str, name: s
     return Line(np.array(centres), np.array(means), kind, name)
 
 
-def plot_ranking(findings: Sequence[Finding], rivals: Sequence[PlacedEffect], axes: tuple[str, ...]) -> str:
+def plot_ranking(
+    findings: Sequence[Finding], rivals: Sequence[PlacedEffect], axes: tuple[str, ...]
+) -> str:
     """Draw candidates by the fall of the squared error on left-out moves, the best first.
 
-    Rivals are those not distinguishable from the added one; they are pale. Those that fail a gate are hollow.
+    Rivals are those not distinguishable from the added one; they are pale. Those that fail a gate
+    are hollow.
     """
     alike = {(rival.effect.name, rival.axis) for rival in rivals}
     rows = []

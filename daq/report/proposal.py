@@ -1,4 +1,6 @@
-"""A proposed change of a controller's file or of the drives: tables for the operator, and what `--json` prints."""
+"""A proposed change of a controller's file or of the drives:
+tables for the operator, and what `--json` prints.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +129,9 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
     console.print(terminal_text(f"* {note}"), style="dim")
     judged, sentence = judge(edit.changes, known)
     if judged and edit.has_effect and not any(change.significant for change in judged.values()):
-        console.print(terminal_text(f"{sentence[0].upper()}{sentence[1:]}. Nothing needs to be written."))
+        console.print(
+            terminal_text(f"{sentence[0].upper()}{sentence[1:]}. Nothing needs to be written.")
+        )
     console.print()
     if isinstance(edit, DriveEdit):
         console.print(terminal_lines(edit.diff.removesuffix("\n")))
@@ -138,7 +142,17 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
 def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Table:
     """Make the table of current and new gains, with the figures to judge a change by."""
     current = GainOrigin.CURRENT.value
-    headings = ("axis", current, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "from it %", "unit")
+    headings = (
+        "axis",
+        current,
+        "identified ± σ",
+        "σ %",
+        "Δ %",
+        "Δ in σ",
+        "nameplate",
+        "from it %",
+        "unit",
+    )
     table = plain_table(headings, left=(0, len(headings) - 1))
     judged, _ = judge(changes, known)
     for change in changes:
@@ -160,7 +174,9 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Ta
     return table
 
 
-def proposal_report(proposal: Proposal[E], written: Written | None, known: Spread) -> FileChange | DriveChange:
+def proposal_report(
+    proposal: Proposal[E], written: Written | None, known: Spread
+) -> FileChange | DriveChange:
     """Return a proposal and its outcome; `written` is None where nothing was written."""
     edit = proposal.edit
     if isinstance(edit, DriveEdit):
@@ -217,12 +233,17 @@ def _drive_change(proposal: Proposal[E], written: Written | None) -> DriveChange
 
 
 def _drive_gain(change: GainChange) -> DriveGain:
-    return DriveGain.of(change, object=change.key, old=change.current_gain, nameplate=change.nameplate_gain)
+    return DriveGain.of(
+        change, object=change.key, old=change.current_gain, nameplate=change.nameplate_gain
+    )
 
 
 def _outcome(written: Written) -> dict[str, Any]:
     """Keys that are there once the drives are written."""
-    return {"record": str(written.backup), "saved": all(change.saved for change in written.parameters)}
+    return {
+        "record": str(written.backup),
+        "saved": all(change.saved for change in written.parameters),
+    }
 
 
 def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
@@ -232,7 +253,8 @@ def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
         console.print(f"{value.axis.name}, {value.parameter}: {value.value:.9g} -> {new:.9g}")
     if edit.record is not None:
         console.print(
-            f"These are the gains before the write of {edit.record.at} by {terminal_text(edit.record.who).plain}."
+            f"These are the gains before the write of {edit.record.at} by "
+            f"{terminal_text(edit.record.who).plain}."
         )
 
 
@@ -289,12 +311,16 @@ def _rollback_diff(edit: Edit) -> str:
     name = terminal_text(Path(edit.subject).name).plain
     before = (edit.before or b"").decode(errors="replace").splitlines()
     after = edit.after.decode(errors="replace").splitlines()
-    diff = difflib.unified_diff(before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1)
+    diff = difflib.unified_diff(
+        before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1
+    )
     return "\n".join(diff)
 
 
 def _show_diff(diff: str, console: Console) -> None:
-    """Print whole lines, also in a pipe, so that a number is never broken and a line can be copied."""
+    """Print whole lines, also in a pipe, so that a number is never broken and a line can be
+    copied.
+    """
     for line in diff.splitlines():
         console.print(Text(line, style=_DIFF_STYLES.get(line[:1], "")), soft_wrap=True)
 

@@ -1,4 +1,5 @@
-"""The closed loop in sentences, tables and JSON: the effects that were added, and what they changed.
+"""The closed loop in sentences, tables and JSON:
+the effects that were added, and what they changed.
 
 docs/reference/residual-json.md describes the keys of the document.
 """
@@ -13,7 +14,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 
-from daq.errors import counted
+from daq.errors import counted, first_few
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_table, identifiability_notes, sigma_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
@@ -39,8 +40,11 @@ from ident.estimators.estimate import RelativeError
 
 _SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
-MUCH = 0.2  #: Share of the squared residual; a candidate that would explain it, and failed a check, is named
-LITTLE = 0.005  #: Share of the squared residual; a candidate on few moves that explains less is not worth a sentence
+#: Share of the squared residual; a candidate that would explain it, and failed a check, is named
+MUCH = 0.2
+#: Share of the squared residual; a candidate on few moves that explains less is not worth a
+#: sentence
+LITTLE = 0.005
 MOST = 0.75  #: Share of the folds on which such a candidate must lower the error
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
@@ -50,7 +54,9 @@ WHEN = ("before", "after")
 def residual_view(
     fitted: Fit, account: Account, calibration: Calibration, *, verbose: bool = False
 ) -> Iterator[RenderableType]:
-    """One screen: what was found, and the gains; if verbose, all that the report says of the search, too."""
+    """One screen: what was found, and the gains;
+    if verbose, all that the report says of the search, too.
+    """
     yield from (Sentence(note, "bold") for note in partial_note(calibration))
     if verbose:
         yield from turns_view(fitted)
@@ -60,8 +66,13 @@ def residual_view(
     if verbose:
         yield from found.parts()
     else:
-        yield SentenceScreen(found, max(SCREEN_LINES - axes - AROUND_SENTENCES, FEWEST_SENTENCE_LINES))
-    statistics = (*statistical_sentences(fitted, account), *identifiability_notes(fitted, calibration.payload_mass))
+        yield SentenceScreen(
+            found, max(SCREEN_LINES - axes - AROUND_SENTENCES, FEWEST_SENTENCE_LINES)
+        )
+    statistics = (
+        *statistical_sentences(fitted, account),
+        *identifiability_notes(fitted, calibration.payload_mass),
+    )
     if verbose:
         yield from map(Sentence, statistics)
         yield ""
@@ -81,8 +92,10 @@ def residual_view(
 
 SCREEN_LINES = 40  #: Largest number of lines of a search on a terminal, whatever was found
 AROUND_SENTENCES = 17
-"""Lines of a terminal of 80 columns besides the sentences and the gains: remarks on the logs, files replaced and
-written, heading of the table and empty lines, how well σ is known, what `--verbose` has, and the next step."""
+"""Lines of a terminal of 80 columns besides the sentences and the gains: remarks on the logs, files
+replaced and written, heading of the table and empty lines, how well σ is known, what `--verbose`
+has, and the next step.
+"""
 FEWEST_SENTENCE_LINES = 10  #: Of a robot with so many axes that their gains alone fill a screen
 
 
@@ -90,7 +103,8 @@ FEWEST_SENTENCE_LINES = 10  #: Of a robot with so many axes that their gains alo
 class Headline:
     """What a search found, in sentences."""
 
-    checks: tuple[str, ...]  #: what is wrong with the recordings or the description, and must be looked at first
+    #: what is wrong with the recordings or the description, and must be looked at first
+    checks: tuple[str, ...]
     effects: tuple[str, ...]  #: each accepted effect with its error before and after
     together: str  #: error of all axes
     judged: tuple[str, ...]  #: effects that held-out runs do not confirm
@@ -102,7 +116,14 @@ class Headline:
 
     def sentences(self) -> tuple[str, ...]:
         """Return all of them, in the order in which they are read."""
-        found = (*self.checks, *self.effects, *self.explained, self.together, *self.judged, *self.refused)
+        found = (
+            *self.checks,
+            *self.effects,
+            *self.explained,
+            self.together,
+            *self.judged,
+            *self.refused,
+        )
         after = (*self.gains, *self.to_record, *self.ending)
         return tuple(sentence for sentence in (*found, *after) if sentence)
 
@@ -112,7 +133,9 @@ class Headline:
             yield Sentence(sentence, "bold" if sentence in self.checks else "")
 
     def by_weight(self) -> tuple[str, ...]:
-        """Return them in the order in which a screen gets them: what decides on the calibration comes first."""
+        """Return them in the order in which a screen gets them:
+        what decides on the calibration comes first.
+        """
         first = (self.together, *self.refused, *self.checks[:1], *self.ending)
         ordered = (
             *first,
@@ -161,13 +184,13 @@ class SentenceScreen:
 
 
 def effect_sizes(calibration: Calibration) -> Iterator[str]:
-    """Name of each effect as in files and commands, its size ± σ, and what these data cannot distinguish from it."""
+    """Name of each effect as in files and commands, its size ± σ,
+    and what these data cannot distinguish from it.
+    """
     for effect in calibration.effects:
-        more = len(effect.ambiguity) - _SHOWN_RIVALS
-        rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS])
-        if more > 0:
-            rivals += f" and {more} more"
-        rivals = f"; not distinguishable from {rivals}" if rivals else ""
+        rivals = first_few(effect.ambiguity, _SHOWN_RIVALS, separator=", ")
+        if rivals:
+            rivals = f"; not distinguishable from {rivals}"
         yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
 
 
@@ -198,7 +221,9 @@ def searched_steps(fitted: Fit) -> tuple[Step, ...]:
 
 
 def candidate_rows(fitted: Fit, step: Step, count: int) -> Iterator[tuple[str, ...]]:
-    """Yield the best named candidates of a turn under CANDIDATE_HEADINGS, the added one among them."""
+    """Yield the best named candidates of a turn under CANDIDATE_HEADINGS,
+    the added one among them.
+    """
     for finding in step.ranked(count):
         probability = UNTESTED
         if finding.probability is not None:
@@ -254,7 +279,8 @@ def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) ->
 
 
 def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
-    """What to check first, each accepted effect, all axes together, the gains, and what held-out runs refute.
+    """What to check first, each accepted effect, all axes together, the gains,
+    and what held-out runs refute.
 
     The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
@@ -268,8 +294,8 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
     if any(is_correction(placed) for placed in in_model):
         # Its gains are right, although the cell file is not yet.
         checks.append(
-            "The model corrects the description of the robot: gains and errors below are those of the corrected one. "
-            "Correct the cell file all the same, and fit again."
+            "The model corrects the description of the robot: gains and errors below are those of "
+            "the corrected one. Correct the cell file all the same, and fit again."
         )
     found: list[str] = []
     for step, turn in zip(fitted.steps, account.turns, strict=True):
@@ -285,7 +311,9 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
     judged = tuple(verdict_sentences(fitted))
     explained = tuple(_explained_checks(fitted, account))
-    to_record = tuple(f"Excitation: {one.words(fitted.cell.axis_names[one.axis])}." for one in fitted.uncertain)
+    to_record = tuple(
+        f"Excitation: {one.words(fitted.cell.axis_names[one.axis])}." for one in fitted.uncertain
+    )
     if not found:
         none = "No structure found"
         if judged:
@@ -333,30 +361,37 @@ def _explained_checks(fitted: Fit, account: Account) -> Iterator[str]:
 
 
 def verdict_sentences(fitted: Fit) -> Iterator[str]:
-    """Name the effects that were found and that held-out runs do not confirm, with the errors that show it."""
+    """Name the effects that were found and that held-out runs do not confirm,
+    with the errors that show it.
+    """
     for verdict in fitted.steps[-1].verdicts:
         if verdict.judgement is Judgement.CONFIRMED and verdict.written:
             continue
         name = verdict.placed.name_among(fitted.cell.place_names)
         evidence = f"{verdict.reason}; {verdict.error_text()}"
         if verdict.judgement is Judgement.REFUTED:
-            yield f"Held-out runs refute {name}: {evidence}. It was found in the runs of the fit, and is not written."
+            yield (
+                f"Held-out runs refute {name}: {evidence}. It was found in the runs of the fit, "
+                "and is not written."
+            )
         elif verdict.judgement is Judgement.CONFIRMED:
             yield (
-                f"Held-out runs confirm {name}, but it is not written: after other effects have left, its σ no longer "
-                "shows it, or it left together with them."
+                f"Held-out runs confirm {name}, but it is not written: after other effects have "
+                "left, its σ no longer shows it, or it left together with them."
             )
         elif verdict.written:
             yield f"Undecided, and written because of --write-undecided: {name}: {evidence}."
         else:
             yield (
-                f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass --write-undecided to "
-                "`drivegain residual`."
+                f"Undecided, and not written: {name}: {evidence}. Hold out more moves, or pass "
+                "--write-undecided to `drivegain residual`."
             )
 
 
 def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
-    """What was not added and why, what would have been detected, and what the noise and the gears hide."""
+    """What was not added and why, what would have been detected,
+    and what the noise and the gears hide.
+    """
     last = fitted.steps[-1]
     sentences: list[str] = []
     for step in fitted.steps:
@@ -371,14 +406,17 @@ def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     is_judged_on_runs = bool(last.verdicts) or bool(runs_to_leave_out(last.after.training))
     if last.after.effects and not is_judged_on_runs:
         sentences.append(
-            "The effects were tested on moves of the same recordings only, kept out of the fit in turn. Record two "
-            "runs without load and two with each payload: whole runs can then be kept out, which is a stricter test."
+            "The effects were tested on moves of the same recordings only, kept out of the fit in "
+            "turn. Record two runs without load and two with each payload: whole runs can then be "
+            "kept out, which is a stricter test."
         )
     return tuple(sentences)
 
 
 def _unconfirmed(account: Account) -> str:
-    """Say of a rise of the held-out error that it is within its noise; empty for a fall, or a rise by more."""
+    """Say of a rise of the held-out error that it is within its noise;
+    empty for a fall, or a rise by more.
+    """
     change = account.holdout_change
     if change is None or change.rise <= 0.0 or change.is_rise:
         return ""
@@ -389,50 +427,72 @@ def _unconfirmed(account: Account) -> str:
 
 
 def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
-    """Name the effects with which `apply` refuses a calibration (`daq.writeback.gates.fit.effect`)."""
+    """Name the effects with which `apply` refuses a calibration
+    (`daq.writeback.gates.fit.effect`).
+    """
     refused = [one for one in effects if not one.is_confirmed]
-    errors = [f"{one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without" for one in refused]
+    errors = [
+        f"{one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without"
+        for one in refused
+    ]
     names = [f"{one.name} on {one.axis}" for one in refused]
     if refused:
-        more = "".join(f"; {name}: {error}" for name, error in zip(names[1:], errors[1:], strict=True))
+        more = "".join(
+            f"; {name}: {error}" for name, error in zip(names[1:], errors[1:], strict=True)
+        )
         yield (
-            f"`apply` refuses a calibration with {names[0]}: on data that the fit did not use, the torque error is "
-            f"{errors[0]}{more}. Record more runs for the fit, or take `drivegain fit`, which adds no effects."
+            f"`apply` refuses a calibration with {names[0]}: on data that the fit did not use, the "
+            f"torque error is {errors[0]}{more}. Record more runs for the fit, or take `drivegain "
+            "fit`, which adds no effects."
         )
 
 
-NOTABLE_SIGMAS = 2.5  #: Difference of a gain from which it is said, although among all axes noise may make it
+#: Difference of a gain from which it is said, although among all axes noise may make it
+NOTABLE_SIGMAS = 2.5
 
 
 def gains_sentence(fitted: Fit, account: Account) -> str:
-    """Say which gains the effects change by more than noise, else the largest difference; empty for held gains."""
+    """Say which gains the effects change by more than noise, else the largest difference;
+    empty for held gains.
+    """
     if fitted.estimate.gains_fixed:
         return ""
     names = fitted.cell.axis_names
     changes = list(zip(names, account.total.gains, strict=True))
-    changed = [f"{axis} by {change.change_percent:+.1f} %" for axis, change in changes if change.significant]
+    changed = [
+        f"{axis} by {change.change_percent:+.1f} %"
+        for axis, change in changes
+        if change.significant
+    ]
     among_all = f"more than noise (probability below {100 * FALSE_ALARM:g} % among all axes)"
     if changed:
-        return f"The effects change gains by {among_all}: {', '.join(changed)} of the gain without them."
+        return (
+            f"The effects change gains by {among_all}: {', '.join(changed)} of the gain "
+            "without them."
+        )
     notable = [one for one in changes if _is_notable(one[1], fitted.cell.target_sigma_percent)]
     if not notable:
         return "With and without the effects, the gains are the same within noise."
     axis, change = max(notable, key=lambda one: abs(one[1].change_percent))
     size = with_deviation(change.change_percent, change.change_std_percent, sign="+")
     return (
-        f"The effects change no gain by {among_all}; the largest difference is {size} % of the gain of {axis} without "
-        "them."
+        f"The effects change no gain by {among_all}; the largest difference is {size} % of the "
+        f"gain of {axis} without them."
     )
 
 
 def _is_notable(change: GainShift, target_percent: float) -> bool:
-    """Whether the difference of a gain is large: in its own σ, or for the σ that the cell asks of its gains."""
+    """Whether the difference of a gain is large:
+    in its own σ, or for the σ that the cell asks of its gains.
+    """
     is_beyond_sigma = abs(change.change_percent) > NOTABLE_SIGMAS * change.change_std_percent
     return is_beyond_sigma or abs(change.change_percent) > target_percent
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
-    """Part of σ that comes from the choice of effects, where it is a third of σ or more (σ is then 6 % larger)."""
+    """Part of σ that comes from the choice of effects,
+    where it is a third of σ or more (σ is then 6 % larger).
+    """
     parts = zip(fitted.cell.axis_names, account.total.gains, strict=True)
     shares = []
     for axis, part in parts:
@@ -441,7 +501,10 @@ def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
             shares.append(f"{percent:.0f} % of it on {axis}")
     if shares:
         listed = ", ".join(shares)
-        yield f"σ of the gains includes the choice of the effects (squares add): {listed}.{_open_text(fitted)}"
+        yield (
+            "σ of the gains includes the choice of the effects (squares add): "
+            f"{listed}.{_open_text(fitted)}"
+        )
 
 
 def _open_text(fitted: Fit) -> str:
@@ -452,7 +515,10 @@ def _open_text(fitted: Fit) -> str:
     verb = "are"
     if len(names) == 1:
         verb = "is"
-    return f" {', '.join(names)} {verb} not in the model and may be true: σ holds what that would move."
+    return (
+        f" {', '.join(names)} {verb} not in the model and may be true: σ holds what that "
+        "would move."
+    )
 
 
 def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
@@ -466,21 +532,21 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
         replaced = rival is not None and rival in last.after.effects
         if rival is not None and rejected.moved and step is last:
             yield (
-                f"{axis}: what looks like {effect_text(finding.effect, axes)} depends clearly more on "
-                f"{variable_text(rival.effect, axes)}, and was not added: it would move "
+                f"{axis}: what looks like {effect_text(finding.effect, axes)} depends clearly more "
+                f"on {variable_text(rival.effect, axes)}, and was not added: it would move "
                 f"{rejected.moved_text(axes)}."
             )
         elif step is last or (replaced and not is_unnamed(finding.effect)):
             yield (
-                f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error of moves left out "
-                f"from {finding.error_before_percent:.1f} to {finding.error_after_percent:.1f} %, and was not "
-                f"added: {rejected.reason(axes)}."
+                f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error "
+                f"of moves left out from {finding.error_before_percent:.1f} to "
+                f"{finding.error_after_percent:.1f} %, and was not added: {rejected.reason(axes)}."
             )
 
 
 def _refused(fitted: Fit) -> Iterator[str]:
-    """Sentences on candidates that failed a check: of each axis the strongest, where it would explain much of the
-    residual, and the first one, where physics alone does not allow it.
+    """Sentences on candidates that failed a check: of each axis the strongest, where it would
+    explain much of the residual, and the first one, where physics alone does not allow it.
     """
     axes = fitted.cell.place_names
     last = fitted.steps[-1]
@@ -491,22 +557,25 @@ def _refused(fitted: Fit) -> Iterator[str]:
     for finding in last.findings:
         first.setdefault(finding.axis, finding)
         failed = finding.explained >= MUCH and finding.refusals and finding.placed not in reported
-        if failed and (finding.axis not in strongest or finding.explained > strongest[finding.axis].explained):
+        if failed and (
+            finding.axis not in strongest or finding.explained > strongest[finding.axis].explained
+        ):
             strongest[finding.axis] = finding
     for axis, finding in first.items():
         name = finding.placed.axis_name(axes)
         if finding.impossible and finding.refusals == (finding.impossible,):
             yield (
-                f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign or size is "
-                f"impossible: {finding.impossible}. The cause may be another one."
+                f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its "
+                f"sign or size is impossible: {finding.impossible}. The cause may be another one."
             )
             if strongest.get(axis) is finding:
                 strongest.pop(axis)
     for finding in strongest.values():
         name = finding.placed.axis_name(axes)
         yield (
-            f"{name}: {effect_text(finding.effect, axes)} would explain {100.0 * finding.explained:.0f} % of the "
-            f"squared residual, but failed a check: {'; '.join(finding.refusals)}. The cause may be another one."
+            f"{name}: {effect_text(finding.effect, axes)} would explain "
+            f"{100.0 * finding.explained:.0f} % of the squared residual, but failed a check: "
+            f"{'; '.join(finding.refusals)}. The cause may be another one."
         )
 
 
@@ -528,14 +597,17 @@ def _on_few_moves(fitted: Fit) -> Iterator[str]:
 
 
 def kinds_of_error(fitted: Fit) -> Iterator[str]:
-    """Say which errors are those of currents, where they differ from those of the joints' torques."""
+    """Say which errors are those of currents, where they differ from those of the joints'
+    torques.
+    """
     ratio = fitted.identification.model.drive_train.ratio
     motors = np.count_nonzero(ratio, axis=0)
     names = [name for name, count in zip(fitted.cell.axis_names, motors, strict=True) if count > 1]
     if names:
         yield (
-            "The errors of a search are those of the motors' currents. `fit`, `validate` and the certificate have "
-            f"those of the joints' torques, which differ where several motors act on a joint ({', '.join(names)})."
+            "The errors of a search are those of the motors' currents. `fit`, `validate` and the "
+            "certificate have those of the joints' torques, which differ where several motors act "
+            f"on a joint ({', '.join(names)})."
         )
 
 
@@ -544,19 +616,25 @@ _FLOOR_CAUSES = {
         "at standstill",
         "a brake that takes the load over, dither, an axis that hunts, or axes that move meanwhile",
     ),
-    FloorSource.REPEATED_MOVES: ("between repeated moves", "warm-up, or moves that are not quite the same"),
+    FloorSource.REPEATED_MOVES: (
+        "between repeated moves",
+        "warm-up, or moves that are not quite the same",
+    ),
 }
 """When a noise was measured, and what else than noise may be in it."""
 
 
 def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
-    """Name the axes whose noise estimate is far above what the model leaves, and possible causes."""
+    """Name the axes whose noise estimate is far above what the model leaves,
+    and possible causes.
+    """
     for axis, floor, left_a in zip(axes, account.floors, account.left_a, strict=True):
         if floor is not None and floor.is_refuted(left_a):
             when, causes = _FLOOR_CAUSES[floor.source]
             yield (
-                f"{axis} has no noise floor: its current {when} scatters {floor.noise_a / left_a:.1f} times "
-                f"as much as the model's error in motion. Possible causes: {causes}."
+                f"{axis} has no noise floor: its current {when} scatters "
+                f"{floor.noise_a / left_a:.1f} times as much as the model's error in motion. "
+                f"Possible causes: {causes}."
             )
 
 
@@ -565,11 +643,14 @@ def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
         return
     if fitted.accept_worse_holdout:
         yield (
-            "The effects raise the error of the held-out runs by more than its noise. They were accepted all the same, "
-            "because --accept-worse-holdout was given."
+            "The effects raise the error of the held-out runs by more than its noise. They were "
+            "accepted all the same, because --accept-worse-holdout was given."
         )
     else:
-        yield "The effects raise the error of the held-out runs by more than its noise: no calibration was written."
+        yield (
+            "The effects raise the error of the held-out runs by more than its noise: no "
+            "calibration was written."
+        )
 
 
 def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
@@ -585,9 +666,9 @@ def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
     delay_ms = 1e3 * abs(skew.seconds)
     std_ms = 1e3 * skew.std
     yield (
-        f"Currents were sampled {delay_ms:.2f} ± {std_ms:.2f} ms {side} the positions, the same "
-        f"on every axis ({standing}). Tenths of a millisecond are a filter of the drive, several milliseconds "
-        "a fault of the recording: check its stamps."
+        f"Currents were sampled {delay_ms:.2f} ± {std_ms:.2f} ms {side} the positions, the same on "
+        f"every axis ({standing}). Tenths of a millisecond are a filter of the drive, several "
+        "milliseconds a fault of the recording: check its stamps."
     )
 
 
@@ -595,23 +676,28 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
     """Say why no time skew is stated."""
     if skew is None:
         yield (
-            "A time skew between currents and positions is not known: it needs instruments, so point-to-point "
-            "moves and one motor for each degree of freedom, and data that show it beside the model."
+            "A time skew between currents and positions is not known: it needs instruments, so "
+            "point-to-point moves and one motor for each degree of freedom, and data that show it "
+            "beside the model."
         )
     elif not skew.confirmed:
         yield (
-            "A time skew between currents and positions is not confirmed: instruments from the demanded motion give "
-            f"{1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
+            "A time skew between currents and positions is not confirmed: instruments from the "
+            f"demanded motion give {1e3 * skew.seconds:.2f} ± {1e3 * skew.std:.2f} ms."
         )
 
 
 def gear_sentences(fitted: Fit) -> Iterator[str]:
-    """Say which gains carry the efficiency of their gear, and what a loss in the model means for its gain."""
+    """Say which gains carry the efficiency of their gear,
+    and what a loss in the model means for its gain.
+    """
     if fitted.estimate.gains_fixed:
         return
     last = fitted.steps[-1]
     in_model = {placed.axis for placed in last.after.effects if is_gear_loss(placed.effect)}
-    for axis, (name, gear) in enumerate(zip(fitted.cell.axis_names, gear_losses(last), strict=True)):
+    for axis, (name, gear) in enumerate(
+        zip(fitted.cell.axis_names, gear_losses(last), strict=True)
+    ):
         yield from _gear_sentence(name, gear, in_model=axis in in_model)
 
 
@@ -620,14 +706,21 @@ def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str
         yield (
             f"If motor and load lose the same share, the gear of {name} has an efficiency of "
             f"{100.0 * gear.efficiency:.1f} %. The gain of its motor is then "
-            f"{100.0 * (gear.gain_factor - 1.0):.2f} % larger than the identified one, which no residual can show."
+            f"{100.0 * (gear.gain_factor - 1.0):.2f} % larger than the identified one, which no "
+            "residual can show."
         )
     elif gear.gain_carries_it and gear.hidden_shift is not None and gear.loss_std is not None:
-        side, share = ("motor", gear.motoring_torque) if gear.lean > 0.0 else ("load", 1.0 - gear.motoring_torque)
+        if gear.lean > 0.0:
+            side = "motor"
+            share = gear.motoring_torque
+        else:
+            side = "load"
+            share = 1.0 - gear.motoring_torque
         yield (
-            f"The gain of {name} includes the efficiency of its gear: the {side} drives in {100.0 * share:.0f} % of "
-            f"the squared load torque. A loss of up to {100.0 * CERTAIN * gear.loss_std:.1f} % would not show, and "
-            f"would change the gain by {100.0 * gear.hidden_shift:.1f} %."
+            f"The gain of {name} includes the efficiency of its gear: the {side} drives in "
+            f"{100.0 * share:.0f} % of the squared load torque. A loss of up to "
+            f"{100.0 * CERTAIN * gear.loss_std:.1f} % would not show, and would change the gain by "
+            f"{100.0 * gear.hidden_shift:.1f} %."
         )
 
 
@@ -643,7 +736,9 @@ def errors_by_data(errors: RelativeErrors) -> dict[str, RelativeError | None]:
 
 
 def error_rows(account: Account) -> dict[str, RelativeError]:
-    """Return the errors [%] by their names and the data they are measured on; those that are not known are left out."""
+    """Return the errors [%] by their names and the data they are measured on;
+    those that are not known are left out.
+    """
     after = errors_by_data(account.total.after)
     rows: dict[str, RelativeError | None] = {}
     for data, before in errors_by_data(account.total.before).items():
@@ -662,7 +757,8 @@ def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[
 
     Args:
         errors: of one model.
-        place: of the axis that the error must be known of: one that rests in the held-out runs has none there.
+        place: of the axis that the error must be known of: one that rests in the held-out runs has
+            none there.
     """
     if errors.holdout is not None and (place is None or math.isfinite(errors.holdout.at(place))):
         return errors.holdout, "on held-out runs"
@@ -672,7 +768,9 @@ def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[
 
 
 def error_change_text(before_percent: float, after_percent: float) -> str:
-    """Describe the change of an error: `falls from 6.9 to 2.8 %`, `falls slightly, from 2.4 to 2.3 %`."""
+    """Describe the change of an error: `falls from 6.9 to 2.8 %`, `falls slightly,
+    from 2.4 to 2.3 %`.
+    """
     before = f"{before_percent:.1f}"
     after = f"{after_percent:.1f}"
     if before == after:
@@ -685,7 +783,9 @@ def error_change_text(before_percent: float, after_percent: float) -> str:
     return f"{change} from {before} to {after} %"
 
 
-def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, step: Step) -> str:
+def _effect_sentence(
+    fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, step: Step
+) -> str:
     axes = fitted.cell.place_names
     name = axes[placed.axis]
     what = effect_text(placed.effect, axes)
@@ -701,28 +801,50 @@ def _effect_sentence(fitted: Fit, account: Account, turn: BeforeAfter, placed: P
         if placed.effect.has_axis:
             subject = name
         if f"{before.total:.1f}" == f"{after.total:.1f}":
-            return f"{subject} has {what}{_hardly_shown_text(fitted, placed, step, before, after, where)}."
+            return (
+                f"{subject} has "
+                f"{what}{_hardly_shown_text(fitted, placed, step, before, after, where)}."
+            )
         change = error_change_text(before.total, after.total)
         return f"{subject} has {what}: the error of all axes {where} {change}."
     if not placed.effect.has_axis:
-        return f"The recording has {what}: the error {where} {error_change_text(before.total, after.total)}."
+        return (
+            f"The recording has {what}: the error {where} "
+            f"{error_change_text(before.total, after.total)}."
+        )
     without = before.at(placed.axis)
     with_it = after.at(placed.axis)
-    if is_unnamed(placed.effect) and step.accepted is not None and step.accepted.share_of_excess is not None:
-        what += f" (about {100.0 * step.accepted.share_of_excess:.0f} % of the residual beyond noise)"
+    if (
+        is_unnamed(placed.effect)
+        and step.accepted is not None
+        and step.accepted.share_of_excess is not None
+    ):
+        what += (
+            f" (about {100.0 * step.accepted.share_of_excess:.0f} % of the residual beyond noise)"
+        )
     if without * (1.0 - SLIGHT) < with_it <= without:
         what += ", a small effect"
     whose = "all axes"
     if placed.axis < len(fitted.cell.axes):
         whose = name
     noise = _noise_text(account, placed.axis)
-    return f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} ({noise})."
+    return (
+        f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} "
+        f"({noise})."
+    )
 
 
 def _hardly_shown_text(
-    fitted: Fit, placed: PlacedEffect, step: Step, before: RelativeError, after: RelativeError, where: str
+    fitted: Fit,
+    placed: PlacedEffect,
+    step: Step,
+    before: RelativeError,
+    after: RelativeError,
+    where: str,
 ) -> str:
-    """Say of a correction that the error of all axes hardly shows: its own σ, and the axis that shows it most."""
+    """Say of a correction that the error of all axes hardly shows:
+    its own σ, and the axis that shows it most.
+    """
     final = fitted.steps[-1].after
     sizes = coefficients(final if placed in final.effects else step.after, placed)
     sigmas = math.hypot(*(one.value / one.std for one in sizes if one.std > 0.0))
@@ -730,8 +852,8 @@ def _hardly_shown_text(
     if sigmas:
         certain = f", by {sigmas:.0f} σ"
     text = (
-        f"{certain}: it hardly shows in the error of all axes {where}, {before.total:.2f} % without it and "
-        f"{after.total:.2f} % with it"
+        f"{certain}: it hardly shows in the error of all axes {where}, {before.total:.2f} % "
+        f"without it and {after.total:.2f} % with it"
     )
     names = fitted.cell.axis_names
     falls = {}
@@ -746,7 +868,9 @@ def _hardly_shown_text(
 
 
 def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
-    """Say what splits of the data call an effect that a turn added; empty where all of them call it the same."""
+    """Say what splits of the data call an effect that a turn added;
+    empty where all of them call it the same.
+    """
     names = names_by_split(step)
     if len(names) < 2 or step.accepted is None or placed.axis != step.accepted.axis:
         return ""
@@ -755,7 +879,8 @@ def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
 
 
 def _noise_text(account: Account, place: int | None = None) -> str:
-    """Say how much of an error noise leaves, to stand in brackets: its lower limit, else the estimate.
+    """Say how much of an error noise leaves, to stand in brackets:
+    its lower limit, else the estimate.
 
     Both are on the rows that `_strictest_error` is measured on.
 
@@ -788,8 +913,8 @@ def _silence(fitted: Fit) -> str:
     last = fitted.steps[-1]
     if last.accepted is not None:
         return (
-            f"The search ended after {MAX_EFFECTS} effects with more to find: check the declared model first "
-            "(drive train, payload, channels)."
+            f"The search ended after {MAX_EFFECTS} effects with more to find: check the declared "
+            "model first (drive train, payload, channels)."
         )
     axis_limits = []
     for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True):
@@ -804,6 +929,6 @@ def _silence(fitted: Fit) -> str:
     if clockless:
         unseen = " The runs have no common clock: a warm-up over the session cannot be seen."
     return (
-        f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean square in motion: "
-        f"{limits}.{unseen}"
+        f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean "
+        f"square in motion: {limits}.{unseen}"
     )

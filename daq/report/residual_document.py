@@ -1,4 +1,6 @@
-"""`residual.json`, and what `residual` prints under `--json`; docs/reference/residual-json.md describes its keys."""
+"""`residual.json`, and what `residual` prints under `--json`;
+docs/reference/residual-json.md describes its keys.
+"""
 
 from __future__ import annotations
 
@@ -240,13 +242,15 @@ class ResidualFile(ResidualReport, ResidualFormat):
 
 
 _METRIC = (
-    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w the gains of the "
-    "declared model"
+    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w "
+    "the gains of the declared model"
 )
 
 
 def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
-    """Return the closed loop: the calibration, the errors before and after, and every turn of the search."""
+    """Return the closed loop: the calibration, the errors before and after,
+    and every turn of the search.
+    """
     axes = fitted.cell.axis_names
     last = fitted.steps[-1]
     confirmed_skew = None
@@ -338,7 +342,9 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
     for rejected in step.set_aside:
         finding = _finding(rejected.finding, axes)
         set_aside.append(AsideEntry.of(finding, reason=rejected.reason(axes)))
-    detection_limits = [DetectionLimit.of(axis=axis.name, rms=limit, unit=axis.unit.force) for axis, limit in limits]
+    detection_limits = [
+        DetectionLimit.of(axis=axis.name, rms=limit, unit=axis.unit.force) for axis, limit in limits
+    ]
     return TurnEntry.of(
         None,
         **changes,
@@ -372,10 +378,18 @@ def _model_errors(errors: RelativeErrors) -> ModelErrors:
     )
 
 
-def _named(kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any) -> NamedT:
+def _named(
+    kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any
+) -> NamedT:
     """Return what a document says of an effect, with its name, axis and settings."""
     settings = {name: float(value) for name, value in placed.effect.settings.items()}
-    return kind.of(*sources, effect=placed.effect.name, axis=placed.axis_name(axes), settings=settings, **others)
+    return kind.of(
+        *sources,
+        effect=placed.effect.name,
+        axis=placed.axis_name(axes),
+        settings=settings,
+        **others,
+    )
 
 
 def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:

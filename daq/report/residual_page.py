@@ -1,4 +1,6 @@
-"""`report.html`: the effects that were added and what they changed, for reading and printing; and both report files."""
+"""`report.html`: the effects that were added and what they changed, for reading and printing;
+and both report files.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,8 @@ def save_report(
     comparison: Comparison | None = None,
     session: str | None = None,
 ) -> None:
-    """Write report.html and residual.json, each completely or not at all; without a comparison, with the nameplate's.
+    """Write report.html and residual.json, each completely or not at all;
+    without a comparison, with the nameplate's.
 
     Args:
         fitted, account: the fit with its effects, and what they changed.
@@ -77,7 +80,8 @@ def save_report(
         OutputFailed: the file system refuses.
     """
     body = residual_report(fitted, account, calibration)
-    # Not strictly: a document that is made takes every sequence for a list, and a calibration has tuples.
+    # Not strictly: a document that is made takes every sequence for a list, and a calibration has
+    # tuples.
     fields = {"format": FORMAT, "version": VERSION, **dict(body)}
     document = ResidualFile.model_validate(fields, strict=False)
     page = residual_page(fitted, account, calibration, comparison, session)
@@ -90,7 +94,8 @@ def save_report(
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:
     """Compare the gains of a fit with the nameplate: a fit reads no controller."""
     unread = (
-        "The controller was not read; `drivegain certificate calibration.yaml --cell CELL` compares with its gains."
+        "The controller was not read; `drivegain certificate calibration.yaml --cell CELL` "
+        "compares with its gains."
     )
     now = datetime.fromisoformat(calibration.created)
     compared = without_controller(calibration, unread, now, fitted.cell)
@@ -105,7 +110,9 @@ def residual_page(
     comparison: Comparison | None = None,
     session: str | None = None,
 ) -> str:
-    """Build the certificate of a closed loop with the account of its turns folded below; see `save_report`."""
+    """Build the certificate of a closed loop with the account of its turns folded below;
+    see `save_report`.
+    """
     comparison = comparison or beside_nameplate(fitted, calibration)
     certificate = certify(calibration, comparison, origin=Origin.of(calibration, session))
     details = page_details(fitted, account, calibration)
@@ -153,11 +160,12 @@ def _errors(fitted: Fit, account: Account) -> str:
         cells = map(percent_text, (*error.axes, error.total))
         rows.append((name, *cells))
     explanation = (
-        "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
-        "in total with each current weighted by its gain. Compare errors only under the same filters (end "
-        "of this page). Noise, estimate: what the current's noise alone would leave, as measured at standstill "
-        "or between repeated moves, whichever is smaller, and at most the error. Noise, at least: its lower "
-        "limit at 95 % confidence, where moves were repeated: in 19 of 20 cases no model's error is smaller."
+        "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in "
+        "motion; in total with each current weighted by its gain. Compare errors only under the "
+        "same filters (end of this page). Noise, estimate: what the current's noise alone would "
+        "leave, as measured at standstill or between repeated moves, whichever is smaller, and at "
+        "most the error. Noise, at least: its lower limit at 95 % confidence, where moves were "
+        "repeated: in 19 of 20 cases no model's error is smaller."
     )
     return folded(
         "Errors without and with the effects",
@@ -175,7 +183,9 @@ def _torques(final: Evidence, cell: Cell) -> str:
     )
 
 
-def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
+def _effect(
+    fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect
+) -> str:
     axes = fitted.cell.place_names
     axis = axes[placed.axis]
     final = fitted.steps[-1].after
@@ -190,9 +200,14 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     sentences = [f"Name in files and commands: `{placed.name_among(axes)}`."]
     doubt = doubted_name(step, placed, axes)
     if doubt:
-        sentences.append(f"Its name is not certain. Chosen without an eighth of the moves, each in turn, {doubt}.")
+        sentences.append(
+            "Its name is not certain. Chosen without an eighth of the moves, each in "
+            f"turn, {doubt}."
+        )
     if step.accepted is not None and step.accepted.ambiguity:
-        rivals = "; ".join(f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in step.accepted.ambiguity)
+        rivals = "; ".join(
+            f"{axes[one.axis]}: {effect_text(one.effect, axes)}" for one in step.accepted.ambiguity
+        )
         sentences.append(f"These data cannot distinguish it from: {rivals}.")
     else:
         sentences.append("Every other candidate is clearly worse.")
@@ -208,7 +223,8 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
             without = percent_text(first.at(placed.axis))
             with_it = percent_text(second.at(placed.axis))
             errors.append((data, without, with_it))
-    # The coefficients of a term without a name mean nothing one by one; the certificate draws its curve.
+    # The coefficients of a term without a name mean nothing one by one; the certificate draws its
+    # curve.
     model = step.after
     if is_in_model:
         model = final
@@ -220,8 +236,8 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     drawings = draw_effect(before, step.after, placed, fitted.cell)
     variable = f"{variable_text(placed.effect, axes)}{of_joint}"
     explanation = (
-        f"Residual of {shown_axis} over time and against {variable}, without "
-        "and with the effect. A mean away from zero is torque that the model still lacks. Gaps: samples left out."
+        f"Residual of {shown_axis} over time and against {variable}, without and with the effect. "
+        "A mean away from zero is torque that the model still lacks. Gaps: samples left out."
     )
     return folded(
         f"{axis}: {effect_text(placed.effect, axes)}",
@@ -235,7 +251,9 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 
 def _gains(fitted: Fit, account: Account) -> str:
     if fitted.estimate.gains_fixed:
-        return folded("Gains without and with the effects", paragraph("The gains were held at the nameplate."))
+        return folded(
+            "Gains without and with the effects", paragraph("The gains were held at the nameplate.")
+        )
     rows = []
     shifts = []
     for axis, change in zip(fitted.cell.axes, account.total.gains, strict=True):
@@ -251,7 +269,10 @@ def _gains(fitted: Fit, account: Account) -> str:
         label = f"{percent:+.2f} %"
         shifts.append(Interval(axis.name, percent, 2.0 * std_percent, -math.inf, math.inf, label))
     drawing = intervals(shifts, "Change of each gain by the effects", "change by the effects [%]")
-    caption = "0 is the gain without the effects. Bar: ± 2 σ of the change, whose noise both estimates share in part."
+    caption = (
+        "0 is the gain without the effects. Bar: ± 2 σ of the change, whose noise both "
+        "estimates share in part."
+    )
     return folded(
         "Gains without and with the effects",
         table("", ("axis", *WHEN, "change ± σ [%]", "verdict"), rows, "words"),
@@ -273,9 +294,9 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
         caption = (
-            "Candidates by how much they reduce the error of left-out moves. Full: passed every check. Pale: these "
-            "data cannot distinguish it from the added one. Hollow: failed a check. The scale counts the squared "
-            "noise of one sample as 1."
+            "Candidates by how much they reduce the error of left-out moves. Full: passed every "
+            "check. Pale: these data cannot distinguish it from the added one. Hollow: failed a "
+            "check. The scale counts the squared noise of one sample as 1."
         )
         ranking = figure(plot_ranking(ranked, rivals, axes), caption)
     sentences = list(turn_sentences(fitted, step))
@@ -297,17 +318,20 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
 def _limits(fitted: Fit, calibration: Calibration) -> str:
     limits = [
         *identifiability_notes(fitted, calibration.payload_mass),
-        "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
-        "every speed, load and position is part of the parameters: neither leaves a residual.",
+        "A torque constant that is wrong by a constant factor is part of the gain, and an effect "
+        "that is the same at every speed, load and position is part of the parameters: neither "
+        "leaves a residual.",
     ]
     if fitted.estimate.gains_fixed:
         limits.append("The gains were held: an error in them is hidden in the parameters.")
     limits += [
-        "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
-        "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
-        "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
-        "Noise that was measured at standstill alone bounds nothing: in motion it may be smaller or larger. Between "
-        "repeated moves its lower limit bounds any model's error (95 % confidence), often loosely: an error above it "
-        "need not be an effect.",
+        "Backlash or elasticity behind an encoder on the motor may leave no trace in "
+        "these signals.",
+        "An effect is named after the variable it depends on and the shape of that dependence; "
+        "another cause with the same dependence would get the same name. Indistinguishable effects "
+        "are listed with each effect.",
+        "Noise that was measured at standstill alone bounds nothing: in motion it may be smaller "
+        "or larger. Between repeated moves its lower limit bounds any model's error (95 % "
+        "confidence), often loosely: an error above it need not be an effect.",
     ]
     return folded("What these data can and cannot show", html_list(limits))

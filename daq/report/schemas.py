@@ -1,4 +1,6 @@
-"""The document of each verb under `--json`, for the published schemas (docs/reference/schemas.md)."""
+"""The document of each verb under `--json`, for the published schemas
+(docs/reference/schemas.md).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,14 @@ from daq.report.job_schemas import (
     SignatureReport,
     SignersReport,
 )
-from daq.report.log import BagReport, ImportReport, InfoReport, RecordReport, SalvageReport, TableReport
+from daq.report.log import (
+    BagReport,
+    ImportReport,
+    InfoReport,
+    RecordReport,
+    SalvageReport,
+    TableReport,
+)
 from daq.report.mjcf_views import MjcfReport
 from daq.report.plan import PlanReport
 from daq.report.proposal import DriveChange, DriveRollback, FileChange, FileRollback

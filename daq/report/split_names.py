@@ -1,8 +1,8 @@
 """Whether splits of the data give one residual the same name.
 
-An effect is chosen by its errors on all folds of moves together. With one fold left out of that comparison, each in
-turn, they show whether the name depends on a few moves: then the residual is a torque that depends on some variable,
-and its names are candidates. Nothing is fitted again.
+An effect is chosen by its errors on all folds of moves together. With one fold left out of that
+comparison, each in turn, they show whether the name depends on a few moves: then the residual is a
+torque that depends on some variable, and its names are candidates. Nothing is fitted again.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ class SplitName:
 def names_by_split(step: Step) -> tuple[SplitName, ...]:
     """Names that splits of the data choose for what a turn added, the most frequent first.
 
-    A split is all folds of moves but one. It keeps the name that was added, unless another one has less ‖e‖² on its
-    left-out moves, and clearly so by a paired comparison over its folds (`is_better`). Other names are those that all
-    data together cannot distinguish from what was added (`Finding.ambiguity`).
+    A split is all folds of moves but one. It keeps the name that was added, unless another one has
+    less ‖e‖² on its left-out moves, and clearly so by a paired comparison over its folds
+    (`is_better`). Other names are those that all data together cannot distinguish from what was
+    added (`Finding.ambiguity`).
 
     Args:
         step: of the search.
@@ -59,5 +60,7 @@ def names_by_split(step: Step) -> tuple[SplitName, ...]:
     # Of equals, what was added comes first.
     order = np.argsort(-count, kind="stable")
     return tuple(
-        SplitName(candidates[number].placed, int(count[number]), folds) for number in order if count[number] > 0
+        SplitName(candidates[number].placed, int(count[number]), folds)
+        for number in order
+        if count[number] > 0
     )

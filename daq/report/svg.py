@@ -1,8 +1,9 @@
-"""Drawings as SVG: intervals beside limits, values before and after, curves, a ranking; and a file of several.
+"""Drawings as SVG: intervals beside limits, values before and after, curves, a ranking;
+and a file of several.
 
-In a page they take their colours from its style (`daq.report.html`), so that they follow dark mode and paper. A drawing
-is `_WIDTH` wide, about that of a phone, so that its text keeps its size there. A curve has no more points than a screen
-can show.
+In a page they take their colours from its style (`daq.report.html`), so that they follow dark mode
+and paper. A drawing is `_WIDTH` wide, about that of a phone, so that its text keeps its size there.
+A curve has no more points than a screen can show.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ class Interval:
 def intervals(rows: Sequence[Interval], title: str, unit: str) -> str:
     """Draw values with their intervals around zero, and the limits of each.
 
-    The scale shows the limits where the values need a tenth of it or more. Else it is the values' own, and arrows at
-    both ends say that the limits are beyond.
+    The scale shows the limits where the values need a tenth of it or more. Else it is the values'
+    own, and arrows at both ends say that the limits are beyond.
     """
     reach = _largest(abs(row.value) + row.half for row in rows)
     lowest_bound = _largest(abs(row.lower) for row in rows)
@@ -102,7 +103,9 @@ def _interval_marks(row: Interval, scale: _Scale, y: float) -> Iterator[str]:
 
 
 def before_after_drawing(rows: Sequence[tuple[str, float, float]], title: str, unit: str) -> str:
-    """Draw each value before (hollow) and after (full), from zero; NaN for one that is not known."""
+    """Draw each value before (hollow) and after (full), from zero;
+    NaN for one that is not known.
+    """
     most_before = _largest(before for _, before, _ in rows)
     most_after = _largest(after for _, _, after in rows)
     most = _ROOM * max(most_before, most_after, 1e-9)
@@ -237,7 +240,8 @@ _STRETCHES = 2 * round(_WIDTH)  #: Two a unit of the drawing's width, the dots o
 
 
 def visible_points(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Select lowest and highest value of each stretch of a curve, and its gaps, so that no peak is lost.
+    """Select lowest and highest value of each stretch of a curve, and its gaps,
+    so that no peak is lost.
 
     Args:
         x, y: shape (k,), NaN in y leaves a gap.
@@ -302,7 +306,9 @@ def ranking(rows: Sequence[tuple[str, float, str]], title: str, unit: str) -> st
         number = f"{length:.3g}"
         if abs(length) >= 100.0:
             number = f"{length:.0f}"
-        parts.append(f'<rect class="{kind}" x="{zero:.1f}" y="{y + 2:.1f}" width="{width:.1f}" height="14"/>')
+        parts.append(
+            f'<rect class="{kind}" x="{zero:.1f}" y="{y + 2:.1f}" width="{width:.1f}" height="14"/>'
+        )
         parts.append(_text(zero + width + 5, y + 14, number, "soft"))
         y += 25.0
     return _drawing(parts, title, scale.bottom + _FOOT)
@@ -331,8 +337,10 @@ def sheet(drawings: Sequence[str], title: str) -> bytes:
     content = "".join(placed)
     paper = LIGHT["paper"]
     text = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
-        f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" fill="{paper}"/>'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" '
+        f'width="{width:g}" '
+        f'height="{height:g}"><style>{style}</style><rect width="100%" height="100%" '
+        f'fill="{paper}"/>'
         f"{_text(gap, 28, title)}{content}</svg>\n"
     )
     return text.encode()
@@ -342,7 +350,9 @@ def _height(drawing: str) -> float:
     """Height of a drawing of `_drawing`."""
     found = re.search(r'viewBox="0 0 \S+ ([\d.]+)"', drawing)
     if found is None:
-        raise ValueError(f"found {drawing[:80]!r}; expected a drawing of this module with its height in viewBox")
+        raise ValueError(
+            f"found {drawing[:80]!r}; expected a drawing of this module with its height in viewBox"
+        )
     return float(found[1])
 
 
@@ -386,7 +396,9 @@ class _Scale:
             yield _line(x, top, x, bottom, "grid")
 
     def ticks(self, unit: str) -> Iterator[str]:
-        """Numbers of the scale with their unit, below all rows; with a sign where some are negative."""
+        """Numbers of the scale with their unit, below all rows;
+        with a sign where some are negative.
+        """
         for tick in _ticks(self.low, self.high):
             number = f"{tick:g}"
             if self.low < 0.0 < tick:
@@ -433,7 +445,8 @@ def _drawing(parts: Iterable[str], title: str, height: float) -> str:
     words = spelled(title)
     content = "".join(parts)
     return (
-        f'<svg viewBox="0 0 {_WIDTH:g} {height:g}" role="group" aria-label="{words}"><title>{words}</title>'
+        f'<svg viewBox="0 0 {_WIDTH:g} {height:g}" role="group" '
+        f'aria-label="{words}"><title>{words}</title>'
         f"{content}</svg>"
     )
 

@@ -1,4 +1,6 @@
-"""Text that comes from a file, made safe to show: on a terminal, in a JSON document, in a spreadsheet; and tables."""
+"""Text that comes from a file, made safe to show:
+on a terminal, in a JSON document, in a spreadsheet; and tables.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-SHOWN_SIGMAS = 2.0  #: Half width of the intervals and bands of reports and pictures, in standard deviations
+#: Half width of the intervals and bands of reports and pictures, in standard deviations
+SHOWN_SIGMAS = 2.0
 
 
 def printable(text: str) -> str:
@@ -64,7 +67,9 @@ def minute_text(iso: str) -> str:
 
 
 def terminal_text(text: str) -> Text:
-    """One line of text that rich does not read as markup; control characters and line ends are spelled out."""
+    """One line of text that rich does not read as markup;
+    control characters and line ends are spelled out.
+    """
     return Text(_spelled_out(text))
 
 
@@ -94,8 +99,8 @@ class Sentence:
 def break_lines(text: str, width: int) -> str:
     """Break the lines of a text that are longer than a terminal at spaces alone.
 
-    A line that is a command is not broken, and a command in backticks stays on one line where it fits, so that they
-    can be copied. Continued lines of an indented one are indented a little more.
+    A line that is a command is not broken, and a command in backticks stays on one line where it
+    fits, so that they can be copied. Continued lines of an indented one are indented a little more.
     """
     lines: list[str] = []
     for line in text.split("\n"):
@@ -108,7 +113,9 @@ def break_lines(text: str, width: int) -> str:
 
 
 _COMMAND_LINE = re.compile(r"\s*(?:[\w ]+: )?(?:drivegain |--\w)")
-"""Begin of a line that is a command: `Next: drivegain …`, or the options that are to be added to one."""
+"""Begin of a line that is a command: `Next:
+drivegain …`, or the options that are to be added to one.
+"""
 _COMMAND_OR_WORD = re.compile(r"[^\s`]*`[^`]*`[^\s`]*|\S+")
 
 
@@ -146,22 +153,28 @@ def _broken(words: Sequence[str], indent: int, width: int) -> list[str]:
 class WholeTable(Table):
     """Table without a frame that never cuts a value.
 
-    Columns that a terminal has no room for follow below, beside the first `keys` columns again. Where not even one of
-    them fits beside those, each value gets a line of its own.
+    Columns that a terminal has no room for follow below, beside the first `keys` columns again.
+    Where not even one of them fits beside those, each value gets a line of its own.
     """
 
     def __init__(self, title: Text | None = None, *, keys: int = 1) -> None:
-        super().__init__(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+        super().__init__(
+            title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
+        )
         self._keys = keys
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render as one table, as several below each other, or as a paragraph a row: heading and value."""
+        """Render as one table, as several below each other, or as a paragraph a row:
+        heading and value.
+        """
         free = options.update(width=_UNBOUNDED, min_width=0, max_width=_UNBOUNDED)
         room = options.max_width
         least = []
         wanted = []
         for column in self.columns:
-            measured = [Measurement.get(console, free, value) for value in (column.header, *column.cells)]
+            measured = [
+                Measurement.get(console, free, value) for value in (column.header, *column.cells)
+            ]
             wanted.append(max(one.maximum for one in measured))
             if column.no_wrap:
                 least.append(wanted[-1])
@@ -191,7 +204,9 @@ class WholeTable(Table):
         return sum(widths[index] for index in chosen) + gaps
 
     def _blocks(self, widths: list[int], room: int) -> list[list[int]]:
-        """Columns of the tables below each other; none where a column does not fit beside the keys."""
+        """Columns of the tables below each other;
+        none where a column does not fit beside the keys.
+        """
         keys = list(range(self._keys))
         blocks = [keys]
         for index in range(self._keys, len(widths)):
@@ -204,10 +219,14 @@ class WholeTable(Table):
 
     def _only(self, chosen: list[int], widths: list[int]) -> Table:
         """Return some columns as a table, each of a width in which no word is broken."""
-        part = Table(box=self.box, show_edge=False, pad_edge=False, collapse_padding=self.collapse_padding)
+        part = Table(
+            box=self.box, show_edge=False, pad_edge=False, collapse_padding=self.collapse_padding
+        )
         columns = [self.columns[index] for index in chosen]
         for column, width in zip(columns, widths, strict=True):
-            part.add_column(column.header, justify=column.justify, no_wrap=column.no_wrap, width=width)
+            part.add_column(
+                column.header, justify=column.justify, no_wrap=column.no_wrap, width=width
+            )
         cells = zip(*(column.cells for column in columns), strict=True)
         for row, values in zip(self.rows, cells, strict=True):
             part.add_row(*values, style=row.style)
@@ -221,11 +240,16 @@ class WholeTable(Table):
             if number:
                 yield ""
             for name, value in zip(names, cells, strict=True):
-                yield Text("\n".join(entry_lines(name, str(value), indent, width)), style=row.style or "")
+                yield Text(
+                    "\n".join(entry_lines(name, str(value), indent, width)), style=row.style or ""
+                )
 
 
-def shared_width(least: Sequence[int], wanted: Sequence[int], chosen: Sequence[int], free: int) -> list[int]:
-    """Widths of some columns: their least ones, and a share of what is free in proportion to what they want.
+def shared_width(
+    least: Sequence[int], wanted: Sequence[int], chosen: Sequence[int], free: int
+) -> list[int]:
+    """Widths of some columns: their least ones, and a share of what is free in proportion to what
+    they want.
 
     Args:
         least: width of each column in which no word is broken.
@@ -253,7 +277,8 @@ _GAP = 3
 
 
 def entry_lines(name: str, text: str, indent: int, width: int) -> list[str]:
-    """Lines of a name and its text, broken at spaces alone; a word without room beside the name is below it.
+    """Lines of a name and its text, broken at spaces alone;
+    a word without room beside the name is below it.
 
     Args:
         name: of the entry.
@@ -282,7 +307,9 @@ def plain_table(
     wrap: Collection[int] = (),
     keys: int = 1,
 ) -> Table:
-    """Make a `WholeTable`; columns of words are aligned to the left, and cells of `wrap` may be broken into lines."""
+    """Make a `WholeTable`; columns of words are aligned to the left,
+    and cells of `wrap` may be broken into lines.
+    """
     heading = None
     if title is not None:
         heading = terminal_text(title)
@@ -310,22 +337,28 @@ def percent_text(percent: float) -> str:
 
 
 def spelled_bytes(text: str) -> str:
-    """Spell out the bytes of a file's name that are not UTF-8, which no document can hold, as `\\udcff`."""
+    """Spell out the bytes of a file's name that are not UTF-8, which no document can hold,
+    as `\\udcff`.
+    """
     return text.encode(errors="backslashreplace").decode()
 
 
 _FORMULA = tuple("=+-@\t\n＝＋－＠")
-"""First characters of a cell that a spreadsheet runs as a formula, which may start programs (OWASP, CSV Injection)."""
+"""First characters of a cell that a spreadsheet runs as a formula, which may start programs (OWASP,
+CSV Injection).
+"""
 
 
 def inert(value: Any) -> Any:
-    """Cell of a CSV: text that a spreadsheet would run as a formula gets an apostrophe, which marks it as text.
+    """Cell of a CSV: text that a spreadsheet would run as a formula gets an apostrophe,
+    which marks it as text.
 
     Numbers are unchanged; bytes of a file's name that are not UTF-8 are spelled out.
     """
     if not isinstance(value, str):
         return value
-    # csv does not quote a carriage return alone, and the text after it would become a cell of its own.
+    # csv does not quote a carriage return alone, and the text after it would become a cell of its
+    # own.
     text = spelled_bytes(value).replace("\r\n", "\n").replace("\r", "\n")
     if text.startswith(_FORMULA):
         return f"'{text}"

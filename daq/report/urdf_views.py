@@ -1,4 +1,6 @@
-"""The bodies that `drivegain export urdf` writes, and how far their torque is from the identified one."""
+"""The bodies that `drivegain export urdf` writes,
+and how far their torque is from the identified one.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +82,9 @@ def urdf_view(
 
     `same_configuration` says whether the cell file is that of the fit; None without a cell file.
     """
-    table = plain_table(("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1))
+    table = plain_table(
+        ("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1)
+    )
     for name, update in updates.items():
         centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
         table.add_row(
@@ -100,17 +104,20 @@ def urdf_view(
         shown = robot.shifts[:_SHOWN_SHIFTS]
         shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in shown)
         yield (
-            f"No physical robot has exactly the identified parameters; the torque of this one differs by "
-            f"{change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
+            "No physical robot has exactly the identified parameters; the torque of this one "
+            f"differs by {change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
         )
     if robot.prior.assumed:
         joints = robot.parameters.model.robot.joints
         names = ", ".join(joints[number].name for number in robot.prior.assumed)
         yield printable(
-            f"The URDF has no possible inertia behind {names}; a ball was assumed where the data have none."
+            f"The URDF has no possible inertia behind {names}; a ball was assumed where the data "
+            "have none."
         )
     if updated.merged:
-        yield printable(f"Merged into the moving link that carries them: {', '.join(updated.merged)}.")
+        yield printable(
+            f"Merged into the moving link that carries them: {', '.join(updated.merged)}."
+        )
     left_out = ["rotor inertias", "offsets"]
     if robot.parameters.model.drive_train.coupled:
         left_out.append("friction of coupled motors")
@@ -125,12 +132,16 @@ def urdf_view(
     yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
     if corrected:
         text = (
-            f"CHECK the description: the bodies are those of the robot as corrected by {', '.join(corrected)}, and the "
-            "joints of this URDF are as they were described. Correct the cell file, fit the logs again, then export."
+            "CHECK the description: the bodies are those of the robot as corrected by "
+            f"{', '.join(corrected)}, and the joints of this URDF are as they were described. "
+            "Correct the cell file, fit the logs again, then export."
         )
         yield Text(printable(text), style="bold")
     if same_configuration is False:
-        yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
+        yield Text(
+            "The cell's configuration has changed since the fit; check the difference.",
+            style="bold",
+        )
 
 
 def urdf_report(
@@ -156,7 +167,9 @@ def urdf_report(
     for number, update in enumerate(updates.values()):
         joints.append(_joint(robot, number, update, updated))
     columns = zip(parameters.model.columns, parameters.standard, strict=True)
-    not_in_urdf = [NotInUrdf.of(column, value=value) for column, value in columns if _is_of_motor(column.name)]
+    not_in_urdf = [
+        NotInUrdf.of(column, value=value) for column, value in columns if _is_of_motor(column.name)
+    ]
     effects = [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
     closures = [closure.name for closure in parameters.model.robot.closures]
     return UrdfReport.of(

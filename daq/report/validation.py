@@ -1,4 +1,6 @@
-"""A validation: relative errors of other logs, weighed payloads, pictures, and the paper's Tables 5 to 8."""
+"""A validation: relative errors of other logs, weighed payloads, pictures,
+and the paper's Tables 5 to 8.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,15 @@ from daq.report.svg import sheet
 from daq.report.text import Sentence, percent_text, plain_table, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.residual_table import ResidualTable
-from daq.workflow.validate import CrossValidation, DataUse, Mass, Validation, WeighedRun, conditioning_of, together
+from daq.workflow.validate import (
+    CrossValidation,
+    DataUse,
+    Mass,
+    Validation,
+    WeighedRun,
+    conditioning_of,
+    together,
+)
 from ident.calibration import Calibration, PayloadMass
 
 
@@ -37,7 +47,9 @@ class ResidualTableReport(Report):
     same_configuration: bool
 
 
-def residual_table_report(found: ResidualTable, calibration: Path, log: Path, table: Path) -> ResidualTableReport:
+def residual_table_report(
+    found: ResidualTable, calibration: Path, log: Path, table: Path
+) -> ResidualTableReport:
     """Return the table of predicted, measured and residual that was written."""
     validation = found.validation
     return ResidualTableReport.of(
@@ -102,7 +114,8 @@ class CheckedPayload(Report):
     masses: dict[str, FoundMass]
 
 
-# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes fit for JSON.
+# Not the `Diagnosis` of `ident`: the name of a run is that of its file, which only a `Report` makes
+# fit for JSON.
 class DiagnosisEntry(Report):
     """Something wrong with a recording or a fit, and where to look."""
 
@@ -134,8 +147,12 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     """Relative errors, doubts about the logs, condition numbers and weighed payloads."""
     validations = found.validations
     headings = ("log", *(gain.axis for gain in calibration.gains), "total", "")
-    table = plain_table(headings, title="Relative error of the torques [%]", left=(0, len(headings) - 1), wrap=(0,))
-    errors = [(validation.run, validation.error, validation.data_use.value) for validation in validations]
+    table = plain_table(
+        headings, title="Relative error of the torques [%]", left=(0, len(headings) - 1), wrap=(0,)
+    )
+    errors = [
+        (validation.run, validation.error, validation.data_use.value) for validation in validations
+    ]
     if len(validations) > 1:
         errors.append(("together", together(validations), ""))
     errors.append(("fit", calibration.relative_error_percent, ""))
@@ -144,8 +161,9 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
     yield table
     filter_ = conditioning_of(calibration)
     yield Sentence(
-        f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
-        "fit. Compare relative errors only under the same filters."
+        f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation "
+        f"{filter_.decimation_cutoff_hz:g} Hz, as in the fit. Compare relative errors only under "
+        "the same filters."
     )
     yield from (Sentence(doubt, "bold") for doubt in _doubts(calibration, found))
     for paper_table in validation_tables(found, complete=False):
@@ -162,25 +180,33 @@ def _doubts(calibration: Calibration, found: CrossValidation) -> Iterator[str]:
         yield f"The fit of this calibration found: {text}" if is_of_fit else text
     for validation in validations:
         if not validation.same_configuration:
-            yield f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
+            yield (
+                f"{validation.log} carries another cell configuration than the logs of the fit; "
+                "check the difference."
+            )
     for validation in validations:
         if validation.error.total > DOUBTFUL_PERCENT:
             yield (
-                f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the torque."
-                " Was the payload mounted as the log says, and is it the same robot?"
+                f"{validation.run} contradicts the calibration: it leaves "
+                f"{validation.error.total:.3g} % of the torque. Was the payload mounted as the log "
+                "says, and is it the same robot?"
             )
     yield from (f"{run.run}: {run.left_out}" for run in found.runs if run.left_out)
 
 
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:
-    """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors shows the same."""
+    """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors
+    shows the same.
+    """
     tables = [paper_tables.condition_table(found)]
     if complete or len(found.calibrations) > 1:
         tables.append(paper_tables.paper_error_table(found))
     return [*tables, *paper_tables.mass_tables(found)]
 
 
-def draw_validations(calibration: Calibration, validations: tuple[Validation, ...], folder: Path) -> dict[Path, Path]:
+def draw_validations(
+    calibration: Calibration, validations: tuple[Validation, ...], folder: Path
+) -> dict[Path, Path]:
     """Draw each log as the paper's Fig. 2; return the pictures by log.
 
     Raises:
@@ -192,7 +218,10 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
     pictures = {}
     for validation in validations:
         # Logs in different folders may have the same name.
-        stem = validation.run if logs_of[validation.run] == 1 else f"{validation.run}-{validation.digest[:8]}"
+        if logs_of[validation.run] == 1:
+            stem = validation.run
+        else:
+            stem = f"{validation.run}-{validation.digest[:8]}"
         path = folder / f"{stem}.svg"
         measured_nm, predicted_nm = (
             np.where(validation.use, torque_nm, np.nan).T
@@ -206,7 +235,9 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
     return pictures
 
 
-def validate_report(calibration: Calibration, found: CrossValidation, drawn: dict[Path, Path]) -> ValidateReport:
+def validate_report(
+    calibration: Calibration, found: CrossValidation, drawn: dict[Path, Path]
+) -> ValidateReport:
     """Return the relative errors of a calibration, and what Tables 5 to 8 show of all calibrations.
 
     Args:
@@ -234,9 +265,12 @@ def validate_report(calibration: Calibration, found: CrossValidation, drawn: dic
         together={"relative_error_percent": together(validations)} if validations else None,
         calibrations=list(found.calibrations),
         runs=[
-            CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None) for run in found.runs
+            CheckedLog.of(run, relative_error_percent=run.errors, left_out=run.left_out or None)
+            for run in found.runs
         ],
-        payloads=[_checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed],
+        payloads=[
+            _checked_payload(run, with_bare_runs=found.with_bare_runs) for run in found.weighed
+        ],
     )
 
 

@@ -1,4 +1,6 @@
-"""A body weighed on the flange, and contacts: tables, documents and the picture of external torques."""
+"""A body weighed on the flange, and contacts:
+tables, documents and the picture of external torques.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ class WeighReport(Report):
     declared_kg: Figure
     mass_kg: WeighedValue
     mass_std_of_reference_kg: Figure
-    """share of σ of the mass that is the tolerance of the payload masses of the calibration; it is in `std`"""
+    """share of σ of the mass that is the tolerance of the payload masses of the calibration;
+    it is in `std`
+    """
     centre_m: WeighedValues
     centre_in_platform_m: WeighedValues | None
     inertia_about_centre_kg_m2: WeighedValues
@@ -129,7 +133,10 @@ class ContactReport(Report):
 
 LISTED = 20  #: Contacts shown in a terminal; `--json` has all
 NOISE_ROWS = 4.0
-"""Longest correlation of noise, in rows. The simulated cell has 1; an undeclared plate of 1.7 kg makes it 6 to 90."""
+"""Longest correlation of noise, in rows.
+
+The simulated cell has 1; an undeclared plate of 1.7 kg makes it 6 to 90.
+"""
 
 
 def weighed_view(found: Weighed) -> Iterator[RenderableType]:
@@ -166,8 +173,8 @@ def weighed_view(found: Weighed) -> Iterator[RenderableType]:
         yield ten
         if any(np.isfinite(body.std) & ~body.identifiable):
             yield (
-                f"Not identifiable with a σ: it is more than {100 * KNOWN:.0f} % of the value, and 2 σ is more than a "
-                "steel cube of the least mass (m − 2 σ) has."
+                f"Not identifiable with a σ: it is more than {100 * KNOWN:.0f} % of the value, and "
+                "2 σ is more than a steel cube of the least mass (m − 2 σ) has."
             )
     if not nothing:
         # Below the table: in its rows they would push σ and unit off a terminal of 80 columns.
@@ -234,11 +241,14 @@ def _add_centre_and_inertia(table: Table, found: Weighed) -> None:
 def _doubts(found: Weighed) -> Iterator[str]:
     body = found.body
     if not body.complete:
-        yield "The calibration has no covariance: σ lacks the errors of its robot; fit its logs again."
+        yield (
+            "The calibration has no covariance: σ lacks the errors of its robot; fit its "
+            "logs again."
+        )
     if body.error.total > DOUBTFUL_PERCENT:
         yield (
-            f"The logs contradict the calibration: {body.error.total:.3g} % of the torque is left. Is it the same "
-            "robot, and one body mounted one way?"
+            f"The logs contradict the calibration: {body.error.total:.3g} % of the torque is left. "
+            "Is it the same robot, and one body mounted one way?"
         )
     is_known = not _shows_nothing(body) and not np.isnan(body.values).any()
     if is_known and _smallest_pseudo_inertia(body) < 0.0:
@@ -246,7 +256,9 @@ def _doubts(found: Weighed) -> Iterator[str]:
 
 
 def carrier_text(cell: Cell) -> str:
-    """Name the joint whose frame the parameters of a payload are in, and where the platform's link is in it."""
+    """Name the joint whose frame the parameters of a payload are in,
+    and where the platform's link is in it.
+    """
     if cell.chain is None and cell.platform is None:
         return "the last joint"
     robot = robot_of(cell)
@@ -258,7 +270,9 @@ def carrier_text(cell: Cell) -> str:
 
 
 def _platform(cell: Cell) -> tuple[str, Place] | None:
-    """Platform's link and its frame in that of the joint that carries it; None where it is that joint's frame."""
+    """Platform's link and its frame in that of the joint that carries it;
+    None where it is that joint's frame.
+    """
     if cell.platform is None:
         return None
     frame = read_urdf(cell.urdf).links[cell.platform]
@@ -269,7 +283,9 @@ def _platform(cell: Cell) -> tuple[str, Place] | None:
 
 
 def weigh_report(found: Weighed) -> WeighReport:
-    """Return a body: mass, centre, inertia, and its ten parameters with the moves that would show them."""
+    """Return a body: mass, centre, inertia, and its ten parameters with the moves that would show
+    them.
+    """
     body = found.body
     platform = _platform(found.cell)
     centre_in_platform_m = None
@@ -333,8 +349,9 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
             stretches = f"{found.left_out} stretches that are"
         source = f"this log less {stretches} far out"
     yield (
-        f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false alarm in an hour of "
-        "motion like that, all axes together, on average and from five quiet minutes on. Standstill is not judged."
+        f"Band (95 %) and threshold from {source}; less than {found.band.alarms_per_hour:g} false "
+        "alarm in an hour of motion like that, all axes together, on average and from five quiet "
+        "minutes on. Standstill is not judged."
     )
     contacts = found.contacts
     missing = not_judged(found, cell)
@@ -346,7 +363,9 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
         yield Text(f"{name} not judged: {reason}.", style="bold")
     if not contacts:
         return
-    listed = plain_table(("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4))
+    listed = plain_table(
+        ("axis", "from s", "to s", "peak", "unit", "× threshold"), title="Contacts", left=(0, 4)
+    )
     for one in contacts[:LISTED]:
         axis = cell.axes[one.axis]
         listed.add_row(
@@ -363,7 +382,9 @@ def contact_view(found: ExternalTorque, cell: Cell) -> Iterator[RenderableType]:
 
 
 def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
-    """Say why an axis cannot show a contact, by its name; only axes without a threshold or without motion."""
+    """Say why an axis cannot show a contact, by its name;
+    only axes without a threshold or without motion.
+    """
     reasons = {}
     band = found.band
     row_s = float(np.median(np.diff(found.time_s)))
@@ -375,16 +396,20 @@ def not_judged(found: ExternalTorque, cell: Cell) -> dict[str, str]:
         elif np.isfinite(level):
             continue
         elif correlation_s <= NOISE_ROWS * row_s:
-            reasons[axis] = f"{quiet_s:.0f} s of quiet motion have too few separate peaks; record longer"
+            reasons[axis] = (
+                f"{quiet_s:.0f} s of quiet motion have too few separate peaks; record longer"
+            )
         else:
             reasons[axis] = (
-                f"its residual stays on one side for {correlation_s:.2g} s at a time, with too few separate peaks; "
-                "a temperature may be missing, or a body undeclared"
+                f"its residual stays on one side for {correlation_s:.2g} s at a time, with too few "
+                "separate peaks; a temperature may be missing, or a body undeclared"
             )
     return reasons
 
 
-def contact_report(found: ExternalTorque, cell: Cell, log: Path, picture: Path | None) -> ContactReport:
+def contact_report(
+    found: ExternalTorque, cell: Cell, log: Path, picture: Path | None
+) -> ContactReport:
     """Return band and threshold of each axis, and the contacts."""
     contacts = []
     for contact in found.contacts:
@@ -446,7 +471,9 @@ def draw_contact(found: ExternalTorque, cell: Cell, log: Path, folder: Path) -> 
         torque = np.where(use, found.torque_nm[index], np.nan)
         band = np.where(use, found.band_nm[index], np.nan)
         threshold = np.where(use, found.threshold_nm[index], np.nan)
-        place.fill_between(found.time_s, -band, band, color=SKY, alpha=0.5, linewidth=0.0, label="band, 95 %")
+        place.fill_between(
+            found.time_s, -band, band, color=SKY, alpha=0.5, linewidth=0.0, label="band, 95 %"
+        )
         for sign, label in ((1.0, "threshold"), (-1.0, None)):
             place.plot(found.time_s, sign * threshold, color=ORANGE, linewidth=0.9, label=label)
         place.plot(found.time_s, torque, color=BLACK, linewidth=0.9, label="external torque")

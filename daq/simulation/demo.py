@@ -1,7 +1,8 @@
-"""The main job from end to end on a simulated cell, over the same driver that a real one is recorded with.
+"""The main job from end to end on a simulated cell,
+over the same driver that a real one is recorded with.
 
-This file and the simulate verb are the only ones that may read a simulation file: the truth serves to judge the result
-once it is final.
+This file and the simulate verb are the only ones that may read a simulation file: the truth serves
+to judge the result once it is final.
 """
 
 from __future__ import annotations
@@ -68,7 +69,10 @@ RUNS = (
     ("loaded-2", "disc", "b"),
     ("held-out", "disc", "c"),
 )
-"""Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload. The last validates."""
+"""Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload.
+
+The last validates.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +109,9 @@ class DemoOutcome:
     written: Written | None  #: what its copy got
 
 
-def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter) -> DemoOutcome:
+def demonstrate(
+    settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter
+) -> DemoOutcome:
     """Scan, plan, record, identify, close the loop, and write a copy of the controller file.
 
     Args:
@@ -124,7 +130,9 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     replaced = make_room(out, logs)
     if replaced:
         names = ", ".join(log.name for log in replaced)
-        reporter.step(f"start anew: {names} of an earlier demonstration are recorded again and replaced")
+        reporter.step(
+            f"start anew: {names} of an earlier demonstration are recorded again and replaced"
+        )
     reporter.step("scan the bus")
     spec = load_simulation(settings.simulation)
     with _simulated(cell, spec), network_of(cell) as network:
@@ -189,7 +197,13 @@ class DemoStages:
     calibration: Calibration
     proposal: Proposal[FileEdit]
 
-    def __init__(self, settings: Settings, cell: Cell, now: Callable[[], datetime], reporter: ProgressReporter) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        cell: Cell,
+        now: Callable[[], datetime],
+        reporter: ProgressReporter,
+    ) -> None:
         """Store the arguments, those of `demonstrate`."""
         self._settings = settings
         self._cell = cell
@@ -203,24 +217,33 @@ class DemoStages:
         """Take the stages.
 
         Raises:
-            DaqError, DriverError, IdentificationError: whatever a job on a real cell could raise, but for a closed
-                gate: the proposal says which one it is.
+            DaqError, DriverError, IdentificationError: whatever a job on a real cell could raise,
+                but for a closed gate: the proposal says which one it is.
         """
         cell = self._cell
         out = self._settings.out
         if cell.controller is None or cell.controller_path is None:
-            raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
+            raise UsageError(
+                "the demo cell",
+                found="no controller",
+                expected="one",
+                remedy="install drivegain again",
+            )
         controller_copy = out / CONTROLLER_COPY
         replace_file(controller_copy, cell.controller_path.read_bytes())
         masses_kg = {payload.name: payload.mass_kg for payload in cell.payloads}
         limits = _Limits(out, self._settings.seed)
         runs = FixedRuns(_planned_runs(out, masses_kg))
         # A run powers on a cell that carries its payload: there is nothing to mount.
-        answers = GivenAnswers("demo", masses_kg, lambda _payload: None, "the demonstration: a simulated cell")
+        answers = GivenAnswers(
+            "demo", masses_kg, lambda _payload: None, "the demonstration: a simulated cell"
+        )
         history = HistoryPlace(out / "history.sqlite", out / AUDIT)
         target = GainTarget(cell, history, controller_copy)
         journal = Journal(StringIO(), Form.TEXT, self._now)
-        context = SessionContext(cell_file, cell, limits, runs, answers, target, self._tools(), journal)
+        context = SessionContext(
+            cell_file, cell, limits, runs, answers, target, self._tools(), journal
+        )
         at = self._now().isoformat(timespec="seconds")
         state = JobState(
             session="demo",
@@ -254,7 +277,9 @@ class DemoStages:
             self.proposal = propose(target, request)
             return self.proposal
 
-        def apply_copy(proposal: Proposal[FileEdit], now: datetime, *, audit: Path, who: str) -> Written | None:
+        def apply_copy(
+            proposal: Proposal[FileEdit], now: datetime, *, audit: Path, who: str
+        ) -> Written | None:
             self.written = apply(proposal, now, audit=audit, who=who)
             return self.written
 
@@ -278,7 +303,9 @@ class DemoStages:
         block_signals: SignalBlocker,
         require_released: Callable[[], None],
     ) -> Recorded:
-        """Record one run of a simulated cell that carries its payload; an invalid one is recorded again."""
+        """Record one run of a simulated cell that carries its payload;
+        an invalid one is recorded again.
+        """
         settings = self._settings
         reporter = self._reporter
         name = request.out.stem
@@ -333,7 +360,9 @@ def _planned_runs(out: Path, masses_kg: dict[str, float]) -> tuple[PlannedRun, .
 
 
 def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
-    """Return the outcome as `summary.json` holds it; `seconds` is how long the demonstration took."""
+    """Return the outcome as `summary.json` holds it;
+    `seconds` is how long the demonstration took.
+    """
     before = outcome.fitted.identification.holdout_error
     after = outcome.fitted.final.holdout_error
     first = next(iter(outcome.calibration.effects), None)
@@ -412,7 +441,8 @@ def _recorded(run: Recorded) -> DemoLog:
 
 
 def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours.
+    """Take a folder, and remove what an earlier demonstration left in it;
+    a folder of anything else is not ours.
 
     Args:
         out: the folder.
@@ -429,7 +459,9 @@ def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:
             remedy="choose another --out",
         )
     out.mkdir(parents=True, exist_ok=True)
-    replace_file(out / MARK, b"Made by `drivegain demo`, which may replace what is in this folder.\n")
+    replace_file(
+        out / MARK, b"Made by `drivegain demo`, which may replace what is in this folder.\n"
+    )
     replaced = tuple(log for log in logs if log.is_file())
     for log in logs:
         log.unlink(missing_ok=True)

@@ -1,4 +1,7 @@
-"""A simulation file: the truth of a simulated cell. Only `simulate` and `demo` read it; no fit, plan or report does."""
+"""A simulation file: the truth of a simulated cell.
+
+Only `simulate` and `demo` read it; no fit, plan or report does.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +31,26 @@ from daq.config.yaml_file import (
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
 from drivers.simulation.faults import FaultKind, FaultSpec
-from drivers.simulation.spec import AxisSpec, Body, CellSpec, Closure, PassiveFriction, UndeclaredEffect
+from drivers.simulation.spec import (
+    AxisSpec,
+    Body,
+    CellSpec,
+    Closure,
+    PassiveFriction,
+    UndeclaredEffect,
+)
 from ident.plausible import GAIN, RATIO, within
 
-AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]  #: J3, or 3
+#: J3, or 3
+AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]
 
 LONGEST_S = 1e6
 MASS_KG = (1e-6, 1e5)  #: Mass of a payload
 CURRENT_A = (1e-6, 1e6)  #: Rated and peak current of an amplifier
-LARGEST_NUMBER = 1e9  #: Any other number, in its own unit: far beyond any robot, far below an overflow
-LAST_CYCLE = 10**12  #: No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them
+#: Any other number, in its own unit: far beyond any robot, far below an overflow
+LARGEST_NUMBER = 1e9
+#: No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them
+LAST_CYCLE = 10**12
 
 _Name = Annotated[str, Field(min_length=1)]
 _Time = Annotated[float, Field(ge=0, le=LONGEST_S)]
@@ -128,7 +141,9 @@ def axis_index(axis: str | int) -> int:
 
 
 class PlantedEffectModel(StrictModel):
-    """An undeclared effect, on an axis, on a passive joint of a closed chain, or in the pivot of a closure."""
+    """An undeclared effect, on an axis, on a passive joint of a closed chain,
+    or in the pivot of a closure.
+    """
 
     name: _Name
     axis: AxisName | None = None
@@ -141,7 +156,9 @@ class PlantedEffectModel(StrictModel):
         places = (self.axis, self.joint, self.closure)
         given = [place for place in places if place is not None]
         if len(given) != 1:
-            raise ValueError("axis, or joint for a passive joint, or closure for a pivot: one of them")
+            raise ValueError(
+                "axis, or joint for a passive joint, or closure for a pivot: one of them"
+            )
         return self
 
     def effect(self) -> UndeclaredEffect:
@@ -450,7 +467,9 @@ def _link_faults(model: SimulationModel, links: list[str]) -> Iterator[Fault]:
 
 
 def _joint_faults(model: SimulationModel, joints: dict[str, str]) -> Iterator[Fault]:
-    """Find motors, positions and friction of joints that the URDF lacks, given the kinds of its joints."""
+    """Find motors, positions and friction of joints that the URDF lacks,
+    given the kinds of its joints.
+    """
     wanted = f"joints of the URDF: {', '.join(joints)}"
     n = len(model.axes)
     motors = set(model.motors)

@@ -1,4 +1,6 @@
-"""The room and the speed of moves that an operator has looked at and accepted; later moves stay inside them."""
+"""The room and the speed of moves that an operator has looked at and accepted;
+later moves stay inside them.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,11 @@ from ident.planning.clearance import BASE, RESOLUTION_M, Box, Checker
 
 STEPS = 50  #: Postures on each way whose extent is taken
 SLACK_M = RESOLUTION_M + 0.001
-"""How far moves may leave the extent of those that were accepted [m]. A part that only turns at one height is at its
-end in all postures. Without room for rounding and for the resolution of the check, no way would be clear."""
+"""How far moves may leave the extent of those that were accepted [m].
+
+A part that only turns at one height is at its end in all postures. Without room for rounding and
+for the resolution of the check, no way would be clear.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +41,8 @@ class AcceptedRoom:
     box: TargetBox  #: joint positions between which they stay
     speed: float  #: share of the joints' limits of velocity that none of them exceeds
     acceleration: float  #: share of the joints' limits of acceleration that none of them exceeds
-    #: Where their moving parts come; None where the cell file declares a workspace, or the shape of the arm is unknown.
+    #: Where their moving parts come; None where the cell file declares a workspace, or the shape of
+    #: the arm is unknown.
     reach: Extent | None
 
     def scene(self, scene: CheckedScene) -> CheckedScene:

@@ -1,4 +1,6 @@
-"""The paper's cases 1 to 4 on the same logs: what is known of the payload, and by which estimator (§4.2)."""
+"""The paper's cases 1 to 4 on the same logs:
+what is known of the payload, and by which estimator (§4.2).
+"""
 
 from __future__ import annotations
 
@@ -71,14 +73,20 @@ class CaseFit:
 
 
 def reduce_logs(
-    logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell | None = None, *, instruments: bool = False
+    logs: Sequence[Path],
+    holdout: Sequence[Path] = (),
+    cell: Cell | None = None,
+    *,
+    instruments: bool = False,
 ) -> ReducedLogs:
-    """Read and reduce logs; the fit must not see those held out, and `cell` replaces the description in the logs.
+    """Read and reduce logs; the fit must not see those held out,
+    and `cell` replaces the description in the logs.
 
     With instruments they can be fitted by ``iv`` too.
 
     Raises:
-        DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
+        DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the
+            others.
         UsageError: the cell declares effects.
     """
     reading = Reading.of(logs, cell)
@@ -89,12 +97,23 @@ def reduce_logs(
     rest = each_run(reading.runs(holdout, "holdout"), set(), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
     return ReducedLogs(
-        reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen, reading.geometry(model)
+        reading.cell,
+        tuple(logs),
+        tuple(holdout),
+        tuple(reading.sources),
+        used,
+        unseen,
+        reading.geometry(model),
     )
 
 
 def fit_case(
-    logs: ReducedLogs, method: Method, known: Known, *, gains_fixed: bool = False, ratio: float | None = None
+    logs: ReducedLogs,
+    method: Method,
+    known: Known,
+    *,
+    gains_fixed: bool = False,
+    ratio: float | None = None,
 ) -> CaseFit:
     """One fit of logs that were read; with a ratio r_σ, of its essential parameters alone.
 
@@ -131,7 +150,8 @@ def fit_case(
 
 
 def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
-    """The same fit with its essential parameters alone (§4.2, by the ratio r_σ); the others are zero, and certain.
+    """The same fit with its essential parameters alone (§4.2, by the ratio r_σ);
+    the others are zero, and certain.
 
     Raises:
         IdentificationError: the estimator refuses.
@@ -141,7 +161,9 @@ def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
     before = fitted.identification
     estimate = before.estimate
     fixed = fixed_gains_of(estimate)
-    found = essential(before.system, lambda system: estimate_with(estimate.method, system, fixed), ratio)
+    found = essential(
+        before.system, lambda system: estimate_with(estimate.method, system, fixed), ratio
+    )
     after = replace(fitted, identification=replace(before, estimate=found.whole))
     return CaseFit(after, before.system.payloads, found)
 
@@ -153,13 +175,18 @@ def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
         cell: whose payload of that name and mounting says what its drawing says.
 
     Raises:
-        ConfigurationInconsistent: the drawing is asked for, and the cell says no more than the mass.
+        ConfigurationInconsistent: the drawing is asked for, and the cell says no more than the
+            mass.
     """
     if known is Known.NOTHING:
         return replace(payload, known={})
     if known is Known.MASS:
-        return replace(payload, known={name: value for name, value in payload.known.items() if name == "m"})
-    of_cell = next((p for p in cell.payloads if (p.name, p.mounting) == (payload.name, payload.mounting)), None)
+        return replace(
+            payload, known={name: value for name, value in payload.known.items() if name == "m"}
+        )
+    of_cell = next(
+        (p for p in cell.payloads if (p.name, p.mounting) == (payload.name, payload.mounting)), None
+    )
     drawn = {**({} if of_cell is None else of_cell.known), **payload.known}
     if set(drawn) == {"m"}:
         raise ConfigurationInconsistent(
@@ -174,15 +201,23 @@ def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
 def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
     """Make the calibration; the known payload parameters are in it without deviation."""
     calibration = calibration_of(case.fitted, created)
-    removed = set() if case.essential is None else {removal.name for removal in case.essential.removed}
-    given = tuple(
-        Parameter(f"{name}:{payload.mounting}", payload.known[name], 0.0, unit)
-        for payload in case.payloads
-        for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)
-        if name in payload.known
-    )
+    if case.essential is None:
+        removed = set()
+    else:
+        removed = {removal.name for removal in case.essential.removed}
+    found = []
+    for payload in case.payloads:
+        for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True):
+            if name in payload.known:
+                found.append(
+                    Parameter(f"{name}:{payload.mounting}", payload.known[name], 0.0, unit)
+                )
+    given = tuple(found)
     kept = tuple(parameter for parameter in calibration.parameters if parameter.name not in removed)
-    condition = calibration.condition if case.essential is None else case.essential.estimate.condition
+    if case.essential is None:
+        condition = calibration.condition
+    else:
+        condition = case.essential.estimate.condition
     covariance = calibration.covariance
     gains = len(calibration.gains)
     factor = None
@@ -190,7 +225,9 @@ def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
         names = [parameter.name for parameter in calibration.parameters]
         places = [*range(gains), *(gains + names.index(parameter.name) for parameter in kept)]
         factor = factor_of(np.pad(covariance[np.ix_(places, places)], (0, len(given))))
-    payload_mass = tuple(_of_parameters(one, calibration.parameters, kept, given) for one in calibration.payload_mass)
+    payload_mass = tuple(
+        _of_parameters(one, calibration.parameters, kept, given) for one in calibration.payload_mass
+    )
     return replace(
         calibration,
         parameters=kept + given,
@@ -201,10 +238,18 @@ def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
 
 
 def _of_parameters(
-    reference: PayloadMass, before: Sequence[Parameter], kept: Sequence[Parameter], given: Sequence[Parameter]
+    reference: PayloadMass,
+    before: Sequence[Parameter],
+    kept: Sequence[Parameter],
+    given: Sequence[Parameter],
 ) -> PayloadMass:
-    """Return a payload's mass with its derivatives of the parameters that a case leaves, and zeros for given ones."""
-    slopes = dict(zip((parameter.name for parameter in before), reference.parameters_per_kg, strict=True))
+    """Return a payload's mass with its derivatives of the parameters that a case leaves,
+    and zeros for given ones.
+    """
+    slopes = dict(
+        zip((parameter.name for parameter in before), reference.parameters_per_kg, strict=True)
+    )
     of_kept = tuple(slopes[parameter.name] for parameter in kept)
-    # The columns of a payload are no part of the robot that predicts: what is given of it moves nothing.
+    # The columns of a payload are no part of the robot that predicts: what is given of it moves
+    # nothing.
     return replace(reference, parameters_per_kg=(*of_kept, *(0.0 for _ in given)))

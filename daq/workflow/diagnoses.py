@@ -1,30 +1,35 @@
 """One judgement of recordings for `fit`, `residual`, `validate`, `report` and `daq.fit_logs`.
 
-`diagnose_fit` judges the logs of a fit, and `diagnose_run` of `daq.workflow.validate` a log that a calibration has not
-seen: a held-out one, or one that is validated. A calibration keeps what was said of its fit, so its report and its
-validation say the same.
+`diagnose_fit` judges the logs of a fit, and `diagnose_run` of `daq.workflow.validate` a log that a
+calibration has not seen: a held-out one, or one that is validated. A calibration keeps what was
+said of its fit, so its report and its validation say the same.
 
 The order of the judgements, causes before their traces:
 
-1. Each log as it is read: currents without a sign (`ident.estimators.diagnosis.require_explained_currents`).
-2. What leaves no usable number (`ident.estimators.refusals.refuse_mistakes`): a payload that does not show; with fixed
-   gains its weight and the signs of the currents; errors; exchanged roles; units. Where one of these refuses, or the
-   estimator does not converge, its causes are looked for in the logs: the geometry, currents without a sign, exchanged
-   currents.
-3. The geometry of every fit (`ident.estimators.turned_geometry`): gravity, and the sense of each position. Nothing else
-   is said of a fit in a wrong geometry, because all of it would be wrong.
-4. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors, torques, condition.
-5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are fixed.
-6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there are more of them than
-   degrees of freedom: found before any torque is looked at, and named first.
-7. Small mistakes of the description: zeros, mounting and late positions, by torque. Beside a fit they are those of
-   `check_diagnoses`; after a search, those that it corrects (`correction_diagnoses`), those that held-out runs leave
-   undecided or that it has set aside (`open_correction_diagnoses`), and what the check says beside its model. Several
-   that the moves do not tell apart are one, `CORRECTION_UNCLEAR`. They are named before 4. to 6., and where they are,
-   no exchange of currents is looked for (`daq.workflow.fit.judged`).
+1. Each log as it is read: currents without a sign
+   (`ident.estimators.diagnosis.require_explained_currents`).
+2. What leaves no usable number (`ident.estimators.refusals.refuse_mistakes`): a payload that does
+   not show; with fixed gains its weight and the signs of the currents; errors; exchanged roles;
+   units. Where one of these refuses, or the estimator does not converge, its causes are looked for
+   in the logs: the geometry, currents without a sign, exchanged currents.
+3. The geometry of every fit (`ident.estimators.turned_geometry`): gravity, and the sense of each
+   position. Nothing else is said of a fit in a wrong geometry, because all of it would be wrong.
+4. What is named (`ident.estimators.diagnosis.diagnose`): gains, estimators, payloads, errors,
+   torques, condition.
+5. Currents without a sign and exchanged ones, where 4. named a trace of them, or the gains are
+   fixed.
+6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there
+   are more of them than degrees of freedom: found before any torque is looked at, and named first.
+7. Small mistakes of the description: zeros, mounting and late positions, by torque. Beside a fit
+   they are those of `check_diagnoses`; after a search, those that it corrects
+   (`correction_diagnoses`), those that held-out runs leave undecided or that it has set aside
+   (`open_correction_diagnoses`), and what the check says beside its model. Several that the moves
+   do not tell apart are one, `CORRECTION_UNCLEAR`. They are named before 4. to 6., and where they
+   are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 
-Currents that are late, one of them or all alike, are named with 7., but they hide no exchange of currents.
+Currents that are late, one of them or all alike, are named with 7., but they hide no exchange of
+currents.
 """
 
 from __future__ import annotations
@@ -93,9 +98,13 @@ from ident.model.urdf import read_urdf
 
 ReadLog = Callable[[Path], tuple[Run, Cell]]  #: Reads a log, and the description of its cell
 
-CHANNELS_AS_WIRED = "--channels-as-wired"  #: Option of `fit` and `residual` with which no exchange is looked for
+#: Option of `fit` and `residual` with which no exchange is looked for
+CHANNELS_AS_WIRED = "--channels-as-wired"
 TRACES_OF_CURRENTS = {"axis-error", "current-reversed", "gain-off-nameplate"}
-"""Diagnoses that exchanged currents, or currents without a sign, may leave. Fixed gains need not leave any."""
+"""Diagnoses that exchanged currents, or currents without a sign, may leave.
+
+Fixed gains need not leave any.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +136,8 @@ def diagnose_fit(
     *,
     corrected: bool = False,
 ) -> tuple[Diagnosis, ...]:
-    """Judge a fit in a right geometry by the recordings that it has used; `turned_geometry` is asked before.
+    """Judge a fit in a right geometry by the recordings that it has used;
+    `turned_geometry` is asked before.
 
     Args:
         found: with all effects.
@@ -185,7 +195,8 @@ def named_causes(recordings: Recordings) -> Iterator[None]:
 
 
 def geometry_refusal(diagnoses: Sequence[Diagnosis]) -> GeometryTurned | None:
-    """Return the error for gains that mean nothing, because their fit is one in a wrong geometry; None for others.
+    """Return the error for gains that mean nothing, because their fit is one in a wrong geometry;
+    None for others.
 
     What is said of a held-out run alone leaves the gains of the others as they are.
 
@@ -214,14 +225,15 @@ def turned_geometry(
     error_percent: float | None,
     corrected: Model | None = None,
 ) -> Diagnosis | None:
-    """Another geometry that explains recordings clearly better, confirmed by a fit of all rows; None without any.
+    """Another geometry that explains recordings clearly better, confirmed by a fit of all rows;
+    None without any.
 
     Args:
         recordings: of the fit.
         instants: a few rows of each; taken from the logs where there are none.
         error_percent: of the fit as declared; None where it was refused.
-        corrected: model of the fit, as a search has corrected it. Where no other geometry explains the recordings
-            better than this one, the search has named what is wrong, with σ.
+        corrected: model of the fit, as a search has corrected it. Where no other geometry explains
+            the recordings better than this one, the search has named what is wrong, with σ.
     """
     cell = recordings.cell
     model = model_of(cell)
@@ -244,15 +256,18 @@ def turned_geometry(
 
 
 def require_right_currents(recordings: Recordings, *, each: bool = True) -> None:
-    """Refuse logs with currents without a sign, or with exchanged ones; they are read again, each once.
+    """Refuse logs with currents without a sign, or with exchanged ones;
+    they are read again, each once.
 
     Args:
         recordings: of the fit.
-        each: look for an exchange in each log alone, too: in one of several, it is hidden by the others.
+        each: look for an exchange in each log alone, too: in one of several, it is hidden by the
+            others.
 
     Raises:
         CurrentUnsigned: drives report the size of the current only.
-        ChannelsExchanged: the currents of some axes are each other's, in all logs together or in one of them.
+        ChannelsExchanged: the currents of some axes are each other's, in all logs together or in
+            one of them.
     """
     cell = recordings.cell
     model = model_of(cell)
@@ -260,7 +275,8 @@ def require_right_currents(recordings: Recordings, *, each: bool = True) -> None
     unsigned = unsigned_channels(model, runs, cell.conditioning, cell.axis_names)
     if unsigned is not None:
         raise unsigned
-    if recordings.channels_as_wired or model.is_redundant:  # internal preload is in every current of a redundant robot
+    # Internal preload is in every current of a redundant robot
+    if recordings.channels_as_wired or model.is_redundant:
         return
     reduced = [channel_triangles(model, run, cell.conditioning) for run in runs]
     _require_own_channels(reduced, "the currents", cell)
@@ -291,7 +307,9 @@ def _require_own_channels(runs: Sequence[ChannelTriangles], currents: str, cell:
 # The description beside the torques
 
 CHECKED_BYTES = 150_000_000
-"""Largest size of all logs of a fit whose rows are kept for the test: some ten minutes of six axes at 1 kHz."""
+"""Largest size of all logs of a fit whose rows are kept for the test:
+some ten minutes of six axes at 1 kHz.
+"""
 
 
 def is_checked(logs: Sequence[Path]) -> bool:
@@ -300,7 +318,8 @@ def is_checked(logs: Sequence[Path]) -> bool:
 
 
 def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
-    """Test the geometry beside a fit by any estimator; None with too few moves, or where ``ml`` fits nothing.
+    """Test the geometry beside a fit by any estimator;
+    None with too few moves, or where ``ml`` fits nothing.
 
     Args:
         evidence: the rows behind the fit.
@@ -308,7 +327,9 @@ def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
     """
     try:
         if evidence.estimate.method is not Method.ML:
-            evidence = replace(evidence, estimate=by_likelihood(evidence.estimate, evidence.training.system()))
+            evidence = replace(
+                evidence, estimate=by_likelihood(evidence.estimate, evidence.training.system())
+            )
         return check_geometry(evidence, np.random.default_rng(seed))
     except (NotConverged, RankDeficient, TooFewMoves):
         return None
@@ -320,7 +341,9 @@ def fixed_gains_of(estimate: Estimate) -> FloatArray | None:
 
 
 def by_likelihood(estimate: Estimate, system: System) -> Estimate:
-    """Return the estimate of a system by ``ml``, in whose terms candidates are judged, or itself if it is by ``ml``."""
+    """Return the estimate of a system by ``ml``, in whose terms candidates are judged,
+    or itself if it is by ``ml``.
+    """
     if estimate.method is Method.ML:
         return estimate
     return estimate_with(Method.ML, system, fixed_gains_of(estimate))
@@ -342,8 +365,11 @@ def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Dia
     return tuple(diagnoses)
 
 
-def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | None = None) -> tuple[Diagnosis, ...]:
-    """Diagnoses of the corrections that a search has made, and of the late currents that it has found.
+def correction_diagnoses(
+    evidence: Evidence, cell: Cell, check: GeometryCheck | None = None
+) -> tuple[Diagnosis, ...]:
+    """Diagnoses of the corrections that a search has made,
+    and of the late currents that it has found.
 
     Args:
         evidence: with its effects.
@@ -363,7 +389,9 @@ def correction_diagnoses(evidence: Evidence, cell: Cell, check: GeometryCheck | 
 
 
 def _is_settled(placed: PlacedEffect, check: GeometryCheck, evidence: Evidence) -> bool:
-    """Whether a correction that the fit did not tell apart from others stands beside one of them in a model."""
+    """Whether a correction that the fit did not tell apart from others stands beside one of them in
+    a model.
+    """
     for alike in check.alike:
         if alike.contain(placed):
             return all(found.placed in evidence.effects for found in alike.findings)
@@ -373,10 +401,11 @@ def _is_settled(placed: PlacedEffect, check: GeometryCheck, evidence: Evidence) 
 def open_correction_diagnoses(
     steps: Sequence[Step], cell: Cell, check: GeometryCheck | None = None
 ) -> tuple[Diagnosis, ...]:
-    """Diagnoses of corrections that a search has found and that are not in its model, although nothing refutes them.
+    """Diagnoses of corrections that a search has found and that are not in its model,
+    although nothing refutes them.
 
-    Held-out runs have left them undecided, or the search has set them aside. The description may be wrong by them, and
-    the gains are those of a robot as it is described.
+    Held-out runs have left them undecided, or the search has set them aside. The description may be
+    wrong by them, and the gains are those of a robot as it is described.
 
     Args:
         steps: of the search, with the verdicts of held-out runs.
@@ -402,12 +431,18 @@ def open_correction_diagnoses(
         is_known = placed in last.after.effects or placed in last.left_open
         if is_correction(placed) and not is_known:
             why = aside.reason(cell.place_names)
-            found.append(_open_correction(placed, finding.coefficients, finding.deviations, why, cell, model, check))
+            found.append(
+                _open_correction(
+                    placed, finding.coefficients, finding.deviations, why, cell, model, check
+                )
+            )
     return tuple(found)
 
 
 def _values_in_search(steps: Sequence[Step], placed: PlacedEffect) -> tuple[FloatArray, FloatArray]:
-    """Coefficients of an effect, and σ, in the last model that had it; as it was found where none is left."""
+    """Coefficients of an effect, and σ, in the last model that had it;
+    as it was found where none is left.
+    """
     for step in reversed(steps):
         if placed in step.after.effects:
             return coefficients_of(step.after.estimate, placed)
@@ -415,7 +450,9 @@ def _values_in_search(steps: Sequence[Step], placed: PlacedEffect) -> tuple[Floa
         found = step.accepted
         if found is not None and found.placed == placed:
             return found.coefficients, found.deviations
-    raise ValueError(f"no step of the search has {placed.effect.name}; expected the steps that its verdict is of")
+    raise ValueError(
+        f"no step of the search has {placed.effect.name}; expected the steps that its verdict is of"
+    )
 
 
 def _open_correction(
@@ -431,7 +468,9 @@ def _open_correction(
     diagnosis = _correction_diagnosis(placed, values, deviations, cell, model)
     if check is not None:
         diagnosis = _beside_alike(diagnosis, placed, check, cell, model)
-    return replace(diagnosis, found=f"{diagnosis.found}; the gains are without this correction ({why})")
+    return replace(
+        diagnosis, found=f"{diagnosis.found}; the gains are without this correction ({why})"
+    )
 
 
 def _finding_diagnosis(found: Finding, cell: Cell, model: Model) -> Diagnosis:
@@ -443,7 +482,8 @@ def _finding_diagnosis(found: Finding, cell: Cell, model: Model) -> Diagnosis:
 def _beside_alike(
     diagnosis: Diagnosis, placed: PlacedEffect, check: GeometryCheck, cell: Cell, model: Model
 ) -> Diagnosis:
-    """The same diagnosis, with the corrections that the moves do not tell apart from its own, and what to record.
+    """The same diagnosis, with the corrections that the moves do not tell apart from its own,
+    and what to record.
 
     Args:
         diagnosis: of one correction.
@@ -473,13 +513,18 @@ def _beside_alike(
         axes=tuple(axes),
         found=f"either {found}: these moves do not tell them apart",
         expected=" and ".join(expected),
-        remedy=f"record {wanted}, and fit them together with these; or measure which of them is wrong; correct nothing "
-        "in the cell file before that",
+        remedy=f"record {wanted}, and fit them together with these; or measure which of them is "
+        "wrong; correct nothing in the cell file before that",
     )
 
 
 def drift_diagnosis(
-    drift: GeometryDrift, model: Model, axes: Sequence[str], runs: Sequence[str], *, is_given: bool = False
+    drift: GeometryDrift,
+    model: Model,
+    axes: Sequence[str],
+    runs: Sequence[str],
+    *,
+    is_given: bool = False,
 ) -> Diagnosis:
     """Diagnosis of a geometry that has changed since a calibration.
 
@@ -494,7 +539,10 @@ def drift_diagnosis(
     name = axes[placed.axis]
     match placed.effect:
         case ZeroOffset():
-            found = f"{_zero_text(placed.axis, name, drift.values, drift.deviations, model)} since the calibration"
+            found = (
+                f"{_zero_text(placed.axis, name, drift.values, drift.deviations, model)} since "
+                "the calibration"
+            )
             expected = "the zero of the calibration"
             remedy = "reference the axis again, or calibrate anew"
         case LatePosition():
@@ -503,14 +551,22 @@ def drift_diagnosis(
             expected = ONE_MOMENT
             remedy = "look for what delays this encoder alone"
         case _:
-            found = f"gravity turned by {_turn_text(drift.values, drift.deviations)} since the calibration"
+            found = (
+                f"gravity turned by {_turn_text(drift.values, drift.deviations)} since the "
+                "calibration"
+            )
             expected = "the mounting of the calibration"
-            remedy = "level the base as it was, or correct `gravity_m_s2` in the cell file and calibrate anew"
-    found += f"; it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
+            remedy = (
+                "level the base as it was, or correct `gravity_m_s2` in the cell file and "
+                "calibrate anew"
+            )
+    found += (
+        f"; it explains {100.0 * drift.share:.0f} % of what the error is larger than in the fit"
+    )
     if is_given:
         remedy = (
-            "the given cell file has another number here than the description in the log: correct the cell file, or "
-            f"if it is right, {remedy}"
+            "the given cell file has another number here than the description in the log: correct "
+            f"the cell file, or if it is right, {remedy}"
         )
     return _diagnosis_of(placed, name, runs, found, expected, remedy)
 
@@ -523,7 +579,9 @@ DIAGNOSED_AS: dict[type[Effect], str] = {
     Lag: "current-late",
     TimeSkew: "time-skew",
 }
-"""Diagnosis of a wrong description, or of currents that are late, by the effect that corrects it."""
+"""Diagnosis of a wrong description, or of currents that are late,
+by the effect that corrects it.
+"""
 HIDING_EXCHANGES = frozenset({"zero-off", "position-late", "gravity-tilted", CORRECTION_UNCLEAR})
 """Those of a wrong description, which may look like exchanged currents."""
 FIT_AGAIN = "then fit the same logs again, with the corrected file as `--cell`"
@@ -556,23 +614,26 @@ def _correction_diagnosis(
             found = f"the position of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT
             remedy = (
-                "look for what delays this encoder alone: a filter, a slower channel, another time stamp than that of "
-                "the other axes"
+                "look for what delays this encoder alone: a filter, a slower channel, another time "
+                "stamp than that of the other axes"
             )
         case Lag():
             found = f"the current of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT
             remedy = (
-                "look for what delays this current alone: a filter of its drive, a slower channel, another time stamp "
-                f"than that of the other axes; {SMALL_DELAY}; {INTO_THE_MODEL}"
+                "look for what delays this current alone: a filter of its drive, a slower channel, "
+                f"another time stamp than that of the other axes; {SMALL_DELAY}; {INTO_THE_MODEL}"
             )
         case TimeSkew():
-            found = f"all currents {_late_text(values, deviations)} beside the positions, the same on every axis"
+            found = (
+                f"all currents {_late_text(values, deviations)} beside the positions, the same on "
+                "every axis"
+            )
             expected = ONE_MOMENT
             remedy = (
-                "no single encoder or drive is late: check how positions and currents are stamped (two messages of one "
-                "cycle, two clocks, a filter that every drive has) and record again; "
-                f"{SMALL_DELAY} of the recording; {INTO_THE_MODEL}"
+                "no single encoder or drive is late: check how positions and currents are stamped "
+                "(two messages of one cycle, two clocks, a filter that every drive has) and record "
+                f"again; {SMALL_DELAY} of the recording; {INTO_THE_MODEL}"
             )
         case _:
             declared = model.robot.gravity_m_s2
@@ -581,7 +642,10 @@ def _correction_diagnosis(
             turned = vector_text(suggested_gravity(found_m_s2, std_m_s2))
             found = f"gravity along {turned}, turned by {_turn_text(values, deviations)}"
             expected = f"{vector_text(declared)}, as the cell file says"
-            remedy = f"write `gravity_m_s2: {turned}` in the cell file, or level the base and record again; {FIT_AGAIN}"
+            remedy = (
+                f"write `gravity_m_s2: {turned}` in the cell file, or level the base and "
+                f"record again; {FIT_AGAIN}"
+            )
     return _diagnosis_of(placed, name, (), found, expected, remedy)
 
 
@@ -592,7 +656,9 @@ def _zero_unit(model: Model, axis: int) -> tuple[str, float]:
     return DEGREES, float(np.degrees(1.0))
 
 
-def _zero_text(axis: int, name: str, values: FloatArray, deviations: FloatArray, model: Model) -> str:
+def _zero_text(
+    axis: int, name: str, values: FloatArray, deviations: FloatArray, model: Model
+) -> str:
     """Say how far a zero is off, with σ."""
     unit, scale = _zero_unit(model, axis)
     return zero_off_text(name, scale * values[0], scale * deviations[0], unit)
@@ -612,21 +678,26 @@ def _turn_text(values: FloatArray, deviations: FloatArray) -> str:
 
 
 def vector_text(vector: FloatArray) -> str:
-    """A vector as a cell file has it, `[0.000, 0.340, -9.804]`: of gravity, a digit of the last place is 0.006°."""
+    """A vector as a cell file has it, `[0.000, 0.340, -9.804]`:
+    of gravity, a digit of the last place is 0.006°.
+    """
     rounded = np.round(vector, 3) + 0.0  # no minus before a zero
     return f"[{', '.join(f'{entry:.3f}' for entry in rounded)}]"
 
 
 WHY_HIDDEN = {
-    ZeroHiddenBy.SYMMETRY: "another one turns or shifts the whole arm, and no torque depends on that",
-    ZeroHiddenBy.LAST_LINK: "no joint is behind it, and another one makes the same torques as another body there",
+    ZeroHiddenBy.SYMMETRY: "another one turns or shifts the whole arm, and no torque "
+    "depends on that",
+    ZeroHiddenBy.LAST_LINK: "no joint is behind it, and another one makes the same torques as "
+    "another body there",
     ZeroHiddenBy.MOVES: "these moves do not show it",
 }
 """Why the zero of a joint is not seen, in words."""
 
 
 def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: Robot) -> str:
-    """Which zeros the data do not show, alone or two together, and why; empty where they show all, or were not asked.
+    """Which zeros the data do not show, alone or two together, and why;
+    empty where they show all, or were not asked.
 
     Args:
         check: beside the fit.
@@ -639,10 +710,16 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: R
     hidden: dict[ZeroHiddenBy, list[str]] = {}
     for axis in check.hidden_zeros:
         hidden.setdefault(zero_hidden_by(robot, axis), []).append(axes[axis])
-    parts = [f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}" for cause in ZeroHiddenBy if cause in hidden]
+    parts = [
+        f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}"
+        for cause in ZeroHiddenBy
+        if cause in hidden
+    ]
     if parts:
         said.append(f"Zeros that are not seen here: {'; '.join(parts)}.")
     if check.hidden_pairs:
-        pairs = ", ".join(f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs)
+        pairs = ", ".join(
+            f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs
+        )
         said.append(f"Not seen here where both zeros are off, one against the other: {pairs}.")
     return " ".join(said)

@@ -1,4 +1,6 @@
-"""Events of a cell in words, with what to do: the console's page and `drivegain monitor` show the same."""
+"""Events of a cell in words, with what to do:
+the console's page and `drivegain monitor` show the same.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +12,21 @@ from drivers.canopen.emcy import ErrorCode, explain
 from drivers.messages import EventKind
 
 REMEDIES = {
-    EventKind.HEARTBEAT_LOST: "check the drive's power and its cable; `drivegain scan` shows which nodes answer",
-    EventKind.FOLLOWING_ERROR: "check brake, load and collision; use slower moves (`record --speed 0.5`)",
+    EventKind.HEARTBEAT_LOST: "check the drive's power and its cable; `drivegain scan` shows which "
+    "nodes answer",
+    EventKind.FOLLOWING_ERROR: "check brake, load and collision; use slower moves (`record "
+    "--speed 0.5`)",
     EventKind.LIMIT: "check limit switches and current limits, or use slower moves",
-    EventKind.SAMPLE_LOST: "check the load of bus and computer; the run is marked invalid, record it again",
+    EventKind.SAMPLE_LOST: "check the load of bus and computer; the run is marked invalid, "
+    "record it again",
     EventKind.BUS_BUSY: "end the other program on this bus",
     EventKind.BUS_LOST: "check the CAN interface and its cable",
     EventKind.BUS_PASSIVE: "check the bus's cable and its two terminating resistors",
-    EventKind.FRAMES_DROPPED: "reduce the load of this computer; the run is marked invalid, record it again",
+    EventKind.FRAMES_DROPPED: "reduce the load of this computer; the run is marked invalid, "
+    "record it again",
     EventKind.SYNC_LOST: "check the device that produces SYNC",
-    EventKind.PDO_LENGTH: "did another program change the mapping, or does another device use this identifier?",
+    EventKind.PDO_LENGTH: "did another program change the mapping, or does another device use this "
+    "identifier?",
     EventKind.FROZEN: "check the encoder and the motor cable; restart the drive",
     EventKind.STOP_UNCONFIRMED: "look at this axis; use the emergency stop if it moves",
 }

@@ -1,4 +1,6 @@
-"""The experiment that a plan is for: the same moves once without load and once with the weighed payload."""
+"""The experiment that a plan is for: the same moves once without load and once with the weighed
+payload.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +47,15 @@ def limits_of(cell: Cell) -> JointLimits:
 
 
 LINK_RADIUS = 0.08
-"""Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
+"""Radius of a guessed link, as a share of the length of the joint chain:
+6 cm for an arm of the TX-40's size.
+"""
 POSTURES = 400
 PAYLOAD = "payload"  #: Name of the capsule of a body that no capsule declares
 ALWAYS = 0.03
-"""Two capsules that are apart in a smaller share of random postures belong together, as at a shared joint."""
+"""Two capsules that are apart in a smaller share of random postures belong together,
+as at a shared joint.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,18 +71,26 @@ class CheckedScene:
     def remarks(self) -> tuple[str, ...]:
         """Remarks for the operator."""
         scene = self.checker.scene
-        known = "guessed from the joint chain; declare `clearance` in the cell file" if self.guessed else "as declared"
+        if self.guessed:
+            known = "guessed from the joint chain; declare `clearance` in the cell file"
+        else:
+            known = "as declared"
         shape = f"shape of the arm: {len(scene.capsules)} capsules, {known}"
-        if self.guessed and self.checker.robot.closures:
+        if self.guessed and self.checker.robot.is_constrained:
             shape = (
-                "shape of the links: unknown, of a closed chain it is not guessed; declare `clearance` in the cell file"
+                "shape of the links: unknown, of a closed chain it is not guessed; declare "
+                "`clearance` in the cell file"
             )
         lines = [shape, f"clearance: {1000 * scene.minimum_m:.0f} mm"]
         if self.together:
             pairs = ", ".join(f"{first} and {second}" for first, second in self.together)
-            lines.append(f"not checked against each other, as they touch in nearly every posture: {pairs}")
+            lines.append(
+                f"not checked against each other, as they touch in nearly every posture: {pairs}"
+            )
         if not scene.boxes and scene.workspace is None:
-            lines.append("obstacles and workspace: none declared; tables, cables and people are not known")
+            lines.append(
+                "obstacles and workspace: none declared; tables, cables and people are not known"
+            )
         return tuple(lines)
 
 
@@ -90,49 +104,75 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         side = side_of_cube(mass_kg)
         axis = robot.joints[last].axis
         at = robot.mounting_m
-        capsules = (*capsules, Capsule(PAYLOAD, last, _point(at + side * axis), _point(at + 2.0 * side * axis), side))
+        capsules = (
+            *capsules,
+            Capsule(PAYLOAD, last, _point(at + side * axis), _point(at + 2.0 * side * axis), side),
+        )
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
-    candidates = tuple(
-        (first, second)
-        for second in range(len(capsules))
-        for first in range(second)
-        if links[first] not in (links[second], parents[second]) and parents[first] != links[second]
-    )
+    found = []
+    for second in range(len(capsules)):
+        for first in range(second):
+            if (
+                links[first] not in (links[second], parents[second])
+                and parents[first] != links[second]
+            ):
+                found.append((first, second))
+    candidates = tuple(found)
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
-    everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
+    everything = Scene(
+        capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m
+    )
     limits = limits_of(cell)
-    postures = np.random.default_rng(0).uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
-    # Of a guessed shape, a pair that never keeps the distance belongs together as one that always touches does.
+    postures = np.random.default_rng(0).uniform(
+        limits.lower, limits.upper, (POSTURES, len(cell.axes))
+    )
+    # Of a guessed shape, a pair that never keeps the distance belongs together as one that always
+    # touches does.
     is_guessed = [not declared.capsules or capsule.name == PAYLOAD for capsule in capsules]
     margin_m = [0.5 * declared.minimum_m if guessed else 0.0 for guessed in is_guessed]
-    grown = [replace(one, radius_m=one.radius_m + more_m) for one, more_m in zip(capsules, margin_m, strict=True)]
+    grown = [
+        replace(one, radius_m=one.radius_m + more_m)
+        for one, more_m in zip(capsules, margin_m, strict=True)
+    ]
     apart = Checker(robot, replace(everything, capsules=tuple(grown))).apart(postures) > ALWAYS
     pairs = tuple(pair for pair, kept in zip(candidates, apart, strict=True) if kept)
     together = tuple(
-        (capsules[a].name, capsules[b].name) for (a, b), kept in zip(candidates, apart, strict=True) if not kept
+        (capsules[a].name, capsules[b].name)
+        for (a, b), kept in zip(candidates, apart, strict=True)
+        if not kept
     )
     scene = replace(everything, pairs=pairs)
     return CheckedScene(Checker(robot, scene), not declared.capsules, together)
 
 
 def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
-    """One from each joint to the next revolute one; the far end is drawn in, so that a bent elbow is no collision.
+    """One from each joint to the next revolute one;
+    the far end is drawn in, so that a bent elbow is no collision.
 
-    A way along a prismatic joint changes its length, and a guess would be no better than none: those links get none.
-    Neither do those of a closed chain, whose legs lie in front of and behind each other.
+    A way along a prismatic joint changes its length, and a guess would be no better than none:
+    those links get none. Neither do those of a closed chain, whose legs lie in front of and behind
+    each other.
     """
-    if robot.closures:
+    if robot.is_constrained:
         return ()
-    radius = LINK_RADIUS * max(sum(float(np.linalg.norm(joint.translation_m)) for joint in robot.joints), 0.1)
+    radius = LINK_RADIUS * max(
+        sum(float(np.linalg.norm(joint.translation_m)) for joint in robot.joints), 0.1
+    )
     capsules = []
     for joint in robot.joints:
         length = float(np.linalg.norm(joint.translation_m))
-        before = robot.joints[joint.parent].kind if joint.parent != BASE else JointKind.REVOLUTE
+        if joint.parent != BASE:
+            before = robot.joints[joint.parent].kind
+        else:
+            before = JointKind.REVOLUTE
         if length <= 2.0 * radius or JointKind.PRISMATIC in (joint.kind, before):
             continue
         end = joint.translation_m * (1.0 - radius / length)
-        name = "base" if joint.parent == BASE else f"link {joint.parent + 1}"
+        if joint.parent == BASE:
+            name = "base"
+        else:
+            name = f"link {joint.parent + 1}"
         capsules.append(Capsule(name, joint.parent, (0.0, 0.0, 0.0), _point(end), radius))
     return tuple(capsules)
 
@@ -141,7 +181,8 @@ def _point(vector: FloatArray) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-RUNS: tuple[int | None, ...] = (None, 0)  #: What is mounted while the moves are made: nothing, then the payload
+#: What is mounted while the moves are made: nothing, then the payload
+RUNS: tuple[int | None, ...] = (None, 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,29 +195,42 @@ class Experiment:
     payload: WeighedPayload  #: that will be mounted
     row_s: float  #: time between two rows of the observation [s]
     edge_s: float  #: how long after a standstill rows begin to count [s]
-    #: Torque limit of each axis [Nm; N of a prismatic joint], inf where it is not known, shape (n,).
+    #: Torque limit of each axis [Nm; N of a prismatic joint], inf where it is not known, shape
+    #: (n,).
     effort: FloatArray
     remarks: tuple[str, ...]  #: what was assumed, in words
-    mounted: tuple[int | None, ...] = RUNS  #: what is mounted at each repetition of the moves: payload or None
+    #: what is mounted at each repetition of the moves: payload or None
+    mounted: tuple[int | None, ...] = RUNS
 
-    def excitation(self, paths: Sequence[Trapezoid], thinning: int = 1) -> tuple[Excitation, tuple[slice, ...]]:
+    def excitation(
+        self, paths: Sequence[Trapezoid], thinning: int = 1
+    ) -> tuple[Excitation, tuple[slice, ...]]:
         """Rows of several moves, one after the other, and which of them belong to which move."""
         period = self.row_s * thinning
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
         motion = _joined(parts)
-        use = np.concatenate([self._use(path, time) for path, time in zip(paths, times, strict=True)], axis=1)
+        use = np.concatenate(
+            [self._use(path, time) for path, time in zip(paths, times, strict=True)], axis=1
+        )
         ends = np.cumsum([len(time) for time in times])
-        slices = tuple(slice(end - len(time), end) for end, time in zip(ends.tolist(), times, strict=True))
+        slices = tuple(
+            slice(end - len(time), end) for end, time in zip(ends.tolist(), times, strict=True)
+        )
         return Excitation(motion, use), slices
 
     def informations(self, paths: Sequence[Trapezoid], thinning: int = 1) -> list[FloatArray]:
-        """Information of each move with everything that is mounted in turn, all from one regressor."""
+        """Information of each move with everything that is mounted in turn,
+        all from one regressor.
+        """
         if not paths:
             return []
         excitation, slices = self.excitation(paths, thinning)
         whitened = self.design.whitened(excitation)
-        return [thinning * self.design.information_of(whitened[:, :, part], self.mounted) for part in slices]
+        return [
+            thinning * self.design.information_of(whitened[:, :, part], self.mounted)
+            for part in slices
+        ]
 
     def effort_shares(self, paths: Sequence[Trapezoid]) -> FloatArray:
         """Largest expected torque of each axis on each way, over its limit; shape (ways, n).
@@ -192,21 +246,32 @@ class Experiment:
         return np.asarray(of_ways.max(axis=2).T)
 
     def _use(self, path: Trapezoid, time_s: FloatArray) -> BoolArray:
-        """Rows of each motor that count; the same rule as ident/equations/rows.py, for moves from rest to rest."""
+        """Rows of each motor that count; the same rule as ident/equations/rows.py,
+        for moves from rest to rest.
+        """
         train = self.design.expectation.model.drive_train
         # On a trapezoid a joint is slowest at the ends of a row's window.
         early = path.at(time_s - self.edge_s)[1].T
         late = path.at(time_s + self.edge_s)[1].T
-        standstill = np.array(self.cell.conditioning.standstill_rad_s or (0.0,) * len(early))[:, None]
+        standstill = np.array(self.cell.conditioning.standstill_rad_s or (0.0,) * len(early))[
+            :, None
+        ]
         moving = np.minimum(np.abs(early), np.abs(late)) > standstill
-        turned = np.minimum(np.abs(train.direction @ early), np.abs(train.direction @ late)) > standstill
+        turned = (
+            np.minimum(np.abs(train.direction @ early), np.abs(train.direction @ late)) > standstill
+        )
         needed = (np.abs(train.to_motor) > 0) | (np.abs(train.direction) > 0)
-        use = np.stack([moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))])
-        return use.all(axis=0) & use if self.design.expectation.model.is_redundant else use
+        use = np.stack(
+            [moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))]
+        )
+        if self.design.expectation.model.is_redundant:
+            return use.all(axis=0) & use
+        return use
 
 
 def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
-    """Expectation of a cell's arm: inertias of the URDF, stated guesses for the rest, nameplate gains.
+    """Expectation of a cell's arm: inertias of the URDF, stated guesses for the rest,
+    nameplate gains.
 
     Args:
         payload: name of it, None for the first.
@@ -220,8 +285,8 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
             f"payloads of cell {cell.name!r}",
             found="none" if payload is None else f"no payload {payload!r}",
             expected=", ".join(declared.name for declared in cell.payloads) or "a weighed payload",
-            remedy="gains show only beside a known mass: give a declared name, or weigh a body and declare it under "
-            "`payloads`",
+            remedy="gains show only beside a known mass: give a declared name, or weigh a body and "
+            "declare it under `payloads`",
         )
     mounted = found[0]
     model = model_of(cell)
@@ -229,13 +294,15 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     limits = limits_of(cell)
     fast_motion = _fast_motion(limits, Checker(model.robot, NOTHING))
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
-    expectation, from_urdf = nominal_expectation(model, cell.urdf, gains, expected, limits, fast_motion)
+    expectation, from_urdf = nominal_expectation(
+        model, cell.urdf, gains, expected, limits, fast_motion
+    )
     scene = scene_of(cell, model.robot, mounted.mass_kg)
     remarks = (
         f"payload: {mounted.name}, {mounted.mass_kg:g} kg",
         f"masses of the links: {'from the URDF' if from_urdf else 'guessed'}",
-        f"noise: {100 * NOISE_SHARE:g} % of each motor's current at its torque limit, correlation {LAG_ONE:g} from row "
-        "to row",
+        f"noise: {100 * NOISE_SHARE:g} % of each motor's current at its torque limit, correlation "
+        f"{LAG_ONE:g} from row to row",
         *scene.remarks,
     )
     design = Design(expectation, visible_base(model, fast_motion))
@@ -246,8 +313,12 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     return Experiment(cell, design, scene, mounted, period, edge, effort, remarks)
 
 
-def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray, *, from_urdf: bool) -> tuple[str, ...]:
-    """Say which axes have no effort limit that moves could be kept below; masses of the links may be guessed."""
+def _effort_remarks(
+    cell: Cell, declared: FloatArray, believed: FloatArray, *, from_urdf: bool
+) -> tuple[str, ...]:
+    """Say which axes have no effort limit that moves could be kept below;
+    masses of the links may be guessed.
+    """
     lines: list[str] = []
     unknown: list[str] = []
     refuted: list[str] = []
@@ -257,22 +328,32 @@ def _effort_remarks(cell: Cell, declared: FloatArray, believed: FloatArray, *, f
         elif np.isinf(limit):
             refuted.append(name)
     if unknown:
-        lines.append(f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there")
-    if refuted:
-        masses = "the masses of the URDF" if from_urdf else "guessed masses of the links"
         lines.append(
-            f"torque limits: with {masses}, gravity alone asks more than the `effort` of {', '.join(refuted)} in the "
-            "URDF; not kept there. Correct `effort` or the masses; the planner knows no balancer"
+            f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there"
+        )
+    if refuted:
+        if from_urdf:
+            masses = "the masses of the URDF"
+        else:
+            masses = "guessed masses of the links"
+        lines.append(
+            f"torque limits: with {masses}, gravity alone asks more than the `effort` of "
+            f"{', '.join(refuted)} in the URDF; not kept there. Correct `effort` or the masses; "
+            "the planner knows no balancer"
         )
     return tuple(lines)
 
 
 PIECE_SHARES = np.array([0.01, 0.25, 0.5, 0.75, 0.99])
-"""Where the torque is looked at in each piece of a trapezoid: near its ends, where it jumps, and between."""
+"""Where the torque is looked at in each piece of a trapezoid:
+near its ends, where it jumps, and between.
+"""
 
 
 def _torque_times(path: Trapezoid) -> FloatArray:
-    """Times at which the torque of a move may be largest [s], also at rest before and after it; as many for each."""
+    """Times at which the torque of a move may be largest [s], also at rest before and after it;
+    as many for each.
+    """
     corners = (0.0, path.ramp_s, path.duration_s - path.ramp_s, path.duration_s)
     pieces = [begin + PIECE_SHARES * (end - begin) for begin, end in pairwise(corners)]
     at_rest = np.array([-1.0, path.duration_s + 1.0])
@@ -283,10 +364,12 @@ NOTHING = Scene((), (), (), None, (), 0.0)  #: Without bodies, a checker knows w
 
 
 def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
-    """Random moves as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
+    """Random moves as fast as the limits allow:
+    which parameters there are does not depend on a plan's seed.
+    """
     rng = np.random.default_rng(0)
     targets = rng.uniform(limits.lower, limits.upper, (40, len(limits.lower)))
-    if checker.robot.closures:
+    if checker.robot.is_constrained:
         targets = _allowed(checker, rng, limits.lower, limits.upper, len(targets))
     parts = []
     for start, end in pairwise(targets):
@@ -313,7 +396,8 @@ def _allowed(
 def towards(
     checker: Checker, start: FloatArray, target: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """The farthest position that a closed chain can go to on the way to a target; the start where there is none.
+    """The farthest position that a closed chain can go to on the way to a target;
+    the start where there is none.
 
     Args:
         checker: of the robot.
@@ -328,7 +412,8 @@ def towards(
 class PlannedMove:
     """One synchronised point-to-point move."""
 
-    target_rad: tuple[float, ...]  #: joint positions at its end [rad; m of a prismatic joint], shape (n,)
+    #: joint positions at its end [rad; m of a prismatic joint], shape (n,)
+    target_rad: tuple[float, ...]
     velocity: float  #: share of the joints' velocity limits, above 0 up to 1
     acceleration: float  #: share of the joints' acceleration limits, above 0 up to 1
     dwell_s: float  #: rest after it [s]
@@ -350,7 +435,9 @@ def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
 
 def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
     """From the first target to the end of the last dwell [s]."""
-    return float(sum(path.duration_s for path in paths_of(cell, moves)) + sum(move.dwell_s for move in moves))
+    return float(
+        sum(path.duration_s for path in paths_of(cell, moves)) + sum(move.dwell_s for move in moves)
+    )
 
 
 SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
@@ -362,19 +449,23 @@ STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way i
 def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     """Some five seconds of each kind, within limits and clear of everything; the same every time.
 
-    For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen from that axis),
-    slow with it stretched, and fast together with a neighbour; and of all axes together.
+    For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen
+    from that axis), slow with it stretched, and fast together with a neighbour; and of all axes
+    together.
     """
     cell = experiment.cell
     checker = experiment.scene.checker
     limits = limits_of(cell)
     low, high = limits.targets()
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
-    if checker.robot.closures:
+    if checker.robot.is_constrained:
         sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
-    ends_of = _swing_of_chain if checker.robot.closures else _swing
+    if checker.robot.is_constrained:
+        ends_of = _swing_of_chain
+    else:
+        ends_of = _swing
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""
@@ -400,7 +491,8 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     robot = experiment.design.expectation.model.robot
     at = poses(robot, checker.joints(clear))
     for axis, (name, joint) in enumerate(zip(names, robot.axis_joints, strict=True)):
-        # Distance of the link with the payload from the axis; of a prismatic one, from the axis' own frame [m].
+        # Distance of the link with the payload from the axis; of a prismatic one, from the axis'
+        # own frame [m].
         way = at.origin_m[robot.carrier + 1] - at.origin_m[joint + 1]
         if robot.joints[joint].kind is not JointKind.PRISMATIC:
             way = np.cross(at.rotation[joint + 1] @ robot.joints[joint].axis, way)
@@ -420,7 +512,9 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
 def _swing(
     checker: Checker, posture: FloatArray, moved: list[int], low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Both ends of the longest clear swing of some axes about the middle of their range; None where there is none."""
+    """Both ends of the longest clear swing of some axes about the middle of their range;
+    None where there is none.
+    """
     for stroke in STROKES:
         inwards = 0.5 * (1.0 - stroke) * (high - low)
         start = posture.copy()
@@ -435,10 +529,14 @@ def _swing(
 def _swing_of_chain(
     checker: Checker, posture: FloatArray, moved: list[int], low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The same where the other axes follow, as far as the closures allow; None where that is nowhere."""
+    """The same where the other axes follow, as far as the closures allow;
+    None where that is nowhere.
+    """
     ends: list[FloatArray] = []
     for limit in (low, high):
         target = posture.copy()
         target[moved] = limit[moved]
         ends.append(towards(checker, ends[-1] if ends else posture, target, low, high))
-    return None if np.allclose(ends[0], ends[1]) else (ends[0], ends[1])
+    if np.allclose(ends[0], ends[1]):
+        return None
+    return (ends[0], ends[1])

@@ -11,13 +11,30 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.arguments import (
+    A_FLAG,
+    A_FUNCTION,
+    A_LIST,
+    A_MOMENT,
+    A_WHOLE_NUMBER,
+    PATHS,
+    checks_arguments,
+    of_kind,
+    optional,
+)
 from daq.config.cell import Cell, model_of
 from daq.config.effects import place_effect
 from daq.config.policy import DEFAULT_APPLY_POLICY
 from daq.config.same_cell import calibrated_robot
 from daq.config.yaml_file import Fault
 from daq.environment import software
-from daq.errors import ConfigurationInconsistent, EffectsRefuted, LogRepeated, LogsDiffer, UsageError
+from daq.errors import (
+    ConfigurationInconsistent,
+    EffectsRefuted,
+    LogRepeated,
+    LogsDiffer,
+    UsageError,
+)
 from daq.files import sha256
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
@@ -48,14 +65,23 @@ from ident.discovery.before_after import error_on
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.geometry_check import GeometryCheck
-from ident.discovery.geometry_covariance import evidence_with_geometry, geometry_covariance, with_geometry_covariance
+from ident.discovery.geometry_covariance import (
+    evidence_with_geometry,
+    geometry_covariance,
+    with_geometry_covariance,
+)
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import TemperatureFriction
 from ident.errors import Diagnosis, EffectImpossible, IdentificationError, PayloadUnseen
 from ident.estimators.comparison import EstimatorComparison, try_estimators
 from ident.estimators.estimate import Estimate, Identification, RelativeError, of_squares
-from ident.estimators.geometry_estimate import GeometryFinding, Positions, estimate_geometry, thinned
+from ident.estimators.geometry_estimate import (
+    GeometryFinding,
+    Positions,
+    estimate_geometry,
+    thinned,
+)
 from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
@@ -75,25 +101,35 @@ class Fit:
     holdout: tuple[Path, ...]  #: held out of the fit; read again likewise
     sources: tuple[Source, ...]  #: all of these, with digests and roles
     identification: Identification  #: the estimate without effects
-    #: A step for each effect that the cell declares, then the turns of the loop; empty without either.
+    #: A step for each effect that the cell declares, then the turns of the loop; empty without
+    #: either.
     steps: tuple[Step, ...]
-    paper: Estimate | None  #: the paper's total least squares on the same equations, None with fixed gains
+    #: the paper's total least squares on the same equations, None with fixed gains
+    paper: Estimate | None
     lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
-    given_cell: Cell | None = None  #: description that replaces the one in the logs; None where that is used
-    diagnoses: tuple[Diagnosis, ...] = ()  #: of the fit, with effects of the last one, and of each held-out log
+    #: description that replaces the one in the logs; None where that is used
+    given_cell: Cell | None = None
+    #: of the fit, with effects of the last one, and of each held-out log
+    diagnoses: tuple[Diagnosis, ...] = ()
     is_holdout_judged: bool = False  #: whether the diagnoses are those of held-out logs, too
-    #: Slope of each axis's own torque over its current, beside the gains; empty where no log has such torques.
+    #: Slope of each axis's own torque over its current, beside the gains; empty where no log has
+    #: such torques.
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
-    #: The operator takes all effects that were found, also what held-out runs would refute: these judge none of them.
+    #: The operator takes all effects that were found, also what held-out runs would refute: these
+    #: judge none of them.
     accept_worse_holdout: bool = False
-    description: GeometryCheck | None = None  #: zeros, mounting and clocks by torque; None where it was not tested
+    #: zeros, mounting and clocks by torque; None where it was not tested
+    description: GeometryCheck | None = None
     channels_as_wired: bool = False  #: the operator says that no currents are exchanged
     #: What the encoders say of the geometry; None for a robot without redundant ones.
     geometry: GeometryFinding | None = None
-    #: Covariance that the corrected geometry adds to gains and parameters; None where the described one was used.
+    #: Covariance that the corrected geometry adds to gains and parameters; None where the described
+    #: one was used.
     geometry_covariance: FloatArray | None = None
-    diagnoses_before: tuple[Diagnosis, ...] = ()  #: of the fit before a search; empty where none was made
-    #: Verdicts on the gains that are not known well enough; empty where all are, and before they are made.
+    #: of the fit before a search; empty where none was made
+    diagnoses_before: tuple[Diagnosis, ...] = ()
+    #: Verdicts on the gains that are not known well enough; empty where all are, and before they
+    #: are made.
     uncertain: tuple[GainVerdict, ...] = ()
 
     @property
@@ -104,12 +140,16 @@ class Fit:
     @property
     def estimate(self) -> Estimate:
         """Estimate with all declared and accepted effects."""
-        return self.steps[-1].after.estimate if self.steps else self.identification.estimate
+        if self.steps:
+            return self.steps[-1].after.estimate
+        return self.identification.estimate
 
     @property
     def final(self) -> Identification:
         """Identification with all accepted effects; their rows are reduced anew at each call."""
-        return self.steps[-1].after.identification if self.steps else self.identification
+        if self.steps:
+            return self.steps[-1].after.identification
+        return self.identification
 
     def read(self, log: Path) -> tuple[Run, Cell]:
         """Read a log as the fit did, with the description of its cell."""
@@ -127,7 +167,9 @@ class Fit:
         )
 
     def evidence(self) -> Evidence:
-        """The rows behind the identification, without effects; the logs are read again unless it has kept them."""
+        """The rows behind the identification, without effects;
+        the logs are read again unless it has kept them.
+        """
         if self.identification.gathered is not None:
             return gather(self.identification)
         return gather(self.identification, self.runs(self.logs), self.runs(self.holdout))
@@ -147,7 +189,9 @@ class Undecided(Enum):
 
     @classmethod
     def of(cls, *, write: bool, ignore_holdout: bool) -> Undecided:
-        """Choose by what the operator asks for: to write undecided effects, or all whatever held-out logs say."""
+        """Choose by what the operator asks for:
+        to write undecided effects, or all whatever held-out logs say.
+        """
         if ignore_holdout:
             return cls.ALL_JOIN
         return cls.JOIN if write else cls.LEFT_OUT
@@ -156,7 +200,9 @@ class Undecided(Enum):
 class Reading:
     """Logs of one cell, read one after the other, and their sources."""
 
-    def __init__(self, first: dict[Path, Run], cell: Cell, read: Callable[[Path], tuple[Run, Cell]]) -> None:
+    def __init__(
+        self, first: dict[Path, Run], cell: Cell, read: Callable[[Path], tuple[Run, Cell]]
+    ) -> None:
         self.cell = cell
         self.sources: list[Source] = []
         self._first = first  #: read already
@@ -167,7 +213,9 @@ class Reading:
         self._corrections = Corrections()
 
     @classmethod
-    def of(cls, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> Reading:
+    def of(
+        cls, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> Reading:
         """Begin with the first log, whose cell is that of all unless another description is given.
 
         Raises:
@@ -181,7 +229,8 @@ class Reading:
 
         Raises:
             LogsDiffer: a log is of another cell or configuration than the first one.
-            LogRepeated: a recording was given twice: it would count twice, or be held out of nothing.
+            LogRepeated: a recording was given twice: it would count twice, or be held out of
+                nothing.
         """
         for log in logs:
             if log in self._first:
@@ -193,8 +242,10 @@ class Reading:
                 raise LogsDiffer(
                     str(log),
                     found=f"cell {cell.name!r}, configuration {cell.digest[:12]}",
-                    expected=f"cell {self.cell.name!r}, configuration {self.cell.digest[:12]}, as in the first log",
-                    remedy="fit logs of one cell and one configuration, or name the right one with --cell",
+                    expected=f"cell {self.cell.name!r}, configuration {self.cell.digest[:12]}, as "
+                    "in the first log",
+                    remedy="fit logs of one cell and one configuration, or name the right one "
+                    "with --cell",
                 )
             self._corrections.note(log, run)
             # By its samples: a file that was rewritten is the same recording still.
@@ -211,8 +262,15 @@ class Reading:
                 self._torques.append(run.torque_channels)
             if self.cell.chain is not None and role == "fit":
                 self._positions.append(thinned(run))
-            name, mass_kg = (None, None) if run.payload is None else (run.payload.name, run.payload.known.get("m"))
-            self.sources.append(Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording))
+            if run.payload is None:
+                name = None
+                mass_kg = None
+            else:
+                name = run.payload.name
+                mass_kg = run.payload.known.get("m")
+            self.sources.append(
+                Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording)
+            )
             yield run
 
     def torque_slopes(self) -> tuple[TorqueSlope | None, ...]:
@@ -225,13 +283,24 @@ class Reading:
         Raises:
             ModelError: the encoders contradict each other so much that no pose fits them.
         """
-        return estimate_geometry(model, self._positions) if self._positions else None
+        if self._positions:
+            return estimate_geometry(model, self._positions)
+        return None
 
 
 _LOG = logging.getLogger("drivegain")
 BOOTSTRAP_SEED = 0  #: Of the significance tests, so that the same logs get the same verdicts
 
 
+@checks_arguments(
+    logs=PATHS,
+    holdout=PATHS,
+    cell=optional(of_kind(Cell)),
+    effects=A_FLAG,
+    created=optional(A_MOMENT),
+    progress=A_FUNCTION,
+    own_effects=A_LIST,
+)
 def fit_logs(
     logs: Sequence[Path | str],
     *,
@@ -251,16 +320,19 @@ def fit_logs(
         effects: detect effects that the declared model lacks, and refit with those that pass.
         created: time stamp of the calibration, with its time zone; now when None.
         progress: receives a line for each step.
-        own_effects: effects that no installed package has, tried beside the others (`ident.Effect`).
+        own_effects: effects that no installed package has, tried beside the others
+            (`ident.Effect`).
 
     Raises:
-        DataError: a log cannot be read, its samples cannot be used, or held-out runs refute the effects found.
+        UsageError: an argument is of another type.
+        DataError: a log cannot be read, its samples cannot be used, or held-out runs refute the
+            effects found.
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
     fitted = fit(
-        list(map(Path, logs)),
-        holdout=list(map(Path, holdout)),
+        logs,
+        holdout=holdout,
         cell=cell,
         keep_rows=effects,
         judge_holdout=not effects,
@@ -271,10 +343,21 @@ def fit_logs(
     return calibration_of(fitted, created or datetime.now(UTC))
 
 
+@checks_arguments(
+    logs=PATHS,
+    holdout=PATHS,
+    method=optional(of_kind(Method)),
+    gains_fixed=A_FLAG,
+    cell=optional(of_kind(Cell)),
+    lossy=of_kind(LossyLogs),
+    keep_rows=A_FLAG,
+    channels_as_wired=A_FLAG,
+    judge_holdout=A_FLAG,
+)
 def fit(
-    logs: Sequence[Path],
+    logs: Sequence[Path | str],
     *,
-    holdout: Sequence[Path] = (),
+    holdout: Sequence[Path | str] = (),
     method: Method | None = None,
     gains_fixed: bool = False,
     cell: Cell | None = None,
@@ -294,11 +377,16 @@ def fit(
         lossy: how to handle logs with losses.
         keep_rows: keep all rows for a search for effects, which then need not read the logs again.
         channels_as_wired: do not look for exchanged currents.
-        judge_holdout: say what is wrong with held-out logs; a search that follows does it with the final model.
+        judge_holdout: say what is wrong with held-out logs; a search that follows does it with the
+            final model.
 
     Raises:
+        UsageError: an argument is of another type.
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
+
+    recorded = [Path(log) for log in logs]
+    held_out = [Path(log) for log in holdout]
 
     def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
         reading = Reading.of(used, cell, lossy)
@@ -337,13 +425,17 @@ def fit(
         )
 
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
-    recordings = Recordings(tuple(logs), lambda log: load_run(log, cell, lossy), gains_fixed, channels_as_wired)
+    recordings = Recordings(
+        tuple(recorded), lambda log: load_run(log, cell, lossy), gains_fixed, channels_as_wired
+    )
     try:
         with named_causes(recordings):
-            judged_fit = _with_diagnoses(attempt(logs, holdout, chosen))
-            return _with_holdout_judged(judged_fit) if judge_holdout else judged_fit
+            judged_fit = _with_diagnoses(attempt(recorded, held_out, chosen))
+            if judge_holdout:
+                return _with_holdout_judged(judged_fit)
+            return judged_fit
     except PayloadUnseen as error:
-        hint = contradicting_log(logs, lambda rest: attempt(rest, (), Method.ML))
+        hint = contradicting_log(recorded, lambda rest: attempt(rest, (), Method.ML))
         raise PayloadUnseen(error.std_percent, error.runs, hint) from error
 
 
@@ -355,12 +447,16 @@ def contradicting_log(logs: Sequence[Path], fit_of: Callable[[Sequence[Path]], F
         except IdentificationError:
             continue
         std = 100.0 * float(np.max(rest.gains_std / np.abs(rest.gains)))
-        return f"without {log} they do (σ at most {std:.1f} %): was the payload of that run declared as it was?"
+        return (
+            f"without {log} they do (σ at most {std:.1f} %): was the payload of that run "
+            "declared as it was?"
+        )
     return ""
 
 
 def judged(fitted: Fit) -> Fit:
-    """Return a fit with all that is said of its recordings, or refuse it: `daq.workflow.diagnoses` has the order.
+    """Return a fit with all that is said of its recordings, or refuse it:
+    `daq.workflow.diagnoses` has the order.
 
     Raises:
         IdentificationError: a mistake leaves no number that can be used.
@@ -369,9 +465,12 @@ def judged(fitted: Fit) -> Fit:
 
 
 def _with_diagnoses(fitted: Fit) -> Fit:
-    """Return a fit with what is said of the logs that it used, or refuse it; held-out logs are not judged yet."""
+    """Return a fit with what is said of the logs that it used, or refuse it;
+    held-out logs are not judged yet.
+    """
     turned = _turned_geometry_of(fitted)
-    if turned is not None:  # nothing else is said, and the description was tested in a wrong geometry
+    # Nothing else is said, and the description was tested in a wrong geometry
+    if turned is not None:
         return replace(fitted, description=None, diagnoses=(turned,), is_holdout_judged=False)
     fitted = with_description(fitted)
     of_description = description_diagnoses(fitted)
@@ -392,7 +491,8 @@ def _with_diagnoses(fitted: Fit) -> Fit:
 def _turned_geometry_of(fitted: Fit) -> Diagnosis | None:
     """Another geometry that explains the logs of a fit clearly better; None without any.
 
-    What a search adds does not turn the geometry, so that the answer of the fit before it holds where that is no.
+    What a search adds does not turn the geometry, so that the answer of the fit before it holds
+    where that is no.
     """
     has_searched = any(not step.declared for step in fitted.steps)
     was_turned = any(one.name in GEOMETRY for one in fitted.diagnoses_before)
@@ -408,7 +508,9 @@ def _turned_geometry_of(fitted: Fit) -> Diagnosis | None:
 
 
 def _with_holdout_judged(fitted: Fit) -> Fit:
-    """Return a fit with what is said of its held-out logs behind what is said of the others, unless it has that."""
+    """Return a fit with what is said of its held-out logs behind what is said of the others,
+    unless it has that.
+    """
     if fitted.is_holdout_judged:
         return fitted
     calibration = replace(_calibration(fitted), diagnoses=fitted.diagnoses)
@@ -422,16 +524,21 @@ def _with_holdout_judged(fitted: Fit) -> Fit:
 def with_description(fitted: Fit) -> Fit:
     """Test the declared geometry beside a fit that has kept its rows, unless it was tested before.
 
-    A search tests it again in each of its turns: gravity and the zeros that are hidden stay those of the fit before it.
+    A search tests it again in each of its turns: gravity and the zeros that are hidden stay those
+    of the fit before it.
     """
     if fitted.description is not None or fitted.identification.gathered is None:
         return fitted
-    evidence = fitted.steps[-1].after if fitted.steps else fitted.evidence()
+    if fitted.steps:
+        evidence = fitted.steps[-1].after
+    else:
+        evidence = fitted.evidence()
     return replace(fitted, description=geometry_beside(evidence, BOOTSTRAP_SEED))
 
 
 def _with_description_after_search(closed: Fit) -> Fit:
-    """Keep the mistakes that the fit before a search has named, unless the search has explained them.
+    """Keep the mistakes that the fit before a search has named,
+    unless the search has explained them.
 
     They are explained by corrections, or by effects beside which the same test names them no more.
     """
@@ -448,8 +555,8 @@ def _with_description_after_search(closed: Fit) -> Fit:
     beside = geometry_beside(after, BOOTSTRAP_SEED)
     if beside is None:
         return replace(closed, description=replace(description, mistakes=()))
-    # Gravity and hidden zeros stay those of the fit, and what it did not tell apart from a correction that the search
-    # has made. Mistakes and their company are those of the final model.
+    # Gravity and hidden zeros stay those of the fit, and what it did not tell apart from a
+    # correction that the search has made. Mistakes and their company are those of the final model.
     unclear = [alike for alike in description.alike if any(map(alike.contain, after.effects))]
     kept = replace(
         beside,
@@ -462,7 +569,8 @@ def _with_description_after_search(closed: Fit) -> Fit:
 
 
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
-    """Name what is wrong with the declared geometry, by the search of a fit and by the test beside it.
+    """Name what is wrong with the declared geometry,
+    by the search of a fit and by the test beside it.
 
     The same mistake of the same axis is said once.
     """
@@ -479,7 +587,9 @@ def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     return tuple(first.values())
 
 
-def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> EstimatorComparison:
+def compare_estimators(
+    fitted: Fit, progress: Callable[[str], None] = lambda _: None
+) -> EstimatorComparison:
     """Every estimator on the logs of a fit, which are read again for each filter.
 
     Raises:
@@ -505,6 +615,13 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
 DOUBTFUL_PERCENT = DEFAULT_APPLY_POLICY.max_error_percent  #: In total
 
 
+@checks_arguments(
+    start=of_kind(Fit),
+    seed=A_WHOLE_NUMBER,
+    progress=A_FUNCTION,
+    undecided=of_kind(Undecided),
+    own_effects=A_LIST,
+)
 def close_loop(
     start: Fit,
     seed: int,
@@ -512,14 +629,16 @@ def close_loop(
     undecided: Undecided = Undecided.LEFT_OUT,
     own_effects: Sequence[Effect] = (),
 ) -> Fit:
-    """Detect and add missing effects: refit with every effect that passes the gates and that held-out logs confirm.
+    """Detect and add missing effects: refit with every effect that passes the gates and that
+    held-out logs confirm.
 
     Args:
-        start: of method ``ml``; another one is refitted by ``ml``, in whose terms candidates are judged.
+        start: of method ``ml``; another one is refitted by ``ml``, in whose terms candidates are
+            judged.
         seed: of the bootstrap.
         progress: receives a line for each step.
-        undecided: whether effects that held-out logs neither confirm nor refute join; all that were found join where
-            `Undecided.ALL_JOIN` overrides the held-out logs.
+        undecided: whether effects that held-out logs neither confirm nor refute join; all that were
+            found join where `Undecided.ALL_JOIN` overrides the held-out logs.
         own_effects: effects that no installed package has, tried beside the others.
 
     Raises:
@@ -531,34 +650,52 @@ def close_loop(
     evidence = known[-1].after if known else start.evidence()
     cold = [data.name for data in evidence.fit_runs if data.temperature_c is None]
     if 0 < len(cold) < len(evidence.fit_runs):
-        _LOG.warning("%s without temperatures: %s is not looked for", ", ".join(cold), TemperatureFriction.name)
+        _LOG.warning(
+            "%s without temperatures: %s is not looked for",
+            ", ".join(cold),
+            TemperatureFriction.name,
+        )
     before = start.identification
     by_ml = by_likelihood(before.estimate, before.system)
     if by_ml is not before.estimate:
         before = replace(before, estimate=by_ml)
-        evidence = with_declared_again(evidence, by_ml) if known else replace(evidence, estimate=by_ml)
+        if known:
+            evidence = with_declared_again(evidence, by_ml)
+        else:
+            evidence = replace(evidence, estimate=by_ml)
     rng = np.random.default_rng(seed)
     places = start.cell.place_names
     check = start.description
-    # The check of the fit has not compared its mistakes with the effects of an argument: it is made again.
-    named = None if check is None or own_effects else check.certain_mistakes
-    steps = find_effects(evidence, rng, progress=progress, axes=places, mistakes=named, own_effects=own_effects)
+    # The check of the fit has not compared its mistakes with the effects of an argument: it is made
+    # again.
+    if check is None or own_effects:
+        named = None
+    else:
+        named = check.certain_mistakes
+    steps = find_effects(
+        evidence, rng, progress=progress, axes=places, mistakes=named, own_effects=own_effects
+    )
     if undecided is not Undecided.ALL_JOIN:
         join = undecided is Undecided.JOIN
-        steps = accept_on_holdout(evidence, steps, rng=rng, write_undecided=join, progress=progress, axes=places)
+        steps = accept_on_holdout(
+            evidence, steps, rng=rng, write_undecided=join, progress=progress, axes=places
+        )
     closed = _with_uncertain_geometry(replace(start, identification=before, steps=(*known, *steps)))
     closed = _with_description_after_search(closed)
     with named_causes(closed.recordings):
         wrong = impossible_declared(closed.steps[-1].after, places)
         if wrong:  # the fit hoped for a correction of the geometry, and the search made none
             raise EffectImpossible(f"the declared {wrong}")
-        if closed.estimate is described and not open_correction_diagnoses(closed.steps, closed.cell):
+        if closed.estimate is described and not open_correction_diagnoses(
+            closed.steps, closed.cell
+        ):
             return _with_holdout_judged(closed)
         return judged(closed)
 
 
 def with_corrected_geometry(start: Fit) -> Fit:
-    """Identify again with the zeros and lengths that the encoders show; the same fit where they contradict none.
+    """Identify again with the zeros and lengths that the encoders show;
+    the same fit where they contradict none.
 
     The logs are read again. σ of the gains contains that of the geometry.
 
@@ -571,7 +708,9 @@ def with_corrected_geometry(start: Fit) -> Fit:
 
 
 def _with_uncertain_geometry(found: Fit) -> Fit:
-    """Add the uncertainty of the corrected geometry to estimates that have none of it; the same fit without one."""
+    """Add the uncertainty of the corrected geometry to estimates that have none of it;
+    the same fit without one.
+    """
     covariance = found.geometry_covariance
     if covariance is None:
         return found
@@ -580,13 +719,16 @@ def _with_uncertain_geometry(found: Fit) -> Fit:
         found,
         identification=with_geometry_covariance(found.identification, covariance),
         steps=tuple(
-            replace(step, after=evidence_with_geometry(step.after, covariance, unknowns)) for step in found.steps
+            replace(step, after=evidence_with_geometry(step.after, covariance, unknowns))
+            for step in found.steps
         ),
     )
 
 
 def _with_geometry_of_encoders(start: Fit) -> Fit:
-    """Identify again with the geometry of the encoders, and leave its uncertainty to be added after a search."""
+    """Identify again with the geometry of the encoders,
+    and leave its uncertainty to be added after a search.
+    """
     finding = start.geometry
     if finding is None or not finding.corrections:
         return start
@@ -619,10 +761,12 @@ def _with_geometry_of_encoders(start: Fit) -> Fit:
 
 
 def check_holdout(fitted: Fit) -> None:
-    """Refuse effects that raise the error of held-out runs by more than its noise, in total or of a motor.
+    """Refuse effects that raise the error of held-out runs by more than its noise,
+    in total or of a motor.
 
-    `close_loop` has taken out what held-out runs refute, by the same comparison; this refuses a fit that was made in
-    another way. Effects that the cell declares are in both models that are compared.
+    `close_loop` has taken out what held-out runs refute, by the same comparison; this refuses a fit
+    that was made in another way. Effects that the cell declares are in both models that are
+    compared.
 
     Raises:
         EffectsRefuted: they do, and the operator has not accepted it.
@@ -631,7 +775,10 @@ def check_holdout(fitted: Fit) -> None:
         return
     after = fitted.steps[-1].after
     declared = [step.after for step in fitted.steps if step.declared]
-    before = declared[-1] if declared else without_effects(after, fitted.identification.estimate)
+    if declared:
+        before = declared[-1]
+    else:
+        before = without_effects(after, fitted.identification.estimate)
     if after.holdout is None or after.effects == before.effects:
         return
     change = compare_on_holdout(before, before, after)
@@ -646,17 +793,23 @@ def check_holdout(fitted: Fit) -> None:
     )
     unseen = after.datasets[len(after.fit_runs) :]
     cold = [one.name for one in unseen if one.temperature_c is None]
-    needed = cold and any(placed.effect.name == TemperatureFriction.name for placed in after.effects)
+    needed = cold and any(
+        placed.effect.name == TemperatureFriction.name for placed in after.effects
+    )
     raise EffectsRefuted(
-        ", ".join(placed.name_among(fitted.cell.place_names) for placed in after.effects[after.declared :]),
+        ", ".join(
+            placed.name_among(fitted.cell.place_names) for placed in after.effects[after.declared :]
+        ),
         found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
         + (f"; {', '.join(cold)} has no temperature, on which an effect depends" if needed else ""),
-        expected=f"no rise by more than its noise over their {change.total.moves} independent blocks of moves; {harm}",
-        remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record more runs for "
-        "the fit (or pass --accept-worse-holdout to `drivegain residual`)",
+        expected=f"no rise by more than its noise over their {change.total.moves} independent "
+        f"blocks of moves; {harm}",
+        remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record "
+        "more runs for the fit (or pass --accept-worse-holdout to `drivegain residual`)",
     )
 
 
+@checks_arguments(fitted=of_kind(Fit), created=A_MOMENT)
 def calibration_of(fitted: Fit, created: datetime) -> Calibration:
     """Make the calibration of a fit.
 
@@ -666,7 +819,9 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
     """
     predicting = _calibration(fitted)
     tolerance_kg = {payload.name: payload.mass_tolerance_kg for payload in fitted.cell.payloads}
-    influences = (one.weighed_to(tolerance_kg.get(one.payload, 0.0)) for one in predicting.payload_mass)
+    influences = (
+        one.weighed_to(tolerance_kg.get(one.payload, 0.0)) for one in predicting.payload_mass
+    )
     return replace(
         predicting,
         payload_mass=tuple(influences),
@@ -701,14 +856,15 @@ def _calibration(fitted: Fit) -> Calibration:
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
     """Hold-out error with the nameplate gains: same model, effects included, parameters refitted.
 
-    Without the effects, their share would be credited to the gains. The total weighs the axes by ‖Y_j‖ of the
-    calibration, because smaller gains alone would lower it otherwise.
+    Without the effects, their share would be credited to the gains. The total weighs the axes by
+    ‖Y_j‖ of the calibration, because smaller gains alone would lower it otherwise.
     """
     final = fitted.final
     unseen = final.holdout
     if unseen is None or final.estimate.gains_fixed:
         return None
-    method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method  # tls corrects gains
+    # TLS estimates gains and cannot hold them: ML takes its place.
+    method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method
     try:
         held = estimate_with(method, final.system, nameplate_of(fitted.cell))
     except (IdentificationError, np.linalg.LinAlgError):
@@ -721,11 +877,13 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     return RelativeError(axes, of_squares(size, left).total)
 
 
-# Effects that a cell file declares: a counterbalance that the robot is known to have needs no search.
+# Effects that a cell file declares: a counterbalance that the robot is known to have needs no
+# search.
 
 
 def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
-    """Return the effects that a cell declares, where no setting is given with those of the dictionary's first member.
+    """Return the effects that a cell declares, where no setting is given with those of the
+    dictionary's first member.
 
     Raises:
         ConfigurationInconsistent: there is no such effect, or it has no such setting, on this axis.
@@ -736,7 +894,8 @@ def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
         found = place_effect(declared.name, declared.axis, declared.settings, robot)
         if isinstance(found, Fault):
             raise ConfigurationInconsistent(
-                f"effects of cell {cell.name!r}: {declared.name} on {cell.place_names[declared.axis]}",
+                f"effects of cell {cell.name!r}: {declared.name} on "
+                f"{cell.place_names[declared.axis]}",
                 found=found.found,
                 expected=found.expected,
                 remedy="correct the cell file",
@@ -752,7 +911,9 @@ def refuse_effects(cell: Cell, option: str) -> None:
         UsageError: the cell declares effects.
     """
     if cell.effects:
-        names = ", ".join(f"{effect.name} on {cell.place_names[effect.axis]}" for effect in cell.effects)
+        names = ", ".join(
+            f"{effect.name} on {cell.place_names[effect.axis]}" for effect in cell.effects
+        )
         raise UsageError(
             option,
             found=f"a cell that declares effects: {names}",
@@ -764,7 +925,8 @@ def refuse_effects(cell: Cell, option: str) -> None:
 def with_effects_of_cell(
     start: Identification, effects: tuple[PlacedEffect, ...], axes: Sequence[str]
 ) -> tuple[Step, ...]:
-    """Add the effects that a cell declares; settings are fitted by ``ml``, then all by the method that was asked for.
+    """Add the effects that a cell declares; settings are fitted by ``ml``,
+    then all by the method that was asked for.
 
     There is no step without effects.
 
@@ -776,7 +938,10 @@ def with_effects_of_cell(
     estimate = start.estimate
     by_ml = by_likelihood(estimate, start.system)
     steps = with_declared(
-        replace(gather(start), estimate=by_ml), effects, np.random.default_rng(BOOTSTRAP_SEED), axes=axes
+        replace(gather(start), estimate=by_ml),
+        effects,
+        np.random.default_rng(BOOTSTRAP_SEED),
+        axes=axes,
     )
     after = steps[-1].after
     if estimate.method is not Method.ML:
@@ -788,6 +953,8 @@ def with_effects_of_cell(
 
 
 def with_declared_again(evidence: Evidence, estimate: Estimate) -> Evidence:
-    """Fit the same data and effects by the estimator, and with the gains, of an estimate without effects."""
+    """Fit the same data and effects by the estimator, and with the gains,
+    of an estimate without effects.
+    """
     refitted = with_effects(without_effects(evidence, estimate), evidence.effects)
     return replace(refitted, declared=evidence.declared)

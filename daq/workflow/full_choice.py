@@ -1,7 +1,9 @@
-"""All standard parameters of a calibrated robot, for simulators: of the fit's prior, or the bodies nearest to a URDF.
+"""All standard parameters of a calibrated robot, for simulators:
+of the fit's prior, or the bodies nearest to a URDF.
 
-A calibration with `full_parameters` (`fit --prior`) has every parameter, each with what it rests on. Without them, the
-bodies nearest to the cell's URDF are chosen among all that have the identified torque (`physical_robot`).
+A calibration with `full_parameters` (`fit --prior`) has every parameter, each with what it rests
+on. Without them, the bodies nearest to the cell's URDF are chosen among all that have the
+identified torque (`physical_robot`).
 """
 
 from __future__ import annotations
@@ -42,7 +44,8 @@ class FullChoice:
     chosen_by: ChosenBy
     #: ‖Δτ‖/‖τ‖ against the torque of the base parameters, on random states [%].
     torque_change_percent: RelativeError
-    assumed: tuple[str, ...]  #: joints with a link for which the URDF has no possible inertia, and a ball was taken
+    #: joints with a link for which the URDF has no possible inertia, and a ball was taken
+    assumed: tuple[str, ...]
 
     @property
     def basis(self) -> tuple[RestsOn, ...]:
@@ -55,19 +58,24 @@ class FullChoice:
         return max(self.torque_change_percent.axes) <= 100.0 * EXACT
 
 
-def full_choice(calibration: Calibration, model: Model, limits: FloatArray, urdf: str) -> FullChoice:
+def full_choice(
+    calibration: Calibration, model: Model, limits: FloatArray, urdf: str
+) -> FullChoice:
     """Choose all standard parameters of a calibration's robot.
 
     Args:
         calibration: with base parameters, and with full ones where its fit had a prior.
         model: the declared model of the same robot.
-        limits: ranges in which torques are compared, as of `ident.physical.physical.random_motion`, shape (4, n).
-        urdf: text of the cell's URDF, which is the prior where the calibration has no full parameters.
+        limits: ranges in which torques are compared, as of `ident.physical.physical.random_motion`,
+            shape (4, n).
+        urdf: text of the cell's URDF, which is the prior where the calibration has no full
+            parameters.
 
     Raises:
         ModelError: the calibration is of another robot.
         NotPhysical: no possible robot was found.
-        ModuleNotFoundError: a semidefinite programme has to be solved, and cvxpy or Clarabel is not installed.
+        ModuleNotFoundError: a semidefinite programme has to be solved, and cvxpy or Clarabel is not
+            installed.
     """
     found = calibration.full_parameters
     assumed: tuple[str, ...] = ()
@@ -101,8 +109,8 @@ def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, FloatArray]:
     if set(by_name) != set(names):
         different = sorted(set(by_name) ^ set(names))
         raise ModelError(
-            f"full_parameters of the calibration are of another robot: {', '.join(different)} in one of the two only; "
-            "use the cell of the fit"
+            f"full_parameters of the calibration are of another robot: {', '.join(different)} in "
+            "one of the two only; use the cell of the fit"
         )
     standard = np.array([by_name[name].value for name in names])
     return standard, np.array([by_name[name].prior_share for name in names])
@@ -111,7 +119,9 @@ def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, FloatArray]:
 def _shares_of_nearest(calibration: Calibration, robot: PhysicalRobot) -> FloatArray:
     base = robot.parameters.base
     prior = LinkPrior(robot.prior.links, DEFAULT_TOLERANCE)
-    return prior_shares(robot.parameters.model, base.grouping, _covariance_of(calibration, base.names), prior)
+    return prior_shares(
+        robot.parameters.model, base.grouping, _covariance_of(calibration, base.names), prior
+    )
 
 
 def _covariance_of(calibration: Calibration, names: tuple[str, ...]) -> FloatArray:

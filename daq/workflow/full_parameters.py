@@ -1,4 +1,6 @@
-"""Full parameters of a fitted robot under a prior: the inertias of a URDF, and how far they may be off."""
+"""Full parameters of a fitted robot under a prior:
+the inertias of a URDF, and how far they may be off.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,11 @@ from ident.physical.full_parameters import FullParameters, LinkPrior, full_param
 from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
 from ident.physical.prior_check import PriorCheck
 
-DEFAULT_TOLERANCE = 0.1  #: Of a CAD model: masses and second moments within 10 %, one standard deviation
+#: Of a CAD model: masses and second moments within 10 %, one standard deviation
+DEFAULT_TOLERANCE = 0.1
 OF_CELL = "the URDF of the cell"
-_SAME_PLACE = 1e-6  #: Largest difference of two statements of one joint's place [m, or of a unit vector]
+#: Largest difference of two statements of one joint's place [m, or of a unit vector]
+_SAME_PLACE = 1e-6
 
 
 def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
@@ -37,8 +41,8 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
         tolerance: one relative standard deviation of masses and second moments.
 
     Raises:
-        UsageError: the robot has a closed chain, the URDF has no inertia for one of its links, or the gains are by an
-            estimator whose σ takes neighbouring rows for independent.
+        UsageError: the robot has a closed chain, the URDF has no inertia for one of its links, or
+            the gains are by an estimator whose σ takes neighbouring rows for independent.
         ConfigurationInconsistent: the URDF is of another robot.
         NotPhysical: no possible robot was found.
     """
@@ -47,7 +51,9 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     prior = LinkPrior(links, tolerance)
     final = fitted.final
     effects = fitted.steps[-1].after.effects if fitted.steps else ()
-    friction = frozenset(one.axis for one in effects if one.effect.declares is Property.ODD_IN_VELOCITY)
+    friction = frozenset(
+        one.axis for one in effects if one.effect.declares is Property.ODD_IN_VELOCITY
+    )
     try:
         found = full_parameters(final.system, _with_std_by_moves(fitted), prior, friction)
     except ModelError as error:
@@ -86,8 +92,9 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
 def _with_std_by_moves(fitted: Fit) -> Estimate:
     """Return the estimate with σ from leaving out moves.
 
-    Neighbouring rows share their errors. σ of ``ls``, ``wls`` and ``tls`` takes them for independent, which would call
-    data what is the prior's, and right priors wrong. With fixed gains, ``ml`` fits the same parameters.
+    Neighbouring rows share their errors. σ of ``ls``, ``wls`` and ``tls`` takes them for
+    independent, which would call data what is the prior's, and right priors wrong. With fixed
+    gains, ``ml`` fits the same parameters.
 
     Raises:
         UsageError: of free gains, whose values ``ml`` would change.
@@ -113,7 +120,9 @@ def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
         joints: names of the joints that move the links.
     """
     if check.is_mass_wrong:
-        yield f"by the data, the links together are {_weight(check.mass_ratio, check.mass_ratio_std)}"
+        yield (
+            f"by the data, the links together are {_weight(check.mass_ratio, check.mass_ratio_std)}"
+        )
     for link in check.wrong_links:
         weight = _weight(float(check.link_ratios[link]), float(check.link_ratio_stds[link]))
         yield f"by the data, the link of joint {joints[link]} is {weight}"
@@ -125,7 +134,9 @@ def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
 
 
 def _weight(ratio: float, std: float) -> str:
-    """Say how heavy something is relative to the prior; a ratio of least squares may be negative, a mass not."""
+    """Say how heavy something is relative to the prior;
+    a ratio of least squares may be negative, a mass not.
+    """
     if ratio <= std:
         return "far lighter than it says"
     return f"{ratio:.2f} ± {std:.2f} times as heavy as it says"
@@ -154,7 +165,11 @@ def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> Fl
         raise ConfigurationInconsistent(
             name, found=str(error), expected="a URDF", remedy="give another file as --prior"
         ) from error
-    differences = [mine.name for mine, other in zip(joints, found.joints, strict=False) if not _is_same(mine, other)]
+    differences = [
+        mine.name
+        for mine, other in zip(joints, found.joints, strict=False)
+        if not _is_same(mine, other)
+    ]
     if len(joints) != len(found.joints):
         differences = [f"{len(found.joints)} moving joints"]
     if differences:
@@ -174,7 +189,8 @@ def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> Fl
         raise UsageError(
             name,
             found=f"no possible inertia for the links of {', '.join(without)}",
-            expected="a positive mass and an inertia with the triangle inequality for each moving link",
+            expected="a positive mass and an inertia with the triangle inequality for each "
+            "moving link",
             remedy="give a URDF with the inertias of the CAD model as --prior",
         )
     return np.array([body.parameters for body in found.bodies])
@@ -192,6 +208,8 @@ def _is_same(mine: Joint, other: Joint) -> bool:
 
 
 def _is_body(mass_kg: float, inertia_kg_m2: FloatArray) -> bool:
-    """Whether mass and inertia about the centre of mass are those of a body, one that is not flat or thin."""
+    """Whether mass and inertia about the centre of mass are those of a body,
+    one that is not flat or thin.
+    """
     moments = np.linalg.eigvalsh(inertia_kg_m2)
     return mass_kg > 0.0 and float(moments[0] + moments[1]) > float(moments[2])

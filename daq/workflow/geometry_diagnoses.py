@@ -1,8 +1,9 @@
-"""The geometry of a cell whose robot has more encoders than degrees of freedom: what is said of it, and what is kept.
+"""The geometry of a cell whose robot has more encoders than degrees of freedom:
+what is said of it, and what is kept.
 
-`ident.estimators.geometry_estimate` finds which numbers of the description the encoders contradict. `fit` names them
-and keeps to the description; `residual` identifies with the corrected numbers, and a calibration says which they are,
-so that `validate` and `weigh` predict with the same geometry.
+`ident.estimators.geometry_estimate` finds which numbers of the description the encoders contradict.
+`fit` names them and keeps to the description; `residual` identifies with the corrected numbers, and
+a calibration says which they are, so that `validate` and `weigh` predict with the same geometry.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ from ident.model.robot import JointKind
 if TYPE_CHECKING:  # who predicts with a calibration estimates no geometry
     from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 
+#: Diagnoses of one cause.
 NAMES = {
     GeometryKind.ZERO: "zero-off",
     GeometryKind.LENGTH: "length-off",
     GeometryKind.PLACE: "place-off",
     GeometryKind.DELAY: "position-late",
-}  #: Diagnoses of one cause
+}
 SEVERAL = "geometry-off"  #: Diagnosis of several, and of a misfit without an explanation
 UNEXPLAINED = "no zero, length, place on the base or late encoder explains, nor any three of them"
 LOOK_FOR = (
-    "look for arms that bend, play in joints, encoders that do not count evenly, and more than three wrong numbers; "
-    "measure zeros, lengths and places, and correct cell file and URDF"
+    "look for arms that bend, play in joints, encoders that do not count evenly, and more than "
+    "three wrong numbers; measure zeros, lengths and places, and correct cell file and URDF"
 )
 MM = 1e-3  #: [m]
 MS = 1e-3  #: [s]
@@ -40,7 +42,9 @@ ANGLE = "rad"  #: Unit of misfits of a robot without prismatic axes
 _SHOWN_ALTERNATIVES = 3
 
 
-def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: bool) -> Iterator[Diagnosis]:
+def geometry_diagnoses(
+    finding: GeometryFinding | None, cell: Cell, *, applied: bool
+) -> Iterator[Diagnosis]:
     """Name the numbers of the description that the encoders contradict.
 
     Args:
@@ -56,7 +60,10 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
     if applied:
         used = "the gains are those of the corrected geometry"
     elif finding.corrections:
-        used = "the gains are those of the described geometry: `drivegain residual` identifies with the corrected one"
+        used = (
+            "the gains are those of the described geometry: `drivegain residual` identifies "
+            "with the corrected one"
+        )
     else:
         used = "the gains are those of the described geometry"
     if not finding.causes:
@@ -74,13 +81,16 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
     several = len(finding.causes) > 1
     ambiguous = ""
     if finding.alternatives:
-        others = [_explanation_text(other, cell) for other in finding.alternatives[:_SHOWN_ALTERNATIVES]]
+        others = [
+            _explanation_text(other, cell) for other in finding.alternatives[:_SHOWN_ALTERNATIVES]
+        ]
         ambiguous = f" (not distinguishable from {'; '.join(others)})"
     yield Diagnosis(
         name=SEVERAL if several else NAMES[finding.causes[0].parameter.kind],
         runs=(),
         axes=tuple(_axes_of(finding.causes, cell)),
-        found=f"{misfit}, which {' and '.join(texts)} {'explain together' if several else 'explains alone'}{ambiguous}",
+        found=f"{misfit}, which {' and '.join(texts)} "
+        f"{'explain together' if several else 'explains alone'}{ambiguous}",
         expected=expected,
         remedy=f"{', and '.join(remedies)}; {used}",
     )
@@ -89,7 +99,9 @@ def geometry_diagnoses(finding: GeometryFinding | None, cell: Cell, *, applied: 
 def _misfit_unit(model: Model) -> str:
     """Unit of misfits: that of the axes, or a share of the robot's size too."""
     kinds = {joint.kind for joint in model.robot.axes}
-    return ANGLE if kinds == {JointKind.REVOLUTE} else "rad or robot size"
+    if kinds == {JointKind.REVOLUTE}:
+        return ANGLE
+    return "rad or robot size"
 
 
 def misfit_text(misfit: float, unit: str) -> str:
@@ -124,11 +136,15 @@ def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> st
 
 
 def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
-    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003° (to be added to its position)`."""
+    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003° (to be added to its
+    position)`.
+    """
     match one.parameter.kind:
         case GeometryKind.ZERO:
             axis = _axis_of(one.parameter, cell)
-            return zero_off_text(axis.name, one.change / axis.unit.si, one.std / axis.unit.si, _unit_of_zero(axis))
+            return zero_off_text(
+                axis.name, one.change / axis.unit.si, one.std / axis.unit.si, _unit_of_zero(axis)
+            )
         case GeometryKind.LENGTH:
             longer = "longer" if one.change > 0.0 else "shorter"
             size = _size_text(abs(one.change), one.std, MM)
@@ -168,15 +184,17 @@ def _remedy(one: GeometryEstimate, cell: Cell) -> str:
             return f"correct the {one.parameter.name} in the URDF: {right}"
         case GeometryKind.DELAY:
             return (
-                f"look for what delays the encoder of {_axis_of(one.parameter, cell).name} alone: a filter, a slower "
-                "channel, another time stamp than that of the other axes"
+                f"look for what delays the encoder of {_axis_of(one.parameter, cell).name} alone: "
+                "a filter, a slower channel, another time stamp than that of the other axes"
             )
 
 
 # What a calibration keeps
 
 
-def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: bool) -> EncoderMisfit | None:
+def encoder_misfit_of(
+    finding: GeometryFinding | None, cell: Cell, *, applied: bool
+) -> EncoderMisfit | None:
     """Make what a calibration keeps of a finding; arguments as for `geometry_diagnoses`."""
     if finding is None:
         return None
@@ -195,7 +213,9 @@ def encoder_misfit_of(finding: GeometryFinding | None, cell: Cell, *, applied: b
 
 
 def _late_text(finding: GeometryFinding, cell: Cell) -> str:
-    """Explanations in which an encoder is late, and those that cannot be distinguished from them."""
+    """Explanations in which an encoder is late,
+    and those that cannot be distinguished from them.
+    """
     explanations = (finding.causes, *finding.alternatives)
     return "; or by ".join(_explanation_text(one, cell) for one in explanations)
 
@@ -225,9 +245,11 @@ def _rounded(value: float) -> float:
 
 
 def calibrated_model(calibration: Calibration, cell: Cell) -> Model:
-    """Build the model with which a calibration predicts: that of the cell, with the geometry of its fit.
+    """Build the model with which a calibration predicts:
+    that of the cell, with the geometry of its fit.
 
-    The corrected numbers hold, whatever the cell says now: one that was corrected meanwhile is not corrected twice.
+    The corrected numbers hold, whatever the cell says now: one that was corrected meanwhile is not
+    corrected twice.
 
     Raises:
         ModelError: the robot is described otherwise than at the fit.

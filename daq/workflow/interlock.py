@@ -1,4 +1,6 @@
-"""The interlock of a cell, which may hold back a motion as the drives may, and the commands that a cell file names."""
+"""The interlock of a cell, which may hold back a motion as the drives may,
+and the commands that a cell file names.
+"""
 
 from __future__ import annotations
 
@@ -28,22 +30,27 @@ _READ_BYTES = 1 << 16
 class Finished:
     """How a program ended."""
 
-    code: int | None  #: exit code; negative for the signal that ended it; None where it never ran, or ran too long
+    #: exit code; negative for the signal that ended it; None where it never ran, or ran too long
+    code: int | None
     said: str  #: the end of what it said, or why it did not run
 
     def __str__(self) -> str:
-        ended = "no exit code" if self.code is None else f"exit code {self.code}"
+        if self.code is None:
+            ended = "no exit code"
+        else:
+            ended = f"exit code {self.code}"
         return f"{ended}{f' ({self.said})' if self.said else ''}"
 
 
-Runner = Callable[[Command, tuple[str, ...], Path], Finished]  #: Runs a command with further arguments in a folder
+#: Runs a command with further arguments in a folder
+Runner = Callable[[Command, tuple[str, ...], Path], Finished]
 
 
 def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
     """Run a program to its end, without a shell and without our input.
 
-    It has a session of its own: a Ctrl-C that stops us does not end it half-way unasked, and when it takes too long, or
-    we are interrupted, all that it started is ended with it.
+    It has a session of its own: a Ctrl-C that stops us does not end it half-way unasked, and when
+    it takes too long, or we are interrupted, all that it started is ended with it.
     """
     try:
         process = subprocess.Popen(
@@ -67,7 +74,9 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
             if isinstance(error, subprocess.TimeoutExpired):
                 return Finished(None, f"not ended within {command.timeout_s:g} s")
             raise
-    return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-MAX_OUTPUT_CHARACTERS:])
+    return Finished(
+        process.returncode, said.decode("utf-8", errors="replace").strip()[-MAX_OUTPUT_CHARACTERS:]
+    )
 
 
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
@@ -91,8 +100,11 @@ def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
 _LOOK_BYTES = 4096
 
 
-def release_check(cell: Cell, now: Callable[[], datetime], run: Runner = run_command) -> Callable[[], None]:
-    """Return the check that the interlock of a cell releases the robot; it does nothing where the cell declares none.
+def release_check(
+    cell: Cell, now: Callable[[], datetime], run: Runner = run_command
+) -> Callable[[], None]:
+    """Return the check that the interlock of a cell releases the robot;
+    it does nothing where the cell declares none.
 
     Args:
         cell: from its file; the interlock is in its `recalibration`.
@@ -105,8 +117,11 @@ def release_check(cell: Cell, now: Callable[[], datetime], run: Runner = run_com
     return partial(require_release, section.interlock, run, now, section.working_folder)
 
 
-def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetime], folder: Path) -> None:
-    """Check that the interlock releases the robot; a program that fails and a file that is unreadable do not.
+def require_release(
+    interlock: Interlock, run: Runner, now: Callable[[], datetime], folder: Path
+) -> None:
+    """Check that the interlock releases the robot;
+    a program that fails and a file that is unreadable do not.
 
     Args:
         now: wall clock, asked when the file is: the command before it may take its time.
@@ -124,7 +139,9 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
 
 def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime]) -> None:
     subject = f"interlock file {file}"
-    expected = f"{interlock.says!r} in its first line, written within the last {interlock.max_age_s:g} s"
+    expected = (
+        f"{interlock.says!r} in its first line, written within the last {interlock.max_age_s:g} s"
+    )
     try:
         with open_regular(file) as stream:
             # Of the file that is open: a gateway may put another in its place meanwhile.
@@ -147,6 +164,6 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         subject,
         found=found,
         expected=expected,
-        remedy="nothing moves: close the cell, let everyone leave it and set automatic mode, then start again; a job "
-        "goes on where it ended",
+        remedy="nothing moves: close the cell, let everyone leave it and set automatic mode, then "
+        "start again; a job goes on where it ended",
     )

@@ -1,15 +1,18 @@
-"""The current that a calibration predicts of the samples as they come, with its band and the residual.
+"""The current that a calibration predicts of the samples as they come,
+with its band and the residual.
 
-The filters are those of the fit, applied to the last samples: a low-pass without phase and central differences for the
-positions, one decimator for predicted and measured current. A row is given once all samples of its window are there,
-some 0.4 s later. At standstill, by the rule of the fit, there is none: stiction hides any current below it.
+The filters are those of the fit, applied to the last samples: a low-pass without phase and central
+differences for the positions, one decimator for predicted and measured current. A row is given once
+all samples of its window are there, some 0.4 s later. At standstill, by the rule of the fit, there
+is none: stiction hides any current below it.
 
-The console draws the rows; `drivegain monitor` judges an axis by the last RECENT_S in which it moved, and points it out
-if more than half of them are outside the band. A single row is outside often enough: at each reversal the model's
-friction errs.
+The console draws the rows; `drivegain monitor` judges an axis by the last RECENT_S in which it
+moved, and points it out if more than half of them are outside the band. A single row is outside
+often enough: at each reversal the model's friction errs.
 
-*Band.* Twice the root mean square of what the calibration left of the motor's current on its held-out run (of the fit,
-without one). It is the size that residuals had, not a limit for alarms, and as large for slow moves as for fast ones.
+*Band.* Twice the root mean square of what the calibration left of the motor's current on its
+held-out run (of the fit, without one). It is the size that residuals had, not a limit for alarms,
+and as large for slow moves as for fast ones.
 """
 
 from __future__ import annotations
@@ -23,7 +26,13 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.errors import DaqError
 from daq.log.feed import RunFacts
-from daq.workflow.validate import check_cell, conditioning_of, on_cell, unpredictable, warn_without_temperature
+from daq.workflow.validate import (
+    check_cell,
+    conditioning_of,
+    on_cell,
+    unpredictable,
+    warn_without_temperature,
+)
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
 from ident.data.conditioning import central_differences, decimator, low_pass
@@ -34,11 +43,15 @@ from ident.model.bodies import Payload
 from ident.model.robot import Motion
 from ident.prediction import as_calibrated, measured_current, predict_current
 
-EDGE_S = 0.15  #: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
-STEP_S = 0.2  #: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the samples
+#: Of a window, where the low-pass is not yet what it is over a whole run (to 2·10⁻⁵ at 40 Hz)
+EDGE_S = 0.15
+#: Samples that are predicted at once: each prediction costs 2 ms, and most of it is not for the
+#: samples
+STEP_S = 0.2
 RECENT_S = 10.0  #: Of motion whose rows are judged together
 LEAST_S = 2.0  #: Of motion before they are judged
-STANDSTILL_SHARE_OF_LIMIT = 0.01  #: Of the speed limit, where the calibration's filter has no standstill speeds
+#: Of the speed limit, where the calibration's filter has no standstill speeds
+STANDSTILL_SHARE_OF_LIMIT = 0.01
 LIVE = "the live motion"  #: Its name in errors and warnings
 
 
@@ -56,7 +69,8 @@ class PredictedRows:
 class RecentCurrent:
     """Current of one motor lately [unit of the gains' current]."""
 
-    measured: float | None  #: filtered, at the last row; None at standstill, or where the scale is unknown
+    #: filtered, at the last row; None at standstill, or where the scale is unknown
+    measured: float | None
     predicted: float | None  #: at the same moment; None at standstill
     band: float | None  #: half the band; None where the calibration has none
     residual_rms: float | None  #: over the last RECENT_S of motion; None without any
@@ -86,9 +100,16 @@ class Recent:
             return []
         found = []
         for predicted, left, band, moving in zip(
-            self._last.predicted[-1], self._last.residual[-1], self._last.band, self._moving, strict=True
+            self._last.predicted[-1],
+            self._last.residual[-1],
+            self._last.band,
+            self._moving,
+            strict=True,
         ):
-            share = float(np.mean(np.abs(moving) > band)) if len(moving) else 0.0
+            if len(moving):
+                share = float(np.mean(np.abs(moving) > band))
+            else:
+                share = 0.0
             found.append(
                 RecentCurrent(
                     measured=float(predicted + left) if np.isfinite(left) else None,
@@ -105,7 +126,9 @@ class Recent:
 class Predictor:
     """Predicts one run; the samples come in order, in blocks of any length."""
 
-    def __init__(self, calibration: Calibration, cell: Cell, payload: Payload | None, rate_hz: float) -> None:
+    def __init__(
+        self, calibration: Calibration, cell: Cell, payload: Payload | None, rate_hz: float
+    ) -> None:
         """Check that the calibration knows the cell and what is mounted.
 
         Raises:
@@ -114,7 +137,8 @@ class Predictor:
             ModelError: the model of the cell is not that of the calibration.
         """
         check_cell(calibration, cell.folder or Path(cell.name), cell)
-        self.problem = unpredictable(calibration, payload)  #: Why nothing is predicted, empty if it is
+        #: Why nothing is predicted, empty if it is
+        self.problem = unpredictable(calibration, payload)
         self._payload = as_calibrated(calibration, payload, LIVE)
         warn_without_temperature(calibration, LIVE, None)
         self._calibration, self._model = on_cell(calibration, cell)
@@ -127,14 +151,17 @@ class Predictor:
         self._margin = self._filter.half + -(-edge // self._filter.factor) * self._filter.factor
         limits = [STANDSTILL_SHARE_OF_LIMIT * axis.limits.velocity for axis in cell.axes]
         self._still = np.array(self._conditioning.standstill_rad_s or limits)
-        self._band = np.full(len(cell.axes), np.inf)  # calibrations of earlier versions do not say what they left
+        # Calibrations of earlier versions do not say what they left
+        self._band = np.full(len(cell.axes), np.inf)
         if calibration.current_residual is not None:
             self._band = 2.0 * np.array(calibration.current_residual)
         self._cycle = -1
         self._position = np.zeros((0, 0))
         self._current = np.zeros((0, 0))
 
-    def take(self, cycle: IntArray, position_rad: FloatArray, current: FloatArray) -> list[PredictedRows]:
+    def take(
+        self, cycle: IntArray, position_rad: FloatArray, current: FloatArray
+    ) -> list[PredictedRows]:
         """Take samples in their order; returns the rows that are complete now.
 
         Args:
@@ -153,7 +180,9 @@ class Predictor:
         ]
         return [part for part in parts if part is not None]
 
-    def _take(self, cycle: int, position_rad: FloatArray, current: FloatArray) -> PredictedRows | None:
+    def _take(
+        self, cycle: int, position_rad: FloatArray, current: FloatArray
+    ) -> PredictedRows | None:
         if cycle != self._cycle + len(self._position) or not len(self._position):
             self._cycle = cycle
             self._position = position_rad
@@ -178,10 +207,13 @@ class Predictor:
         smooth = low_pass(raw, rate_hz, settings.position_cutoff_hz, settings.position_order)
         position, velocity, acceleration = central_differences(smooth, rate_hz)
         motion = Motion(position.T, velocity.T, acceleration.T)
-        # A recorded motion: what the calibration corrects of recordings, as a late position, is wrong with it too.
+        # A recorded motion: what the calibration corrects of recordings, as a late position, is
+        # wrong with it too.
         data = replace(planned(motion, rate_hz, self._payload), is_planned=False)
         predicted = self._filter(predict_current(self._calibration, self._model, data).T)
-        measured = self._filter(measured_current(self._calibration, self._model, self._current[1:-1], motion).T)
+        measured = self._filter(
+            measured_current(self._calibration, self._model, self._current[1:-1], motion).T
+        )
         centres = self._filter.centres(position.shape[1])
         whole = (centres >= self._margin) & (centres < position.shape[1] - self._margin)
         moving, motor_moving = moving_samples(velocity, self._still, self._model.drive_train)
@@ -190,10 +222,14 @@ class Predictor:
         predicted = predicted[:, whole]
         measured = measured[:, whole]
         predicted = np.where(still, np.nan, predicted)
-        return PredictedRows(self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band)
+        return PredictedRows(
+            self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band
+        )
 
 
-def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[Predictor | None, str]:
+def predictor_of(
+    calibration: Calibration, cell: Cell, run: RunFacts
+) -> tuple[Predictor | None, str]:
     """Return the predictor of a run, and why it predicts nothing, empty if it does."""
     if run.axes != cell.axis_names:
         return None, "no prediction: the run has other axes than the cell file"
@@ -201,8 +237,8 @@ def predictor_of(calibration: Calibration, cell: Cell, run: RunFacts) -> tuple[P
     try:
         if run.rate_hz < 2.0 * (passed_hz := conditioning_of(calibration).position_cutoff_hz):
             return None, (
-                f"no prediction: {run.rate_hz:.3g} positions a second are too few for velocity and acceleration; the "
-                f"fit's filter passes {passed_hz:g} Hz"
+                f"no prediction: {run.rate_hz:.3g} positions a second are too few for velocity and "
+                f"acceleration; the fit's filter passes {passed_hz:g} Hz"
             )
         found = Predictor(calibration, cell, payload, run.rate_hz)
     except (DaqError, IdentificationError) as error:

@@ -1,4 +1,5 @@
-"""Effects of a calibration that a joint of MuJoCo has: springs, and friction of joints without a motor.
+"""Effects of a calibration that a joint of MuJoCo has:
+springs, and friction of joints without a motor.
 
 | effect | at its joint |
 |---|---|
@@ -6,8 +7,8 @@
 | `passive-spring`, τ = c q + a | `stiffness` c, `springref` −a/c |
 | `passive-friction`, τ = a sign(q̇) + b q̇ | `frictionloss` a, `damping` b |
 
-A spring that pushes away, c < 0, and effects in a pivot that a loop is cut at are left out. Beyond the largest
-torque of the fit `predict_torque` limits an effect, and a simulator does not.
+A spring that pushes away, c < 0, and effects in a pivot that a loop is cut at are left out. Beyond
+the largest torque of the fit `predict_torque` limits an effect, and a simulator does not.
 """
 
 from __future__ import annotations
@@ -62,7 +63,10 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
             in_geometry.append(name)
             continue
         joint = _joint_of(placed.axis, robot)
-        own = None if joint is None else _numbers_of(placed.effect, coefficients)
+        if joint is None:
+            own = None
+        else:
+            own = numbers_of(placed.effect, coefficients)
         if own is None or (own[0] > 0.0 and numbers[0, joint] > 0.0):
             left_out.append(name)
         else:
@@ -70,17 +74,25 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
             at_joints.append(name)
     stiffness, spring_rest, damping, dry_friction = numbers
     return JointEffects(
-        stiffness, spring_rest, damping, dry_friction, tuple(at_joints), tuple(in_geometry), tuple(left_out)
+        stiffness,
+        spring_rest,
+        damping,
+        dry_friction,
+        tuple(at_joints),
+        tuple(in_geometry),
+        tuple(left_out),
     )
 
 
 def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, ...]]:
-    """Return a calibration without the effects of packages that are not installed, and a name of each of those.
+    """Return a calibration without the effects of packages that are not installed,
+    and a name of each of those.
 
     A model of a simulator holds no effect of another package, so none is needed to write it.
 
     Raises:
-        EffectRefused: the calibration holds an effect that does not exist, and names no package that had it.
+        EffectRefused: the calibration holds an effect that does not exist, and names no package
+            that had it.
     """
     installed: list[AcceptedEffect] = []
     missing: list[str] = []
@@ -89,7 +101,9 @@ def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, .
         try:
             placed_effect(accepted, calibration)
         except EffectNotInstalled:
-            missing.append(f"{accepted.name} on {accepted.axis} (of {accepted.package}, not installed)")
+            missing.append(
+                f"{accepted.name} on {accepted.axis} (of {accepted.package}, not installed)"
+            )
             gone |= {coefficient.name for coefficient in accepted.coefficients}
         else:
             installed.append(accepted)
@@ -98,11 +112,15 @@ def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, .
 
 
 def _without_parameters(calibration: Calibration, names: Set[str]) -> Calibration:
-    """Leave parameters out, and their rows of the covariance: those of the others stay as they are."""
+    """Leave parameters out, and their rows of the covariance:
+    those of the others stay as they are.
+    """
     if not names:
         return calibration
     is_kept = [parameter.name not in names for parameter in calibration.parameters]
-    parameters = tuple(parameter for parameter in calibration.parameters if parameter.name not in names)
+    parameters = tuple(
+        parameter for parameter in calibration.parameters if parameter.name not in names
+    )
     factor = calibration.covariance_factor
     if factor is not None:
         lower = np.zeros((len(factor), len(factor)))
@@ -117,11 +135,11 @@ def _without_parameters(calibration: Calibration, names: Set[str]) -> Calibratio
 
 def _joint_of(place: int, robot: Robot) -> int | None:
     """Joint of a place of effects (`Robot.places`); None of a pivot that a loop is cut at."""
-    joints = (*robot.axis_joints, *robot.passive_joints)
+    joints = robot.place_joints
     return joints[place] if place < len(joints) else None
 
 
-def _numbers_of(effect: Effect, coefficients: FloatArray) -> FloatArray | None:
+def numbers_of(effect: Effect, coefficients: FloatArray) -> FloatArray | None:
     """Stiffness, rest, damping and dry friction of an effect; None of one that joints do not have.
 
     A class of one's own that derives from one of these has columns of its own.

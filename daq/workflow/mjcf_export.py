@@ -10,10 +10,10 @@
 | closure of a loop | `<connect>` or `<weld>` between two sites |
 | `<visual>`, `<collision>` of the URDF | `<geom>` of class `visual`, `collision`; meshes stay where they are |
 
-MuJoCo makes dry friction a soft constraint. `solreffriction` and `solimpfriction` are as stiff as a step allows: a
-joint that friction can stop within a step stops, and one that moves on has its whole dry friction. Loops are closed by
-soft constraints, too.
-"""
+MuJoCo makes dry friction a soft constraint. `solreffriction` and `solimpfriction` are as stiff as a
+step allows: a joint that friction can stop within a step stops, and one that moves on has its whole
+dry friction. Loops are closed by soft constraints, too.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -40,8 +40,11 @@ from ident.physical.drive_terms import DriveTerms, LeftOver, drive_terms
 FORMAT = "drivegain-mjcf"  #: What the comment at the head of a written model says it is
 TIME_STEP_S = 0.001
 CLOSED_SHARE = 1e-6
-"""Change of a distance from position to position, as a share of the robot's size, below which it is constant."""
-HINGE_SHARE = 0.1  #: Distance of the two points that hold a hinge of a loop, as a share of the robot's size
+"""Change of a distance from position to position, as a share of the robot's size,
+below which it is constant.
+"""
+#: Distance of the two points that hold a hinge of a loop, as a share of the robot's size
+HINGE_SHARE = 0.1
 WORLD = "world"  #: Name of MuJoCo's own body, which no other one may have
 THINNEST_M = 1e-3  #: Shorter links are not drawn
 VISUAL = "visual"  #: Class of the shapes that are drawn
@@ -58,14 +61,16 @@ class MjcfSource:
     model: Model  #: with the geometry that is written
     standard: FloatArray  #: χ_st without payload, of bodies that can exist, shape (c,)
     gains: tuple[Gain, ...]  #: one an axis
-    #: Frames of the URDF's links by name: the joint that moves each of them, and where it is in that joint's frame.
+    #: Frames of the URDF's links by name: the joint that moves each of them, and where it is in
+    #: that joint's frame.
     frames: Mapping[str, Place]
     lower: FloatArray  #: least position of each axis [rad or m], -inf without a limit, shape (m,)
     upper: FloatArray  #: largest position, shape (m,)
     shapes: UrdfShapes  #: of the URDF's links
     folder: Path  #: that the model will be in; names of mesh files are relative to it
     effects: JointEffects  #: of the calibration
-    remarks: tuple[str, ...]  #: for the comment at the head, beside what the writer itself leaves out
+    #: for the comment at the head, beside what the writer itself leaves out
+    remarks: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,16 +88,25 @@ def write_mjcf(source: MjcfSource, closed_positions: FloatArray) -> Mjcf:
 
     Args:
         source: the robot.
-        closed_positions: some positions of all joints at which the loops are closed, shape (k, n); of a serial robot
-            they do not matter.
+        closed_positions: some positions of all joints at which the loops are closed, shape (k, n);
+            of a serial robot they do not matter.
     """
     model = source.model
     robot = model.robot
     terms = drive_terms(model, source.standard)
     root = Element("mujoco", model=source.name)
-    SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false", balanceinertia="false")
+    SubElement(
+        root,
+        "compiler",
+        angle="radian",
+        autolimits="true",
+        inertiafromgeom="false",
+        balanceinertia="false",
+    )
     gravity = _numbers(robot.gravity_m_s2)
-    SubElement(root, "option", timestep=repr(TIME_STEP_S), gravity=gravity, integrator="implicitfast")
+    SubElement(
+        root, "option", timestep=repr(TIME_STEP_S), gravity=gravity, integrator="implicitfast"
+    )
     _add_defaults(root)
     meshes = _add_meshes(root, source)
     bodies = _add_bodies(root, source, terms)
@@ -101,7 +115,7 @@ def write_mjcf(source: MjcfSource, closed_positions: FloatArray) -> Mjcf:
     open_closures = tuple(_add_closures(root, source, bodies, closed_positions))
     _add_tendons(root, source, terms)
     actuators = tuple(_add_actuators(root, source))
-    if robot.closures:
+    if robot.is_constrained:
         keyframe = SubElement(root, "keyframe")
         SubElement(keyframe, "key", name="assembly", qpos=_numbers(model.assembly.position_rad))
     left = [*source.remarks, *_describe_left(terms.left_over, open_closures, _units(source.gains))]
@@ -121,7 +135,16 @@ def _add_defaults(root: Element) -> None:
     SubElement(default, "tendon", friction)
     SubElement(default, "equality", solref=_numbers((4.0 * TIME_STEP_S, 1.0)))
     # What is drawn has neither mass nor contact.
-    SubElement(default, "geom", type="capsule", size="0.02", contype="0", conaffinity="0", mass="0", group="2")
+    SubElement(
+        default,
+        "geom",
+        type="capsule",
+        size="0.02",
+        contype="0",
+        conaffinity="0",
+        mass="0",
+        group="2",
+    )
     visual = SubElement(default, "default", {"class": VISUAL})
     SubElement(visual, "geom", group="2")
     # Contact changes torques: who wants it gives this class contype="1" conaffinity="1".
@@ -147,7 +170,9 @@ def _add_meshes(root: Element, source: MjcfSource) -> dict[tuple[Path, tuple[flo
 
 
 def _add_shapes(
-    source: MjcfSource, bodies: Sequence[Element], meshes: Mapping[tuple[Path, tuple[float, ...]], str]
+    source: MjcfSource,
+    bodies: Sequence[Element],
+    meshes: Mapping[tuple[Path, tuple[float, ...]], str],
 ) -> None:
     """Add what the URDF shows of its links, and the shapes that they touch others with."""
     for shape in source.shapes.found:
@@ -198,7 +223,14 @@ def _add_bodies(root: Element, source: MjcfSource, terms: DriveTerms) -> list[El
         inertial = body_of(links[index])
         tensor = inertial.inertia_kg_m2
         # MuJoCo's order: the diagonal first.
-        entries = (tensor[0, 0], tensor[1, 1], tensor[2, 2], tensor[0, 1], tensor[0, 2], tensor[1, 2])
+        entries = (
+            tensor[0, 0],
+            tensor[1, 1],
+            tensor[2, 2],
+            tensor[0, 1],
+            tensor[0, 2],
+            tensor[1, 2],
+        )
         SubElement(
             body,
             "inertial",
@@ -226,7 +258,9 @@ def _add_joint(body: Element, source: MjcfSource, terms: DriveTerms, index: int)
 
 
 def joint_drive(source: MjcfSource, terms: DriveTerms, index: int) -> dict[str, float]:
-    """Rotor, friction and spring of a joint, by the attributes of MuJoCo; those of a spring only where it has one."""
+    """Rotor, friction and spring of a joint, by the attributes of MuJoCo;
+    those of a spring only where it has one.
+    """
     robot = source.model.robot
     effects = source.effects
     drive = {
@@ -246,7 +280,8 @@ def joint_drive(source: MjcfSource, terms: DriveTerms, index: int) -> dict[str, 
 
 
 def _body_names(source: MjcfSource) -> list[str]:
-    """Name of the URDF's link that each joint moves: of links with its frame, the first from the base.
+    """Name of the URDF's link that each joint moves:
+    of links with its frame, the first from the base.
 
     A link with the name of MuJoCo's own body gets another one, and a site keeps its name.
     """
@@ -283,11 +318,21 @@ def _add_site(bodies: Sequence[Element], name: str, place: Place) -> None:
 def _add_closures(
     root: Element, source: MjcfSource, bodies: Sequence[Element], closed_positions: FloatArray
 ) -> Iterator[str]:
-    """Add a constraint for each closure, and return those that MuJoCo has none for."""
+    """Add a constraint for each follower and closure,
+    and return the closures that MuJoCo has none for.
+    """
     robot = source.model.robot
-    if not robot.closures:
+    if not robot.is_constrained:
         return
     equality = SubElement(root, "equality")
+    for coupling in robot.couplings:
+        SubElement(
+            equality,
+            "joint",
+            joint1=robot.joints[coupling.follower].name,
+            joint2=robot.joints[coupling.leader].name,
+            polycoef=_numbers((coupling.offset, coupling.multiplier, 0.0, 0.0, 0.0)),
+        )
     size_m = source.model.assembly.size_m
     for closure in robot.closures:
         holds = set(closure.directions)
@@ -307,7 +352,8 @@ def _add_closures(
 
 
 def _lasting_gap(source: MjcfSource, closure: Closure, positions: FloatArray) -> FloatArray | None:
-    """Where the second frame of a closure is in its first, if it is there at every position, shape (3,) [m].
+    """Where the second frame of a closure is in its first, if it is there at every position,
+    shape (3,) [m].
 
     A planar mechanism closes in two directions and stays where it is in the third one.
     """
@@ -368,7 +414,9 @@ def _add_actuators(root: Element, source: MjcfSource) -> Iterator[str]:
         is_coupled = axis in model.drive_train.coupled
         acts_on = "tendon" if is_coupled else "joint"
         name = gain.axis if is_coupled else model.robot.axes[axis].name
-        SubElement(actuator, "motor", {"name": gain.axis, acts_on: name, "gear": _number(gain.value)})
+        SubElement(
+            actuator, "motor", {"name": gain.axis, acts_on: name, "gear": _number(gain.value)}
+        )
         yield f"{acts_on} {name}"
 
 
@@ -378,8 +426,13 @@ def _units(gains: Sequence[Gain]) -> str:
     return ", ".join(units)
 
 
-def _describe_left(left_over: Sequence[LeftOver], open_closures: Sequence[str], units: str) -> Iterator[str]:
-    yield f"ctrl of each actuator is the current reference of its drive [{units}], gear its identified drive gain"
+def _describe_left(
+    left_over: Sequence[LeftOver], open_closures: Sequence[str], units: str
+) -> Iterator[str]:
+    yield (
+        f"ctrl of each actuator is the current reference of its drive [{units}], gear its "
+        "identified drive gain"
+    )
     if left_over:
         shown = ", ".join(f"{left.name} = {left.value:.6g} {left.unit}" for left in left_over)
         yield f"NOT in this model: {shown}"

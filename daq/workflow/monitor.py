@@ -1,7 +1,9 @@
-"""The work of `drivegain monitor`: it reads the bus, publishes every sample for consoles, and predicts the currents.
+"""The work of `drivegain monitor`: it reads the bus, publishes every sample for consoles,
+and predicts the currents.
 
-While a recorder of drivegain leads the bus, the recorder's feed names the run: its rate, payload and the scale of its
-currents. Beside another master the rate is counted, and the scale is known only if the drives were queried before.
+While a recorder of drivegain leads the bus, the recorder's feed names the run: its rate, payload
+and the scale of its currents. Beside another master the rate is counted, and the scale is known
+only if the drives were queried before.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ class _SampleSource:
 
     reading: ReadingSource
     recorded: bool  #: the facts are those of a recorder
-    rate_hz: float | None  #: of the samples, counted here; None if recorded: it is then in the recorder's facts
+    #: of the samples, counted here; None if recorded: it is then in the recorder's facts
+    rate_hz: float | None
     ampere: tuple[float | None, ...]
 
 
@@ -64,10 +67,13 @@ class WatchedCell:
     """One reading of the bus with all that is shown beside it."""
 
     reading: CellReading
-    position: Sequence[float | None]  #: of each joint [rad or m], None where a motor that moves it is unknown
-    ampere: Sequence[float | None]  #: amperes per raw unit of each axis' current, None where unknown
+    #: of each joint [rad or m], None where a motor that moves it is unknown
+    position: Sequence[float | None]
+    #: amperes per raw unit of each axis' current, None where unknown
+    ampere: Sequence[float | None]
     events: Sequence[CellEvent]  #: recent ones, oldest first
-    faults: Mapping[str, ErrorCode] = field(default_factory=dict)  #: error code of axes in fault, by name
+    #: error code of axes in fault, by name
+    faults: Mapping[str, ErrorCode] = field(default_factory=dict)
     recorder: bool = False  #: whether a recording or job of drivegain on this computer has the bus
     prediction: CellPrediction | None = None  #: None without a calibration
 
@@ -91,10 +97,13 @@ class CellWatch:
         self._calibration = calibration
         self._payload = payload
         offset_ns = time.time_ns() - network.link.clock()
-        self._monitor = CellMonitor(network.link, network.axes, self._take, offset_ns, taken=lambda: bus_taken(cell))
+        self._monitor = CellMonitor(
+            network.link, network.axes, self._take, offset_ns, taken=lambda: bus_taken(cell)
+        )
         self._ampere: list[float | None] = [None] * len(network.axes)
         self._events: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)
-        self._alarms: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)  # which other events do not displace
+        # Kept apart, so that other events do not displace them.
+        self._alarms: deque[CellEvent] = deque(maxlen=KEPT_EVENTS)
         self._unscaled = set(range(len(network.axes)))  # axes whose scale was not asked for yet
         self._lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP
         self._codes: dict[int, int] = {}  # last error code of each axis that is in fault
@@ -152,7 +161,10 @@ class CellWatch:
                 continue  # another master is no event here: the head line names it
             (self._alarms if event.kind in ALARMING else self._events).append(event)
             if event.axis is not None and event.kind in (EventKind.EMCY, EventKind.EMCY_RESET):
-                self._codes[event.axis] = event.code if event.kind is EventKind.EMCY else 0
+                if event.kind is EventKind.EMCY:
+                    self._codes[event.axis] = event.code
+                else:
+                    self._codes[event.axis] = 0
             if self._facts is not None:
                 self._feed.event(event)
         for number, axis in enumerate(reading.axes):
@@ -160,13 +172,16 @@ class CellWatch:
                 self._codes.pop(number, None)
 
     def _query(self, reading: CellReading) -> None:
-        """On a quiet bus, read the current's scale of each axis once, and the error code of an axis in fault."""
+        """On a quiet bus, read the current's scale of each axis once,
+        and the error code of an axis in fault.
+        """
         asked = reading.source is ReadingSource.ASKED
         for number, (axis, found) in enumerate(zip(self._network.axes, reading.axes, strict=True)):
             if not asked or found.delay_s is None or found.is_late:
                 continue
             if bus_taken(self._cell):
-                return  # a recorder has come meanwhile, and would refuse a bus on which it hears requests
+                # A recorder has come meanwhile, and would refuse a bus on which it hears requests
+                return
             if number in self._unscaled:
                 self._unscaled.remove(number)
                 self._monitor.pause()
@@ -179,14 +194,20 @@ class CellWatch:
                 self._publish_fault(number)
 
     def _publish_fault(self, axis: int) -> None:
-        """Show an error to the console that it cannot know: of before the run, or read from the drive."""
+        """Show an error to the console that it cannot know:
+        of before the run, or read from the drive.
+        """
         code = self._codes[axis]
         if code and self._facts is not None:
             text = f"in fault: {explain(code).hex} {explain(code).text}"
             self._feed.event(CellEvent(time.time_ns(), axis, EventKind.EMCY, code, text))
 
     def _faults(self) -> dict[str, ErrorCode]:
-        return {self._cell.axis_names[axis]: explain_error_code(code) for axis, code in self._codes.items() if code}
+        return {
+            self._cell.axis_names[axis]: explain_error_code(code)
+            for axis, code in self._codes.items()
+            if code
+        }
 
     def _follow(self, reading: CellReading, recorder: bool) -> None:
         """Begin anew where the source of the samples has changed."""
@@ -198,7 +219,10 @@ class CellWatch:
             return
         recorder = recorder and reading.source is ReadingSource.OVERHEARD
         recorded = self._source is not None and self._source.recorded and recorder
-        run = facts_of_recorder(self._cell_file, FACTS_S) if recorder and not recorded else None
+        if recorder and not recorded:
+            run = facts_of_recorder(self._cell_file, FACTS_S)
+        else:
+            run = None
         if run is not None:
             self._ampere = [value if isfinite(value) else None for value in run.current_per_unit]
         recorded = recorded or run is not None
@@ -211,14 +235,18 @@ class CellWatch:
         self._source = source
         try:
             self._begin(
-                self._own_facts(rate_hz or 0.0) if run is None else replace(run, log=None, moves=0, bus_load={})
+                self._own_facts(rate_hz or 0.0)
+                if run is None
+                else replace(run, log=None, moves=0, bus_load={})
             )
         except LogIncomplete as error:
             self._facts = None
             self._remark = str(error)
 
     def _rate_hz(self, reading: CellReading) -> float | None:
-        """Rate of the samples; None where SYNC began or changed within a reading, whose count is then not its rate."""
+        """Rate of the samples; None where SYNC began or changed within a reading,
+        whose count is then not its rate.
+        """
         if reading.source is ReadingSource.ASKED:
             return 1.0 / READING_S
         sync = self._cell.sync
@@ -229,10 +257,19 @@ class CellWatch:
         self._sync_hz = reading.sync_hz
         counting_hz = 2.0 / reading.seconds  # error of a count of SYNCs
         known = self._source
-        known_hz = None if known is None or known.reading is not reading.source else known.rate_hz
-        if known_hz is not None and abs(reading.sync_hz - known_hz) < CHANGED_RATE * known_hz + counting_hz:
+        if known is None or known.reading is not reading.source:
+            known_hz = None
+        else:
+            known_hz = known.rate_hz
+        if (
+            known_hz is not None
+            and abs(reading.sync_hz - known_hz) < CHANGED_RATE * known_hz + counting_hz
+        ):
             return known_hz
-        if before_hz == 0.0 or abs(reading.sync_hz - before_hz) > SAME_RATE * before_hz + counting_hz:
+        if (
+            before_hz == 0.0
+            or abs(reading.sync_hz - before_hz) > SAME_RATE * before_hz + counting_hz
+        ):
             return None
         same = abs(reading.sync_hz - declared_hz) < SAME_RATE * declared_hz + counting_hz
         return declared_hz if same else reading.sync_hz
@@ -241,7 +278,9 @@ class CellWatch:
         """Facts of a run that no recorder names."""
         units = (nan if ampere is None else ampere for ampere in self._ampere)
         answers = zip(self._cell.axis_names, units, strict=True)
-        scale = scaling(self._cell, Readback(tuple(AxisReadback(name, unit) for name, unit in answers)))
+        scale = scaling(
+            self._cell, Readback(tuple(AxisReadback(name, unit) for name, unit in answers))
+        )
         return RunFacts(
             run_id="monitor",
             log=None,
@@ -258,7 +297,10 @@ class CellWatch:
 
     def _begin(self, facts: RunFacts) -> None:
         """Publish a run and begin its prediction."""
-        self._monitor.period_ns = None if self._lockstep else round(1e9 / facts.rate_hz)
+        if self._lockstep:
+            self._monitor.period_ns = None
+        else:
+            self._monitor.period_ns = round(1e9 / facts.rate_hz)
         self._facts = facts
         self._count = 0
         self._missing = [0] * len(facts.axes)
@@ -268,10 +310,15 @@ class CellWatch:
         self._predictor = self._recent = None
         if self._calibration is not None:
             self._predictor, self._remark = predictor_of(self._calibration, self._cell, facts)
-            self._recent = None if self._predictor is None else Recent(self._predictor.rows_hz)
+            if self._predictor is None:
+                self._recent = None
+            else:
+                self._recent = Recent(self._predictor.rows_hz)
 
     def _statistics(self) -> RunStatistics:
-        return RunStatistics(self._count, len(self._cycles) - self._count, tuple(self._missing), valid=True)
+        return RunStatistics(
+            self._count, len(self._cycles) - self._count, tuple(self._missing), valid=True
+        )
 
     def _predict(self) -> None:
         """Take the samples of a reading."""
@@ -280,10 +327,14 @@ class CellWatch:
         if self._predictor is None or self._recent is None or self._facts is None or not whole:
             return
         scale = self._facts.scaling
-        position = scale.joint_position(np.array([sample.position_counts for sample in whole], dtype=np.int64))
+        position = scale.joint_position(
+            np.array([sample.position_counts for sample in whole], dtype=np.int64)
+        )
         current = np.array([sample.current_raw for sample in whole]) * scale.current_per_unit
         try:
-            for rows in self._predictor.take(np.array([sample.cycle for sample in whole]), position, current):
+            for rows in self._predictor.take(
+                np.array([sample.cycle for sample in whole]), position, current
+            ):
                 self._recent.add(rows)
         except IdentificationError as error:
             self._predictor = None
@@ -301,8 +352,12 @@ class CellWatch:
 
 def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
     """Position of each joint [rad or m], None where a motor that moves it is unknown."""
-    rad_per_count = np.array([2.0 * np.pi / (axis.counts_per_revolution or np.inf) for axis in cell.axes])
-    unknown = np.array([axis.position_counts is None for axis in reading.axes]) | (rad_per_count == 0.0)
+    rad_per_count = np.array(
+        [2.0 * np.pi / (axis.counts_per_revolution or np.inf) for axis in cell.axes]
+    )
+    unknown = np.array([axis.position_counts is None for axis in reading.axes]) | (
+        rad_per_count == 0.0
+    )
     to_joint = np.linalg.inv(cell.ratio).astype(np.float64)
     offset = np.array([axis.zero_offset_rad for axis in cell.axes])
     scale = SiScaling(rad_per_count, to_joint, offset, current_per_unit=np.full(len(offset), nan))

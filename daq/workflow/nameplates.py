@@ -1,6 +1,8 @@
-"""Compare the nameplate gains of a cell with the current gains, and with the motors' data in the drives.
+"""Compare the nameplate gains of a cell with the current gains,
+and with the motors' data in the drives.
 
-A mistyped nameplate is found before anything moves. What tolerances and gear losses can explain is a warning at most.
+A mistyped nameplate is found before anything moves. What tolerances and gear losses can explain is
+a warning at most.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from ident.plausible import NAMEPLATE_RATIO
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What a nameplate is compared with: the current gain, or N·Kt of the motor's data in the drive."""
+    """What a nameplate is compared with:
+    the current gain, or N·Kt of the motor's data in the drive.
+    """
 
     gain: float  #: in the unit of the nameplate
     name: str  #: what it is, in words
@@ -32,7 +36,8 @@ class Reference:
 def check_controller(cell_file: Path, cell: Cell) -> None:
     """Compare each nameplate with the current gain in the controller's file.
 
-    A file that cannot be read, or without such a number, is left to `drivegain apply`: there need not be one before.
+    A file that cannot be read, or without such a number, is left to `drivegain apply`: there need
+    not be one before.
 
     Args:
         cell_file: file of the cell, for the lines.
@@ -46,7 +51,9 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     if controller is None or file is None:
         return
     try:
-        numbers = decode_document(read_controller_file(file), str(file), controller.format).locate(controller.keys)
+        numbers = decode_document(read_controller_file(file), str(file), controller.format).locate(
+            controller.keys
+        )
     except ControllerUnfit:
         return
     current_gains = [
@@ -57,7 +64,8 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
 
 
 def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReading | None]) -> None:
-    """Compare each nameplate with the current gain, and with N·Kt of the motor's data in the drive (paper eq. 4).
+    """Compare each nameplate with the current gain, and with N·Kt of the motor's data in the drive
+    (paper eq. 4).
 
     Args:
         cell_file: file of the cell, for the lines.
@@ -69,32 +77,44 @@ def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReadin
     """
     check_controller(cell_file, cell)
     references = list[Reference | None]()
-    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
-        constant = None if reading is None else reading.torque_constant_nm_per_a
+    for axis, reduction, reading in zip(
+        cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True
+    ):
+        if reading is None:
+            constant = None
+        else:
+            constant = reading.torque_constant_nm_per_a
         if reading is None or constant is None or not _comparable(axis):
             references.append(None)
             continue
         source = f"{reading.rated_torque_nm} Nm / {reading.rated_current_a} A"
-        references.append(Reference(constant * abs(float(reduction)), "N·Kt of the drive's motor", source))
+        references.append(
+            Reference(constant * abs(float(reduction)), "N·Kt of the drive's motor", source)
+        )
     _require_alike(cell_file, cell, references)
 
 
 def nameplate_warnings(cell: Cell, readings: Sequence[ScaleReading | None]) -> tuple[str, ...]:
-    """Return warnings about the recorded currents: no reference, what cannot be checked, what differs.
+    """Return warnings about the recorded currents:
+    no reference, what cannot be checked, what differs.
 
     Args:
         cell: content of its file.
         readings: of each drive; None for one that does not answer.
     """
     axes_by_warning: dict[str, list[str]] = {}
-    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
+    for axis, reduction, reading in zip(
+        cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True
+    ):
         if reading is None:
             continue
         found = reading.warnings
         if axis.profile is None or not _comparable(axis):
             found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
         else:
-            found += check_nameplate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
+            found += check_nameplate(
+                reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction)
+            )
         for warning in found:
             axes_by_warning.setdefault(warning, []).append(axis.name)
     note = actual_current_note(cell)
@@ -108,19 +128,29 @@ def _comparable(axis: CellAxis) -> bool:
 
 
 def actual_current_note(cell: Cell) -> str | None:
-    """Warning where an axis has no current reference: its gain is per actual current, not per reference."""
-    actual = [axis for axis in cell.axes if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL]
+    """Warning where an axis has no current reference:
+    its gain is per actual current, not per reference.
+    """
+    actual = [
+        axis
+        for axis in cell.axes
+        if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL
+    ]
     if not actual:
         return None
-    drives = ", ".join(dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None))
+    drives = ", ".join(
+        dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None)
+    )
     return (
-        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} reports none): the "
-        "gains are Nm per A of actual current"
+        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} "
+        "reports none): the gains are Nm per A of actual current"
     )
 
 
 def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference | None]) -> None:
-    """Refuse nameplates whose size is beyond NAMEPLATE_RATIO of a reference; signs are compared before a write."""
+    """Refuse nameplates whose size is beyond NAMEPLATE_RATIO of a reference;
+    signs are compared before a write.
+    """
     wrong: dict[int, Reference] = {}
     for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True)):
         if reference is not None and not _alike(axis.nameplate_gain, reference.gain):
@@ -134,14 +164,16 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
         keys = document.tree["axes"][index]
         key = next(key for key in keys if key.startswith("nameplate_gain"))
         found = (
-            f"{axis.nameplate_gain:g} {axis.gain_unit}, while {reference.name} is {reference.gain:.4g} "
-            f"({reference.source})"
+            f"{axis.nameplate_gain:g} {axis.gain_unit}, while {reference.name} is "
+            f"{reference.gain:.4g} ({reference.source})"
         )
-        faults.append(Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}"))
+        faults.append(
+            Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}")
+        )
     raise ConfigurationInconsistent(
         **fault_texts(document, faults),
-        remedy="correct the nameplate, the gear ratio or the other number: is one of them in another unit (mA, mNm), "
-        "on the motor's side, or of another axis?",
+        remedy="correct the nameplate, the gear ratio or the other number: is one of them in "
+        "another unit (mA, mNm), on the motor's side, or of another axis?",
     )
 
 

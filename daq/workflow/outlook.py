@@ -1,4 +1,6 @@
-"""What the recorded blocks say of the next ones: why a gain takes long, what would help, and moves for the worst."""
+"""What the recorded blocks say of the next ones:
+why a gain takes long, what would help, and moves for the worst.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,16 @@ from ident.planning.target import SlowCause, recorded_information, slow_cause
 
 HELP = {
     SlowCause.NO_PAYLOAD: "record blocks with the payload",
-    SlowCause.PRELOAD: "let the platform shift and turn farther, by wider joint limits in the cell file",
-    SlowCause.MOTION: "give {axis} wider limits of position, speed and acceleration in the cell file",
-    SlowCause.NOISE: "find what disturbs the current of {axis}: its channel, its cable, or the tuning of its loop",
-    SlowCause.INERTIA: "give {axis} more speed and acceleration in the cell file, or mount a body whose mass lies "
-    "farther from its axis",
-    SlowCause.COUPLING: "mount a body that loads {axis} more: a heavier one, or one whose mass lies farther from its "
-    "axis",
+    SlowCause.PRELOAD: "let the platform shift and turn farther, by wider joint limits in the "
+    "cell file",
+    SlowCause.MOTION: "give {axis} wider limits of position, speed and acceleration in the "
+    "cell file",
+    SlowCause.NOISE: "find what disturbs the current of {axis}: its channel, its cable, or the "
+    "tuning of its loop",
+    SlowCause.INERTIA: "give {axis} more speed and acceleration in the cell file, or mount a body "
+    "whose mass lies farther from its axis",
+    SlowCause.COUPLING: "mount a body that loads {axis} more: a heavier one, or one whose mass "
+    "lies farther from its axis",
     SlowCause.TIME: "",
 }
 """What makes σ of a gain fall faster, beside more time."""
@@ -37,20 +42,24 @@ class Outlook:
     design: Design  #: unknowns, with gains, parameters and noise of the last estimate
     information: FloatArray  #: of the blocks behind that estimate, shape (p, p)
     causes: tuple[SlowCause, ...]  #: why each gain takes long
-    #: σ of the last estimate over the one that the design predicts for the same blocks, shape (n,). A design predicts
-    #: ratios of σ well, but not the level.
+    #: σ of the last estimate over the one that the design predicts for the same blocks, shape (n,).
+    #: A design predicts ratios of σ well, but not the level.
     scale: FloatArray
 
     def goal(self, target_percent: float) -> PlanGoal:
-        """Return the goal of the next moves: the gain that is farthest from its target by the last estimate.
+        """Return the goal of the next moves: the gain that is farthest from its target by the last
+        estimate.
 
         Args:
             target_percent: σ that every gain shall reach [%].
         """
         return PlanGoal(self.information, target_percent / self.scale)
 
-    def experiment(self, experiment: Experiment, *, is_loaded: bool, room: AcceptedRoom) -> Experiment:
-        """Return the experiment that the next block is: moves with or without load, inside the accepted room.
+    def experiment(
+        self, experiment: Experiment, *, is_loaded: bool, room: AcceptedRoom
+    ) -> Experiment:
+        """Return the experiment that the next block is:
+        moves with or without load, inside the accepted room.
 
         Args:
             experiment: of the cell with the payload of the session.
@@ -58,7 +67,9 @@ class Outlook:
             room: of the moves that were accepted.
         """
         mounted = (0,) if is_loaded else (None,)
-        return replace(experiment, design=self.design, scene=room.scene(experiment.scene), mounted=mounted)
+        return replace(
+            experiment, design=self.design, scene=room.scene(experiment.scene), mounted=mounted
+        )
 
 
 def outlook_of(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> Outlook:

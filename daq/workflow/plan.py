@@ -1,8 +1,10 @@
-"""A plan: point-to-point moves that show every gain, chosen for the experiment that they are made in (paper §2.3).
+"""A plan: point-to-point moves that show every gain, chosen for the experiment that they are made
+in (paper §2.3).
 
 The search exchanges moves and judges them by the worst gain's predicted standard deviation
-(ident/planning/excitation.py). The information of a plan is the sum over its moves. A changed target touches two moves,
-so a proposal costs two small sums and one factorisation; the regressors of a whole round of proposals are made at once.
+(ident/planning/excitation.py). The information of a plan is the sum over its moves. A changed
+target touches two moves, so a proposal costs two small sums and one factorisation; the regressors
+of a whole round of proposals are made at once.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from itertools import compress, pairwise
 from pathlib import Path
@@ -21,11 +23,21 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from daq.config.cell import DEGREE, Cell, JointUnit, model_of
-from daq.config.same_cell import RobotIdentity, robot_identity
+from daq.config.same_cell import (
+    calibrated_robot,
+    expected_text,
+    found_text,
+    robot_differences,
+)
 from daq.config.yaml_file import DocumentKind, StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError, counted
 from daq.files import replace_file
-from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_CONDITION_OF_CHAIN, LARGEST_STD_PERCENT
+from daq.workflow.choices import (
+    EXCHANGES,
+    LARGEST_CONDITION,
+    LARGEST_CONDITION_OF_CHAIN,
+    LARGEST_STD_PERCENT,
+)
 from daq.workflow.experiment import (
     CheckedScene,
     Experiment,
@@ -41,6 +53,7 @@ from daq.workflow.experiment import (
 from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
+from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot
 from ident.model.robot import Robot
 from ident.planning.clear_way import clear_way
 from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
@@ -57,16 +70,20 @@ class Plan:
     cell: str  #: name of the cell it was made for
     seed: int  #: it was made from
     condition: float  #: of the weighted observation matrix that these moves give
-    #: Standard deviation of each gain [% of it] when the moves are made once without load and once with the cell's
-    #: payload, as predicted from nominal parameters; empty in plans of earlier versions.
+    #: Standard deviation of each gain [% of it] when the moves are made once without load and once
+    #: with the cell's payload, as predicted from nominal parameters; empty in plans of earlier
+    #: versions.
     predicted_std_percent: tuple[float, ...]
-    #: From the first target to the end of the last dwell [s]; how long the way to the first target takes depends on the
-    #: robot's position.
+    #: From the first target to the end of the last dwell [s]; how long the way to the first target
+    #: takes depends on the robot's position.
     duration_s: float
     moves: tuple[PlannedMove, ...]  #: in order
     units: tuple[JointUnit, ...]  #: in which people read the targets, one a joint
-    purpose: str = ""  #: what it was planned for, in words for its page; empty for a first plan, which is for all gains
-    robot: RobotIdentity | None = None  #: of the robot it was made for; None in plans of earlier versions
+    #: what it was planned for, in words for its page; empty for a first plan, which is for all
+    #: gains
+    purpose: str = ""
+    #: of the robot it was made for; None in plans of earlier versions
+    robot: CalibratedRobot | None = None
 
 
 DWELL_S = 0.1
@@ -74,14 +91,19 @@ NEAR = 0.15  #: Standard deviation of a near target, as a share of the joint's r
 ROUND = 8  #: Proposals whose regressors are made at once
 THINNING = 2  #: Every second row is enough to compare proposals by
 SHARPNESS = 8.0
-"""The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
+"""The search lowers this norm of all gains' deviations, nearly the largest:
+the second worst counts a little.
+"""
 MIN_PLANNED_MOVES = 5
 WISHED_MOVES = 30  #: With so many, σ is judged by leaving moves out, and the search has a choice
-MAX_TRIES = 100  #: Random postures or ways that are tried from one place before it counts as shut in
+#: Random postures or ways that are tried from one place before it counts as shut in
+MAX_TRIES = 100
 MAX_RETREATS = 30
 MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
-SLOWER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2)  #: Shares of its speed at which a move is tried that asks too much torque
-PLACES = 3  #: Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says
+#: Shares of its speed at which a move is tried that asks too much torque
+SLOWER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2)
+#: Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says
+PLACES = 3
 
 
 class Kind(Enum):
@@ -110,16 +132,21 @@ class Draft:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanGoal:
-    """Purpose of a plan: σ of each gain relative to its target, together with all that was recorded before."""
+    """Purpose of a plan: σ of each gain relative to its target,
+    together with all that was recorded before.
+    """
 
-    #: Information of what has been recorded (`ident.planning.target.recorded_information`) with the design of the
-    #: experiment, shape (p, p).
+    #: Information of what has been recorded (`ident.planning.target.recorded_information`) with the
+    #: design of the experiment, shape (p, p).
     recorded: FloatArray
-    target_percent: FloatArray  #: σ that each gain shall reach [%], inf for one that does not matter, shape (n,)
+    #: σ that each gain shall reach [%], inf for one that does not matter, shape (n,)
+    target_percent: FloatArray
 
     @classmethod
     def of_first(cls, design: Design) -> PlanGoal:
-        """Return the goal of a first plan: nothing was recorded before, and all gains matter alike."""
+        """Return the goal of a first plan:
+        nothing was recorded before, and all gains matter alike.
+        """
         recorded = np.zeros((design.size, design.size))
         return cls(recorded, np.ones(len(design.expectation.gains)))
 
@@ -133,7 +160,9 @@ class PlanGoal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetBox:
-    """Least and largest joint positions that targets may have [rad; m of a prismatic joint], shape (n,) each."""
+    """Least and largest joint positions that targets may have [rad;
+    m of a prismatic joint], shape (n,) each.
+    """
 
     lower: FloatArray
     upper: FloatArray
@@ -179,7 +208,11 @@ class Search:
         for _ in range(MAX_STARTS):
             moves, paths = self._filled()
             if len(moves) >= MIN_PLANNED_MOVES:
-                return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
+                return Draft(
+                    tuple(moves),
+                    tuple(paths),
+                    tuple(self._experiment.informations(paths, THINNING)),
+                )
             most = max(most, moves, key=len)
         found = f"room for {len(most)} moves"
         if len(most) == 1:  # which only says where the run starts
@@ -213,15 +246,21 @@ class Search:
             else:
                 moves = [self._clear_start()]
 
-    def improve(self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]) -> Draft:
-        """Exchange moves; an exchange stays when it lowers the deviations and the run gets no longer than allowed."""
+    def improve(
+        self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]
+    ) -> Draft:
+        """Exchange moves; an exchange stays when it lowers the deviations and the run gets no
+        longer than allowed.
+        """
         best, worst = self._judge(draft, np.inf)
         done = 0
         while done < tries:
             count = min(ROUND, tries - done)
             chosen = draft
             # One a round: proposals that were made from the same moves do not go together.
-            for candidate in self._drafts(draft, [self._proposal(draft.moves) for _ in range(count)]):
+            for candidate in self._drafts(
+                draft, [self._proposal(draft.moves) for _ in range(count)]
+            ):
                 value, found = self._judge(candidate, best)
                 if value < best:
                     chosen = candidate
@@ -233,7 +272,9 @@ class Search:
         return draft
 
     def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
-        """Cost of the search, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
+        """Cost of the search, and the deviations [%]:
+        nearly the worst, raised where W is too badly conditioned.
+        """
         information = self._goal.recorded + np.sum(draft.informations, axis=0)
         found = self._experiment.design.std_percent(information)
         # Unseen gains are as bad as each other; the norm of inf would hide the rest.
@@ -241,7 +282,10 @@ class Search:
         worst = np.max(bounded)
         value = float(worst * np.sum((bounded / worst) ** SHARPNESS) ** (1.0 / SHARPNESS))
         if value < to_beat:  # the condition can only raise it
-            value *= max(1.0, self._experiment.design.condition(information) / self._largest_condition) ** 2
+            value *= (
+                max(1.0, self._experiment.design.condition(information) / self._largest_condition)
+                ** 2
+            )
         return value, found
 
     def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
@@ -266,7 +310,10 @@ class Search:
                 inwards = 0.25 * float(rng.random()) * (high[axis] - low[axis])
                 target = np.array(old.target_rad)
                 below = moves[max(index - 1, 0)].target_rad[axis] < 0.5 * (low[axis] + high[axis])
-                target[axis] = high[axis] - inwards if below else low[axis] + inwards
+                if below:
+                    target[axis] = high[axis] - inwards
+                else:
+                    target[axis] = low[axis] + inwards
                 changed = (*before, replace(old, target_rad=self._written(target)), *after)
             case Kind.SPEED:
                 speedy = replace(old, velocity=random.velocity, acceleration=random.acceleration)
@@ -279,24 +326,38 @@ class Search:
         return changed
 
     def _drafts(self, draft: Draft, proposals: Sequence[tuple[PlannedMove, ...]]) -> list[Draft]:
-        """The proposals that are short enough and whose new ways are clear, with their information."""
+        """The proposals that are short enough and whose new ways are clear,
+        with their information.
+        """
         known = {
             _way(pair): (path, information)
-            for pair, path, information in zip(pairwise(draft.moves), draft.paths, draft.informations, strict=True)
+            for pair, path, information in zip(
+                pairwise(draft.moves), draft.paths, draft.informations, strict=True
+            )
         }
         fresh: dict[_Way, Trapezoid] = {}
         kept = []
         for moves in proposals:
             ways = [_way(pair) for pair in pairwise(moves)]
-            new = {way: path_of(self._cell, np.array(way[0]), way[1]) for way in ways if way not in known}
-            lengths = [new[way].duration_s if way in new else known[way][0].duration_s for way in ways]
+            new = {
+                way: path_of(self._cell, np.array(way[0]), way[1])
+                for way in ways
+                if way not in known
+            }
+            lengths = [
+                new[way].duration_s if way in new else known[way][0].duration_s for way in ways
+            ]
             # The time is quick to check, the clearance is not.
             if sum(lengths) + sum(move.dwell_s for move in moves) > self._duration_s:
                 continue
             if not all(map(self._is_within, moves)):
                 continue
             obstruction = self._experiment.scene.checker.obstruction
-            if all(obstruction(path.start, path.end) is None for way, path in new.items() if way not in fresh):
+            if all(
+                obstruction(path.start, path.end) is None
+                for way, path in new.items()
+                if way not in fresh
+            ):
                 kept.append((moves, ways))
                 fresh |= new
         is_carried = self._is_carried(list(fresh.values()))
@@ -307,7 +368,8 @@ class Search:
         kept = [(moves, ways) for moves, ways in kept if usable.issuperset(ways)]
         informations = self._experiment.informations(list(fresh.values()), THINNING)
         known |= {
-            way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
+            way: (path, information)
+            for (way, path), information in zip(fresh.items(), informations, strict=True)
         }
         drafts = []
         for moves, ways in kept:
@@ -319,8 +381,10 @@ class Search:
         for _ in range(MAX_TRIES):
             move = self._random_move()
             checker = self._experiment.scene.checker
-            if checker.robot.closures:
-                near = towards(checker, checker.home, np.array(move.target_rad), self._low, self._high)
+            if checker.robot.is_constrained:
+                near = towards(
+                    checker, checker.home, np.array(move.target_rad), self._low, self._high
+                )
                 move = replace(move, target_rad=self._written(near))
             if self._is_within(move) and checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
                 return move
@@ -331,7 +395,7 @@ class Search:
             move = self._random_move()
             checker = self._experiment.scene.checker
             target = np.array(move.target_rad)
-            if checker.robot.closures:  # a way to a far target often leaves the workspace
+            if checker.robot.is_constrained:  # a way to a far target often leaves the workspace
                 target = towards(checker, start, target, self._low, self._high)
                 move = replace(move, target_rad=self._written(target))
             if np.array_equal(target, start) or not self._is_within(move):
@@ -354,13 +418,16 @@ class Search:
         return None
 
     def _is_carried(self, paths: Sequence[Trapezoid]) -> list[bool]:
-        """Whether the drives can give the torque of each way, with a margin for what is not known of it."""
+        """Whether the drives can give the torque of each way,
+        with a margin for what is not known of it.
+        """
         shares = self._experiment.effort_shares(paths)
         is_carried = np.all(EFFORT_MARGIN * shares <= 1.0, axis=1)
         return list(map(bool, is_carried))
 
     def _random_move(self) -> PlannedMove:
-        # Slow and fast moves both: friction is distinguished from inertia by moves of different speed and acceleration.
+        # Slow and fast moves both: friction is distinguished from inertia by moves of different
+        # speed and acceleration.
         return PlannedMove(
             target_rad=self._written(self._rng.uniform(self._low, self._high)),
             velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),
@@ -369,7 +436,9 @@ class Search:
         )
 
     def _is_within(self, move: PlannedMove) -> bool:
-        """Whether a target is allowed; the motors of a redundant drive were moved to fit each other."""
+        """Whether a target is allowed; the motors of a redundant drive were moved to fit each
+        other.
+        """
         target = np.array(move.target_rad)
         return bool(np.all((target >= self._allowed.lower) & (target <= self._allowed.upper)))
 
@@ -377,7 +446,9 @@ class Search:
         """As the plan file will say it: what is judged is what is made."""
         target = self._experiment.scene.checker.fitting(target)
         units = [axis.unit.si for axis in self._cell.axes]
-        return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
+        return tuple(
+            round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True)
+        )
 
     def _blocked(self, what: str) -> UsageError:
         """Error that names the two bodies which are in the way most often."""
@@ -394,22 +465,32 @@ class Search:
             axes = " and ".join(self._too_weak()) or "some axis"
             found += f": also slowly, they ask too much torque of {axes}"
             expected = f"at most the `effort` of the URDF over {EFFORT_MARGIN:g}"
-            remedy = "correct `effort` in the URDF, declare a lighter payload, or narrow the joint limits"
+            remedy = (
+                "correct `effort` in the URDF, declare a lighter payload, or narrow the "
+                "joint limits"
+            )
             return _unfit(self._cell, self._duration_s, found, expected, remedy)
         if not blocking:
-            return _unfit(self._cell, self._duration_s, found, "room to move in", "widen the joint limits")
+            return _unfit(
+                self._cell, self._duration_s, found, "room to move in", "widen the joint limits"
+            )
         pairs = Counter((one.first, one.second) for one in blocking)
         (worst, times), *_ = pairs.most_common(1)
         if worst[0] == CLOSURES:
             remedy = f"correct {_keys(blocking[0])} in the cell file"
             return _unfit(self._cell, self._duration_s, found, "poses that the loops allow", remedy)
         farthest_m = max(one.distance_m for one in blocking if (one.first, one.second) == worst)
-        found += f": in {times} of {MAX_TRIES} {worst[0]} and {worst[1]} are at most {1000.0 * farthest_m:.0f} mm apart"
+        found += (
+            f": in {times} of {MAX_TRIES} {worst[0]} and {worst[1]} are at most "
+            f"{1000.0 * farthest_m:.0f} mm apart"
+        )
         expected = f"at least {1000.0 * checker.scene.minimum_m:.0f} mm"
         return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, worst))
 
     def _too_weak(self) -> list[str]:
-        """Names of the axes whose drives cannot carry most of some slow random ways, or at least the most of them."""
+        """Names of the axes whose drives cannot carry most of some slow random ways,
+        or at least the most of them.
+        """
         paths: list[Trapezoid] = []
         start = np.array(self._random_move().target_rad)
         for _ in range(MAX_TRIES):
@@ -431,7 +512,10 @@ def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
         return f"correct `{pair[1]}` of `clearance.obstacles` in the cell file, or the joint limits"
     if scene.guessed:
         return "the shape of the arm is guessed: declare it in the cell file (`clearance.capsules`)"
-    return "correct these `clearance.capsules` or `clearance.minimum_m` in the cell file, or the joint limits"
+    return (
+        "correct these `clearance.capsules` or `clearance.minimum_m` in the cell file, or the "
+        "joint limits"
+    )
 
 
 def _tens(seconds: float) -> float:
@@ -440,7 +524,8 @@ def _tens(seconds: float) -> float:
 
 
 def longer_run_s(used_s: float, requested_s: float, ratio: float) -> float | None:
-    """Duration of a run in which σ is smaller by a ratio [s]; None where it is longer than a plan may be.
+    """Duration of a run in which σ is smaller by a ratio [s];
+    None where it is longer than a plan may be.
 
     σ falls with the square root of the time.
 
@@ -456,7 +541,12 @@ def longer_run_s(used_s: float, requested_s: float, ratio: float) -> float | Non
 
 
 def _unfit(
-    cell: Cell, duration_s: float, found: str, expected: str, remedy: str, kind: type[UsageError] = UsageError
+    cell: Cell,
+    duration_s: float,
+    found: str,
+    expected: str,
+    remedy: str,
+    kind: type[UsageError] = UsageError,
 ) -> UsageError:
     subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
     return kind(subject, found=found, expected=expected, remedy=remedy)
@@ -486,10 +576,11 @@ def plan(
 ) -> Plan:
     """Choose moves that let the worst gain be known as well as the time allows.
 
-    Random moves fill the duration; then they are exchanged, shifted, stretched and sped up one at a time, and what
-    lowers the predicted standard deviation of the worst gain stays. All moves keep position, velocity and acceleration
-    limits, the workspace and clear of the arm itself, on their whole way, and the torque limits of the URDF with a
-    margin. The way to the first target is not known before the recording: see `way_to_first_target`.
+    Random moves fill the duration; then they are exchanged, shifted, stretched and sped up one at a
+    time, and what lowers the predicted standard deviation of the worst gain stays. All moves keep
+    position, velocity and acceleration limits, the workspace and clear of the arm itself, on their
+    whole way, and the torque limits of the URDF with a margin. The way to the first target is not
+    known before the recording: see `way_to_first_target`.
 
     Args:
         cell: with robot, limits and a weighed payload.
@@ -497,15 +588,20 @@ def plan(
         duration_s: of the run [s].
         exchanges: tries; every one of them is made. With 0 the random moves are the plan.
         speed: share of the limits of velocity that the fastest moves may use.
-        acceleration: share of the limits of acceleration that the hardest moves may use; ``speed`` when None.
+        acceleration: share of the limits of acceleration that the hardest moves may use; ``speed``
+            when None.
         largest_condition: a plan worse than this is refused; that of the kind of robot when None.
         largest_std_percent: a plan that predicts more than this for a gain is refused.
-        experiment: that the plan is for, None for the one with the cell's first payload. After a fit, its design may
-            be that of `daq.workflow.verdicts.design_after`; ``mounted`` says what the moves are made with.
-        goal: target σ of each gain, and what has been recorded before; None for a first plan. With a goal, the worst
-            gain is that with the largest σ over target, and the plan's deviations are those of all recordings together.
-        box: joint positions between which the targets stay, inside the limits; None for all that the limits allow.
-        progress: receives the number of tries and the deviation predicted for the worst gain so far [%].
+        experiment: that the plan is for, None for the one with the cell's first payload. After a
+            fit, its design may be that of `daq.workflow.verdicts.design_after`; ``mounted`` says
+            what the moves are made with.
+        goal: target σ of each gain, and what has been recorded before; None for a first plan. With
+            a goal, the worst gain is that with the largest σ over target, and the plan's deviations
+            are those of all recordings together.
+        box: joint positions between which the targets stay, inside the limits; None for all that
+            the limits allow.
+        progress: receives the number of tries and the deviation predicted for the worst gain so far
+            [%].
 
     Raises:
         PlanTooShort: a longer plan would show every gain, or have room for enough moves.
@@ -514,7 +610,10 @@ def plan(
     """
     experiment = experiment or experiment_of(cell)
     if largest_condition is None:
-        largest_condition = LARGEST_CONDITION if cell.chain is None else LARGEST_CONDITION_OF_CHAIN
+        if cell.chain is None:
+            largest_condition = LARGEST_CONDITION
+        else:
+            largest_condition = LARGEST_CONDITION_OF_CHAIN
     goal = goal or PlanGoal.of_first(experiment.design)
     room = _room(cell, duration_s, box)
     allowed = _allowed_targets(cell, box)
@@ -529,14 +628,18 @@ def plan(
         room,
         allowed,
     )
-    draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
+    draft = search.improve(
+        search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found)))
+    )
     information = goal.recorded + np.sum(experiment.informations(draft.paths), axis=0)
     predicted = experiment.design.std_percent(information)
     found = experiment.design.condition(information)
     worst = int(np.argmax(goal.ratio(predicted)))
     if not found <= largest_condition:
         condition = format_at_limit(found, largest_condition, 0)
-        words = f"condition {condition} of the weighted observation matrix after {exchanges} exchanges"
+        words = (
+            f"condition {condition} of the weighted observation matrix after {exchanges} exchanges"
+        )
         ratio = found / largest_condition
         remedy = _condition_remedy(experiment, duration_s, ratio)
         kind = PlanTooShort if _is_mended_by_time(duration_s, ratio) else UsageError
@@ -545,11 +648,15 @@ def plan(
     if not predicted[worst] <= largest_std_percent:
         percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
         words = f"{percent} % predicted for the gain of {cell.axes[worst].name}"
-        judged = verdicts(experiment.design, [(experiment.excitation(draft.paths)[0], experiment.mounted)])
+        judged = verdicts(
+            experiment.design, [(experiment.excitation(draft.paths)[0], experiment.mounted)]
+        )
         ways = ["allow more exchanges, wider joint limits or higher speed"]
         kind = UsageError
         if np.isfinite(predicted[worst]):
-            longer_s = longer_run_s(used_s, duration_s, float(predicted[worst]) / largest_std_percent)
+            longer_s = longer_run_s(
+                used_s, duration_s, float(predicted[worst]) / largest_std_percent
+            )
             if longer_s is not None:
                 ways.insert(0, f"allow a longer run (some --duration {longer_s:.0f})")
                 kind = PlanTooShort
@@ -563,11 +670,12 @@ def plan(
         duration_s=used_s,
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
-        robot=robot_identity(cell),
+        robot=calibrated_robot(cell),
     )
 
 
-MADE_BY_MORE_MOVES = 10.0  #: Ratio of two conditions that more moves make; a larger one is of the robot
+#: Ratio of two conditions that more moves make; a larger one is of the robot
+MADE_BY_MORE_MOVES = 10.0
 
 
 def _is_mended_by_time(duration_s: float, ratio: float) -> bool:
@@ -576,7 +684,9 @@ def _is_mended_by_time(duration_s: float, ratio: float) -> bool:
 
 
 def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -> str:
-    """Say what lowers a condition that is too large by a ratio: more moves, or right angles that are right."""
+    """Say what lowers a condition that is too large by a ratio:
+    more moves, or right angles that are right.
+    """
     other = "more exchanges, wider joint limits or higher speed; `--condition` accepts more"
     if _is_mended_by_time(duration_s, ratio):
         return f"allow a longer run (some --duration {_tens(2.0 * duration_s):.0f}), {other}"
@@ -585,20 +695,23 @@ def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -
         return f"allow {other}"
     exact = "1.5707963267948966 for a quarter turn, 3.141592653589793 for a half"
     return (
-        f"the URDF turns {', '.join(turned)} by nearly a right angle, as rounded numbers do (1.5708): parameters that "
-        f"an exact angle hides are nearly invisible then. Write {exact}. If these angles are measured ones, "
-        "`--condition` accepts more"
+        f"the URDF turns {', '.join(turned)} by nearly a right angle, as rounded numbers do "
+        f"(1.5708): parameters that an exact angle hides are nearly invisible then. Write {exact}. "
+        "If these angles are measured ones, `--condition` accepts more"
     )
 
 
 NEARLY_RIGHT = 2e-3
-"""Largest difference between the entries of a joint's rotation and those of right angles that rounding makes: 3.14 for
-a half turn is off by 1.6e-3."""
+"""Largest difference between the entries of a joint's rotation and those of right angles that
+rounding makes: 3.14 for a half turn is off by 1.6e-3.
+"""
 EXACTLY_RIGHT = 1e-9  #: Difference that a double leaves
 
 
 def nearly_right_joints(robot: Robot) -> tuple[str, ...]:
-    """Names of the joints that the URDF turns by nearly, but not exactly, right angles; axes are looked at, too."""
+    """Names of the joints that the URDF turns by nearly, but not exactly, right angles;
+    axes are looked at, too.
+    """
     found = []
     for joint in robot.joints:
         entries = np.concatenate((joint.rotation.ravel(), joint.axis))
@@ -615,33 +728,50 @@ def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
     if box is None:
         return TargetBox(lower, upper)
     room = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
-    outside = [axis.name for axis, is_empty in zip(cell.axes, room.lower > room.upper, strict=True) if is_empty]
+    outside = [
+        axis.name
+        for axis, is_empty in zip(cell.axes, room.lower > room.upper, strict=True)
+        if is_empty
+    ]
     if outside:
         found = f"a box of targets outside the joint limits of {', '.join(outside)}"
-        raise _unfit(cell, duration_s, found, "a box inside the limits", "give a box that they allow")
+        raise _unfit(
+            cell, duration_s, found, "a box inside the limits", "give a box that they allow"
+        )
     return room
 
 
 def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
-    """Return where targets may be: within the joint limits, and within a box but for the rounding of a plan file."""
+    """Return where targets may be: within the joint limits,
+    and within a box but for the rounding of a plan file.
+    """
     limits = limits_of(cell)
     if box is None:
         return TargetBox(limits.lower, limits.upper)
     rounding = np.array([axis.unit.si for axis in cell.axes]) * 10.0**-PLACES
-    return TargetBox(np.maximum(limits.lower, box.lower - rounding), np.minimum(limits.upper, box.upper + rounding))
+    return TargetBox(
+        np.maximum(limits.lower, box.lower - rounding),
+        np.minimum(limits.upper, box.upper + rounding),
+    )
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
-    """The same ways at a share of their speed, as for a first run; the predictions are those of the plan as made."""
+    """The same ways at a share of their speed, as for a first run;
+    the predictions are those of the plan as made.
+    """
     moves = tuple(
-        replace(move, velocity=move.velocity * override, acceleration=move.acceleration * override**2)
+        replace(
+            move, velocity=move.velocity * override, acceleration=move.acceleration * override**2
+        )
         for move in plan_.moves
     )
     return replace(plan_, duration_s=experiment_duration_s(cell, moves), moves=moves)
 
 
 def _slower(move: PlannedMove, share: float) -> PlannedMove:
-    """The same way at a share of its speed, as the plan file will say it, and no slower than one may say."""
+    """The same way at a share of its speed, as the plan file will say it,
+    and no slower than one may say.
+    """
     velocity = round(move.velocity * share, PLACES)
     acceleration = round(move.acceleration * share**2, PLACES)
     return replace(
@@ -655,7 +785,8 @@ def _slower(move: PlannedMove, share: float) -> PlannedMove:
 
 LONGEST_S = 3600.0
 LEAST_VELOCITY = 0.01  #: Share of the limits; slower than that a move would hardly end
-LEAST_ACCELERATION = 0.0001  #: A hundredth of the speed on the same ways is a ten-thousandth of the acceleration
+#: A hundredth of the speed on the same ways is a ten-thousandth of the acceleration
+LEAST_ACCELERATION = 0.0001
 Velocity = Annotated[float, Field(ge=LEAST_VELOCITY, le=1)]
 Acceleration = Annotated[float, Field(ge=LEAST_ACCELERATION, le=1)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -675,9 +806,40 @@ class _Move(StrictModel):
         return self
 
 
+class _Joint(StrictModel):
+    name: str
+    kind: str
+    parent: str
+
+
+class _Drive(StrictModel):
+    axis: str
+    node_id: int | None
+    vendor_id: int | None
+    product_code: int | None
+
+
 class _Robot(StrictModel):
     kinematics_sha256: Digest
     drives_sha256: Digest
+    # Plans of earlier versions have the digests alone.
+    joints: tuple[_Joint, ...] = ()
+    drives: tuple[_Drive, ...] = ()
+    motors: tuple[str, ...] = ()
+
+    @property
+    def robot(self) -> CalibratedRobot:
+        """The robot."""
+        joints = []
+        for joint in self.joints:
+            joints.append(CalibratedJoint(joint.name, joint.kind, joint.parent))
+        drives = []
+        for drive in self.drives:
+            ids = (drive.node_id, drive.vendor_id, drive.product_code)
+            drives.append(CalibratedDrive(drive.axis, *ids))
+        return CalibratedRobot(
+            self.kinematics_sha256, self.drives_sha256, tuple(joints), tuple(drives), self.motors
+        )
 
 
 class _Plan(StrictModel):
@@ -700,7 +862,8 @@ class PlanHead:
 
     cell: str  #: name of the cell it was made for
     seed: int  #: it was made from
-    predicted_std_percent: tuple[float, ...]  #: of each gain [% of it]; empty in plans of earlier versions
+    #: of each gain [% of it]; empty in plans of earlier versions
+    predicted_std_percent: tuple[float, ...]
 
 
 def plan_head(path: Path) -> PlanHead:
@@ -725,7 +888,8 @@ def save_plan(plan: Plan, path: Path) -> None:
     if plan.purpose:
         recorded = "all blocks of the session and these moves together"
     lines = [
-        "# Synchronised point-to-point moves; velocity and acceleration are shares of the joint limits.",
+        "# Synchronised point-to-point moves; velocity and acceleration are shares of the "
+        "joint limits.",
         f"# Targets: {', '.join(unit.name for unit in plan.units)}.",
         "format: drivegain-plan",
         f"cell: {plan.cell}",
@@ -736,17 +900,37 @@ def save_plan(plan: Plan, path: Path) -> None:
     if plan.purpose:
         lines.append(f"purpose: {json.dumps(plan.purpose)}")  # a string of JSON is one of YAML
     if plan.robot is not None:
-        lines.append("robot:    # a plan is for one robot")
-        lines.append(f"  kinematics_sha256: {plan.robot.kinematics_sha256}")
-        lines.append(f"  drives_sha256: {plan.robot.drives_sha256}")
+        lines += _robot_lines(plan.robot)
     lines.append("moves:")
     for move in plan.moves:
-        target = ", ".join(f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True))
+        target = ", ".join(
+            f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True)
+        )
         lines.append(
-            f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: {move.acceleration:.4f}, "
-            f"dwell_s: {move.dwell_s:.3f}}}"
+            f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: "
+            f"{move.acceleration:.4f}, dwell_s: {move.dwell_s:.3f}}}"
         )
     replace_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def _robot_lines(robot: CalibratedRobot) -> list[str]:
+    lines = [
+        "robot:    # a plan is for one robot",
+        f"  kinematics_sha256: {robot.kinematics_sha256}",
+        f"  drives_sha256: {robot.drives_sha256}",
+    ]
+    # An object of JSON is one of YAML.
+    if robot.joints:
+        lines.append("  joints:")
+        for joint in robot.joints:
+            lines.append(f"    - {json.dumps(asdict(joint))}")
+    if robot.drives:
+        lines.append("  drives:")
+        for drive in robot.drives:
+            lines.append(f"    - {json.dumps(asdict(drive))}")
+    if robot.motors:
+        lines.append(f"  motors: {json.dumps(robot.motors)}")
+    return lines
 
 
 def load_plan(path: Path, cell: Cell) -> Plan:
@@ -755,19 +939,23 @@ def load_plan(path: Path, cell: Cell) -> Plan:
     What its moves show, and the torque that they ask for, are not judged again.
 
     Raises:
-        ConfigurationError: the file is missing, is not what its schema says, a target lies outside the joint limits,
-            the plan takes longer than an hour, a way leaves the declared workspace or clearance, or the plan was made
-            for another robot with the same cell name.
+        ConfigurationError: the file is missing, is not what its schema says, a target lies outside
+            the joint limits, the plan takes longer than an hour, a way leaves the declared
+            workspace or clearance, or the plan was made for another robot with the same cell name.
     """
     model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
     if model.cell != cell.name:
         remedy = "make a plan for this cell: `drivegain plan CELL`"
-        raise _refused(str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy)
+        raise _refused(
+            str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy
+        )
     robot = _robot_of(path, model.robot, cell)
     if len(model.predicted_std_percent) not in (0, len(cell.axes)):
         found = f"{len(model.predicted_std_percent)} numbers"
         remedy = "make the plan anew: `drivegain plan CELL`"
-        raise _refused(f"{path}: predicted_std_percent", found, f"{len(cell.axes)}, one a gain", remedy)
+        raise _refused(
+            f"{path}: predicted_std_percent", found, f"{len(cell.axes)}, one a gain", remedy
+        )
     moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
     duration_s = experiment_duration_s(cell, moves)
     if duration_s > LONGEST_S:
@@ -788,28 +976,35 @@ def load_plan(path: Path, cell: Cell) -> Plan:
     )
 
 
-def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> RobotIdentity | None:
-    """Return the robot that a plan is for, None for a plan of an earlier version; refuse that of another robot."""
+def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> CalibratedRobot | None:
+    """Return the robot that a plan is for, None for a plan of an earlier version;
+    refuse that of another robot.
+    """
     if stated is None:
         return None
-    found = RobotIdentity(stated.kinematics_sha256, stated.drives_sha256)
-    differences = found.differences(robot_identity(cell))
+    found = stated.robot
+    differences = robot_differences(found, calibrated_robot(cell))
     if differences:
-        differing = " and ".join(differences)
         raise _refused(
             f"{path}: robot",
-            f"a plan for another robot with the same cell name {cell.name!r}; what differs: {differing}",
-            "a plan for the robot that the cell file describes",
-            "give the cell file that the plan was made with, or make a plan for this cell: `drivegain plan CELL`",
+            f"a plan for another robot with the same cell name {cell.name!r}: "
+            f"{found_text(differences)}",
+            f"{expected_text(differences)}, as in the cell file",
+            "give the cell file that the plan was made with, or make a plan for this cell: "
+            "`drivegain plan CELL`",
         )
     return found
 
 
 def _key(units: tuple[JointUnit, ...]) -> str:
-    return "target_deg" if all(unit == DEGREE for unit in units) else "target"
+    if all(unit == DEGREE for unit in units):
+        return "target_deg"
+    return "target"
 
 
-def _refused(where: str, found: str, expected: str, remedy: str = "correct the move") -> ConfigurationInconsistent:
+def _refused(
+    where: str, found: str, expected: str, remedy: str = "correct the move"
+) -> ConfigurationInconsistent:
     return ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
 
 
@@ -834,15 +1029,18 @@ def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
 
 
 AROUND_SHARE = 0.25
-"""Largest share of the limits at which a robot goes around what is in its way to the first target: no one has seen
-these moves before."""
+"""Largest share of the limits at which a robot goes around what is in its way to the first target:
+no one has seen these moves before.
+"""
 
 
-def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[tuple[PlannedMove, ...], str]:
+def way_to_first_target(
+    cell: Cell, plan: Plan, start_rad: FloatArray
+) -> tuple[tuple[PlannedMove, ...], str]:
     """Return the moves to the first target of a plan, and a remark where it is more than one.
 
-    Where the straight way is clear, it is the first move of the plan. Else slow moves lead around what is in the way,
-    between the joint positions of the plan and the one where the robot stands.
+    Where the straight way is clear, it is the first move of the plan. Else slow moves lead around
+    what is in the way, between the joint positions of the plan and the one where the robot stands.
 
     Args:
         cell: with `workspace`, `clearance` or closures; without any, nothing is known of the room.
@@ -850,7 +1048,8 @@ def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[
         start_rad: where the robot stands [rad; m of a prismatic joint], shape (n,).
 
     Raises:
-        MotionRefused: no clear way was found; with the place and the bodies that come too close on the straight one.
+        MotionRefused: no clear way was found; with the place and the bodies that come too close on
+            the straight one.
     """
     first = plan.moves[0]
     if not _is_bounded(cell):
@@ -866,17 +1065,20 @@ def way_to_first_target(cell: Cell, plan: Plan, start_rad: FloatArray) -> tuple[
     turns = clear_way(checker, start_rad, target, lower, upper, np.random.default_rng(0))
     if turns is None:
         raise MotionRefused(
-            f"the way from here to the first target of the plan: found {_spell(cell, blocked)}, and no other clear way "
-            f"between the positions of the plan; bring the robot near the first target by hand, or correct "
-            f"{_keys(blocked)} in the cell file"
+            f"the way from here to the first target of the plan: found {_spell(cell, blocked)}, "
+            "and no other clear way between the positions of the plan; bring the robot near the "
+            f"first target by hand, or correct {_keys(blocked)} in the cell file"
         )
     slow = replace(
-        first, velocity=min(first.velocity, AROUND_SHARE), acceleration=min(first.acceleration, AROUND_SHARE)
+        first,
+        velocity=min(first.velocity, AROUND_SHARE),
+        acceleration=min(first.acceleration, AROUND_SHARE),
     )
     moves = [replace(slow, target_rad=tuple(turn.tolist()), dwell_s=DWELL_S) for turn in turns]
     remark = (
         f"the straight way from where the robot stood to the first target of the plan is not clear "
-        f"({_spell(cell, blocked)}): slow moves led around it, by {counted(len(turns), 'further position')}"
+        f"({_spell(cell, blocked)}): slow moves led around it, by "
+        f"{counted(len(turns), 'further position')}"
     )
     return (*moves, slow), remark
 
@@ -892,8 +1094,8 @@ def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) 
     found = _checker(cell).obstruction(start_rad, end_rad)
     if found is not None:
         raise MotionRefused(
-            f"{way}: found {_spell(cell, found)}; bring the robot within its limits by hand, or correct "
-            f"{_keys(found)} in the cell file"
+            f"{way}: found {_spell(cell, found)}; bring the robot within its limits by hand, or "
+            f"correct {_keys(found)} in the cell file"
         )
 
 
@@ -910,15 +1112,21 @@ def _spell(cell: Cell, found: Obstruction) -> str:
 
 
 def _keys(found: Obstruction) -> str:
-    return "`closures`, `motors` and `limits`" if found.first == CLOSURES else "`workspace` and `clearance`"
+    if found.first == CLOSURES:
+        return "`closures`, `motors` and `limits`"
+    return "`workspace` and `clearance`"
 
 
 def _checker(cell: Cell) -> Checker:
-    """Distances to what the cell file declares; that a guessed arm touches itself refuses nothing."""
+    """Distances to what the cell file declares;
+    that a guessed arm touches itself refuses nothing.
+    """
     robot = model_of(cell).robot
     lightest = min((payload.mass_kg for payload in cell.payloads), default=1.0)
     scene = scene_of(cell, robot, lightest)
-    return Checker(robot, replace(scene.checker.scene, pairs=())) if scene.guessed else scene.checker
+    if scene.guessed:
+        return Checker(robot, replace(scene.checker.scene, pairs=()))
+    return scene.checker
 
 
 def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
@@ -933,6 +1141,8 @@ def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
             raise _refused(
                 f"{path}: moves[{number}], on the way there",
                 _spell(cell, found),
-                "poses inside the workspace" if found.first == CLOSURES else f"at least {1000 * minimum_m:.0f} mm",
+                "poses inside the workspace"
+                if found.first == CLOSURES
+                else f"at least {1000 * minimum_m:.0f} mm",
                 f"correct the move, or {_keys(found)} in the cell file",
             )

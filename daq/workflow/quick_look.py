@@ -1,11 +1,11 @@
 """The gains after each move of a block that is being recorded, by the quick linear estimate.
 
-A look is for the eye, and nothing is decided by it. The quick estimate is honest from half a minute of motion on
-(docs/evidence/stopping.md), so there are no figures before.
+A look is for the eye, and nothing is decided by it. The quick estimate is honest from half a minute
+of motion on (docs/evidence/stopping.md), so there are no figures before.
 
-The quick estimate knows no effects. What the search has found after the last block is noise to it, and its σ may be
-several times that of the estimator. So σ is shown in proportion to that of the last block, and the quick one says how
-it falls since (`GainsSoFar.in_proportion`).
+The quick estimate knows no effects. What the search has found after the last block is noise to it,
+and its σ may be several times that of the estimator. So σ is shown in proportion to that of the
+last block, and the quick one says how it falls since (`GainsSoFar.in_proportion`).
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ class GainsSoFar:
     motions: tuple[tuple[Excitation, tuple[int | None, ...]], ...] = ()
     motion_s: float = 0.0  #: of these blocks
     honest_s: float = HONEST_S  #: motion before the first figures
-    #: σ of the estimator over the quick one after the same blocks, shape (n,); None before the first block was judged.
+    #: σ of the estimator over the quick one after the same blocks, shape (n,); None before the
+    #: first block was judged.
     scale: FloatArray | None = None
 
     @classmethod
@@ -130,15 +131,23 @@ class GainsSoFar:
         """
         experiment = experiment_of(cell, payload)
         model = experiment.design.expectation.model
-        return cls(experiment, target_percent, GrowingFit(model, cell.conditioning, (experiment.payload.payload,)))
+        return cls(
+            experiment,
+            target_percent,
+            GrowingFit(model, cell.conditioning, (experiment.payload.payload,)),
+        )
 
     def with_run(self, run: Run, *, is_complete: bool = True) -> GainsSoFar:
-        """Fold in a block; one that is not complete is folded in again and again as it grows, into the result.
+        """Fold in a block; one that is not complete is folded in again and again as it grows,
+        into the result.
 
         Raises:
             DataUnfit: see `GrowingFit.with_run`.
         """
-        fit = self.fit.with_run(run) if is_complete else self.fit.with_run_so_far(run)
+        if is_complete:
+            fit = self.fit.with_run(run)
+        else:
+            fit = self.fit.with_run_so_far(run)
         return replace(self, fit=fit)
 
     def with_motion(self, run: Run) -> GainsSoFar:
@@ -152,7 +161,9 @@ class GainsSoFar:
         mounted = None if run.payload is None else 0
         motion = recorded(model, data, self.fit.conditioning)
         seconds = float(run.time_s[-1] - run.time_s[0])
-        return replace(self, motions=(*self.motions, (motion, (mounted,))), motion_s=self.motion_s + seconds)
+        return replace(
+            self, motions=(*self.motions, (motion, (mounted,))), motion_s=self.motion_s + seconds
+        )
 
     def in_proportion(self, std_percent: FloatArray) -> GainsSoFar:
         """Show σ from now on in proportion to that of the estimator after these blocks.
@@ -199,7 +210,9 @@ class GainsSoFar:
         mounted = [payloads for _, payloads in self.motions]
         name = self.experiment.payload.name.upper()
         if (0,) not in mounted:
-            return f"the gains show only beside a known mass, and no block with {name} is recorded yet"
+            return (
+                f"the gains show only beside a known mass, and no block with {name} is recorded yet"
+            )
         if (None,) not in mounted:
             return f"the gains show only beside a block without {name}, and none is recorded yet"
         if self.motion_s < self.honest_s:
@@ -215,7 +228,10 @@ class GainsSoFar:
     def _gains(self, gains: FloatArray, std_percent: FloatArray) -> list[QuickGain]:
         """Return the gains, the worst first."""
         rows = zip(self.experiment.cell.axes, gains.tolist(), std_percent.tolist(), strict=True)
-        found = [QuickGain(axis.name, axis.gain_unit, value, std, self.target_percent) for axis, value, std in rows]
+        found = [
+            QuickGain(axis.name, axis.gain_unit, value, std, self.target_percent)
+            for axis, value, std in rows
+        ]
         return sorted(found, key=lambda gain: -gain.ratio)
 
     def _why(self, axis: int) -> str:

@@ -14,7 +14,14 @@ import numpy as np
 
 from daq.config import cell as declared
 from daq.config.cell import Cell, joint_names
-from daq.config.cell_buses import bus_loads, cell_address, drive_axes, load_warnings, polling_fits, polling_warnings
+from daq.config.cell_buses import (
+    bus_loads,
+    cell_address,
+    drive_axes,
+    load_warnings,
+    polling_fits,
+    polling_warnings,
+)
 from daq.config.cell_file import bundle
 from daq.config.drive import shipped_profiles
 from daq.config.policy import Permission
@@ -52,15 +59,23 @@ from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync, Pacing, TimedSync
 from ident.model.bodies import Payload
 
-LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
+#: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
+LOCKSTEP_TIMEOUT_S = 3.0
 GUARD_MS = {declared.PacingMode.TIMED: 500, declared.PacingMode.LOCKSTEP: 5000}
-"""Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while the recorder is late."""
-SYNC_SILENCE_S = 0.1  #: Silence of the SYNC producer after which this program sends SYNC to stop the axes
+"""Silence of the recorder after which the amplifiers stop;
+in lockstep nothing moves while the recorder is late.
+"""
+#: Silence of the SYNC producer after which this program sends SYNC to stop the axes
+SYNC_SILENCE_S = 0.1
 SYNC_SILENCE_PERIODS = 3  #: The same in periods; the longer counts
 ALLOWANCE_S = 10.0
-"""Time added to moves and dwells for enabling, hand-shakes, settling and the stop; a good run takes less."""
+"""Time added to moves and dwells for enabling, hand-shakes, settling and the stop;
+a good run takes less.
+"""
 LATE_LOSSES_S = 0.25
-"""Time to read on after the last sample: the interface's counters are read five times a second (capture.py)."""
+"""Time to read on after the last sample:
+the interface's counters are read five times a second (capture.py).
+"""
 SPACE_CHECK_S = 0.1  #: Recorded time between two checks of the free space on the disk
 ROUNDING = 1.001  #: Factor by which rounding to whole counts may exceed a limit
 
@@ -73,7 +88,9 @@ class Clocks:
     monotonic_ns: Callable[[], int] = time.monotonic_ns
 
     def wall_minus_monotonic_ns(self) -> int:
-        """Return the present offset of the two [ns]; the monotonic clock is read before and after the other."""
+        """Return the present offset of the two [ns];
+        the monotonic clock is read before and after the other.
+        """
         before_ns = self.monotonic_ns()
         wall_ns = self.wall_ns()
         after_ns = self.monotonic_ns()
@@ -86,7 +103,9 @@ class Clocks:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A finished recording: the log with its statistics, those of the stream, and warnings about the currents."""
+    """A finished recording: the log with its statistics, those of the stream,
+    and warnings about the currents.
+    """
 
     path: Path
     log: RunStatistics
@@ -115,7 +134,9 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
 
 @dataclass(frozen=True, slots=True)
 class RecordingRequest:
-    """A recording to make: its moves, its log, what the robot carries, and who permits the motion."""
+    """A recording to make: its moves, its log, what the robot carries,
+    and who permits the motion.
+    """
 
     cell_file: Path  #: file of the cell; the log gets it with all files that it names
     cell: Cell  #: content of this file
@@ -126,9 +147,12 @@ class RecordingRequest:
     granted_by: str | None  #: operator who permits the motion; None refuses it
     run_id: str  #: identity of the run in its log
     speed: float = (
-        1.0  #: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for the log
+        #: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for
+        #: the log
+        1.0
     )
-    entered_kg: float | None = None  #: mass of the payload that was weighed for this recording [kg]; None if it was not
+    #: mass of the payload that was weighed for this recording [kg]; None if it was not
+    entered_kg: float | None = None
     unguarded: bool = False  #: whether axes may move that go on moving when this program is killed
 
 
@@ -150,22 +174,27 @@ def record(
         free: returns the free bytes of a folder's disk.
         block_signals: blocks signals while the axes are stopped.
         progress: receives the number of finished moves and of all moves.
-        require_released: check that the robot may move, before the drives are used and again before they get power; if
-            it raises, no file is made. By default the interlock of the cell file decides, where it declares one.
+        require_released: check that the robot may move, before the drives are used and again before
+            they get power; if it raises, no file is made. By default the interlock of the cell file
+            decides, where it declares one.
         feed: gets what the log gets, for consoles.
 
-    The cell's `policy` permits nothing here: it is for jobs, which put its permissions into the request.
+    The cell's `policy` permits nothing here: it is for jobs, which put its permissions into the
+    request.
 
     Raises:
-        UsageError: the weighed mass is not the payload's, or a file of that name exists; no file was made.
-        MotionRefused: motion is disabled, an axis is unguarded or outside its limits, or the moves leave them; no file
-            was made, and nothing has moved, except where an axis was brought back (`recovery_move`).
+        UsageError: the weighed mass is not the payload's, or a file of that name exists; no file
+            was made.
+        MotionRefused: motion is disabled, an axis is unguarded or outside its limits, or the moves
+            leave them; no file was made, and nothing has moved, except where an axis was brought
+            back (`recovery_move`).
         NotReleased: the interlock does not release the robot; nothing has moved.
-        DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
-            marked invalid.
+        DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the
+            log is complete but marked invalid.
         ConfigurationInconsistent, OutputFailed: see daq/errors.py.
-        DriverError: from the bus; the axes were stopped. The samples until then stay in an unfinished log (`.part`).
-            No fit reads it; `daq.log.salvage` converts it to a partial log.
+        DriverError: from the bus; the axes were stopped. The samples until then stay in an
+            unfinished log (`.part`). No fit reads it; `daq.log.salvage` converts it to a partial
+            log.
     """
     clocks = clocks or Clocks()
     cell = request.cell
@@ -174,7 +203,11 @@ def record(
     check_entered_mass(cell, request.payload, request.entered_kg)
     require_released = require_released or release_check(cell, clocks.now)
     require_released()
-    with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as wanted:
+    with (
+        defer_full_gc(),
+        network_of(cell, block_signals) as network,
+        _sync_producer(cell, network) as wanted,
+    ):
         network.prepare()
         _require_guarded(network, request.unguarded)
         polling = Polling.found(network, beside_stream=polling_fits(cell))
@@ -182,12 +215,15 @@ def record(
         check_nameplates(request.cell_file, cell, scales)
         warnings = [*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()]
         warnings += polling_warnings(cell) if polling else ()
-        readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
+        readback = readback_of_drives(
+            cell.axis_names, network.ampere_per_unit(), network.readback()
+        )
         scale = scaling(cell, readback)
         rate_hz = 1e6 / _sync(cell).period_us
         files = bundle(request.cell_file)
-        # Read the positions first, so that a refusal comes before a file exists. This takes a stream of its own: the
-        # checks below last many periods, and the schedule of the recording does not wait.
+        # Read the positions first, so that a refusal comes before a file exists. This takes a
+        # stream of its own: the checks below last many periods, and the schedule of the recording
+        # does not wait.
         producer, remarks = _started(cell, wanted)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
@@ -209,7 +245,9 @@ def record(
             )
             kept.feed.begin(_facts(cell, scale, run, out, len(moves)), lambda: log.statistics)
             log.readings(temperatures)
-            stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), kept.event)
+            stream = SyncStream(
+                network, _pacing(cell, run.started_wall_ns, clocks, producer), kept.event
+            )
             polling.begin(stream, log.reading)
             for sample in until_complete(stream):
                 kept.sample(sample)
@@ -222,7 +260,9 @@ def record(
                 or stream_losses(stream.statistics)
                 or kept.motion.reason(cell, readback, rate_hz)
             )
-            log.conclude(not reason, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+            log.conclude(
+                not reason, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns()
+            )
         kept.feed.finish()
         if short is not None:
             raise short
@@ -250,10 +290,14 @@ def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunI
 
 
 def controller_digest(cell: Cell) -> str | None:
-    """Return the SHA-256 of the controller's file now; None if the cell names none or it cannot be read."""
+    """Return the SHA-256 of the controller's file now;
+    None if the cell names none or it cannot be read.
+    """
     path = cell.controller_path
     try:
-        return None if path is None else sha256(read_controller_file(path))
+        if path is None:
+            return None
+        return sha256(read_controller_file(path))
     except ControllerUnfit:
         return None
 
@@ -300,11 +344,13 @@ class Kept:
             self.progress(self.done)
 
 
-def keep_samples(samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int) -> None:
+def keep_samples(
+    samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int
+) -> None:
     """Log and publish every sample of a motion; end the motion when logging fails.
 
-    An error is thrown into `execute`, which stops the axes and attaches to the error what it could not confirm. If the
-    generator were only closed, these notes would be lost.
+    An error is thrown into `execute`, which stops the axes and attaches to the error what it could
+    not confirm. If the generator were only closed, these notes would be lost.
 
     Raises:
         DiskSpaceShort, OutputFailed, DriverError: the axes were stopped.
@@ -322,7 +368,9 @@ def keep_samples(samples: Generator[Sample, None, None], kept: Kept, room: DiskR
 def _keep_motion(
     samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int
 ) -> DiskSpaceShort | None:
-    """Log a motion to its end; returns the error of a disk that became full, after which the axes were stopped."""
+    """Log a motion to its end; returns the error of a disk that became full,
+    after which the axes were stopped.
+    """
     with closing(samples):
         try:
             keep_samples(samples, kept, room, check_every)
@@ -341,7 +389,9 @@ def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: flo
     return total_s
 
 
-def _log_bytes(cell: Cell, moves: Sequence[Move], start_counts: Sequence[int], files: Mapping[str, bytes]) -> int:
+def _log_bytes(
+    cell: Cell, moves: Sequence[Move], start_counts: Sequence[int], files: Mapping[str, bytes]
+) -> int:
     """Return the size of the log of these moves at most [bytes]."""
     rate_hz = 1e6 / _sync(cell).period_us
     longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
@@ -349,7 +399,8 @@ def _log_bytes(cell: Cell, moves: Sequence[Move], start_counts: Sequence[int], f
 
 
 def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
-    """Return the samples up to the first that has the position of every axis; no move can be planned without it.
+    """Return the samples up to the first that has the position of every axis;
+    no move can be planned without it.
 
     Raises:
         SampleLost: more incomplete cycles in a row than the stream tolerates.
@@ -371,10 +422,11 @@ def _positions(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
 
 
 def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
-    """Return the limits of each motor, within which no motor alone can move a joint out of its limits [counts].
+    """Return the limits of each motor, within which no motor alone can move a joint out of its
+    limits [counts].
 
-    A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits of the joints are
-    checked in the plan.
+    A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits
+    of the joints are checked in the plan.
     """
     limits = limits_of(cell)
     lower = limits.lower - scale.offset_rad
@@ -392,8 +444,12 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     )
 
 
-def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
-    """Convert the joint trapezoids of a plan to motor moves [counts]: R is linear, and all axes share the ramps."""
+def motor_moves(
+    cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int]
+) -> tuple[Move, ...]:
+    """Convert the joint trapezoids of a plan to motor moves [counts]:
+    R is linear, and all axes share the ramps.
+    """
     moves = []
     here_rad = scale.joint_position(np.array(start_counts))
     here = tuple(start_counts)
@@ -401,12 +457,16 @@ def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence
         path = path_of(cell, here_rad, planned)
         target_rad = np.array(planned.target_rad)
         target = tuple(
-            int(count) for count in np.rint(cell.ratio @ (target_rad - scale.offset_rad) / scale.rad_per_count)
+            int(count)
+            for count in np.rint(cell.ratio @ (target_rad - scale.offset_rad) / scale.rad_per_count)
         )
         speed = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
         ramp = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
         # Limits for this move alone: the fastest trapezoid within them is that of the joints.
-        exact = [AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0) for v, a in zip(speed, ramp, strict=True)]
+        exact = [
+            AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0)
+            for v, a in zip(speed, ramp, strict=True)
+        ]
         dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
         moves.append(synchronised_move(here, target, exact, dwell))
         here_rad = target_rad
@@ -423,7 +483,8 @@ def _permission(granted_by: str | None) -> str:
     if granted_by is None:
         raise MotionRefused(
             "a recording without permission to move",
-            expected="an operator who permits motion; `policy: {motion: allowed}` is for `recalibrate` alone",
+            expected="an operator who permits motion; `policy: {motion: allowed}` is for "
+            "`recalibrate` alone",
             remedy="pass --enable-motion",
         )
     return granted_by
@@ -440,28 +501,33 @@ def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
         raise MotionRefused(
             f"axes that are UNGUARDED: {'; '.join(network.unguarded())}",
             expected="that every axis watches the recorder's heartbeat (1016h)",
-            remedy=f"nothing has moved; pass --unguarded to move {', '.join(without)} all the same, with a hand at the "
-            "emergency stop; a scheduled job needs `policy: {unguarded: allowed}` in the cell file",
+            remedy=f"nothing has moved; pass --unguarded to move {', '.join(without)} all the "
+            "same, with a hand at the emergency stop; a scheduled job needs `policy: {unguarded: "
+            "allowed}` in the cell file",
         )
 
 
-# An abrupt stop, of a brake or a killed recorder, may end a little beyond a limit. No recording begins there. A cell
-# file with `policy: {recovery_motion: allowed}` permits a slow return by a little; it needs the same permission to
-# move, and the same interlock, as every motion.
+# An abrupt stop, of a brake or a killed recorder, may end a little beyond a limit. No recording
+# begins there. A cell file with `policy: {recovery_motion: allowed}` permits a slow return by a
+# little; it needs the same permission to move, and the same interlock, as every motion.
 
 LARGEST_SHARE = 0.02  #: Of an axis's range: farther beyond a limit a person has to find out why
 RECOVERY_SPEED = 0.05  #: Share of an axis's limits of velocity and acceleration
-INSIDE = 0.001  #: Share of the range by which the return ends within the limit: a loop at rest is off by some counts
+#: Share of the range by which the return ends within the limit: a loop at rest is off by some
+#: counts
+INSIDE = 0.001
 LEAST_PER_S = 3.0  #: Least velocity and acceleration of a move [counts/s, counts/s²]
 
 
 def recovery_move(
     cell: Cell, scale: SiScaling, start_counts: Sequence[int], limits: Sequence[AxisLimits]
 ) -> tuple[Move, tuple[AxisLimits, ...], str] | None:
-    """Return the move that brings all axes within their limits, its own limits, and a remark; None if all are inside.
+    """Return the move that brings all axes within their limits, its own limits, and a remark;
+    None if all are inside.
 
     Raises:
-        MotionRefused: an axis is outside and the cell does not allow the return, or it is too long or not clear.
+        MotionRefused: an axis is outside and the cell does not allow the return, or it is too long
+            or not clear.
     """
     outside: list[str] = []
     target: list[int] = []
@@ -475,7 +541,10 @@ def recovery_move(
             continue
         share = beyond / max(high - low, 1)
         largest_share = max(largest_share, share)
-        outside.append(f"{name} at {start} counts, {beyond} ({100.0 * share:.2g} % of its range) beyond its limits")
+        outside.append(
+            f"{name} at {start} counts, {beyond} ({100.0 * share:.2g} % of its range) "
+            "beyond its limits"
+        )
         inside = INSIDE * (high - low)
         target.append(round(np.clip(start, low + inside, high - inside)))
     if not outside:
@@ -494,11 +563,19 @@ def recovery_move(
         )
         for start, limit in zip(start_counts, limits, strict=True)
     )
-    return synchronised_move(start_counts, tuple(target), slow), slow, f"{found}; it was brought back slowly"
+    return (
+        synchronised_move(start_counts, tuple(target), slow),
+        slow,
+        (f"{found}; it was brought back slowly"),
+    )
 
 
 def bring_back(
-    network: CanopenNetwork, pacing: Pacing, move: Move, limits: tuple[AxisLimits, ...], granted_by: str
+    network: CanopenNetwork,
+    pacing: Pacing,
+    move: Move,
+    limits: tuple[AxisLimits, ...],
+    granted_by: str,
 ) -> None:
     """Make the recovery move; the network is then as after `prepare`.
 
@@ -506,7 +583,9 @@ def bring_back(
         DriverError: as `execute`; the axes were stopped.
     """
     stream = SyncStream(network, pacing)
-    with closing(execute(network, stream, (move,), MotionPermission(granted_by, limits))) as samples:
+    with closing(
+        execute(network, stream, (move,), MotionPermission(granted_by, limits))
+    ) as samples:
         for _ in samples:
             pass
     network.prepare()  # a motion ends the guards
@@ -519,7 +598,10 @@ def _require_allowed(cell: Cell, found: str, share: float) -> None:
     elif share > LARGEST_SHARE:
         remedy = f"{by_hand}, and find out how it got there: it is too far for `recovery_motion`"
     elif cell.recovery_motion is not Permission.ALLOWED:
-        remedy = f"{by_hand}, or allow a slow return with `policy: {{recovery_motion: allowed}}` in the cell file"
+        remedy = (
+            f"{by_hand}, or allow a slow return with `policy: {{recovery_motion: allowed}}` "
+            "in the cell file"
+        )
     else:
         return
     raise MotionRefused(found, expected="every axis within its limits", remedy=remedy)
@@ -533,7 +615,8 @@ def _start(
     pacing: Callable[[], Pacing],
     require_released: Callable[[], None],
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the positions of the axes [counts], brought back within their limits if need be, and remarks about that.
+    """Return the positions of the axes [counts], brought back within their limits if need be,
+    and remarks about that.
 
     Raises:
         MotionRefused: an axis is outside its limits, and may not be brought back.
@@ -550,9 +633,14 @@ def _start(
 
 
 def _checked_moves(
-    cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int], permission: MotionPermission
+    cell: Cell,
+    plan: Plan,
+    scale: SiScaling,
+    start_counts: Sequence[int],
+    permission: MotionPermission,
 ) -> tuple[tuple[Move, ...], tuple[str, ...]]:
-    """Convert a plan to motor moves that keep the limits, with a clear way to its first target, and remarks about it.
+    """Convert a plan to motor moves that keep the limits, with a clear way to its first target,
+    and remarks about it.
 
     Raises:
         MotionRefused: they do not keep the limits, or no way to the first target is clear.
@@ -566,11 +654,15 @@ def _checked_moves(
 
 def _stopped(short: DiskSpaceShort | None, kept: Kept, moves: int) -> str:
     """Return why the moves were not finished; empty where they were."""
-    return "" if short is None else f"stopped after {kept.done} of {moves} moves: {short.found}"
+    if short is None:
+        return ""
+    return f"stopped after {kept.done} of {moves} moves: {short.found}"
 
 
 def stream_losses(statistics: StreamStatistics) -> str:
-    """Return the losses of a run, each of which makes it invalid; empty without a lost or unexplained frame."""
+    """Return the losses of a run, each of which makes it invalid;
+    empty without a lost or unexplained frame.
+    """
     return loss_reason(
         {
             Loss.MISSING: statistics.missing,
@@ -589,12 +681,17 @@ def stream_losses(statistics: StreamStatistics) -> str:
 def _sync(cell: Cell) -> declared.Sync:
     if cell.sync is None:
         raise ConfigurationInconsistent(
-            f"cell {cell.name!r}", found="no `sync`", expected="its period and pacing", remedy="complete the cell file"
+            f"cell {cell.name!r}",
+            found="no `sync`",
+            expected="its period and pacing",
+            remedy="complete the cell file",
         )
     return cell.sync
 
 
-def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManager[SyncProducer | None]:
+def _sync_producer(
+    cell: Cell, network: CanopenNetwork
+) -> AbstractContextManager[SyncProducer | None]:
     """Return the SYNC producer; None if this program sends SYNC.
 
     On one SocketCAN bus the kernel sends it for this program, which a busy computer delays.
@@ -605,22 +702,30 @@ def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManage
         return nullcontext()
     timed = sync.pacing is declared.PacingMode.TIMED
     by_kernel = isinstance(address, BusAddress) and address.kind.has_kernel_sync
-    if sync.producer == declared.KERNEL or (sync.producer == declared.RECORDER and timed and by_kernel):
+    if sync.producer == declared.KERNEL or (
+        sync.producer == declared.RECORDER and timed and by_kernel
+    ):
         return KernelProducer(network, sync.period_us)
     if sync.producer == declared.RECORDER:
         return nullcontext()
     return DriveProducer(network, cell.axis_names.index(sync.producer), sync.period_us)
 
 
-def _started(cell: Cell, producer: SyncProducer | None) -> tuple[SyncProducer | None, tuple[str, ...]]:
-    """Start the SYNC producer; returns it, or None with a remark if this program has to send SYNC after all."""
+def _started(
+    cell: Cell, producer: SyncProducer | None
+) -> tuple[SyncProducer | None, tuple[str, ...]]:
+    """Start the SYNC producer; returns it, or None with a remark if this program has to send SYNC
+    after all.
+    """
     try:
         if producer is not None:
             producer.start()
     except BusError as error:
         if _sync(cell).producer != declared.RECORDER:
             raise
-        return None, (f"SYNC is sent by this program, and late when the computer is busy: {error.reason}",)
+        return None, (
+            f"SYNC is sent by this program, and late when the computer is busy: {error.reason}",
+        )
     return producer, ()
 
 

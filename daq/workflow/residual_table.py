@@ -27,15 +27,16 @@ class ResidualTable:
     """One log under a calibration."""
 
     validation: Validation
-    #: By name. Of each axis: torque of its joint [Nm; N], current reference of its motor, whether the row counts.
+    #: By name. Of each axis: torque of its joint [Nm; N], current reference of its motor, whether
+    #: the row counts.
     columns: Columns
 
 
 def residual_table(calibration: Calibration, log: Path, cell: Cell | None = None) -> ResidualTable:
     """Predict a log with a calibration, in the rows of its fit: filtered and decimated.
 
-    A current is that of the torques of all joints through the drive train, v = (T τ)/g. Internal preload of a redundant
-    drive is in none of them.
+    A current is that of the torques of all joints through the drive train, v = (T τ)/g. Internal
+    preload of a redundant drive is in none of them.
 
     Args:
         calibration: with the filter of its fit.
@@ -66,7 +67,8 @@ def residual_table(calibration: Calibration, log: Path, cell: Cell | None = None
         columns |= {
             f"{name}.{torque}_predicted_{force}": found.predicted_nm[index],
             f"{name}.{torque}_measured_{force}": found.measured_nm[index],
-            f"{name}.{torque}_residual_{force}": found.measured_nm[index] - found.predicted_nm[index],
+            f"{name}.{torque}_residual_{force}": found.measured_nm[index]
+            - found.predicted_nm[index],
             f"{name}.current_predicted_{current}": predicted_a[index],
             f"{name}.current_measured_{current}": measured_a[index],
             f"{name}.current_residual_{current}": measured_a[index] - predicted_a[index],

@@ -18,7 +18,9 @@ from ident.model.bodies import Payload
 FreeBytes = Callable[[Path], int]  #: Room left for this user on the disk of a folder [bytes]
 
 RESERVE_BYTES = 64 * 2**20
-"""Never used: others write to the same disk, and the stop of the axes and the end of the log need some too."""
+"""Never used: others write to the same disk, and the stop of the axes and the end of the log need
+some too.
+"""
 INDEX_BYTES = 16  #: Index entry of a message, behind its chunk
 MESSAGE_HEAD_BYTES = 31
 CHUNKS_BYTES_S = 4096.0  #: Heads and indexes of the chunks of one second
@@ -26,18 +28,30 @@ ENDS_BYTES = 2**16  #: Definitions and metadata, at the start and again at the e
 
 
 def free_bytes(folder: Path) -> int:
-    """Room left for this user on the disk of a folder [bytes]; OSError when there is no such folder."""
+    """Room left for this user on the disk of a folder [bytes];
+    OSError when there is no such folder.
+    """
     return shutil.disk_usage(folder).free
 
 
-def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]) -> int:
+def largest_log_bytes(
+    names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]
+) -> int:
     """Size of a log at most: as if nothing could be compressed [bytes]."""
     zeros = [0.0] * len(names)
-    shown = (joint_state_bytes(joint_state_prefix(names), 0, zeros, zeros), currents_bytes(0, zeros))
+    shown = (
+        joint_state_bytes(joint_state_prefix(names), 0, zeros, zeros),
+        currents_bytes(0, zeros),
+    )
     of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
-    of_states = 1e9 / JOINT_STATE_NS * sum(MESSAGE_HEAD_BYTES + len(message) + INDEX_BYTES for message in shown)
+    of_states = (
+        1e9
+        / JOINT_STATE_NS
+        * sum(MESSAGE_HEAD_BYTES + len(message) + INDEX_BYTES for message in shown)
+    )
     growth_bytes_s = of_samples + of_states + CHUNKS_BYTES_S
-    files = sum(map(len, attached.values())) + len(attached.get(URDF, b""))  # a topic has it too, for viewers
+    # A topic has it too, for viewers
+    files = sum(map(len, attached.values())) + len(attached.get(URDF, b""))
     return round(duration_s * growth_bytes_s) + ENDS_BYTES + files
 
 
@@ -57,7 +71,8 @@ class DiskRoom:
         """
         self._require(
             needed_bytes + RESERVE_BYTES,
-            f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} in reserve",
+            f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} "
+            "in reserve",
             "nothing has moved; free space, name a folder on another disk, or plan a shorter run",
         )
 
@@ -71,7 +86,8 @@ class DiskRoom:
         self._require(
             RESERVE_BYTES,
             f"{_megabytes(RESERVE_BYTES)} in reserve",
-            "the axes were sent a stop; the log up to there is finished and marked invalid: free space, record again",
+            "the axes were sent a stop; the log up to there is finished and marked invalid: free "
+            "space, record again",
         )
 
     def _require(self, least_bytes: int, expected: str, remedy: str) -> None:
@@ -103,7 +119,8 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
     """Refuse a mass from the scale that is not the cell file's, before anything moves.
 
     Raises:
-        UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is mounted.
+        UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is
+            mounted.
     """
     if entered_kg is None:
         return
@@ -121,7 +138,8 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
             f"payload {payload.name!r}",
             found=f"{entered_kg:g} kg from the scale",
             expected=f"{declared_kg:g} kg within {within_kg:g} kg, as in the cell file",
-            remedy="weigh it again and correct the wrong one of the two: all gains are in proportion to this mass",
+            remedy="weigh it again and correct the wrong one of the two: all gains are in "
+            "proportion to this mass",
         )
 
 
@@ -132,11 +150,13 @@ NEVER = 2**31 - 1  #: Searches of the middle generation before one of everything
 def defer_full_gc() -> Iterator[None]:
     """Defer full collections until the block ends; young objects are still collected.
 
-    A search through all that the program and its libraries have made takes tens of milliseconds, in which nothing else
-    of the process runs: so many periods without SYNC at 1 kHz, and a run that is marked invalid.
+    A search through all that the program and its libraries have made takes tens of milliseconds, in
+    which nothing else of the process runs: so many periods without SYNC at 1 kHz, and a run that is
+    marked invalid.
     """
     before = gc.get_threshold()
-    # Python's own limits for young objects, which the command line raises: each of these searches takes microseconds.
+    # Python's own limits for young objects, which the command line raises: each of these searches
+    # takes microseconds.
     gc.set_threshold(700, 10, NEVER)
     try:
         yield

@@ -33,11 +33,14 @@ from ident.physical.physical import (
 from ident.prediction import corrections_of, placed_effect
 
 SAMPLES = 400
-"""Random states on which torques are compared: some ten times as many equations as a six-axis arm has parameters."""
+"""Random states on which torques are compared:
+some ten times as many equations as a six-axis arm has parameters.
+"""
 SEED = 0
 MOTION = 0.6
-"""Share of the limits of speed and acceleration within which the states lie: recorded runs have a root mean square of
-about a third of their limits, and uniform states one of 0.58 of theirs."""
+"""Share of the limits of speed and acceleration within which the states lie: recorded runs have a
+root mean square of about a third of their limits, and uniform states one of 0.58 of theirs.
+"""
 
 
 CHAIN_SHARES = (1.0, 0.7, 0.5, 0.3, 0.1)
@@ -60,17 +63,22 @@ class PhysicalRobot:
 
     parameters: PhysicalParameters  #: with their certificate
     prior: InertiaPrior  #: what was believed of the links beforehand
-    #: Of base parameters, largest first; none where the identified ones are those of a possible robot.
+    #: Of base parameters, largest first; none where the identified ones are those of a possible
+    #: robot.
     shifts: tuple[Shift, ...]
 
 
-def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, urdf: str) -> PhysicalRobot:
+def physical_robot(
+    calibration: Calibration, model: Model, limits: FloatArray, urdf: str
+) -> PhysicalRobot:
     """The parameters of bodies that could exist and need the torques that the calibration says.
 
     Args:
-        calibration: its gains, payloads and effects take no part; an axis with an accepted effect of friction may have
-            any sign of fv and fs, because they are only a part of its friction.
-        limits: ranges in which the torques are compared, as of `ident.physical.physical.random_motion`, shape (4, n).
+        calibration: its gains, payloads and effects take no part; an axis with an accepted effect
+            of friction may have any sign of fv and fs, because they are only a part of its
+            friction.
+        limits: ranges in which the torques are compared, as of
+            `ident.physical.physical.random_motion`, shape (4, n).
 
     Raises:
         ModelError: the calibration is of another robot.
@@ -78,13 +86,21 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     """
     model = corrected_model(model, corrections_of(calibration))
     columns = model.regressor(random_states(model, limits))
-    of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
-    known = {p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name}
+    of_effects = {
+        coefficient.name for effect in calibration.effects for coefficient in effect.coefficients
+    }
+    known = {
+        p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name
+    }
     # A URDF has the robot without a payload.
-    known = {name: parameter for name, parameter in known.items() if not parameter.is_payload_friction}
+    known = {
+        name: parameter for name, parameter in known.items() if not parameter.is_payload_friction
+    }
     base = regroup(model, tuple(known), columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
     placed = [placed_effect(effect, calibration)[0] for effect in calibration.effects]
-    friction = frozenset(one.axis for one in placed if one.effect.declares is Property.ODD_IN_VELOCITY)
+    friction = frozenset(
+        one.axis for one in placed if one.effect.declares is Property.ODD_IN_VELOCITY
+    )
     prior = inertia_prior(urdf)
     values = np.array([known[name].value for name in base.names])
     found = physical_parameters(model, base, values, columns, prior, friction)
@@ -92,7 +108,10 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     if not found.exact:
         for name, before, after in zip(base.names, found.identified, found.realised, strict=True):
             std = known[name].std
-            deviations = float(abs(after - before) / std) if std > 0.0 else float("inf")
+            if std > 0.0:
+                deviations = float(abs(after - before) / std)
+            else:
+                deviations = float("inf")
             shifts.append(Shift(name.split(" ", 1)[0], float(before), float(after), deviations))
     return PhysicalRobot(found, prior, tuple(sorted(shifts, key=lambda shift: -shift.deviations)))
 
@@ -100,8 +119,9 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
 def random_states(model: Model, limits: FloatArray) -> Motion:
     """Draw the states on which torques are compared.
 
-    The ranges of the motors of a closed chain may hold positions that its loops do not reach; then the ranges are
-    narrower, about their middle. Of more motors than degrees of freedom, some lead and the others follow.
+    The ranges of the motors of a closed chain may hold positions that its loops do not reach; then
+    the ranges are narrower, about their middle. Of more motors than degrees of freedom, some lead
+    and the others follow.
 
     Args:
         model: the declared model.
@@ -110,7 +130,7 @@ def random_states(model: Model, limits: FloatArray) -> Motion:
     Raises:
         ModelError: the loops of a closed chain close in no such range.
     """
-    if not model.robot.closures:
+    if not model.robot.is_constrained:
         return random_motion(limits, SAMPLES, SEED)
     leading, robot, assembly = _leading_motors(model)
     failure: ModelError | None = None
@@ -134,7 +154,9 @@ def random_states(model: Model, limits: FloatArray) -> Motion:
 
 
 def _leading_motors(model: Model) -> tuple[list[int], Robot, Assembly]:
-    """As many axes as there are degrees of freedom, the best ones to lead, and the robot without the other motors."""
+    """As many axes as there are degrees of freedom, the best ones to lead,
+    and the robot without the other motors.
+    """
     found: list[tuple[list[int], Robot, Assembly]] = []
     failure: ModelError | None = None
     for axes in combinations(range(model.robot.axis_count), model.assembly.mobility):
@@ -153,7 +175,9 @@ def _leading_motors(model: Model) -> tuple[list[int], Robot, Assembly]:
 
 
 def cell_limits(cell: Cell) -> FloatArray:
-    """Middle and half of the range of each axis, and MOTION of its speed and acceleration, shape (4, n) [rad, s]."""
+    """Middle and half of the range of each axis, and MOTION of its speed and acceleration,
+    shape (4, n) [rad, s].
+    """
     limits = limits_of(cell)
     middle = 0.5 * (limits.lower + limits.upper)
     half_range = 0.5 * (limits.upper - limits.lower)
@@ -161,7 +185,8 @@ def cell_limits(cell: Cell) -> FloatArray:
 
 
 MAX_BYTES = 16 * 2**20  #: No URDF is larger; meshes are files of their own
-MAX_DEPTH = 64  #: Elements in elements; a URDF has five or so, and readers that recurse end at some depth
+#: Elements in elements; a URDF has five or so, and readers that recurse end at some depth
+MAX_DEPTH = 64
 _TAG = re.compile(rb"<[^\s/>]+(?:\s+[^\s=>/]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*/?>")
 
 
@@ -190,7 +215,9 @@ class Markup:
         elements = self.links if kind == "link" else self.joints
         if name not in elements:
             known = ", ".join(sorted(elements)) or "none"
-            raise refused(self.file, f"no {kind} {name!r} (there are {known})", "the robot of the calibration")
+            raise refused(
+                self.file, f"no {kind} {name!r} (there are {known})", "the robot of the calibration"
+            )
         return elements[name]
 
     def only(self, element: Element, name: str) -> Element | None:
@@ -202,7 +229,9 @@ class Markup:
         found = [child for child in element.children if child.name == name]
         if len(found) > 1:
             what = f"<{element.name} name={element.attributes.get('name', '')!r}>"
-            raise refused(self.file, f"{len(found)} <{name}> in {what}", "at most one", "remove the wrong one")
+            raise refused(
+                self.file, f"{len(found)} <{name}> in {what}", "at most one", "remove the wrong one"
+            )
         return found[0] if found else None
 
     def tag_end(self, element: Element) -> int:
@@ -220,14 +249,18 @@ class Markup:
     def end(self, element: Element) -> int:
         """Return the offset behind a whole element."""
         tag_end = self.tag_end(element)
-        return tag_end if self.is_empty(element) else self.content.index(b">", element.end) + 1
+        if self.is_empty(element):
+            return tag_end
+        return self.content.index(b">", element.end) + 1
 
     def is_empty(self, element: Element) -> bool:
         """Whether an element is written as <name/>."""
         return self.content.startswith(b"/>", self.tag_end(element) - 2)
 
     def indentation(self, at: int) -> bytes:
-        """Return the space before an offset in its line; empty where something else is before it."""
+        """Return the space before an offset in its line;
+        empty where something else is before it.
+        """
         line = self.content[self.content.rfind(b"\n", 0, at) + 1 : at]
         return line if not line.strip() else b""
 
@@ -236,8 +269,8 @@ def parse_markup(content: bytes, file: str) -> Markup:
     """Find links and joints.
 
     Raises:
-        SchemaMismatch: not well-formed, not UTF-8, too large, too deep, with a document type (which can define
-            entities and name files), or two links or joints of one name.
+        SchemaMismatch: not well-formed, not UTF-8, too large, too deep, with a document type (which
+            can define entities and name files), or two links or joints of one name.
     """
     if len(content) > MAX_BYTES:
         raise refused(file, f"{len(content)} bytes", f"at most {MAX_BYTES}")
@@ -268,11 +301,15 @@ def parse_markup(content: bytes, file: str) -> Markup:
     fixed: dict[str, list[str]] = {}
     for joint in named["joint"].values():
         if joint.attributes.get("type") == "fixed":
-            fixed.setdefault(_link_of(file, joint, "parent"), []).append(_link_of(file, joint, "child"))
+            fixed.setdefault(_link_of(file, joint, "parent"), []).append(
+                _link_of(file, joint, "child")
+            )
     return Markup(file, content, root, named["link"], named["joint"], fixed)
 
 
-def refused(file: str, found: str, expected: str, remedy: str = "give another URDF") -> SchemaMismatch:
+def refused(
+    file: str, found: str, expected: str, remedy: str = "give another URDF"
+) -> SchemaMismatch:
     """The error for a file that is no URDF to write into."""
     return SchemaMismatch(file, found=found, expected=expected, remedy=remedy)
 
@@ -280,7 +317,9 @@ def refused(file: str, found: str, expected: str, remedy: str = "give another UR
 def _link_of(file: str, joint: Element, end: str) -> str:
     named = [child.attributes.get("link") for child in joint.children if child.name == end]
     if len(named) != 1 or named[0] is None:
-        raise refused(file, f"joint {joint.attributes.get('name')!r} without one <{end} link=...>", "one")
+        raise refused(
+            file, f"joint {joint.attributes.get('name')!r} without one <{end} link=...>", "one"
+        )
     return named[0]
 
 
@@ -292,7 +331,8 @@ _MERGED = b"<!-- drivegain: this body's inertia is in that of the moving link it
 class JointUpdate:
     """New values of a joint and the link it moves."""
 
-    #: Everything that moves with the joint as one: its link and what fixed joints hold to it, in the link frame.
+    #: Everything that moves with the joint as one: its link and what fixed joints hold to it, in
+    #: the link frame.
     body: Body
     damping: float  #: viscous friction, not negative [Nm/(rad/s), N/(m/s)]
     friction: float  #: dry friction, not negative [Nm, N]
@@ -304,24 +344,28 @@ class Updated:
 
     content: bytes  #: the file
     links: dict[str, str]  #: name of the link that each joint moves, by the joint's name
-    merged: tuple[str, ...]  #: links whose own inertia was taken out, because it is part of a moving link's
+    #: links whose own inertia was taken out, because it is part of a moving link's
+    merged: tuple[str, ...]
 
 
-def update_urdf(content: bytes, name: str, joints: Mapping[str, JointUpdate], provenance: str) -> Updated:
+def update_urdf(
+    content: bytes, name: str, joints: Mapping[str, JointUpdate], provenance: str
+) -> Updated:
     """Replace or insert <inertial> of each moving link and damping and friction of its joint.
 
-    What the identification calls a link is all that moves as one. Its whole inertia goes to the link behind the moving
-    joint; the <inertial> of links that fixed joints hold to it becomes a comment, or their masses would count twice.
-    Links fixed to the base keep theirs: no torque depends on them. Comments, order, line ends, meshes and all other
-    elements and attributes are the same bytes as before.
+    What the identification calls a link is all that moves as one. Its whole inertia goes to the
+    link behind the moving joint; the <inertial> of links that fixed joints hold to it becomes a
+    comment, or their masses would count twice. Links fixed to the base keep theirs: no torque
+    depends on them. Comments, order, line ends, meshes and all other elements and attributes are
+    the same bytes as before.
 
     Args:
         joints: of every moving joint, by its name.
         provenance: for the comment at the head; one of an earlier export is replaced.
 
     Raises:
-        SchemaMismatch: it is no plain URDF: not well-formed, not UTF-8, with a document type, or without one of these
-            joints or links, or two inertias in one.
+        SchemaMismatch: it is no plain URDF: not well-formed, not UTF-8, with a document type, or
+            without one of these joints or links, or two inertias in one.
     """
     markup = parse_markup(content, name)
     edits = [_header(markup, provenance)]
@@ -372,7 +416,11 @@ def _put(markup: Markup, parent: Element, old: Element | None, lines: list[str])
     """Put an element in the place of the old one, or first into its parent."""
     new = [line.encode() for line in lines]
     if old is not None:
-        return old.start, markup.end(old), (markup.newline + markup.indentation(old.start)).join(new)
+        return (
+            old.start,
+            markup.end(old),
+            (markup.newline + markup.indentation(old.start)).join(new),
+        )
     indentation = markup.indentation(parent.start)
     inner = markup.newline + indentation + b"  "
     text = inner + inner.join(new)
@@ -384,7 +432,10 @@ def _put(markup: Markup, parent: Element, old: Element | None, lines: list[str])
 
 
 def _dynamics(markup: Markup, joint: Element, update: JointUpdate) -> _Edit:
-    values = {key: f'{key}="{value!r}"' for key, value in (("damping", update.damping), ("friction", update.friction))}
+    values = {
+        key: f'{key}="{value!r}"'
+        for key, value in (("damping", update.damping), ("friction", update.friction))
+    }
     old = markup.only(joint, "dynamics")
     if old is None:
         return _put(markup, joint, None, [f"<dynamics {' '.join(values.values())}/>"])

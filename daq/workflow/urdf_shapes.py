@@ -1,7 +1,9 @@
-"""The shapes of a URDF's links, `<visual>` and `<collision>`, and the limits of its joints, for other models.
+"""The shapes of a URDF's links, `<visual>` and `<collision>`, and the limits of its joints,
+for other models.
 
-Meshes are files beside the URDF. `package://NAME/…` is looked for in each folder above the URDF: as NAME in it, or in
-it where it is NAME itself. What cannot be read is listed with its reason, because a shape moves no torque.
+Meshes are files beside the URDF. `package://NAME/…` is looked for in each folder above the URDF: as
+NAME in it, or in it where it is NAME itself. What cannot be read is listed with its reason, because
+a shape moves no torque.
 """
 
 from __future__ import annotations
@@ -48,10 +50,12 @@ class UrdfShape:
     kind: ShapeKind
     rotation: FloatArray  #: shape's axes in the link's frame, shape (3, 3)
     translation_m: FloatArray  #: its origin there, shape (3,)
-    #: Sides of a box; radius and length of a cylinder or capsule; radius of a sphere; scales of a mesh [m; 1].
+    #: Sides of a box; radius and length of a cylinder or capsule; radius of a sphere; scales of a
+    #: mesh [m; 1].
     size: tuple[float, ...]
     mesh: Path | None  #: file of a mesh
-    colour: tuple[float, ...] | None  #: red, green, blue, opacity, 0 to 1; None where the URDF has none
+    #: red, green, blue, opacity, 0 to 1; None where the URDF has none
+    colour: tuple[float, ...] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +66,7 @@ class UrdfShapes:
     left_out: tuple[str, ...]  #: shapes that cannot be carried over, each with its reason
 
 
-class _Unreadable(Exception):
+class ShapeUnreadable(Exception):
     """A shape that is left out; its text is the reason."""
 
 
@@ -83,13 +87,15 @@ def shapes_of(urdf: str, folder: Path) -> UrdfShapes:
             for element in link.findall(tag):
                 try:
                     found.append(_shape(element, name, folder, colours))
-                except _Unreadable as reason:
+                except ShapeUnreadable as reason:
                     left_out.append(f"{tag} of {name}: {reason}")
     return UrdfShapes(tuple(found), tuple(left_out))
 
 
 def joint_ranges(urdf: str) -> dict[str, tuple[float, float]]:
-    """Return the least and the largest position of each moving joint [rad or m]; infinite without a usable limit."""
+    """Return the least and the largest position of each moving joint [rad or m];
+    infinite without a usable limit.
+    """
     ranges: dict[str, tuple[float, float]] = {}
     for joint in fromstring(urdf).findall("joint"):
         limit = joint.find("limit")
@@ -103,15 +109,17 @@ def joint_ranges(urdf: str) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _shape(element: Element, link: str, folder: Path, colours: dict[str, tuple[float, ...]]) -> UrdfShape:
+def _shape(
+    element: Element, link: str, folder: Path, colours: dict[str, tuple[float, ...]]
+) -> UrdfShape:
     geometry = element.find("geometry")
     children = [] if geometry is None else list(geometry)
     if len(children) != 1:
-        raise _Unreadable(f"{len(children)} geometries, where one is expected")
+        raise ShapeUnreadable(f"{len(children)} geometries, where one is expected")
     body = children[0]
     kinds = {kind.value: kind for kind in ShapeKind}
     if body.tag not in kinds:
-        raise _Unreadable(f"<{body.tag}>, which is none of {', '.join(kinds)}")
+        raise ShapeUnreadable(f"<{body.tag}>, which is none of {', '.join(kinds)}")
     kind = kinds[body.tag]
     rotation, translation_m = _origin(element)
     mesh = None
@@ -133,7 +141,7 @@ def _size(body: Element, kind: ShapeKind) -> tuple[float, ...]:
     if kind is ShapeKind.MESH:
         scale = _numbers(body, "scale", "1 1 1", 3)
         if 0.0 in scale:
-            raise _Unreadable(f"scale {body.get('scale')!r}, where no number may be 0")
+            raise ShapeUnreadable(f"scale {body.get('scale')!r}, where no number may be 0")
         return scale
     if kind is ShapeKind.BOX:
         size = _numbers(body, "size", "", 3)
@@ -142,12 +150,14 @@ def _size(body: Element, kind: ShapeKind) -> tuple[float, ...]:
     else:
         size = (*_numbers(body, "radius", "", 1), *_numbers(body, "length", "", 1))
     if min(size) <= 0.0:
-        raise _Unreadable(f"<{body.tag}> with a size of {min(size):g} m, which is not positive")
+        raise ShapeUnreadable(f"<{body.tag}> with a size of {min(size):g} m, which is not positive")
     return size
 
 
 def _origin(element: Element) -> tuple[FloatArray, FloatArray]:
-    """Axes and origin of a shape in its link; roll, pitch and yaw turn about the axes of the link."""
+    """Axes and origin of a shape in its link;
+    roll, pitch and yaw turn about the axes of the link.
+    """
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
@@ -160,10 +170,12 @@ def _mesh_file(name: str, folder: Path) -> Path:
     """Return the file that a URDF names, where it exists and MuJoCo reads it."""
     path = next((place for place in _places(name, folder) if place.is_file()), None)
     if path is None:
-        raise _Unreadable(f"no file {name!r} beside or above the URDF")
+        raise ShapeUnreadable(f"no file {name!r} beside or above the URDF")
     ending = path.suffix.lower()
     if ending not in MESH_FORMATS:
-        raise _Unreadable(f"{path.name} is no {', '.join(MESH_FORMATS)}; convert it, and name it in the URDF")
+        raise ShapeUnreadable(
+            f"{path.name} is no {', '.join(MESH_FORMATS)}; convert it, and name it in the URDF"
+        )
     if ending == ".stl":
         _check_stl(path)
     return path.resolve()
@@ -187,17 +199,20 @@ def _places(name: str, folder: Path) -> Iterator[Path]:
 
 
 def _check_stl(path: Path) -> None:
-    """Refuse an STL of text, a cut one, and one of too many triangles: MuJoCo refuses the whole model for it."""
+    """Refuse an STL of text, a cut one, and one of too many triangles:
+    MuJoCo refuses the whole model for it.
+    """
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(STL_HEAD_BYTES)
     triangles = int.from_bytes(head[-4:], "little")
     if len(head) < STL_HEAD_BYTES or size != STL_HEAD_BYTES + STL_TRIANGLE_BYTES * triangles:
-        raise _Unreadable(f"{path.name} is no binary STL, or was cut; save it as binary STL")
+        raise ShapeUnreadable(f"{path.name} is no binary STL, or was cut; save it as binary STL")
     if not LEAST_TRIANGLES <= triangles <= MOST_TRIANGLES:
         allowed = f"{LEAST_TRIANGLES} to {MOST_TRIANGLES}"
-        raise _Unreadable(
-            f"{path.name} has {triangles} triangles, where {allowed} are read; save it with fewer or more"
+        raise ShapeUnreadable(
+            f"{path.name} has {triangles} triangles, where {allowed} are read; save it with "
+            "fewer or more"
         )
 
 
@@ -217,13 +232,15 @@ def _colour(element: Element, named: dict[str, tuple[float, ...]]) -> tuple[floa
 
 
 def _own_colour(material: Element) -> tuple[float, ...] | None:
-    """Colour of a material; None without one, or where it is none: a picture is no reason to stop."""
+    """Colour of a material; None without one, or where it is none:
+    a picture is no reason to stop.
+    """
     colour = material.find("color")
     if colour is None:
         return None
     try:
         return _numbers(colour, "rgba", "", 4)
-    except _Unreadable:
+    except ShapeUnreadable:
         return None
 
 
@@ -232,7 +249,9 @@ def _numbers(element: Element, key: str, default: str, count: int) -> tuple[floa
     numbers = [_as_number(word) for word in text.split()]
     found = tuple(number for number in numbers if number is not None)
     if len(numbers) != count or len(found) != count:
-        raise _Unreadable(f"<{element.tag}> with {key}={text!r}, where {count} numbers are expected")
+        raise ShapeUnreadable(
+            f"<{element.tag}> with {key}={text!r}, where {count} numbers are expected"
+        )
     return found
 
 

@@ -1,4 +1,5 @@
-"""A calibration put to the test: what it predicts of a run, beside what was measured, under the filter of the fit.
+"""A calibration put to the test: what it predicts of a run, beside what was measured,
+under the filter of the fit.
 
 Several calibrations are compared on runs that they may never have seen (paper §4.3, Tables 5 to 8).
 """
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.arguments import PATHS, checks_arguments, of_kind, optional
 from daq.config.cell import Cell, model_of
 from daq.config.same_cell import GRAVITY as GRAVITY_SECTION
 from daq.config.same_cell import differing_zeros, mismatch_of_calibration
@@ -90,7 +92,8 @@ class Validation:
     run: str  #: its name
     digest: str  #: of the log (sha256, hex)
     data_use: DataUse  #: whether the fit has seen it
-    same_configuration: bool  #: the log carries the cell configuration that the calibration was made with
+    #: the log carries the cell configuration that the calibration was made with
+    same_configuration: bool
     partial: bool  #: the log was salvaged from a recording that never finished
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
     measured_nm: FloatArray  #: V g with the calibration's gains, shape (n, r)
@@ -113,7 +116,10 @@ class Validation:
         return int(np.count_nonzero(self.use))
 
 
-def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None = None) -> tuple[Validation, ...]:
+@checks_arguments(calibration=of_kind(Calibration), logs=PATHS, cell=optional(of_kind(Cell)))
+def validate(
+    calibration: Calibration, logs: Sequence[Path | str], cell: Cell | None = None
+) -> tuple[Validation, ...]:
     """Predict every log with a calibration.
 
     Args:
@@ -122,15 +128,17 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
         cell: corrected description of the same cell, which replaces the one in the logs.
 
     Raises:
+        UsageError: an argument is of another type.
         DataError, ConfigurationError: a log cannot be used.
         LogsDiffer: a log is of another cell.
         CalibrationUnreadable: the calibration does not say its filter.
-        IdentificationError: the calibration cannot speak of this run: unknown mounting, effect or parameter.
+        IdentificationError: the calibration cannot speak of this run: unknown mounting, effect or
+            parameter.
     """
     conditioning_of(calibration)  # refuses a calibration without a filter before any log is read
     validations: list[Validation] = []
     corrections = Corrections()
-    for log in logs:
+    for log in map(Path, logs):
         run, described = load_run(log, cell)
         corrections.note(log, run)
         check_cell(calibration, log, described)
@@ -140,7 +148,9 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
 
 
 def together(validations: Sequence[Validation]) -> RelativeError:
-    """‖ρ‖/‖Y‖ over the rows of several runs [%]; of the logs of the fit, it is the fit's own figure."""
+    """‖ρ‖/‖Y‖ over the rows of several runs [%];
+    of the logs of the fit, it is the fit's own figure.
+    """
     return relative_error(
         np.concatenate([validation.measured_nm for validation in validations], axis=1),
         np.concatenate([validation.predicted_nm for validation in validations], axis=1),
@@ -160,7 +170,8 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
         numbers = sorted(Conditioning().document().keys() - {"standstill_rad_s"})
         raise CalibrationUnreadable(
             f"calibration of cell {calibration.cell!r}, filter",
-            found=", ".join(f"{name}: {value}" for name, value in calibration.filter.items()) or "nothing",
+            found=", ".join(f"{name}: {value}" for name, value in calibration.filter.items())
+            or "nothing",
             expected=f"a list standstill_rad_s and numbers {', '.join(numbers)}",
             remedy="fit the logs again with this drivegain",
         ) from error
@@ -189,7 +200,10 @@ def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
     if "m" not in payload.known:
         return f"payload {payload.name!r} is not predicted: the log leaves its mass open"
     if not mounted_parameters(calibration, payload.mounting):
-        return f"payload {payload.name!r} is not predicted: nothing is known of mounting {payload.mounting!r}"
+        return (
+            f"payload {payload.name!r} is not predicted: nothing is known of mounting "
+            f"{payload.mounting!r}"
+        )
     return ""
 
 
@@ -214,7 +228,9 @@ def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) ->
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model, data, conditioning)
     if not use.any():
-        raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
+        raise DataUnfit(
+            data.name, "no row is left after the standstill and validity masks; did the robot move?"
+        )
     return Validation(
         log=log,
         run=run.name,
@@ -232,38 +248,54 @@ def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) ->
 def data_use(calibration: Calibration, run: Run) -> DataUse:
     """Whether a calibration has met a run."""
     roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
-    return DataUse.FIT if "fit" in roles else DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW
+    if "fit" in roles:
+        return DataUse.FIT
+    return DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW
 
 
-def warn_of_fitted(calibration: Calibration, runs: Sequence[Run], consequence: str) -> tuple[str, ...]:
+def warn_of_fitted(
+    calibration: Calibration, runs: Sequence[Run], consequence: str
+) -> tuple[str, ...]:
     """Warn of runs that the fit has seen, and name them."""
     seen = tuple(run.name for run in runs if data_use(calibration, run) is DataUse.FIT)
     if seen:
-        _LOG.warning("%s %s part of the fit: %s", ", ".join(seen), "were" if len(seen) > 1 else "was", consequence)
+        _LOG.warning(
+            "%s %s part of the fit: %s",
+            ", ".join(seen),
+            "were" if len(seen) > 1 else "was",
+            consequence,
+        )
     return seen
 
 
 def warn_of_corrections(calibration: Calibration, name: str, configuration_sha256: str) -> None:
-    """Warn of a run with another description of the cell than the fit, where the calibration corrects the description.
+    """Warn of a run with another description of the cell than the fit,
+    where the calibration corrects the description.
 
     A zero that was corrected in the cell file since would be corrected twice.
     """
     if configuration_sha256 == calibration.configuration_sha256:
         return
     # What a calibration knows of the description of its fit, `on_cell` has compared.
-    unknown = [one for one in calibration.effects if one.name in CORRECTIONS and one.described is None]
+    unknown = [
+        one for one in calibration.effects if one.name in CORRECTIONS and one.described is None
+    ]
     corrected = [f"{one.name} on {one.axis}" for one in unknown]
     if corrected:
         _LOG.warning(
-            "%s has another description of the cell than the fit, which the calibration corrects (%s): if the cell "
-            "file was corrected since, calibrate anew",
+            "%s has another description of the cell than the fit, which the calibration corrects "
+            "(%s): if the cell file was corrected since, calibrate anew",
             name,
             ", ".join(corrected),
         )
 
 
-def warn_without_temperature(calibration: Calibration, name: str, temperature_c: FloatArray | None) -> None:
-    """Warn of a run without the temperatures, shape (k, n), that an effect of the calibration depends on."""
+def warn_without_temperature(
+    calibration: Calibration, name: str, temperature_c: FloatArray | None
+) -> None:
+    """Warn of a run without the temperatures, shape (k, n),
+    that an effect of the calibration depends on.
+    """
     axes = [gain.axis for gain in calibration.gains]
     for effect in calibration.effects:
         # Without such an axis, the prediction refuses the effect.
@@ -271,7 +303,10 @@ def warn_without_temperature(calibration: Calibration, name: str, temperature_c:
             continue
         if temperature_c is None or np.isnan(temperature_c[:, axes.index(effect.axis)]).any():
             _LOG.warning(
-                "%s has no temperature of %s: its friction is predicted at %g °C", name, effect.axis, REFERENCE_C
+                "%s has no temperature of %s: its friction is predicted at %g °C",
+                name,
+                effect.axis,
+                REFERENCE_C,
             )
 
 
@@ -294,7 +329,8 @@ class CheckedRun:
 
     log: Path  #: where it was read
     run: str  #: its name
-    #: Of its weighted observation matrix, None where the run alone does not show the base parameters.
+    #: Of its weighted observation matrix, None where the run alone does not show the base
+    #: parameters.
     condition: float | None
     #: ‖ρ‖/‖Y‖ by label of the calibration; calibrations that cannot predict the run are not in it.
     errors: dict[str, RelativeError]
@@ -322,7 +358,8 @@ class CrossValidation:
     runs: tuple[CheckedRun, ...]  #: in the order of the logs
     weighed: tuple[WeighedRun, ...]  #: those with a payload
     with_bare_runs: bool  #: the payloads were found together with the robot, from runs without load
-    validations: tuple[Validation, ...]  #: of the first calibration, for the runs that it can predict
+    #: of the first calibration, for the runs that it can predict
+    validations: tuple[Validation, ...]
     diagnoses: tuple[Diagnosis, ...]  #: of these runs under the first calibration, and of its fit
 
 
@@ -349,7 +386,8 @@ def cross_validate(
                 f"calibration {label}",
                 found=f"the filter {calibration.filter}",
                 expected=f"that of {first}: {calibrations[first].filter}",
-                remedy="a relative error can be compared under one filter only: fit both with one cell file",
+                remedy="a relative error can be compared under one filter only: fit both with one "
+                "cell file",
             )
     runs = []
     bare = []
@@ -380,7 +418,9 @@ def cross_validate(
             condition = _condition(calibrations[first], standard)
         if standard is not None and first in found and not found[first].is_judged:
             suspected = replaced_geometry(first_own, run, described)
-            diagnoses += diagnose_run(first_own, found[first], model, run, standard, conditioning, suspected)
+            diagnoses += diagnose_run(
+                first_own, found[first], model, run, standard, conditioning, suspected
+            )
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
             of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
@@ -395,13 +435,17 @@ def cross_validate(
                 condition=condition,
                 errors={label: validation.error for label, validation in found.items()},
                 left_out="; ".join(
-                    reason if len(labels) == len(calibrations) else f"{reason} ({', '.join(labels)})"
+                    reason
+                    if len(labels) == len(calibrations)
+                    else f"{reason} ({', '.join(labels)})"
                     for reason, labels in reasons.items()
                 ),
                 seen_by=tuple(label for label, v in found.items() if v.data_use is DataUse.FIT),
             )
         )
-    of_cell_now = {label: on_cell(calibration, described)[0] for label, calibration in calibrations.items()}
+    of_cell_now = {
+        label: on_cell(calibration, described)[0] for label, calibration in calibrations.items()
+    }
     weighed = []
     for log, run, payload, kg in loaded:
         rows: RowsToWeigh | str
@@ -422,8 +466,12 @@ def cross_validate(
     )
 
 
-def _standard_system(calibration: Calibration, model: Model, run: Run, conditioning: Conditioning) -> System:
-    """Equations of one run in standard parameters, of the description as the calibration corrects it."""
+def _standard_system(
+    calibration: Calibration, model: Model, run: Run, conditioning: Conditioning
+) -> System:
+    """Equations of one run in standard parameters,
+    of the description as the calibration corrects it.
+    """
     return reduce_runs(fitted_model(calibration, model), (run,), conditioning)
 
 
@@ -434,7 +482,9 @@ def _condition(calibration: Calibration, standard: System) -> float:
     return wls(system, _gains(calibration)).condition
 
 
-def diagnose_log(calibration: Calibration, log: Path, run: Run, described: Cell) -> tuple[Diagnosis, ...]:
+def diagnose_log(
+    calibration: Calibration, log: Path, run: Run, described: Cell
+) -> tuple[Diagnosis, ...]:
     """Judge a log that the fit of a calibration has not seen, as `cross_validate` does.
 
     Args:
@@ -477,7 +527,9 @@ def _masses(
             continue
         mass = found.mass_kg
         if np.isnan(mass):
-            masses[label] = "these moves do not distinguish the payload's mass from its other parameters"
+            masses[label] = (
+                "these moves do not distinguish the payload's mass from its other parameters"
+            )
             continue
         masses[label] = Mass(
             mass_kg=mass,
@@ -501,7 +553,8 @@ def diagnose_run(
     conditioning: Conditioning,
     suspected: Sequence[PlacedEffect] = (),
 ) -> tuple[Diagnosis, ...]:
-    """Judge a run that the fit of a calibration has not seen: scale and sign of its currents, its payload, its errors.
+    """Judge a run that the fit of a calibration has not seen:
+    scale and sign of its currents, its payload, its errors.
 
     Args:
         calibration: of the cell.
@@ -542,26 +595,37 @@ def diagnose_run(
     is_right = not errors and not any(one.name == "current-reversed" for one in found)
     if is_right or of_channels:  # a fault of a channel is the cause of the others
         return (*of_channels, *(found or errors))
-    turned = find_turned_geometry(model, read_instants(model, (run,), conditioning), _gains(calibration))
+    turned = find_turned_geometry(
+        model, read_instants(model, (run,), conditioning), _gains(calibration)
+    )
     if turned is not None:
         return (turned.diagnosis(axes, runs),)
-    exchanged = exchanged_channels(model, (run,), conditioning, axes) if errors else None
+    if errors:
+        exchanged = exchanged_channels(model, (run,), conditioning, axes)
+    else:
+        exchanged = None
     if exchanged is not None:
         return (replace(exchanged, runs=runs),)
     return tuple(found or errors)
 
 
-def replaced_geometry(calibration: Calibration, run: Run, described: Cell) -> tuple[PlacedEffect, ...]:
+def replaced_geometry(
+    calibration: Calibration, run: Run, described: Cell
+) -> tuple[PlacedEffect, ...]:
     """Return the corrections of zeros and gravity that a given description makes in that of a log.
 
-    There are none where the calibration was made with the given description: it predicts in the same geometry.
+    There are none where the calibration was made with the given description: it predicts in the
+    same geometry.
 
     Args:
         calibration: that predicts.
         run: as it was read.
         described: the given description.
     """
-    if run.recording is None or described.recording_digest == calibration.recording_configuration_sha256:
+    if (
+        run.recording is None
+        or described.recording_digest == calibration.recording_configuration_sha256
+    ):
         return ()
     sections = run.recording.corrected
     axes = described.axis_names
@@ -577,7 +641,9 @@ def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
 
 
-def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: System) -> Iterator[Diagnosis]:
+def _payload_diagnoses(
+    calibration: Calibration, payload: Payload, standard: System
+) -> Iterator[Diagnosis]:
     """Compare the payload of a run with that of its mounting in the calibration."""
     mounted = mounted_parameters(calibration, payload.mounting)
     unknown = tuple(
@@ -587,7 +653,9 @@ def _payload_diagnoses(calibration: Calibration, payload: Payload, standard: Sys
     )
     of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
     values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
-    return payload_diagnoses(regrouped(standard, standard.base, (unknown,)), _gains(calibration), values)
+    return payload_diagnoses(
+        regrouped(standard, standard.base, (unknown,)), _gains(calibration), values
+    )
 
 
 def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
@@ -601,9 +669,10 @@ def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Ite
             yield one
 
 
-# A search corrects what the cell file says of zeros and of the mounting (`ident.effects.geometry_corrections`), and
-# tells the operator to correct the cell file. Once that is done, a calibration of before must not correct the same
-# number again: it keeps how the number was described, and what is left to correct is the difference.
+# A search corrects what the cell file says of zeros and of the mounting
+# (`ident.effects.geometry_corrections`), and tells the operator to correct the cell file. Once that
+# is done, a calibration of before must not correct the same number again: it keeps how the number
+# was described, and what is left to correct is the difference.
 
 
 def with_described(calibration: Calibration, cell: Cell) -> Calibration:
@@ -624,7 +693,8 @@ def with_described(calibration: Calibration, cell: Cell) -> Calibration:
 
 
 def on_cell(calibration: Calibration, cell: Cell) -> tuple[Calibration, Model]:
-    """A calibration with the corrections that a cell still needs, and the model with which it predicts.
+    """A calibration with the corrections that a cell still needs,
+    and the model with which it predicts.
 
     Args:
         calibration: of the cell, at any date.
@@ -655,11 +725,14 @@ def _remaining(accepted: AcceptedEffect, calibration: Calibration, cell: Cell) -
         case _:
             return accepted
     by_name = dict(zip((column.name for column in placed.columns), left, strict=True))
-    coefficients = tuple(replace(one, value=float(by_name[one.name])) for one in accepted.coefficients)
+    coefficients = tuple(
+        replace(one, value=float(by_name[one.name])) for one in accepted.coefficients
+    )
     return replace(accepted, coefficients=coefficients)
 
 
-SAME_SIGMAS = 3.0  #: Of a correction: what is left of it after the cell file was corrected is its own noise
+#: Of a correction: what is left of it after the cell file was corrected is its own noise
+SAME_SIGMAS = 3.0
 
 
 def not_corrected_since(calibration: Calibration, cell: Cell) -> tuple[Diagnosis, ...]:
@@ -678,11 +751,17 @@ def not_corrected_since(calibration: Calibration, cell: Cell) -> tuple[Diagnosis
         if all(abs(one.value) <= SAME_SIGMAS * one.std for one in left.coefficients):
             axis = accepted.axis if placed.effect.has_axis else None
             corrected.add((DIAGNOSED_AS[type(placed.effect)], axis))
-    return tuple(one for one in calibration.diagnoses if (one.name, next(iter(one.axes), None)) not in corrected)
+    return tuple(
+        one
+        for one in calibration.diagnoses
+        if (one.name, next(iter(one.axes), None)) not in corrected
+    )
 
 
 def _described(placed: PlacedEffect, cell: Cell) -> tuple[float, ...] | None:
-    """The number that a correction corrects, as a cell describes it; None of a correction of recordings."""
+    """The number that a correction corrects, as a cell describes it;
+    None of a correction of recordings.
+    """
     match placed.effect:
         case ZeroOffset():
             return (float(cell.axes[placed.axis].zero_offset_rad),)
@@ -700,7 +779,9 @@ class Corrections:
         self._said: set[tuple[str, ...]] = set()
 
     def note(self, log: Path, run: Run) -> None:
-        """Say what the given description corrects in a log, unless an earlier log of the command had the same."""
+        """Say what the given description corrects in a log,
+        unless an earlier log of the command had the same.
+        """
         recording = run.recording
         if recording is None or not recording.corrected or recording.corrected in self._said:
             return

@@ -1,4 +1,6 @@
-"""Verdicts on the gains of a fit: which are known well enough, and which moves or payloads would help."""
+"""Verdicts on the gains of a fit: which are known well enough,
+and which moves or payloads would help.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ from ident.planning.gain_verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, v
 
 
 def design_after(found: Identification) -> Design:
-    """Return the design of further recordings after a fit with free gains: its gains, parameters and noise.
+    """Return the design of further recordings after a fit with free gains:
+    its gains, parameters and noise.
 
     Effects are left out.
     """
@@ -42,9 +45,13 @@ def design_after(found: Identification) -> Design:
         parameters = payload.known_parameters
         parameters[list(indices)] = estimate.parameters[first : first + len(indices)]
         first += len(indices)
-        payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
+        payloads.append(
+            ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters)
+        )
     # ml's noise is that of the current references, the others' that of the joint torques.
-    noise = estimate.axis_noise / (1.0 if estimate.method.is_of_currents else np.abs(estimate.gains))
+    noise = estimate.axis_noise / (
+        1.0 if estimate.method.is_of_currents else np.abs(estimate.gains)
+    )
     expectation = Expectation(
         model=found.model,
         gains=estimate.gains,
@@ -58,8 +65,9 @@ def design_after(found: Identification) -> Design:
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
 
-    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further moves, are multiplied
-    by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
+    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further
+    moves, are multiplied by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not
+    the noise level.
     """
     extra: tuple[ExtraMoves, ...] = ()
     with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
@@ -82,13 +90,25 @@ def excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...
     mountings = [payload.mounting for payload in found.system.payloads]
     for run in fitted.runs(fitted.logs):
         data = differentiate(run, found.model.drive_train, found.conditioning)
-        mounted = None if run.payload is None else mountings.index(run.payload.mounting)
+        if run.payload is None:
+            mounted = None
+        else:
+            mounted = mountings.index(run.payload.mounting)
         yield recorded(found.model, data, found.conditioning), (mounted,)
 
 
 def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:
-    factor = std_percent / gain.std_percent if np.isfinite(gain.std_percent) and gain.std_percent else 1.0
+    if np.isfinite(gain.std_percent) and gain.std_percent:
+        factor = std_percent / gain.std_percent
+    else:
+        factor = 1.0
     advice = gain.advice and replace(gain.advice, std_percent=factor * gain.advice.std_percent)
     alone = {source: factor * alone for source, alone in gain.alone_percent.items()}
     known = gain.known_preload_percent and factor * gain.known_preload_percent
-    return replace(gain, std_percent=std_percent, known_preload_percent=known, alone_percent=alone, advice=advice)
+    return replace(
+        gain,
+        std_percent=std_percent,
+        known_preload_percent=known,
+        alone_percent=alone,
+        advice=advice,
+    )

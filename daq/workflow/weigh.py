@@ -1,4 +1,6 @@
-"""Weigh the body on the flange, and find contacts: a calibration used on logs that it has not seen."""
+"""Weigh the body on the flange, and find contacts:
+a calibration used on logs that it has not seen.
+"""
 
 from __future__ import annotations
 
@@ -38,12 +40,18 @@ class Weighed:
     bare: tuple[Path, ...]  #: without load
     body: WeighedBody  #: mass, centre and inertia
     help: tuple[Help, ...]  #: moves for what the logs do not show
-    declared_kg: float | None  #: mass of the payload that the logs declare; None where they do not, or differ
-    fitted: tuple[str, ...] = ()  #: runs that the calibration's fit has seen: their agreement proves nothing
+    #: mass of the payload that the logs declare; None where they do not, or differ
+    declared_kg: float | None
+    #: runs that the calibration's fit has seen: their agreement proves nothing
+    fitted: tuple[str, ...] = ()
 
 
 def weigh_logs(
-    calibration: Calibration, logs: Sequence[Path], *, bare: Sequence[Path] = (), cell: Cell | None = None
+    calibration: Calibration,
+    logs: Sequence[Path],
+    *,
+    bare: Sequence[Path] = (),
+    cell: Cell | None = None,
 ) -> Weighed:
     """Weigh the body that some logs carry.
 
@@ -55,8 +63,8 @@ def weigh_logs(
 
     Raises:
         DataError, ConfigurationError: a log cannot be used.
-        LogsDiffer: a log is of another cell, one that should be bare declares a payload, or the logs with the body
-            declare different ones.
+        LogsDiffer: a log is of another cell, one that should be bare declares a payload, or the
+            logs with the body declare different ones.
         LogRepeated: a log was given twice: its moves would count twice.
         IdentificationError: see `ident.weigh`.
     """
@@ -77,7 +85,9 @@ def weigh_logs(
     for run in (*loaded, *without):
         warn_without_temperature(calibration, run.name, run.temperature_c)
     _require_once((*logs, *bare), (*loaded, *without))
-    fitted = warn_of_fitted(calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen")
+    fitted = warn_of_fitted(
+        calibration, loaded, "the agreement proves nothing; weigh a log that the fit has not seen"
+    )
     described = reading.described
     warn_of_corrections(calibration, loaded[0].name, described.digest)
     calibration, model = on_cell(calibration, described)
@@ -114,7 +124,8 @@ def _declared(run: Run) -> str:
 def contact_in(
     calibration: Calibration, log: Path, *, quiet: Sequence[Path] = (), cell: Cell | None = None
 ) -> tuple[ExternalTorque, Cell]:
-    """Compute the external torque in a log, with band and thresholds from quiet logs or the log's own quiet part.
+    """Compute the external torque in a log, with band and thresholds from quiet logs or the log's
+    own quiet part.
 
     Raises:
         DataError, ConfigurationError: a log cannot be used.
@@ -132,21 +143,36 @@ def contact_in(
     if quiet:
         calm = [reading.load(one) for one in quiet]
         _require_once((log, *quiet), (run, *calm))
-        warn_of_fitted(calibration, calm, "other motion has larger errors than it, and the threshold is too low")
-        known = (_predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True))
+        warn_of_fitted(
+            calibration,
+            calm,
+            "other motion has larger errors than it, and the threshold is too low",
+        )
+        known = (
+            _predictable(calibration, one, other) for one, other in zip(quiet, calm, strict=True)
+        )
         band = prediction_band(calibration, model, known, conditioning)
-    return external_torque(calibration, model, _predictable(calibration, log, run), conditioning, band), described
+    return external_torque(
+        calibration, model, _predictable(calibration, log, run), conditioning, band
+    ), described
 
 
 def _require_once(logs: Sequence[Path], runs: Sequence[Run]) -> None:
     digests = [run.digest for run in runs]
     for log, digest in zip(logs, digests, strict=True):
         if digests.count(digest) > 1:
-            raise LogRepeated(str(log), found="the same log twice", expected="every log once", remedy="name other logs")
+            raise LogRepeated(
+                str(log),
+                found="the same log twice",
+                expected="every log once",
+                remedy="name other logs",
+            )
 
 
 class _Logs:
-    """Logs of the cell of a calibration, all read by one description: the model of the first is that of all."""
+    """Logs of the cell of a calibration, all read by one description:
+    the model of the first is that of all.
+    """
 
     def __init__(self, calibration: Calibration, given: Cell | None) -> None:
         self._calibration = calibration
@@ -177,7 +203,8 @@ class _Logs:
             sections = ", ".join(differing_sections(first, described)) or "the files of the cell"
             raise LogsDiffer(
                 str(log),
-                found=f"a description of the cell that differs from that of {first_log} in {sections}",
+                found=f"a description of the cell that differs from that of {first_log} in "
+                f"{sections}",
                 expected="one description for all logs",
                 remedy="give the right one for all of them with --cell, or logs of one description",
             )

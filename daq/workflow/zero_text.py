@@ -1,7 +1,7 @@
 """The words for a zero that is off: the same by torque, by encoders, and on the certificate.
 
-The number is what has to be added: to the positions of the axis, and so to its `zero_offset_…` in the cell file. A zero
-that was declared 2° too large is off by -2°.
+The number is what has to be added: to the positions of the axis, and so to its `zero_offset_…` in
+the cell file. A zero that was declared 2° too large is off by -2°.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ FEWEST_DECIMALS = 2
 
 
 def zero_off_text(name: str, value: float, std: float, unit: str) -> str:
-    """Say how far a zero is off: `the zero of J3 off by -2.00 ± 0.04° (to be added to its position)`.
+    """Say how far a zero is off: `the zero of J3 off by -2.00 ± 0.04° (to be added to its
+    position)`.
 
     Args:
         name: of the axis.

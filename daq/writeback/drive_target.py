@@ -1,8 +1,9 @@
 """The drives of a cell as a target: one object in each drive holds the gain of its axis.
 
-`drivers.canopen.parameters` writes them: without power, read back, saved, all of them or none. A record of the write,
-with the previous gains, is on the disk before the first drive is touched. It is called <time>.json and is never
-changed. It carries the digest of its content: a rollback writes its numbers back into the drives.
+`drivers.canopen.parameters` writes them: without power, read back, saved, all of them or none. A
+record of the write, with the previous gains, is on the disk before the first drive is touched. It
+is called <time>.json and is never changed. It carries the digest of its content: a rollback writes
+its numbers back into the drives.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -21,15 +22,28 @@ from pydantic import Field
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
 from daq.config.yaml_file import DocumentKind, StrictModel
-from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit, counted
+from daq.errors import (
+    CalibrationRefused,
+    ConfigurationInconsistent,
+    ControllerChanged,
+    ControllerUnfit,
+    counted,
+)
 from daq.files import read_regular, replace_file, sha256
-from daq.ledger.ledger import names_of
+from daq.ledger.fold import utc
+from daq.ledger.ledger import present_name
 from daq.ledger.names import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
 from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes
 from daq.writeback.target import Written
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.parameters import ParameterValue, ParameterWrite, Saving, read_parameters, write_parameters
+from drivers.canopen.parameters import (
+    ParameterValue,
+    ParameterWrite,
+    Saving,
+    read_parameters,
+    write_parameters,
+)
 from drivers.profiles.profile import Axis, DriveParameter, ParameterKind
 from ident.calibration import Calibration, Gain
 
@@ -46,7 +60,8 @@ class DriveNote(StrictModel):
     vendor_id: _U32  #: vendor that the drive reported (1018h:1)
     product_code: _U32 | None  #: product (1018h:2)
     serial: _U32 | None  #: serial number (1018h:4)
-    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: index of the object that was to be written
+    #: index of the object that was to be written
+    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
     subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: its subindex
     type: ParameterKind  #: its data type
     old: _U32  #: bits of the previous gain
@@ -88,7 +103,9 @@ def record_folder(cell: Cell) -> Path:
     return store.with_name(store.name.removesuffix(".sqlite").removesuffix(".history") + ".drives")
 
 
-def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple[DriveNote, ...]) -> Path:
+def write_record(
+    folder: Path, cell: str, now: datetime, who: str, drives: tuple[DriveNote, ...]
+) -> Path:
     """Put a record on the disk, later in order than every other.
 
     Raises:
@@ -97,7 +114,12 @@ def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{next_order(list(_records(folder)), now)}.json"
     record = DriveRecord(
-        format="drivegain drive record 1", cell=cell, at=now.isoformat(), who=who, drives=drives, sha256=""
+        format="drivegain drive record 1",
+        cell=cell,
+        at=now.isoformat(),
+        who=who,
+        drives=drives,
+        sha256="",
     )
     body = {**_body(record), "sha256": _digest(record)}
     replace_file(path, (json.dumps(body, indent=1, ensure_ascii=False) + "\n").encode())
@@ -130,7 +152,10 @@ def read_record(path: Path) -> DriveRecord:
     except (OSError, ValueError) as error:
         raise _unfit(path, str(error).splitlines()[0][:200]) from error
     if record.sha256 != _digest(record):
-        raise _unfit(path, f"content with SHA-256 {_digest(record)[:12]}…, not {record.sha256[:12]}… as it says")
+        raise _unfit(
+            path,
+            f"content with SHA-256 {_digest(record)[:12]}…, not {record.sha256[:12]}… as it says",
+        )
     return record
 
 
@@ -161,7 +186,8 @@ class DriveEdit(Edit):
     folder: Path  #: of the records
     values: tuple[ParameterValue, ...]  #: current gains in the drives
     writes: tuple[ParameterWrite, ...]  #: values to be written
-    record: DriveRecord | None = None  #: of the write that a rollback undoes; None for a calibration
+    #: of the write that a rollback undoes; None for a calibration
+    record: DriveRecord | None = None
 
     @property
     def place(self) -> Path:
@@ -179,7 +205,9 @@ class DriveEdit(Edit):
 
     @property
     def has_effect(self) -> bool:
-        """Always: drives that have these gains in RAM are made to save them, and lose what they had saved."""
+        """Always: drives that have these gains in RAM are made to save them,
+        and lose what they had saved.
+        """
         return True
 
 
@@ -211,14 +239,19 @@ class DriveTarget:
                 f"cell {self.cell.name!r}: controller",
                 found="no objects in the drives",
                 expected="the object of each axis's gain",
-                remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: ...}, ...]}` to the "
-                "cell file, one for each axis (docs/how-to/write-gains.md)",
+                remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: "
+                "...}, ...]}` to the cell file, one for each axis (docs/how-to/write-gains.md)",
             )
         require_axes(calibration, self.cell.axis_names)
         gains = {gain.axis: gain for gain in calibration.gains}
-        pairs = [(axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)]
+        pairs = [
+            (axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)
+        ]
         base = read_parameters(self.network, pairs)
-        planned = [_change(gains[value.axis.name], value, one) for value, one in zip(base, objects, strict=True)]
+        planned = [
+            _change(gains[value.axis.name], value, one)
+            for value, one in zip(base, objects, strict=True)
+        ]
         writes = tuple(write for _, write in planned)
         folder = record_folder(self.cell)
         return DriveEdit(
@@ -233,7 +266,8 @@ class DriveTarget:
         )
 
     def plan_rollback(self) -> DriveEdit:
-        """See `Target.plan_rollback`: undo the last write that changed the drives, whole or cut off by a kill.
+        """See `Target.plan_rollback`: undo the last write that changed the drives,
+        whole or cut off by a kill.
 
         Raises:
             CalibrationRefused: there is no record of such a write.
@@ -266,7 +300,9 @@ class DriveTarget:
             )
         raise CalibrationRefused(
             self.subject,
-            found=f"{counted(len(paths), 'record')} of the current gains" if paths else f"no record in {folder}",
+            found=f"{counted(len(paths), 'record')} of the current gains"
+            if paths
+            else f"no record in {folder}",
             expected="the record of a write that changed them",
             remedy="nothing was written",
         )
@@ -292,7 +328,10 @@ class DriveTarget:
             }
             for value, write in zip(edit.values, edit.writes, strict=True)
         ]
-        restored = {} if edit.source is None else {"restored": str(edit.source)}
+        if edit.source is None:
+            restored = {}
+        else:
+            restored = {"restored": str(edit.source)}
         return {"saving": self.saving.value, "drives": drives, **restored}
 
     def write(self, edit: DriveEdit, now: datetime, who: str) -> Written:
@@ -329,21 +368,37 @@ class DriveTarget:
 
     def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, DriveParameter]]:
         axes = {(axis.name, axis.node_id): axis for axis in self.network.axes}
-        unknown_axes = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
-        if record.cell not in names_of(self.cell) or unknown_axes:
+        unknown_axes = [
+            note.axis for note in record.drives if (note.axis, note.node_id) not in axes
+        ]
+        never = datetime.min.replace(tzinfo=UTC)
+        present = present_name(self.cell, record.cell, utc(record.at, never))
+        if present != self.cell.name or unknown_axes:
+            found = f"a write to cell {record.cell!r} at {record.at}"
+            if present != record.cell:
+                found += f", which is called {present!r} now"
+            if unknown_axes:
+                found += f", with {', '.join(unknown_axes)} that this cell does not have"
             raise ControllerUnfit(
                 str(path),
-                found=f"a write to cell {record.cell!r}"
-                + (f", with {', '.join(unknown_axes)} that this cell does not have" if unknown_axes else ""),
-                expected=f"one to the drives of cell {self.cell.name!r}",
-                remedy="nothing was written; has the cell file been changed since?",
+                found=found,
+                expected=f"one to the drives of the cell that is called {self.cell.name!r} now",
+                remedy="nothing was written; has the cell file been changed since, or the cell "
+                "been renamed (`drivegain history`)?",
             )
         return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
 
 
-def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...] | None = None) -> bytes:
-    """Encode drives and their values, or the values to be written, as the bytes that digests are taken of."""
-    words = [value.word for value in base] if writes is None else [write.word for write in writes]
+def content_of(
+    base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...] | None = None
+) -> bytes:
+    """Encode drives and their values, or the values to be written,
+    as the bytes that digests are taken of.
+    """
+    if writes is None:
+        words = [value.word for value in base]
+    else:
+        words = [write.word for write in writes]
     listed = [
         [value.axis.name, value.axis.node_id, value.identity.serial, str(value.parameter), word]
         for value, word in zip(base, words, strict=True)
@@ -351,7 +406,9 @@ def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, .
     return json.dumps(listed).encode()
 
 
-def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, ParameterWrite]:
+def _change(
+    gain: Gain, value: ParameterValue, gain_object: GainObject
+) -> tuple[GainChange, ParameterWrite]:
     """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
     parameter = gain_object.parameter
     factor = gain_object.factor
@@ -368,7 +425,8 @@ def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple
                 key,
                 found=str(error),
                 expected="a gain that fits",
-                remedy="check `type` and `factor` in `controller.objects` of the cell file; nothing was written",
+                remedy="check `type` and `factor` in `controller.objects` of the cell file; "
+                "nothing was written",
             ) from error
         held = parameter.value(word)
         if held == 0 or 0 < std < abs(held - wanted):
@@ -376,18 +434,22 @@ def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple
                 key,
                 found=f"{wanted:.6g} ± {std:.2g}, which the number {held:.9g} does not represent",
                 expected="a rounding below σ",
-                remedy="this object is too coarse for the gain: use another one, or another factor in "
-                "`controller.objects`; nothing was written",
+                remedy="this object is too coarse for the gain: use another one, or another factor "
+                "in `controller.objects`; nothing was written",
             )
         planned = (held / factor, f"{held:.9g}")
-    return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(value.axis, parameter, word)
+    return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(
+        value.axis, parameter, word
+    )
 
 
-def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tuple[GateFinding, ...]:
+def _changed_since_record(
+    base: tuple[ParameterValue, ...], folder: Path
+) -> tuple[GateFinding, ...]:
     """Compare the drives with the newest record, as logs do not carry their values.
 
-    A drive has the written value, or the one before it, where the write was rolled back or never saved. Before the
-    first write there is no record, and nothing to compare with.
+    A drive has the written value, or the one before it, where the write was rolled back or never
+    saved. Before the first write there is no record, and nothing to compare with.
     """
     records = read_records(folder)
     if not records:
@@ -402,9 +464,14 @@ def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tup
         if note is not None and value.word not in {note.old, note.new}:
             new = value.parameter.value(note.new)
             old = value.parameter.value(note.old)
-            expected = f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as before that write"
+            expected = (
+                f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as "
+                "before that write"
+            )
             remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW}"
-            found.append((f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy))
+            found.append(
+                (f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy)
+            )
     return tuple(found)
 
 
@@ -425,5 +492,6 @@ def _check_untouched(path: Path, record: DriveRecord, base: tuple[ParameterValue
                 found=f"{value.value:.9g}",
                 expected=f"{note.parameter.value(note.new):.9g} as drivegain wrote it, or "
                 f"{note.parameter.value(note.old):.9g} as before",
-                remedy=f"nothing was written: the gain was changed since; {path} has the previous gains",
+                remedy=f"nothing was written: the gain was changed since; {path} has the "
+                "previous gains",
             )

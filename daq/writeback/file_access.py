@@ -1,8 +1,10 @@
-"""Access to a controller's file: which links may be followed, one writer at a time, and backups beside it.
+"""Access to a controller's file: which links may be followed, one writer at a time,
+and backups beside it.
 
-A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first digits of SHA-256: of the backup's
-content, and of the content that replaced it. So a backup shows by itself whether it was changed, and whether the
-controller file was changed since; there is no other file that could be lost or disagree.
+A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first digits of SHA-256: of
+the backup's content, and of the content that replaced it. So a backup shows by itself whether it
+was changed, and whether the controller file was changed since; there is no other file that could be
+lost or disagree.
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ def resolve_links(file: Path) -> Path:
         file: as it was declared. A name that was resolved before has no links left to judge.
 
     Raises:
-        ControllerUnfit: the links form a circle, one of them belongs to another user, or they lead into a folder in
-            which every user may exchange the file.
+        ControllerUnfit: the links form a circle, one of them belongs to another user, or they lead
+            into a folder in which every user may exchange the file.
     """
     try:
         target = follow_links(file)
@@ -57,9 +59,11 @@ def resolve_links(file: Path) -> Path:
 
 
 def require_existing(file: Path) -> None:
-    """Refuse a symbolic link that leads nowhere, by that name, and a file of several names (hard links).
+    """Refuse a symbolic link that leads nowhere, by that name,
+    and a file of several names (hard links).
 
-    A new file takes the place of one name; a controller that reads another one would keep the current gains.
+    A new file takes the place of one name; a controller that reads another one would keep the
+    current gains.
 
     Raises:
         ControllerUnfit: for either; see also `resolve_links`.
@@ -78,8 +82,9 @@ def require_existing(file: Path) -> None:
             str(file),
             found=f"a file with {names} names (hard links)",
             expected="one name: under the others the current gains would stay",
-            remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of them, or give this name "
-            f"a file of its own: cp -p {quoted} {quoted}.new && mv {quoted}.new {quoted}",
+            remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of "
+            f"them, or give this name a file of its own: cp -p {quoted} {quoted}.new && mv "
+            f"{quoted}.new {quoted}",
         )
 
 
@@ -103,7 +108,8 @@ def exclusive_writer(target: Path) -> Iterator[None]:
                 remedy="wait until it has finished, then take a new dry run",
             ) from error
         except OSError as error:
-            # Not "it is as it was": an empty lock file may stay behind where the disk refuses to remove it.
+            # Not "it is as it was": an empty lock file may stay behind where the disk refuses to
+            # remove it.
             raise OutputFailed(
                 str(lock),
                 found=reason_of(error),
@@ -135,8 +141,8 @@ class Backup:
                 str(self.path),
                 found=f"{len(content)} bytes with SHA-256 {short_digest(content)}…",
                 expected=f"{self.was}…, as its name says",
-                remedy="this backup was changed after it was made, and nothing was restored; if its gains are right, "
-                "copy it over the controller file by hand",
+                remedy="this backup was changed after it was made, and nothing was restored; if "
+                "its gains are right, copy it over the controller file by hand",
             )
         return content
 
@@ -144,7 +150,8 @@ class Backup:
 def backups(target: Path) -> tuple[Backup, ...]:
     """Backups beside a controller file, oldest first."""
     name = re.compile(
-        re.escape(target.name) + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak"
+        re.escape(target.name)
+        + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak"
     )
     found = [
         Backup(path, match[1], int(match[2] or 0), match[3], match[4])
@@ -155,9 +162,11 @@ def backups(target: Path) -> tuple[Backup, ...]:
 
 
 def backups_without_log(audit: Path, target: Path) -> int:
-    """Return the number of backups beside a controller file whose audit log is absent; 0 where there is a log.
+    """Return the number of backups beside a controller file whose audit log is absent;
+    0 where there is a log.
 
-    A write that is audited leaves both: backups alone show that the log was removed or moved, or that another is used.
+    A write that is audited leaves both: backups alone show that the log was removed or moved, or
+    that another is used.
     """
     if os.path.lexists(audit):
         return 0
@@ -176,8 +185,11 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
         OSError: from the file system; no backup is left.
     """
     order = next_order([(one.stamp, one.count) for one in backups(target)], now)
-    backup = target.with_name(f"{target.name}.{order}.{short_digest(before)}-{short_digest(after)}.bak")
-    # The lock excludes every other drivegain, and time and count are beyond every backup: the name is free.
+    backup = target.with_name(
+        f"{target.name}.{order}.{short_digest(before)}-{short_digest(after)}.bak"
+    )
+    # The lock excludes every other drivegain, and time and count are beyond every backup: the name
+    # is free.
     try:
         replace_file(backup, before, like=target)
     except BaseException:
@@ -189,8 +201,8 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
 def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:
     """Return time and count for the name of a backup, later in order than all others.
 
-    A clock that was set back, or two writes in one second, must not make an older one look newer. `taken` has time and
-    count of the others, in order.
+    A clock that was set back, or two writes in one second, must not make an older one look newer.
+    `taken` has time and count of the others, in order.
     """
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%SZ")
     count = 0

@@ -1,7 +1,9 @@
-"""The controller's file as a target: only the numbers of the gains change, and the file is replaced whole.
+"""The controller's file as a target: only the numbers of the gains change,
+and the file is replaced whole.
 
-The order of a write: lock, the file is still the reviewed one, backup, temporary file, read back and compared, the file
-is still the same, rename. A kill at any point leaves the old file or the new one.
+The order of a write: lock, the file is still the reviewed one, backup, temporary file, read back
+and compared, the file is still the same, rename. A kill at any point leaves the old file or the new
+one.
 """
 
 from __future__ import annotations
@@ -18,12 +20,30 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
-from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.errors import (
+    CalibrationRefused,
+    ConfigurationInconsistent,
+    ControllerChanged,
+    ControllerUnfit,
+)
 from daq.files import fsync_folder, replace_file, sha256
 from daq.formats.document import comment_behind, decode_document, read_controller_file
 from daq.formats.scalar import ControllerDocument, rewrite_gain
-from daq.writeback.file_access import back_up, backups, exclusive_writer, require_existing, resolve_links
-from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes, short_digest
+from daq.writeback.file_access import (
+    back_up,
+    backups,
+    exclusive_writer,
+    require_existing,
+    resolve_links,
+)
+from daq.writeback.request import (
+    Edit,
+    GainChange,
+    GateFinding,
+    is_writable,
+    require_axes,
+    short_digest,
+)
 from daq.writeback.target import Written
 from ident.calibration import Calibration
 
@@ -49,7 +69,9 @@ class FileEdit(Edit):
     def diff(self) -> str:
         """The change as a unified diff, empty where there is none."""
         name = " ".join(self.file.name.splitlines())
-        before, after = (self.document(content or b"").text for content in (self.before, self.after))
+        before, after = (
+            self.document(content or b"").text for content in (self.before, self.after)
+        )
         lines = difflib.unified_diff(
             before.splitlines(keepends=True),
             after.splitlines(keepends=True),
@@ -140,18 +162,27 @@ class FileTarget:
         changes = []
         for gain, scalar in zip(calibration.gains, scalars, strict=True):
             factor = self.factors.get(gain.axis, 1.0)
-            put = rewrite_gain(scalar, gain.value, gain.std, factor) if is_writable(gain) else None
+            if is_writable(gain):
+                put = rewrite_gain(scalar, gain.value, gain.std, factor)
+            else:
+                put = None
             planned = None if put is None else (put.new, put.spelling)
-            changes.append(GainChange.of(gain, scalar.key, scalar.line, scalar.value / factor, planned))
+            changes.append(
+                GainChange.of(gain, scalar.key, scalar.line, scalar.value / factor, planned)
+            )
         for one, other in combinations(scalars, 2):
-            if one.start < other.end and other.start < one.end:  # an axis would get the gain of the other
+            # An axis would get the gain of the other
+            if one.start < other.end and other.start < one.end:
                 raise ControllerUnfit(
                     f"{self.file}, line {one.line}",
                     found=f"{one.key} and {other.key}, which name the same number",
                     expected="a number of its own for each axis",
-                    remedy="correct `controller.gains` of the cell configuration; nothing was written",
+                    remedy="correct `controller.gains` of the cell configuration; nothing "
+                    "was written",
                 )
-        after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
+        after = now.with_values(
+            {change.key: change.spelling for change in changes if change.spelling}
+        )
         return FileEdit(
             subject=self.subject,
             before=content,
@@ -165,14 +196,20 @@ class FileTarget:
     def plan_rollback(self) -> FileEdit:
         """See `Target.plan_rollback`: the newest backup that differs from the file."""
         target = Path(self.subject)
-        before = read_controller_file(target) if target.exists() else None
+        if target.exists():
+            before = read_controller_file(target)
+        else:
+            before = None
         found = backups(target)
-        # A writer that was killed before it replaced the file leaves a backup of the present content.
+        # A writer that was killed before it replaced the file leaves a backup of the present
+        # content.
         others = [one for one in found if before is None or one.was != short_digest(before)]
         if not others:
             raise CalibrationRefused(
                 str(self.file),
-                found=f"{len(found)} backups with the same content" if found else "no backup beside it",
+                found=f"{len(found)} backups with the same content"
+                if found
+                else "no backup beside it",
                 expected=f"{target.name}.<time>.<digests>.bak with another content",
                 remedy="nothing was changed",
             )
@@ -184,12 +221,18 @@ class FileTarget:
             raise ControllerChanged(
                 str(self.file),
                 found=f"content {short_digest(before)}…",
-                expected=f"{backup.after_digest}…, as drivegain wrote it when it made {backup.path.name}",
+                expected=f"{backup.after_digest}…, as drivegain wrote it when it made "
+                f"{backup.path.name}",
                 remedy="the file was edited since, and a rollback would lose that; compare with "
                 f"`diff {one} {other}`; to go back all the same, `cp {one} {other}`",
             )
         return FileEdit(
-            subject=str(target), before=before, after=after, source=backup.path, file=self.file, format=self.format
+            subject=str(target),
+            before=before,
+            after=after,
+            source=backup.path,
+            file=self.file,
+            format=self.format,
         )
 
     @contextlib.contextmanager
@@ -197,7 +240,10 @@ class FileTarget:
         """See `Target.lock`."""
         target = resolve_links(self.file)
         with exclusive_writer(target):
-            found = None if edit.before is None and not target.exists() else read_controller_file(target)
+            if edit.before is None and not target.exists():
+                found = None
+            else:
+                found = read_controller_file(target)
             if (str(target), found) != (edit.subject, edit.before):
                 raise ControllerChanged(
                     str(self.file),
@@ -217,7 +263,9 @@ class FileTarget:
         for change in edit.changes:
             # "old" is the key of the current gain in every audit log.
             numbers = {"old": change.current_gain, "new": change.new, "std": change.std}
-            finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+            finite = {
+                name: value if math.isfinite(value) else None for name, value in numbers.items()
+            }
             changes.append({"axis": change.axis, "key": change.key, "unit": change.unit, **finite})
         return {"changes": changes}
 
@@ -240,9 +288,9 @@ class FileTarget:
             backup.unlink()
             raise
         except BaseException:
-            # Before the rename the old file is in place; after it (the folder's fsync failed) the backup replaces it.
-            # A file that was saved by another program in between stays, and so does the backup.
-            # A file system that allows none of this leaves both.
+            # Before the rename the old file is in place; after it (the folder's fsync failed) the
+            # backup replaces it. A file that was saved by another program in between stays, and so
+            # does the backup. A file system that allows none of this leaves both.
             with contextlib.suppress(OSError):
                 found = _content(target)
                 if found == edit.before:
@@ -254,14 +302,20 @@ class FileTarget:
         return Written(edit, backup)
 
 
-def _changed_since_recording(calibration: Calibration, file: str, base_sha256: str) -> tuple[GateFinding, ...]:
+def _changed_since_recording(
+    calibration: Calibration, file: str, base_sha256: str
+) -> tuple[GateFinding, ...]:
     """Compare with the first log that was recorded with another content of the file."""
     for log in calibration.sources:
-        recorded = None if log.recording is None else log.recording.controller_sha256
+        if log.recording is None:
+            recorded = None
+        else:
+            recorded = log.recording.controller_sha256
         if recorded is not None and recorded != base_sha256:
             remedy = (
-                "the file was changed since, by hand or by an earlier write: review its gains and the diff of this dry "
-                f"run, and where both are right, repeat it with --base {base_sha256}"
+                "the file was changed since, by hand or by an earlier write: review its gains and "
+                "the diff of this dry run, and where both are right, repeat it with --base "
+                f"{base_sha256}"
             )
             expected = f"{recorded[:12]}…, as when {log.name} was recorded"
             return ((file, f"content {base_sha256[:12]}…", expected, remedy),)
@@ -271,7 +325,8 @@ def _changed_since_recording(calibration: Calibration, file: str, base_sha256: s
 def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:
     """Make the check right before the rename; the lock excludes every drivegain, and no editor.
 
-    Between the check and the rename are two system calls; a file that is saved in between is still lost.
+    Between the check and the rename are two system calls; a file that is saved in between is still
+    lost.
     """
 
     def check(written: bytes) -> None:
@@ -279,7 +334,9 @@ def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:
         if edit.before is None or edit.source is not None:
             document.locate(())
         else:
-            document.check_against(edit.document(edit.before), {one.key: one.spelling for one in edit.changes})
+            document.check_against(
+                edit.document(edit.before), {one.key: one.spelling for one in edit.changes}
+            )
         found = _content(target)
         if found != edit.before:
             raise ControllerChanged(
@@ -288,7 +345,8 @@ def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:
                 expected="no file, as before"
                 if edit.before is None
                 else f"{short_digest(edit.before)}…, as before this write",
-                remedy="the file was saved meanwhile, and stays as it was saved: take a new dry run",
+                remedy="the file was saved meanwhile, and stays as it was saved: take a "
+                "new dry run",
             )
 
     return check

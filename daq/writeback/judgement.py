@@ -1,4 +1,6 @@
-"""Whether gains differ from those in a controller by more than noise: one answer for dry run, drives, page and job."""
+"""Whether gains differ from those in a controller by more than noise:
+one answer for dry run, drives, page and job.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +22,20 @@ from ident.drift.change import DISPERSION, FALSE_ALARM, decide
 _LOG = logging.getLogger("drivegain")
 
 SAME_SIGMAS = 0.5
-"""A current gain that is as near to a gain of the history is that gain, rounded for the controller's file."""
+"""A current gain that is as near to a gain of the history is that gain,
+rounded for the controller's file.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
     """Figures of a history that a change is judged by; empty without a history."""
 
-    #: σ of the current gains, by axis [unit of the gain]; a gain whose σ is missing, or 0, is taken as exact: a person
-    #: entered it, or the history does not have it.
+    #: σ of the current gains, by axis [unit of the gain]; a gain whose σ is missing, or 0, is taken
+    #: as exact: a person entered it, or the history does not have it.
     stds: Mapping[str, float] = field(default_factory=dict)
-    #: Scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for a missing one.
+    #: Scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for
+    #: a missing one.
     dispersions: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -42,7 +47,8 @@ class JudgedChange:
     """The change of one gain, judged among all axes."""
 
     percent: float = math.nan  #: as of `ident.drift.change.Change`
-    sigmas: float = math.nan  #: the change in σ of both as calibrations scatter, negative where the gain has decreased
+    #: the change in σ of both as calibrations scatter, negative where the gain has decreased
+    sigmas: float = math.nan
     significant: bool = False  #: whether it is more than noise, at FALSE_ALARM over all axes
 
 
@@ -51,7 +57,11 @@ NOT_JUDGED = JudgedChange()
 
 
 def query_history(
-    cell: Cell, target: str, request: Request, changes: Sequence[GainChange], audit: Path | None = None
+    cell: Cell,
+    target: str,
+    request: Request,
+    changes: Sequence[GainChange],
+    audit: Path | None = None,
 ) -> Spread:
     """Return the figures of a cell's history; none, with a warning, where it cannot be read.
 
@@ -68,17 +78,20 @@ def query_history(
     try:
         history = read_history(ledger)
     except DaqError as error:
-        _LOG.warning("the history cannot be read, so the current gains are taken as exact: %s", error)
+        _LOG.warning(
+            "the history cannot be read, so the current gains are taken as exact: %s", error
+        )
         return NOTHING
     if history.may_lack:
         _LOG.warning(MAY_LACK)
     if history.renamed is not None:
         _LOG.warning(
-            "cell %r was renamed to %r at %s: its history is under that name, so the current gains are taken as exact; "
-            "give the cell file with the new name",
+            "cell %r was renamed to %r at %s: its history is under that name, so the current gains "
+            "are taken as exact; %s",
             cell.name,
             history.renamed.new,
             history.renamed.at,
+            history.renamed.remedy,
         )
     return known_of(history, target, sha256(request.signed), changes)
 
@@ -86,12 +99,13 @@ def query_history(
 def known_of(history: History, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
     """Return the figures of a history for the current gains.
 
-    The σ of a current gain is that of the calibration in force, if the gain is still that calibration's. Else it is
-    that of the newest calibration with this gain: the history lacks a write after a kill, or when a backup was copied
-    back by hand. It is 0 for a gain of no calibration, such as a nameplate, which a person entered.
+    The σ of a current gain is that of the calibration in force, if the gain is still that
+    calibration's. Else it is that of the newest calibration with this gain: the history lacks a
+    write after a kill, or when a backup was copied back by hand. It is 0 for a gain of no
+    calibration, such as a nameplate, which a person entered.
 
-    The calibration that is judged, by its digest, is left out: a gain that is near to it is another one unless it is
-    in force, and the scatter is that of the others.
+    The calibration that is judged, by its digest, is left out: a gain that is near to it is another
+    one unless it is in force, and the scatter is that of the others.
     """
     entries = history.entries
     in_force = history.in_force(target)
@@ -99,7 +113,9 @@ def known_of(history: History, target: str, digest: str, changes: Sequence[GainC
     gains = {change.axis: change.compared_gain for change in changes}
     stds = dict.fromkeys(gains, 0.0)
     # Oldest first, then the one in force: the last one that fits counts.
-    for entry in sorted(entries if in_force == digest else others, key=lambda entry: entry.digest == in_force):
+    for entry in sorted(
+        entries if in_force == digest else others, key=lambda entry: entry.digest == in_force
+    ):
         for gain in entry.gains:
             if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
                 stds[gain.axis] = gain.std
@@ -114,7 +130,8 @@ def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, Judge
     comparable = [
         change
         for change in changes
-        if all(map(math.isfinite, (change.compared_gain, change.new, change.std))) and change.std >= 0.0
+        if all(map(math.isfinite, (change.compared_gain, change.new, change.std)))
+        and change.std >= 0.0
     ]
     found = decide(
         tuple(change.axis for change in comparable),
@@ -124,7 +141,10 @@ def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, Judge
         [change.std for change in comparable],
         dispersion=[known.dispersions.get(change.axis, DISPERSION) for change in comparable],
     )
-    judged = (JudgedChange(one.percent, one.sigmas, s) for one, s in zip(found.changes, found.significant, strict=True))
+    judged = (
+        JudgedChange(one.percent, one.sigmas, s)
+        for one, s in zip(found.changes, found.significant, strict=True)
+    )
     return dict(zip(found.axes, judged, strict=True)), found.words
 
 
@@ -137,6 +157,6 @@ def noise_note(changes: Sequence[GainChange], known: Spread) -> str:
         whose = "all axes" if len(exact) == len(changes) else listed
         taken = f"the {exact[0].compared_with.value} is taken as exact on {whose}"
     return (
-        f"more than noise: the probability that noise alone makes such a change, on any axis, is below "
-        f"{100 * FALSE_ALARM:g} %; {taken}"
+        "more than noise: the probability that noise alone makes such a change, on any axis, is "
+        f"below {100 * FALSE_ALARM:g} %; {taken}"
     )

@@ -1,16 +1,17 @@
 """The file formats of minisign: keys and signatures with Ed25519 (RFC 8032) and BLAKE2b.
 
-Layouts from minisign's documentation, numbers little-endian, each as base64 under a line of comment::
+Layouts from minisign's documentation, numbers little-endian, each as base64 under a line of
+comment::
 
     public key   "Ed" | key id 8 | public key 32
     secret key   "Ed" | kdf 2 | "B2" | salt 32 | opslimit 8 | memlimit 8 | key id 8 | seed 32 | public key 32 | check 32
     signature    "ED" | key id 8 | signature 64 of BLAKE2b-512(file);
                  then a trusted comment, and 64 bytes that sign signature | trusted comment
 
-The last 104 bytes of a secret key are XORed with scrypt's key stream where kdf is "Sc"; then check is
-BLAKE2b-256("Ed" | key id | seed | public key). Where kdf is zero they are plain, and check is zero.
-Text that does not fit is a ValueError with what was found.
-"""
+The last 104 bytes of a secret key are XORed with scrypt's key stream where kdf is "Sc"; then check
+is BLAKE2b-256("Ed" | key id | seed | public key). Where kdf is zero they are plain, and check is
+zero. Text that does not fit is a ValueError with what was found.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ _BODY = struct.Struct("<8s32s32s32s")
 _SIGNATURE = struct.Struct("<2s8s64s")
 _SIGNATURE_LINES = 4
 
-# scrypt with N = 2¹⁷, r = 8, p = 1: 128 MB and half a second, which the PC of a cell can spare (minisign's own: 1 GB).
+# scrypt with N = 2¹⁷, r = 8, p = 1: 128 MB and half a second, which the PC of a cell can spare
+# (minisign's own: 1 GB).
 _OPSLIMIT = 2**22
 _MEMLIMIT = 2**27
 _MEMLIMIT_ALLOWED = 2**30
@@ -56,7 +58,10 @@ class SecretKey:
     @property
     def public(self) -> PublicKey:
         """The public half."""
-        return PublicKey(self.key_id, Ed25519PrivateKey.from_private_bytes(self.seed).public_key().public_bytes_raw())
+        return PublicKey(
+            self.key_id,
+            Ed25519PrivateKey.from_private_bytes(self.seed).public_key().public_bytes_raw(),
+        )
 
     def sign(self, content: bytes, comment: str) -> Signature:
         """Sign bytes, and with them a comment of one line."""
@@ -73,7 +78,9 @@ class SecretKey:
         """
         public = self.public.key
         if password:
-            body = _BODY.pack(self.key_id, self.seed, public, _checksum(self.key_id, self.seed, public))
+            body = _BODY.pack(
+                self.key_id, self.seed, public, _checksum(self.key_id, self.seed, public)
+            )
             body = _xor(body, _stream(password, salt, _OPSLIMIT, _MEMLIMIT))
             packed = _SECRET.pack(KEY_ALGORITHM, _SCRYPT, _CHECK, salt, _OPSLIMIT, _MEMLIMIT, body)
         else:
@@ -107,7 +114,9 @@ def check_signature(key: PublicKey, signature: Signature, content: bytes) -> Non
         ValueError: they did not.
     """
     if signature.key_id != key.key_id:
-        raise ValueError(f"a signature of key {shown_id(signature.key_id)}, not of {shown_id(key.key_id)}")
+        raise ValueError(
+            f"a signature of key {shown_id(signature.key_id)}, not of {shown_id(key.key_id)}"
+        )
     public = Ed25519PublicKey.from_public_bytes(key.key)
     try:
         public.verify(signature.signature, hashlib.blake2b(content).digest())
@@ -150,16 +159,24 @@ def parse_signature(text: str) -> Signature:
     Raises:
         ValueError: it is none, or not a prehashed one.
     """
-    lines = (
-        text.replace("\r\n", "\n").removesuffix("\n").split("\n")
-    )  # line ends of a mail or of Windows are not signed
-    shaped = len(lines) == _SIGNATURE_LINES and lines[0].startswith(UNTRUSTED) and lines[2].startswith(TRUSTED)
+    # Line ends of a mail or of Windows are not signed.
+    lines = text.replace("\r\n", "\n").removesuffix("\n").split("\n")
+    shaped = (
+        len(lines) == _SIGNATURE_LINES
+        and lines[0].startswith(UNTRUSTED)
+        and lines[2].startswith(TRUSTED)
+    )
     if not shaped:
-        raise ValueError("no signature: expected four lines, comment, signature, trusted comment, signature")
+        raise ValueError(
+            "no signature: expected four lines, comment, signature, trusted comment, signature"
+        )
     packed = decode_line(lines[1], _SIGNATURE.size, "a signature")
     algorithm, key_id, signature = _SIGNATURE.unpack(packed)
     if algorithm != _PREHASHED:
-        raise ValueError(f"a signature of kind {algorithm!r}, not the prehashed kind ED (`minisign -S -H` makes it)")
+        raise ValueError(
+            f"a signature of kind {algorithm!r}, not the prehashed kind ED (`minisign -S -H` makes "
+            "it)"
+        )
     whole = decode_line(lines[3], 64, "the signature of the trusted comment")
     return Signature(key_id, signature, lines[2].removeprefix(TRUSTED), whole)
 
@@ -169,7 +186,9 @@ def _parts(text: str) -> tuple[bytes, bytes, int, int, bytes]:
     packed = decode_line(lines[-1] if lines else "", _SECRET.size, "a secret key")
     algorithm, kdf, check, salt, opslimit, memlimit, body = _SECRET.unpack(packed)
     if algorithm != KEY_ALGORITHM or check != _CHECK or kdf not in {_SCRYPT, _PLAIN}:
-        raise ValueError(f"a key of algorithm {algorithm!r}, key derivation {kdf!r}, checksum {check!r}")
+        raise ValueError(
+            f"a key of algorithm {algorithm!r}, key derivation {kdf!r}, checksum {check!r}"
+        )
     return kdf, salt, opslimit, memlimit, body
 
 
@@ -185,7 +204,9 @@ def _stream(password: str, salt: bytes, opslimit: int, memlimit: int) -> bytes:
 
 
 def _scrypt_parameters(opslimit: int, memlimit: int) -> tuple[int, int]:
-    """Return N and p for r = 8, as libsodium derives them from its two limits (crypto_pwhash_scryptsalsa208sha256)."""
+    """Return N and p for r = 8, as libsodium derives them from its two limits
+    (crypto_pwhash_scryptsalsa208sha256).
+    """
     opslimit = max(opslimit, 32768)
     quick = opslimit < memlimit // 32
     largest = opslimit // 32 if quick else memlimit // 1024

@@ -1,8 +1,8 @@
 """A request to write a calibration to a controller, and the planned change that it leads to.
 
-`--base` ties the two together. A dry run prints the digests of the content before and after the change; the write
-repeats them, and only that change is made: not another one because the calibration, the keys or the file have changed
-in between.
+`--base` ties the two together. A dry run prints the digests of the content before and after the
+change; the write repeats them, and only that change is made: not another one because the
+calibration, the keys or the file have changed in between.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from daq.files import sha256
 from ident.calibration import Calibration, Gain
 
 _DIGITS = 12
-"""Hexadecimal digits of SHA-256 in the name of a backup and in --base: 48 bits distinguish a few hundred contents."""
+"""Hexadecimal digits of SHA-256 in the name of a backup and in --base:
+48 bits distinguish a few hundred contents.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +37,21 @@ class Request:
     accepts_changed_configuration: bool = False
     #: Masses weighed again for this write, by the payload's name [kg].
     entered_kg: Mapping[str, float] = field(default_factory=dict)
-    #: Value of --base: `Edit.base` of the reviewed change, or the SHA-256 of its content, for any change.
+    #: Value of --base: `Edit.base` of the reviewed change, or the SHA-256 of its content, for any
+    #: change.
     base: str | None = None
-    appliers: Collection[str] = ()  #: names of the operator, the login last; their own signatures do not count
-    file: Path | None = None  #: calibration file, beside which signatures are searched; None without one
+    #: names of the operator, the login last; their own signatures do not count
+    appliers: Collection[str] = ()
+    #: calibration file, beside which signatures are searched; None without one
+    file: Path | None = None
     content: bytes | None = None  #: bytes of that file as they were read; None without one
 
     @property
     def signed(self) -> bytes:
         """The bytes that a signature must cover."""
-        return encode_calibration(self.calibration) if self.content is None else self.content
+        if self.content is None:
+            return encode_calibration(self.calibration)
+        return self.content
 
     @property
     def evidence(self) -> dict[str, object]:
@@ -59,12 +66,17 @@ class Request:
                 "software": calibration.software,
             },
             "configuration_sha256": calibration.configuration_sha256,
-            "logs": [{"name": one.name, "sha256": one.sha256, "role": one.role} for one in calibration.sources],
+            "logs": [
+                {"name": one.name, "sha256": one.sha256, "role": one.role}
+                for one in calibration.sources
+            ],
         }
 
 
 class GainOrigin(Enum):
-    """Origin of the gain that a new one is compared with; the value is the word for it in messages."""
+    """Origin of the gain that a new one is compared with;
+    the value is the word for it in messages.
+    """
 
     CURRENT = "current gain"  #: what the controller has
     NAMEPLATE = "nameplate"  #: from the data sheet, as the cell file has it
@@ -79,23 +91,33 @@ class GainChange:
     axis: str  #: name of the axis
     key: str  #: place of the number: its key in the controller file, or the drive's object
     line: int  #: of the number in the file, from 1; 0 in a drive
-    compared_gain: float  #: gain that the new one is compared with [unit]; `compared_with` says which
+    #: gain that the new one is compared with [unit]; `compared_with` says which
+    compared_gain: float
     new: float  #: gain as it will be read back [unit], NaN where there is none to write
     std: float  #: standard deviation of the identified gain [unit]
     unit: str  #: Nm at the joint per unit of the current-loop reference
     nameplate_gain: float  #: gain of the data sheet [unit]
-    spelling: str  #: the new number as written, in the controller's own unit; empty where none can be written
+    #: the new number as written, in the controller's own unit; empty where none can be written
+    spelling: str
     compared_with: GainOrigin = GainOrigin.CURRENT
 
     @classmethod
-    def of(cls, gain: Gain, key: str, line: int, current_gain: float, planned: tuple[float, str] | None) -> GainChange:
-        """Make the change of one gain; `planned` is `new` and `spelling`, None where there is none to write."""
+    def of(
+        cls, gain: Gain, key: str, line: int, current_gain: float, planned: tuple[float, str] | None
+    ) -> GainChange:
+        """Make the change of one gain; `planned` is `new` and `spelling`,
+        None where there is none to write.
+        """
         new, spelling = planned or (gain.value, "")
-        return cls(gain.axis, key, line, current_gain, new, gain.std, gain.unit, gain.nameplate, spelling)
+        return cls(
+            gain.axis, key, line, current_gain, new, gain.std, gain.unit, gain.nameplate, spelling
+        )
 
     @property
     def current_gain(self) -> float:
-        """Gain that the controller has [unit]; NaN where the new one is compared with another gain."""
+        """Gain that the controller has [unit];
+        NaN where the new one is compared with another gain.
+        """
         if self.compared_with is not GainOrigin.CURRENT:
             return math.nan
         return self.compared_gain
@@ -116,7 +138,8 @@ class GainChange:
         return _percent(self.std, abs(self.new))
 
 
-GateFinding = tuple[str, str, str, str]  #: Reason to refuse a write: subject, found, expected, remedy
+#: Reason to refuse a write: subject, found, expected, remedy
+GateFinding = tuple[str, str, str, str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,8 +149,10 @@ class Edit:
     subject: str  #: the target, as audit and history name it
     before: bytes | None  #: its content now; None where the file is gone
     after: bytes  #: its content after the change
-    changes: tuple[GainChange, ...] = ()  #: one for each gain, in the order of the calibration; none in a rollback
-    unexpected: tuple[GateFinding, ...] = ()  #: where the content now is not the one that drivegain expects there
+    #: one for each gain, in the order of the calibration; none in a rollback
+    changes: tuple[GainChange, ...] = ()
+    #: where the content now is not the one that drivegain expects there
+    unexpected: tuple[GateFinding, ...] = ()
     source: Path | None = None  #: backup or record that a rollback restores; None for a calibration
 
     @property
@@ -152,7 +177,9 @@ class Edit:
 
     @property
     def keeps_all(self) -> bool:
-        """Whether the controller has exactly these gains already, so that a write would lose nothing."""
+        """Whether the controller has exactly these gains already,
+        so that a write would lose nothing.
+        """
         return not self.has_effect and all(change.spelling for change in self.changes)
 
     @property
@@ -198,14 +225,16 @@ def change_digest(before: bytes, after: bytes) -> str:
 
 
 def parse_base(base: str, before: bytes) -> tuple[str, str | None]:
-    """Read the value of --base: `change_digest` of a change, or the whole SHA-256 of the content before it.
+    """Read the value of --base: `change_digest` of a change,
+    or the whole SHA-256 of the content before it.
 
     Args:
         base: as the operator gave it.
         before: content now; a short digest that fits it means this content.
 
     Returns:
-        SHA-256 of the reviewed content, and the first digits of that after the change; None where any is accepted.
+        SHA-256 of the reviewed content, and the first digits of that after the change; None where
+        any is accepted.
 
     Raises:
         UsageError: it is neither.
@@ -217,7 +246,8 @@ def parse_base(base: str, before: bytes) -> tuple[str, str | None]:
         raise UsageError(
             f"--base {base}",
             found="no digest",
-            expected=f"the value that a dry run prints: {_DIGITS} digits, a hyphen, {_DIGITS} digits",
+            expected=f"the value that a dry run prints: {_DIGITS} digits, a hyphen, "
+            f"{_DIGITS} digits",
             remedy="copy it from the last line of the dry run",
         )
     return sha256(before) if was == short_digest(before) else was, after_digest

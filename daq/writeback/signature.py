@@ -1,4 +1,6 @@
-"""Signatures of a calibration: one file beside it for each person, which `minisign -V` checks too."""
+"""Signatures of a calibration: one file beside it for each person,
+which `minisign -V` checks too.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from daq.config.policy import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
 from daq.config.yaml_file import read_file
 from daq.errors import CalibrationMissing, OutputFailed, SignatureInvalid, UsageError, reason_of
 from daq.files import read_regular, replace_file
-from daq.writeback.minisign import SecretKey, check_signature, is_encrypted, parse_secret_key, parse_signature
+from daq.writeback.minisign import (
+    SecretKey,
+    check_signature,
+    is_encrypted,
+    parse_secret_key,
+    parse_signature,
+)
 
 SUFFIX = ".minisig"
 _LARGEST_BYTES = 16_384
@@ -37,7 +45,10 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
     for path in (secret, public):
         if path.exists() or path.is_symlink():
             raise UsageError(
-                str(path), found="a key", expected="no file", remedy="keys are not replaced: choose another name"
+                str(path),
+                found="a key",
+                expected="no file",
+                remedy="keys are not replaced: choose another name",
             )
     key = SecretKey(os.urandom(8), os.urandom(32))
     try:
@@ -55,7 +66,9 @@ def needs_password(secret_key: Path) -> bool:
         return is_encrypted(_text_of(secret_key))
 
 
-def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: datetime | None = None) -> Path:
+def sign(
+    file: Path, secret_key: Path, name: str, *, password: str = "", at: datetime | None = None
+) -> Path:
     """Write a signature of the file's bytes beside it; it replaces an earlier one of the same name.
 
     Args:
@@ -85,9 +98,15 @@ def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: dat
             is_signature = False
         if not is_signature:
             raise UsageError(
-                str(path), found="no signature", expected="no file, or an earlier signature", remedy="move it away"
+                str(path),
+                found="no signature",
+                expected="no file, or an earlier signature",
+                remedy="move it away",
             )
-    when = [] if at is None else [f"timestamp:{int(at.timestamp())}", f"at:{at.isoformat(timespec='seconds')}"]
+    if at is None:
+        when = []
+    else:
+        when = [f"timestamp:{int(at.timestamp())}", f"at:{at.isoformat(timespec='seconds')}"]
     shown = "".join(c if c.isprintable() else "?" for c in file.name)
     signature = key.sign(content, "\t".join([*when, f"file:{shown}", f"signer:{name}", "hashed"]))
     try:
@@ -102,20 +121,25 @@ def signature_path(file: Path, name: str) -> Path:
     return file.with_name(f"{file.name}.{name}{SUFFIX}")
 
 
-def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = None) -> tuple[str, ...]:
+def signers_of(
+    file: Path, trusted: Mapping[str, str], content: bytes | None = None
+) -> tuple[str, ...]:
     """Find the trusted persons who have signed a file.
 
     Args:
         file: a calibration; only its name is used where `content` is given.
         trusted: public key by name, each its line of base64. Signatures of others are ignored.
-        content: bytes of the file where it was read already, so that the checked bytes are the used ones.
+        content: bytes of the file where it was read already, so that the checked bytes are the used
+            ones.
 
     Returns:
         Names with a valid signature beside the file, in the order of `trusted`.
 
     Raises:
-        SignatureInvalid: the signature of a trusted person does not fit the file: one of the two was changed.
-        ConfigurationInconsistent: a public key is none, or two names share one: they would be one person.
+        SignatureInvalid: the signature of a trusted person does not fit the file: one of the two
+            was changed.
+        ConfigurationInconsistent: a public key is none, or two names share one: they would be one
+            person.
         CalibrationMissing: the file cannot be read.
     """
     keys = public_keys(trusted)
@@ -131,7 +155,8 @@ def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = N
                     str(path),
                     found=_spelled(error),
                     expected=f"the signature of {name} for {file.name} as it is now",
-                    remedy=f"have {name} review the calibration and sign it again, or remove the signature",
+                    remedy=f"have {name} review the calibration and sign it again, or remove the "
+                    "signature",
                 ) from error
             found.append(name)
     return tuple(found)
@@ -142,7 +167,8 @@ def _checked(name: str) -> str:
         raise UsageError(
             "name of the signer",
             found=repr(name),
-            expected="letters, digits, '.', '_' and '-', at most 64, beginning with a letter or digit",
+            expected="letters, digits, '.', '_' and '-', at most 64, beginning with a "
+            "letter or digit",
             remedy="give another one, as the cell file spells it",
         )
     return name
@@ -172,13 +198,16 @@ def _reading_key(path: Path) -> Iterator[None]:
         raise UsageError(
             str(path),
             found=_spelled(error),
-            expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if it has one",
+            expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if "
+            "it has one",
             remedy="check the name (the file that ends in .key is the secret one) and the password",
         ) from error
 
 
 def _spelled(error: Exception) -> str:
-    return reason_of(error) if isinstance(error, OSError) else str(error)
+    if isinstance(error, OSError):
+        return reason_of(error)
+    return str(error)
 
 
 def _text_of(path: Path) -> str:
@@ -191,7 +220,8 @@ def _read_signed(file: Path) -> bytes:
 
 
 def _write_new(path: Path, text: str, mode: int) -> None:
-    # O_EXCL: a key that is made at the same time stays. The mode is set before a byte of the secret is written.
+    # O_EXCL: a key that is made at the same time stays. The mode is set before a byte of the secret
+    # is written.
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     with os.fdopen(descriptor, "wb") as stream:
         os.fchmod(descriptor, mode)

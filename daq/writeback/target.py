@@ -1,8 +1,10 @@
-"""Propose a change of a target, apply it, and roll it back: the one path by which gains reach a controller.
+"""Propose a change of a target, apply it, and roll it back:
+the one path by which gains reach a controller.
 
-A target is a place that holds the gains of a cell: the controller's file (`FileTarget`) or the drives themselves
-(`DriveTarget`). It plans an `Edit` and writes it. Everything else is done here, once for all targets: the gates, the
-audit before and after the write, the refusal, and the calibration's entry in the history. Nothing else writes either.
+A target is a place that holds the gains of a cell: the controller's file (`FileTarget`) or the
+drives themselves (`DriveTarget`). It plans an `Edit` and writes it. Everything else is done here,
+once for all targets: the gates, the audit before and after the write, the refusal, and the
+calibration's entry in the history. Nothing else writes either.
 """
 
 from __future__ import annotations
@@ -15,6 +17,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
+from daq.arguments import (
+    A_MOMENT,
+    A_PATH,
+    A_TEXT,
+    argument_refused,
+    checks_arguments,
+    of_kind,
+    optional,
+    with_methods,
+)
 from daq.config.cell import Cell
 from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, counted, evidence, reason_of
 from daq.files import sha256
@@ -89,7 +101,8 @@ class Target(Protocol[E]):
         Raises:
             ControllerChanged: the content is not the one that the change was planned for.
             DriverError: from the drives.
-            OSError: from the file system; the content is as it was, unless its digest shows the new one.
+            OSError: from the file system; the content is as it was, unless its digest shows the new
+                one.
         """
 
 
@@ -104,13 +117,17 @@ class Proposal(Generic[E]):
 
     @property
     def error(self) -> CalibrationRefused:
-        """The error for a proposal with failed checks, with what its fit found wrong in the description."""
+        """The error for a proposal with failed checks,
+        with what its fit found wrong in the description.
+        """
         error = self._refusal
         said = {(refusal.found, refusal.remedy) for refusal in self.refusals}
         for diagnosis in self.request.calibration.diagnoses:
             is_said = (diagnosis.found, diagnosis.remedy) in said
             if diagnosis.name in OF_DESCRIPTION and not is_said:
-                error.add_note(f"hint: the fit of this calibration found {diagnosis.found}; {diagnosis.remedy}")
+                error.add_note(
+                    f"hint: the fit of this calibration found {diagnosis.found}; {diagnosis.remedy}"
+                )
                 break
         return error
 
@@ -119,7 +136,9 @@ class Proposal(Generic[E]):
         """The failed checks; several are listed one a line."""
         if len(self.refusals) == 1:
             only = self.refusals[0]
-            return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
+            return CalibrationRefused(
+                only.subject, found=only.found, expected=only.expected, remedy=only.remedy
+            )
         listed = "".join(f"\n  {refusal}" for refusal in self.refusals)
         return CalibrationRefused(
             self.edit.subject,
@@ -129,20 +148,33 @@ class Proposal(Generic[E]):
         )
 
 
+A_TARGET = with_methods("a FileTarget or a DriveTarget", "plan", "plan_rollback", "write")
+
+
+@checks_arguments(target=A_TARGET, request=of_kind(Request))
 def propose(target: Target[E], request: Request) -> Proposal[E]:
     """Plan what a calibration changes in a target, and check every gate; reads only.
 
     Raises:
-        UsageError: the value of --base is no digest.
+        UsageError: the value of --base is no digest, or an argument is of another type.
         ConfigurationInconsistent, CalibrationRefused, ControllerUnfit: see `Target.plan`.
         DriverError: from the drives.
     """
+    for name, expected in (("calibration", of_kind(Calibration)), ("now", A_MOMENT)):
+        value = getattr(request, name)
+        if not expected.is_met(value):
+            raise argument_refused(
+                f"{name} of the request", value, expected, "write Request(calibration, now)"
+            )
     edit = target.plan(request.calibration)
     refusals = check_gates(GateContext(request, edit, target.cell))
     return Proposal(target, request, edit, refusals)
 
 
-def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, who: str = "") -> Written | None:
+@checks_arguments(proposal=of_kind(Proposal), now=A_MOMENT, audit=optional(A_PATH), who=A_TEXT)
+def apply(
+    proposal: Proposal[E], now: datetime, *, audit: Path | None = None, who: str = ""
+) -> Written | None:
     """Make a proposed change, and enter it in audit log and history.
 
     The history is part of the audit log: of a target without a cell there is none.
@@ -150,25 +182,30 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
     Args:
         proposal: without refusals.
         now: time for the name of the backup, and for the audit.
-        audit: file that records the beginning before anything is replaced, the end, the calibration, and refusals;
-            None for none of it.
+        audit: file that records the beginning before anything is replaced, the end, the
+            calibration, and refusals; None for none of it.
         who: the operator or the job.
 
     Returns:
-        the change, None where there was nothing to write. What is written is not undone where the history cannot take
-        it: a warning is logged, and the change says why.
+        the change, None where there was nothing to write. What is written is not undone where the
+        history cannot take it: a warning is logged, and the change says why.
 
     Raises:
+        UsageError: an argument is of another type; nothing was written.
         CalibrationRefused: a check failed; every failed one is listed.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
-        OutputFailed: the file system failed once the new content was in place, or so that the content is not known.
+        OutputFailed: the file system failed once the new content was in place, or so that the
+            content is not known.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
     edit = proposal.edit
     recorder = _Recorder(audit, who, now, edit.subject)
     details = {**proposal.target.details(edit), **proposal.request.evidence}
     if proposal.refusals:
-        listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in proposal.refusals]
+        listed = [
+            {"gate": one.gate.value, "subject": one.subject, "found": one.found}
+            for one in proposal.refusals
+        ]
         recorder.end(AuditAction.REFUSED, {"refusals": listed, **details})
         raise proposal.error
     if not edit.has_effect:
@@ -184,13 +221,20 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
         raise
 
 
+@checks_arguments(target=A_TARGET, now=A_MOMENT, audit=optional(A_PATH), who=A_TEXT)
 def rollback(
-    target: Target[E], now: datetime, *, audit: Path | None = None, who: str = "", planned: E | None = None
+    target: Target[E],
+    now: datetime,
+    *,
+    audit: Path | None = None,
+    who: str = "",
+    planned: E | None = None,
 ) -> Written:
-    """Restore the content before the last write, and enter that in audit log and history, which are one.
+    """Restore the content before the last write, and enter that in audit log and history,
+    which are one.
 
-    The replaced content is kept as well, so that a second rollback undoes the first. A file that was deleted comes
-    back as it was before the last write.
+    The replaced content is kept as well, so that a second rollback undoes the first. A file that
+    was deleted comes back as it was before the last write.
 
     Args:
         target: where.
@@ -198,6 +242,7 @@ def rollback(
         planned: rollback that was planned and shown already.
 
     Raises:
+        UsageError: an argument is of another type; nothing was written.
         CalibrationRefused: see `Target.plan_rollback`.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
@@ -233,7 +278,9 @@ def _write(
             made = edit.has_effect and found == digests["sha256_after"]
             if begun is not None:
                 says = {"begun": begun.number, "error": f"{type(error).__name__}: {error}"[:500]}
-                recorder.end(actions[1] if made else AuditAction.FAILED, {**says, "sha256_found": found})
+                recorder.end(
+                    actions[1] if made else AuditAction.FAILED, {**says, "sha256_found": found}
+                )
             if isinstance(error, OSError) and found != (before or GONE):
                 raise _disturbed(edit, error, made=made) from error
             if made:
@@ -256,8 +303,9 @@ def _absence_of_log(recorder: _Recorder) -> dict[str, object]:
     if count == 0:
         return {}
     _LOG.warning(
-        "%s is absent, although %s has %s of earlier writes beside it: a new audit log begins with this write, and "
-        "says so; if the old one was not moved on purpose, restore it and ask who removed it",
+        "%s is absent, although %s has %s of earlier writes beside it: a new audit log begins with "
+        "this write, and says so; if the old one was not moved on purpose, restore it and ask who "
+        "removed it",
         recorder.audit,
         subject,
         counted(count, "backup"),
@@ -266,19 +314,28 @@ def _absence_of_log(recorder: _Recorder) -> dict[str, object]:
 
 
 def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
-    """Enter the calibration whose gains the target has now; return why it could not be entered, empty if it was.
+    """Enter the calibration whose gains the target has now;
+    return why it could not be entered, empty if it was.
 
     The target may have had them before: their writer was killed, or they were entered by hand.
     """
     cell = proposal.target.cell
-    ledger = None if cell is None or recorder.audit is None else Ledger.of(cell, recorder.audit)
+    if cell is None or recorder.audit is None:
+        ledger = None
+    else:
+        ledger = Ledger.of(cell, recorder.audit)
     if ledger is None:
         return ""
     request = proposal.request
     digest = sha256(request.signed)
     try:
-        enter_calibration(ledger, request.calibration, digest=digest, who=recorder.who, at=recorder.at)
-        if not proposal.edit.has_effect and read_history(ledger).in_force(recorder.subject) != digest:
+        enter_calibration(
+            ledger, request.calibration, digest=digest, who=recorder.who, at=recorder.at
+        )
+        if (
+            not proposal.edit.has_effect
+            and read_history(ledger).in_force(recorder.subject) != digest
+        ):
             details = {
                 "action": WriteAction.APPLIED.value,
                 "begun": None,
@@ -288,7 +345,8 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
             recorder.begin(AuditAction.WRITE_FOUND, details)
     except Exception as error:  # noqa: BLE001 - the target has these gains: no error of the history may call that undone
         _LOG.warning(
-            "the history may lack this write: %s; `drivegain history CELL --add CALIBRATION` enters it",
+            "the history may lack this write: %s; `drivegain history CELL --add CALIBRATION` "
+            "enters it",
             evidence(error),
         )
         return evidence(error)
@@ -300,19 +358,27 @@ _IN_PLACE = "{} has the new content, complete; the history lacks this write"
 
 def _disturbed(edit: Edit, error: OSError, *, made: bool) -> OutputFailed:
     """Return the error for a write after which the content is the new one, or is not known."""
-    entering = "`drivegain history CELL --add CALIBRATION` enters it, `drivegain rollback CELL` undoes it"
-    asking = f"whether {edit.subject} has the new content is not known: compare it with the newest backup beside it"
+    entering = (
+        "`drivegain history CELL --add CALIBRATION` enters it, `drivegain rollback CELL` undoes it"
+    )
+    asking = (
+        f"whether {edit.subject} has the new content is not known: compare it with the newest "
+        "backup beside it"
+    )
     return OutputFailed(
         edit.subject,
         found=f"{reason_of(error)}, {'after' if made else 'during'} the replacement",
         expected="a file system that completes what it began",
-        remedy=f"check the disk; {_IN_PLACE.format(edit.subject) + ': ' + entering if made else asking}",
+        remedy="check the disk; "
+        f"{_IN_PLACE.format(edit.subject) + ': ' + entering if made else asking}",
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _Recorder:
-    """Record one write to a controller: that it begins, before anything is replaced, and how it ended."""
+    """Record one write to a controller: that it begins, before anything is replaced,
+    and how it ended.
+    """
 
     audit: Path | None  #: file of the audit log; None records nothing
     who: str  #: the person or the job
@@ -324,7 +390,9 @@ class _Recorder:
         if self.audit is None:
             return None
         try:
-            return record_write(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+            return record_write(
+                self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details
+            )
         except OSError as error:
             raise OutputFailed(
                 str(self.audit),
@@ -338,9 +406,12 @@ class _Recorder:
         try:
             return self.begin(action, details)
         except (OutputFailed, AuditUnusable) as error:
-            # The write is done, and the first entry has its digests: no reason to call it undone. The line may be
-            # there all the same: a flush that failed says nothing about what the disk has.
-            _LOG.warning("the audit log may lack the entry that it is %s: %s", action.value, evidence(error))
+            # The write is done, and the first entry has its digests: no reason to call it undone.
+            # The line may be there all the same: a flush that failed says nothing about what the
+            # disk has.
+            _LOG.warning(
+                "the audit log may lack the entry that it is %s: %s", action.value, evidence(error)
+            )
             return None
 
     @contextlib.contextmanager

@@ -1,9 +1,10 @@
 """Open a CAN bus by its address, with one kind of error for everything that can go wrong.
 
-A bus between processes of one machine is a socketcand hub (drivers/simulation/hub.py). Its client here notices when the
-server is gone, and handles frames in bursts. Protocol: github.com/linux-can/socketcand, doc/protocol.md (raw mode).
-Frames to the bus are ``< send ID DLC B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of
-three hexadecimal digits is a base one, of eight an extended one. There are neither remote frames nor CAN FD.
+A bus between processes of one machine is a socketcand hub (drivers/simulation/hub.py). Its client
+here notices when the server is gone, and handles frames in bursts. Protocol:
+github.com/linux-can/socketcand, doc/protocol.md (raw mode). Frames to the bus are ``< send ID DLC
+B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of three hexadecimal
+digits is a base one, of eight an extended one. There are neither remote frames nor CAN FD.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from drivers.canopen.socketcan import BurstBus, open_socketcan, receive_within
 from drivers.errors import BusError
 
 CONNECT_TIMEOUT_S = 5.0
-SEND_S = 2.0  #: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
+#: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
+SEND_S = 2.0
 _RECEIVE_BYTES = 1 << 16
 # Frames for devices (CiA 301): NMT, SYNC, RPDOs, SDO requests, heartbeats.
 _TO_DEVICES: list[CanFilter] = [
@@ -37,7 +39,10 @@ _TO_DEVICES: list[CanFilter] = [
     for cob_id in (0x000, 0x080, 0x200, 0x300, 0x400, 0x500, 0x600, 0x700)
 ]
 LONGEST_BYTES = 4096
-"""Longest unfinished message; a frame has some 50. A server that never ends a message speaks another protocol."""
+"""Longest unfinished message; a frame has some 50.
+
+A server that never ends a message speaks another protocol.
+"""
 _LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16  #: Hexadecimal digits
 _SHOWN = 60
 _ADDRESS = re.compile(r"([\w-]+):([^@]+)(?:@([^:]+):(\d+))?")
@@ -49,9 +54,11 @@ _FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]++) ([0-9]++\.?+[0-9]*+) ([0-9A-Fa
 class BusAddress:
     """Address of a bus."""
 
-    interface: str  #: one of `INTERFACES` (drivers/canopen/interfaces.py), or the name of any other of python-can
+    #: one of `INTERFACES` (drivers/canopen/interfaces.py), or the name of any other of python-can
+    interface: str
     channel: str  #: of the interface, such as ``can0``
-    bitrate_bit_s: int = 1_000_000  #: of the wire; buses of the kernel and of a hub have theirs already
+    #: of the wire; buses of the kernel and of a hub have theirs already
+    bitrate_bit_s: int = 1_000_000
     host: str = "127.0.0.1"  #: of the hub (socketcand only)
     port: int = 29536  #: of the hub (socketcand only)
 
@@ -61,7 +68,10 @@ class BusAddress:
         return interface_of(self.interface)
 
     def __str__(self) -> str:
-        where = f"@{self.host}:{self.port}" if self.kind.has_server else ""
+        if self.kind.has_server:
+            where = f"@{self.host}:{self.port}"
+        else:
+            where = ""
         return f"{self.interface}:{self.channel}{where}"
 
     @classmethod
@@ -73,9 +83,14 @@ class BusAddress:
         """
         match = _ADDRESS.fullmatch(text)
         if match is None:
-            raise BusError(text, "expected INTERFACE:CHANNEL or INTERFACE:CHANNEL@HOST:PORT, such as socketcan:can0")
+            raise BusError(
+                text,
+                "expected INTERFACE:CHANNEL or INTERFACE:CHANNEL@HOST:PORT, such as socketcan:can0",
+            )
         interface, channel, host, port = match.groups()
-        return cls(interface, channel) if host is None else cls(interface, channel, host=host, port=int(port))
+        if host is None:
+            return cls(interface, channel)
+        return cls(interface, channel, host=host, port=int(port))
 
 
 @contextmanager
@@ -90,13 +105,14 @@ def bus_errors(address: object) -> Iterator[None]:
 def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
     """Open one end of a bus.
 
-    A ``virtual`` bus keeps every unread frame without limit (a limit would block the *sender* for ever), so close ends
-    that are not read. No end receives its own frames, except the SYNCs on ``socketcan``, which return with their time
-    and ``is_rx`` False (drivers/canopen/socketcan.py).
+    A ``virtual`` bus keeps every unread frame without limit (a limit would block the *sender* for
+    ever), so close ends that are not read. No end receives its own frames, except the SYNCs on
+    ``socketcan``, which return with their time and ``is_rx`` False (drivers/canopen/socketcan.py).
 
     Args:
         address: of the bus.
-        answering: for a device that answers each frame: on ``socketcan`` without the capture process.
+        answering: for a device that answers each frame: on ``socketcan`` without the capture
+            process.
 
     Raises:
         BusError: the interface is unknown, the device is absent, or the hub does not answer.
@@ -148,12 +164,16 @@ def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
 
 
 class VirtualEnd(BurstBus, VirtualBus):
-    """One end of python-can's bus of one process; its deep copies and its queue took half of a simulated cycle."""
+    """One end of python-can's bus of one process;
+    its deep copies and its queue took half of a simulated cycle.
+    """
 
     def __init__(self, channel: str) -> None:
         self._received = deque()
         super().__init__(channel)
-        self.channel[self.channel.index(self.queue)] = self.queue = cast("Queue[can.Message]", SimpleQueue())
+        self.channel[self.channel.index(self.queue)] = self.queue = cast(
+            "Queue[can.Message]", SimpleQueue()
+        )
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         self._check_if_open()
@@ -210,12 +230,16 @@ class SocketcandBus(BurstBus):
                 raise can.CanInitializationError(self._endless(self._buffer))
             chunk = self._socket.recv(_RECEIVE_BYTES)
             if not chunk:
-                raise can.CanInitializationError(f"{self.channel_info}: closed during the handshake")
+                raise can.CanInitializationError(
+                    f"{self.channel_info}: closed during the handshake"
+                )
             self._buffer += chunk
         answer, _, self._buffer = self._buffer.partition(b">")
         found = answer.strip(b"< ").decode("ascii", "replace")
         if found != word:
-            raise can.CanInitializationError(f"{self.channel_info}: expected '{word}', the server sent '{found}'")
+            raise can.CanInitializationError(
+                f"{self.channel_info}: expected '{word}', the server sent '{found}'"
+            )
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -235,7 +259,9 @@ class SocketcandBus(BurstBus):
             except BlockingIOError:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
-                    self._stuck = f"{self.channel_info}: the server accepts nothing for {SEND_S:g} s"
+                    self._stuck = (
+                        f"{self.channel_info}: the server accepts nothing for {SEND_S:g} s"
+                    )
                     raise can.CanOperationError(self._stuck) from None
             except OSError as error:
                 raise can.CanOperationError(f"{self.channel_info}: {error}") from error
@@ -258,13 +284,15 @@ class SocketcandBus(BurstBus):
             identifier, seconds, data, other = match.groups()
             if other is not None:
                 if other.startswith(b"error"):
-                    raise can.CanOperationError(f"{self.channel_info}: {other.decode('ascii', 'replace')}")
+                    raise can.CanOperationError(
+                        f"{self.channel_info}: {other.decode('ascii', 'replace')}"
+                    )
                 continue
             if len(data) % 2 or len(data) > _LONGEST_DATA or len(identifier) > _LONGEST_IDENTIFIER:
                 shown = match.group()[:_SHOWN].decode("ascii")
                 raise can.CanOperationError(
-                    f"{self.channel_info}: a frame of {len(identifier)} digits of identifier and {len(data)} of data: "
-                    f"{shown}"
+                    f"{self.channel_info}: a frame of {len(identifier)} digits of identifier and "
+                    f"{len(data)} of data: {shown}"
                 )
             self._received.append(
                 can.Message(
@@ -281,8 +309,8 @@ class SocketcandBus(BurstBus):
 
     def _endless(self, buffer: bytes) -> str:
         return (
-            f"{self.channel_info}: {len(buffer)} bytes without the end of a message, beginning with "
-            f"{buffer[:_SHOWN]!r}: is this a socketcand server?"
+            f"{self.channel_info}: {len(buffer)} bytes without the end of a message, beginning "
+            f"with {buffer[:_SHOWN]!r}: is this a socketcand server?"
         )
 
     def shutdown(self) -> None:
@@ -293,6 +321,11 @@ class SocketcandBus(BurstBus):
 def _command(message: can.Message) -> bytes:
     """Return a frame as the protocol's ``send`` command."""
     if message.is_remote_frame or message.is_fd or message.is_error_frame:
-        raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")
-    identifier = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+        raise can.CanOperationError(
+            f"the socketcand protocol has no remote, FD or error frames to send: {message}"
+        )
+    if message.is_extended_id:
+        identifier = f"{message.arbitration_id:08X}"
+    else:
+        identifier = f"{message.arbitration_id:03X}"
     return f"< send {identifier} {message.dlc:X} {message.data.hex(' ')} >".encode("ascii")

@@ -2,10 +2,11 @@
 
     python capture.py SOCKET OUT INTERFACE [RECORDS]     (two inherited file descriptors by their numbers)
 
-It runs as a script, isolated and with the standard library alone, so that it starts within milliseconds. Its parent
-sends on the same socket; only this process receives. Frames leave as records of fixed size. While the parent is busy
-they wait here in a bounded backlog; overflow is counted. The process ends when its parent is gone.
-"""
+It runs as a script, isolated and with the standard library alone, so that it starts within
+milliseconds. Its parent sends on the same socket; only this process receives. Frames leave as
+records of fixed size. While the parent is busy they wait here in a bounded backlog; overflow is
+counted. The process ends when its parent is gone.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -25,14 +26,18 @@ from enum import IntEnum
 SO_RXQ_OVFL = 40
 SCM_TIMESTAMPNS = 35
 SO_MEMINFO = 55
-MSG_OWN, MSG_LOCAL = 0x800, 0x4
+MSG_OWN = 0x800
+MSG_LOCAL = 0x4
 """linux/can/raw.h: MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
 BACKLOG_RECORDS = 1 << 20  #: A hundred seconds of a full bus in 56 MiB
 BURST = 128  #: Frames between two checks of the parent
 IDLE_MS = 20  #: Silence after which losses are reported without a following frame
-LOOK_NS = 200_000_000  #: Time between two checks of the interface's own counters, and of the parent's process id
+#: Time between two checks of the interface's own counters, and of the parent's process id
+LOOK_NS = 200_000_000
 INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
-"""Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
+"""Frames that were lost before any socket:
+in the kernel's queue behind the driver, and in the controller.
+"""
 FRAME = struct.Struct("=IB3x8s")  #: struct can_frame
 SYNC = 0x080
 _TIMESPEC = struct.Struct("@ll")
@@ -43,7 +48,8 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.si
 _ANCILLARY_HEAD = struct.Struct("@Nii")  # struct cmsghdr: its length with the data, level, type
 _SEND_BYTES = 1 << 16
 _PAUSE_NS = 200_000
-_CLOCK_STEP_NS = 1_000_000  #: A larger difference between two bursts is no slewing: the wall clock was set
+#: A larger difference between two bursts is no slewing: the wall clock was set
+_CLOCK_STEP_NS = 1_000_000
 
 
 class RecordKind(IntEnum):
@@ -58,10 +64,11 @@ class RecordKind(IntEnum):
 RECORD = struct.Struct("=qqQQQIBB??8s")
 """One frame, or a note of the capture process.
 
-Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic clock [ns]; a note
-has 0, and the monotonic time at which nothing was left to receive. Frames lost so far in the socket's buffer, before
-it, and in the backlog; identifier and flags of struct can_frame; `RecordKind`; bytes of data; whether it was sent by
-this very socket, and by any program of this machine; eight bytes.
+Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic
+clock [ns]; a note has 0, and the monotonic time at which nothing was left to receive. Frames lost
+so far in the socket's buffer, before it, and in the backlog; identifier and flags of struct
+can_frame; `RecordKind`; bytes of data; whether it was sent by this very socket, and by any program
+of this machine; eight bytes.
 """
 
 
@@ -109,7 +116,10 @@ class Batch:
         self._fresh = bytes(self._messages)
 
     def receive(self) -> int:
-        """Receive what waits, `BURST` frames at most; returns their number. OSError as for a socket."""
+        """Receive what waits, `BURST` frames at most; returns their number.
+
+        OSError as for a socket.
+        """
         ctypes.memmove(self._messages, self._fresh, len(self._fresh))
         count: int = self._receive(self._handle, self._messages, BURST, socket.MSG_DONTWAIT, None)
         if count < 0:
@@ -117,7 +127,9 @@ class Batch:
         return count
 
     def about(self, number: int) -> tuple[int, int, int | None, int | None]:
-        """Return bytes, flags, time stamp [ns since 1970; None without] and drop counter of a received frame."""
+        """Return bytes, flags, time stamp [ns since 1970;
+        None without] and drop counter of a received frame.
+        """
         message = self._messages[number]
         stamp_ns: int | None = None
         drops: int | None = None
@@ -136,10 +148,11 @@ class Batch:
 
 
 class MonotonicTime:
-    """Converts the kernel's wall-clock stamps to the monotonic clock, also when the wall clock is set.
+    """Converts the kernel's wall-clock stamps to the monotonic clock,
+    also when the wall clock is set.
 
-    The kernel stamps received frames by CLOCK_REALTIME alone. The difference of the clocks is read after each burst;
-    after a step of the wall clock a frame may still have a stamp from before it.
+    The kernel stamps received frames by CLOCK_REALTIME alone. The difference of the clocks is read
+    after each burst; after a step of the wall clock a frame may still have a stamp from before it.
 
     Args:
         wall_ns, monotonic_ns: both clocks, read together; no stamp becomes older than that.
@@ -150,7 +163,8 @@ class MonotonicTime:
         self._last_ns = monotonic_ns
 
     def of(self, stamp_ns: int, wall_ns: int, monotonic_ns: int) -> int:
-        """Return the monotonic time of a kernel's stamp [ns], from both clocks read together after the frame.
+        """Return the monotonic time of a kernel's stamp [ns],
+        from both clocks read together after the frame.
 
         It is never before the previous one, and never after `monotonic_ns`.
         """
@@ -176,7 +190,11 @@ class Capture:
     """
 
     def __init__(
-        self, bus: socket.socket, out: socket.socket, interface: str, backlog_records: int = BACKLOG_RECORDS
+        self,
+        bus: socket.socket,
+        out: socket.socket,
+        interface: str,
+        backlog_records: int = BACKLOG_RECORDS,
     ) -> None:
         self._bus = bus
         self._out = out
@@ -186,7 +204,9 @@ class Capture:
         self._now_ns = time.monotonic_ns()
         self._time = MonotonicTime(time.time_ns(), self._now_ns)
         self._backlog_dropped = self._interface_dropped = 0
-        self._counters = tuple(f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS)
+        self._counters = tuple(
+            f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS
+        )
         self._interface_before = self._read_interface()
         self._empty_ns = 0
         self._reported_drops = (0, 0, 0)
@@ -215,9 +235,8 @@ class Capture:
                     ended = True
             elif not ready:
                 self._empty_ns = self._now_ns = time.monotonic_ns()
-                self._note(
-                    RecordKind.LOSSES
-                )  # the parent distinguishes a silent bus from a capture process that was stopped
+                # The parent distinguishes a silent bus from a capture process that was stopped.
+                self._note(RecordKind.LOSSES)
                 # A frame reports the drops before it, and there may be none: ask the socket itself.
                 with suppress(OSError):  # before Linux 4.12 the next frame reports it
                     counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
@@ -232,7 +251,9 @@ class Capture:
                     return  # another process holds the parent's end of the pair open
 
     def receive(self) -> int:
-        """Receive waiting frames, a burst at most; returns the error number that ended the bus, else 0."""
+        """Receive waiting frames, a burst at most;
+        returns the error number that ended the bus, else 0.
+        """
         number = count = 0
         try:
             count = self._batch.receive()
@@ -245,7 +266,8 @@ class Capture:
         self._now_ns = time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2
         if self._now_ns - before_ns > _PAUSE_NS:
-            wall_ns = now_ns + self._time.offset_ns  # preempted between the readings: they do not belong together
+            # Preempted between the readings: they do not belong together
+            wall_ns = now_ns + self._time.offset_ns
         for index in range(count):
             size, flags, stamp_ns, drops = self._batch.about(index)
             if size == 0:
@@ -265,17 +287,22 @@ class Capture:
             own = bool(flags & MSG_OWN)
             local = bool(flags & MSG_LOCAL)
             head = (stamp_ns, monotonic_ns, *self._reported_drops)
-            self._backlog += RECORD.pack(*head, can_id, RecordKind.FRAME, length, own, local, payload)
+            self._backlog += RECORD.pack(
+                *head, can_id, RecordKind.FRAME, length, own, local, payload
+            )
         return number
 
     def _see_drops(self, count: int) -> None:
-        # A frame carries the count of the time when it was queued, which may be less than a reading of the socket.
+        # A frame carries the count of the time when it was queued, which may be less than a reading
+        # of the socket.
         self._kernel_dropped = max(count, self._kernel_dropped)
 
     def _note(self, kind: RecordKind, number: int = 0) -> None:
         """Append a note to the backlog, even when that is full: notes are few."""
         self._reported_drops = self._counts
-        self._backlog += RECORD.pack(0, self._empty_ns, *self._reported_drops, number, kind, 0, False, False, bytes(8))
+        self._backlog += RECORD.pack(
+            0, self._empty_ns, *self._reported_drops, number, kind, 0, False, False, bytes(8)
+        )
 
     @property
     def _counts(self) -> tuple[int, int, int]:
@@ -292,11 +319,15 @@ class Capture:
         return total
 
     def forward(self) -> bool:
-        """Forward what the parent accepts without waiting; returns False when the parent is gone."""
+        """Forward what the parent accepts without waiting;
+        returns False when the parent is gone.
+        """
         try:
             while self._backlog:
                 with memoryview(self._backlog) as waiting:
-                    sent = self._out.send(waiting[:_SEND_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+                    sent = self._out.send(
+                        waiting[:_SEND_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+                    )
                 del self._backlog[:sent]
             if self._reported_drops != self._counts:
                 self._note(RecordKind.LOSSES)
@@ -312,10 +343,14 @@ def run_capture(arguments: list[str]) -> None:
     # The parent handles Ctrl-C: it stops the axes first, and needs the frames for that.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = os.getppid()
-    # Real-time priority where permitted (root, CAP_SYS_NICE): this process does little and must not wait.
+    # Real-time priority where permitted (root, CAP_SYS_NICE): this process does little and must not
+    # wait.
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    with socket.socket(fileno=int(arguments[0])) as bus, socket.socket(fileno=int(arguments[1])) as out:
+    with (
+        socket.socket(fileno=int(arguments[0])) as bus,
+        socket.socket(fileno=int(arguments[1])) as out,
+    ):
         Capture(bus, out, arguments[2], *map(int, arguments[3:])).run(parent)
 
 

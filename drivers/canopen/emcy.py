@@ -1,7 +1,7 @@
 """Error codes of EMCY and 603Fh in words.
 
-The texts are those of CiA 301 and CiA 402-2 (emcy.txt). Other codes are described by their class: upper byte, then
-upper digit.
+The texts are those of CiA 301 and CiA 402-2 (emcy.txt). Other codes are described by their class:
+upper byte, then upper digit.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from drivers.canopen.sdo import ObjectAccess
 
 _LINES = Path(__file__).with_name("emcy.txt").read_text(encoding="utf-8").splitlines()
-_TEXTS = {digits: text for digits, _, text in (line.partition(" ") for line in _LINES if not line.startswith("#"))}
+_TEXTS = {
+    digits: text
+    for digits, _, text in (line.partition(" ") for line in _LINES if not line.startswith("#"))
+}
 CODES = {int(digits, 16): text for digits, text in _TEXTS.items() if len(digits) == 4}
 """Text of each code that the two standards name."""
 
@@ -55,7 +58,10 @@ def remedy_of(code: int) -> str:
     """Return what to try first for an error code; the drive's manual says more."""
     if code >> 8 == _NO_ERROR:
         return "nothing: the drive reports no error"
-    first = "check brake, load and collision; use slower moves" if code >> 8 in (0x84, 0x85, 0x86) else ""
+    if code >> 8 in (0x84, 0x85, 0x86):
+        first = "check brake, load and collision; use slower moves"
+    else:
+        first = ""
     first = first or _REMEDIES.get(code >> 12, "see the drive's manual")
     return f"{first}; then reset the fault with `CanopenNetwork.reset_faults`"
 

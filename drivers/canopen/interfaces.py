@@ -1,4 +1,6 @@
-"""The interfaces that drivegain treats in a way of their own; any other of python-can is opened by its name alone."""
+"""The interfaces that drivegain treats in a way of their own;
+any other of python-can is opened by its name alone.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ class BusInterface:
 
     name: str  #: as in cell files and to python-can
     is_simulated: bool = False  #: only simulated cells are on it, whose time may be simulated too
-    has_server: bool = False  #: an address has host and port of a server, which carries no error frames
+    #: an address has host and port of a server, which carries no error frames
+    has_server: bool = False
     is_of_process: bool = False  #: a bus of that name in another process is another bus
     has_kernel_sync: bool = False  #: the kernel can send SYNC on it
 

@@ -1,7 +1,7 @@
 """The one reader of a bus: sends, receives, and dispatches every frame that is no PDO.
 
-There is no receiving thread. Code that waits (for an SDO answer, a heartbeat, the answers to a SYNC) reads the bus
-while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
+There is no receiving thread. Code that waits (for an SDO answer, a heartbeat, the answers to a
+SYNC) reads the bus while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
 """
 
 from __future__ import annotations
@@ -16,7 +16,14 @@ import can
 
 from drivers.canopen.bus import base_frame, bus_errors, send_burst
 from drivers.canopen.emcy import describe_error_code
-from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
+from drivers.canopen.sdo import (
+    SDO_ANSWER,
+    SDO_REQUEST,
+    Clock,
+    ObjectAccess,
+    SdoPolicy,
+    SynchronousSdoClient,
+)
 from drivers.canopen.socketcan import CapturedMessage, receive_only
 from drivers.canopen.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 from drivers.errors import BusBusy, BusError, StateRefused, node_label
@@ -26,18 +33,24 @@ SYNC_COB_ID = 0x080
 NMT_COB_ID = 0x000
 EMCY = 0x080
 HEARTBEAT = 0x700
-LSS = frozenset((0x7E4, 0x7E5))  #: Layer setting services (CiA 305): a device gets another node id or bit rate
+#: Layer setting services (CiA 305): a device gets another node id or bit rate
+LSS = frozenset((0x7E4, 0x7E5))
 _COMMANDS = LSS | {NMT_COB_ID, SYNC_COB_ID}
-_RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
-_WRITES = frozenset((0, 1, 6))  #: Command specifiers (upper three bits) of downloads: segment, begin, block
+#: Set-points of a drive (CiA 301, predefined connection set)
+_RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))
+#: Command specifiers (upper three bits) of downloads: segment, begin, block
+_WRITES = frozenset((0, 1, 6))
 _LSS_NAME = "a layer setting service, which changes node ids"
 _NAMES = {NMT_COB_ID: "an NMT command", SYNC_COB_ID: "a SYNC", **dict.fromkeys(LSS, _LSS_NAME)}
 BOOTS_S = 0.5  #: Two boot-up messages in this time are those of two devices
 BEATS_KEPT = 8  #: Heartbeats of each node by which a second device is found
 BEATS_JUDGED, JUDGED_PERIODS = 4, 2.2
-"""So many heartbeats of one device last three periods; those of two that have one node id, two at most."""
+"""So many heartbeats of one device last three periods;
+those of two that have one node id, two at most.
+"""
 BEATS_S = 3.0  #: Longest time to listen for the heartbeats of a second device
-PERIODS_HEARD = 3.0  #: Periods in which two devices send `BEATS_JUDGED` heartbeats, and then at least one more
+#: Periods in which two devices send `BEATS_JUDGED` heartbeats, and then at least one more
+PERIODS_HEARD = 3.0
 LISTEN_S = 0.2  #: Usual time to listen for other masters before the first frame is sent
 PUMP_S = 0.1  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
@@ -110,7 +123,9 @@ def command_name(identifier: int, names: Mapping[int, str]) -> str:
 
 
 def _too_fast(beats: Sequence[Beat], period_ms: int) -> bool:
-    """Whether heartbeats come so fast, more than once, that they are those of two devices with this period."""
+    """Whether heartbeats come so fast, more than once,
+    that they are those of two devices with this period.
+    """
     fast = 0
     for first, last in zip(beats, beats[BEATS_JUDGED - 1 :], strict=False):
         timed_by_clock = first.syncs == last.syncs
@@ -120,12 +135,21 @@ def _too_fast(beats: Sequence[Beat], period_ms: int) -> bool:
 
 
 def _sent_ns(message: can.Message, now_ns: int) -> int:
-    """Return the time of a frame by its own stamp where it has one, however late it is read; one clock for one bus."""
-    return message.monotonic_ns if isinstance(message, CapturedMessage) else round(message.timestamp * 1e9) or now_ns
+    """Return the time of a frame by its own stamp where it has one, however late it is read;
+    one clock for one bus.
+    """
+    return (
+        message.monotonic_ns
+        if isinstance(message, CapturedMessage)
+        else round(message.timestamp * 1e9) or now_ns
+    )
 
 
 class Link:
-    """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost."""
+    """An open bus and the last known state of its nodes.
+
+    Methods that use the bus raise BusError when it is lost.
+    """
 
     def __init__(
         self,
@@ -140,24 +164,31 @@ class Link:
         self.nmt: dict[int, int] = {}  #: Last NMT state of each node that sent a heartbeat
         self.heard_ns: dict[int, int] = {}  #: Time of that heartbeat by the clock
         self.answered: Counter[int] = Counter()  #: SDO answers of each node
-        self.boots: Counter[int] = Counter()  #: Boot-up messages of each node id right after another
+        #: Boot-up messages of each node id right after another
+        self.boots: Counter[int] = Counter()
         self.twice: dict[int, str] = {}  #: Node ids whose request was answered twice, and by what
-        self.asked_by: dict[int, object] = {}  #: Client of the last SDO request to each node; none where it had none
+        #: Client of the last SDO request to each node; none where it had none
+        self.asked_by: dict[int, object] = {}
         self._beats: dict[int, deque[Beat]] = {}  # the last ones of each node
         self._foreign_syncs = 0  # since the bus was opened
-        self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
-        self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
-        #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request, set-point of one of our
-        #: axes, any frame with our own node id) and that we did not send.
+        #: Nodes that did not answer their last request, and sent nothing since
+        self.silent: set[int] = set()
+        #: Node ids of which any frame arrived since the bus was opened
+        self.heard: set[int] = set()
+        #: Number of frames by identifier that only we should send (NMT, SYNC, LSS, SDO request,
+        #: set-point of one of our axes, any frame with our own node id) and that we did not send.
         self.foreign: Counter[int] = Counter()
-        self.written: dict[int, str] = {}  #: Downloads to our axes that we did not send, by identifier
+        #: Downloads to our axes that we did not send, by identifier
+        self.written: dict[int, str] = {}
         self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
         self.names: Mapping[int, str] = {}  #: Of our axes by node id
-        #: Time by the clock at which everything that waits must end [ns]; None while the network is not closed.
+        #: Time by the clock at which everything that waits must end [ns]; None while the network is
+        #: not closed.
         self.deadline_ns: int | None = None
         #: Whether the operator wants what is left to be given up.
         self.given_up: Callable[[], bool] = never
-        #: Device that sends SYNC on our behalf (drivers/stream/producers.py); None while only we send it.
+        #: Device that sends SYNC on our behalf (drivers/stream/producers.py); None while only we
+        #: send it.
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0
@@ -173,7 +204,9 @@ class Link:
         self._bus = self._opener(self.address)
 
     def narrow(self) -> None:
-        """Receive from now on only what concerns our axes, or is a command: a flood of others costs nothing."""
+        """Receive from now on only what concerns our axes, or is a command:
+        a flood of others costs nothing.
+        """
         services = (EMCY, *range(0x180, SDO_REQUEST, 0x80), HEARTBEAT)
         wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
         wanted += [(number, 0x7FF) for number in sorted(_COMMANDS)]
@@ -202,7 +235,9 @@ class Link:
             send_burst(self.bus, messages)
 
     def pump(self, timeout_s: float) -> None:
-        """Handle one frame, waiting at most ``timeout_s`` for it; with 0, all frames that have already arrived."""
+        """Handle one frame, waiting at most ``timeout_s`` for it;
+        with 0, all frames that have already arrived.
+        """
         self.beat()
         with bus_errors(self.address):
             message = self.bus.recv(timeout_s)
@@ -212,10 +247,16 @@ class Link:
                 message = self.bus.recv(0.0) if self.clock() < end_ns else None
 
     def allowed_s(self, seconds: float) -> float:
-        """Return how long a step may wait that takes so many seconds: less, or not at all, while the network closes."""
+        """Return how long a step may wait that takes so many seconds:
+        less, or not at all, while the network closes.
+        """
         if self.deadline_ns is None:
             return seconds
-        return 0.0 if self.given_up() else min(seconds, max(0.0, (self.deadline_ns - self.clock()) * 1e-9))
+        return (
+            0.0
+            if self.given_up()
+            else min(seconds, max(0.0, (self.deadline_ns - self.clock()) * 1e-9))
+        )
 
     def pass_time(self) -> None:
         """Send one SYNC and handle frames for 1 ms: a cell in lockstep advances by SYNC alone."""
@@ -247,7 +288,9 @@ class Link:
             BusBusy: a command of another master was among them.
         """
         if self.foreign:
-            seen = ", ".join(command_name(identifier, self.names) for identifier in sorted(self.foreign))
+            seen = ", ".join(
+                command_name(identifier, self.names) for identifier in sorted(self.foreign)
+            )
             raise BusBusy.by_master(self.address, seen)
 
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
@@ -284,7 +327,12 @@ class Link:
         if identifier in _COMMANDS or setpoint or request or self.is_own(identifier):
             if identifier != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(identifier)
-            if service == SDO_REQUEST and node_id in self.names and message.data and message.data[0] >> 5 in _WRITES:
+            if (
+                service == SDO_REQUEST
+                and node_id in self.names
+                and message.data
+                and message.data[0] >> 5 in _WRITES
+            ):
                 self._note_write(identifier)
             return True
         if node_id == 0:
@@ -297,7 +345,10 @@ class Link:
             code, register, data = struct.unpack("<HB5s", message.data)
             # CiA 301: codes 00xxh report the end of an error.
             kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
-            text = f"EMCY {code:04X}h {describe_error_code(code)}, error register {register:02X}h, data {data.hex()}"
+            text = (
+                f"EMCY {code:04X}h {describe_error_code(code)}, error register {register:02X}h, "
+                f"data {data.hex()}"
+            )
             self._events.append((node_id, kind, code, text))
         elif service == SDO_ANSWER:
             self.answered[node_id] += 1
@@ -312,15 +363,27 @@ class Link:
         if message.arbitration_id & BUS_OFF:
             raise BusError(str(self.address), BUS_OFF_REASON)
         if message.arbitration_id & _RESTARTED:
-            self._events.append((0, EventKind.CONTROLLER, _RESTARTED, "the CAN controller was restarted"))
-        bits = message.data[1] if message.arbitration_id & _CONTROLLER and len(message.data) > 1 else 0
+            self._events.append(
+                (0, EventKind.CONTROLLER, _RESTARTED, "the CAN controller was restarted")
+            )
+        bits = (
+            message.data[1] if message.arbitration_id & _CONTROLLER and len(message.data) > 1 else 0
+        )
         if bits & _PASSIVE:
             text = "the CAN controller is error passive: check termination, wiring and bit rate"
             self._events.append((0, EventKind.BUS_PASSIVE, bits, text))
         elif bits:
-            states = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
-            description = ", ".join(text for mask, text in states if bits & mask) or f"reports {bits:02X}h"
-            self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {description}"))
+            states = (
+                (_OVERFLOW, "overflows, frames are lost"),
+                (_WARNING, "counts errors"),
+                (_ACTIVE, "recovered"),
+            )
+            description = (
+                ", ".join(text for mask, text in states if bits & mask) or f"reports {bits:02X}h"
+            )
+            self._events.append(
+                (0, EventKind.CONTROLLER, bits, f"the CAN controller {description}")
+            )
 
     def is_own(self, identifier: int) -> bool:
         """Whether only a device with our own node id sends a frame with this identifier."""
@@ -329,7 +392,9 @@ class Link:
         return self.own_id is not None and sent_by_it and identifier & 0x7F == self.own_id
 
     def note_foreign(self, identifier: int) -> None:
-        """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
+        """Count a command, or a heartbeat with our node id,
+        that neither we nor our SYNC producer sent.
+        """
         self.foreign[identifier] += 1
         self._foreign_syncs += identifier == SYNC_COB_ID
         if self.foreign[identifier] == 1:  # once: a master would fill the log
@@ -337,9 +402,13 @@ class Link:
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
     def _note_write(self, identifier: int) -> None:
-        """Report, once, that another master writes to one of our axes by SDO: that can move it, or stop a move."""
+        """Report, once, that another master writes to one of our axes by SDO:
+        that can move it, or stop a move.
+        """
         if identifier not in self.written:
-            seen = command_name(identifier, self.names).replace("an SDO request", "an SDO download (it writes)")
+            seen = command_name(identifier, self.names).replace(
+                "an SDO request", "an SDO download (it writes)"
+            )
             self.written[identifier] = seen
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{seen} that we did not send"))
 
@@ -357,10 +426,14 @@ class Link:
         self.nmt[node_id] = state
         self.heard_ns[node_id] = now_ns
         if previous != state:
-            self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
+            self._events.append(
+                (node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}")
+            )
 
     def note_twice(self, node_id: int, first: bytes, second: bytes) -> None:
-        """Note that a node gave two answers to one request, unless another program asked the same."""
+        """Note that a node gave two answers to one request,
+        unless another program asked the same.
+        """
         if SDO_REQUEST + node_id not in self.foreign:
             entry = f"{first[2]:02X}{first[1]:02X}h:{first[3]:02X}"
             values = f"{first[4:].hex(' ')} and {second[4:].hex(' ')}"
@@ -381,13 +454,13 @@ class Link:
     def shared_id(self, node_id: int, period_ms: int) -> str:
         """Describe the evidence that two devices have a node id; empty without any.
 
-        Heartbeats count by their rate where no SYNC of another producer came between them: a cell in lockstep lives as
-        fast as its SYNC comes, and its heartbeats with it.
+        Heartbeats count by their rate where no SYNC of another producer came between them: a cell
+        in lockstep lives as fast as its SYNC comes, and its heartbeats with it.
 
         Args:
             node_id: of the node.
-            period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is unknown. One late
-                heartbeat is no evidence.
+            period_ms: of its heartbeat since `count_beats`, or since its first one; 0 where that is
+                unknown. One late heartbeat is no evidence.
         """
         if node_id in self.twice:
             return self.twice[node_id]
@@ -408,7 +481,9 @@ class Link:
         return ""
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
-        """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
+        """Return the events since the last call in their order;
+        axis is None for nodes that are no axes of ours.
+        """
         taken = self._events
         self._events = deque()
         found = []
@@ -424,7 +499,9 @@ class Link:
         if (node_id, policy) not in self._access:
             client = SynchronousSdoClient(node_id, self, policy)
             self.listen(node_id, client.receive)
-            self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
+            self._access[node_id, policy] = ObjectAccess(
+                node_id, client, policy, self.names.get(node_id, "")
+            )
         return self._access[node_id, policy]
 
     def listen(self, node_id: int, listener: SdoListener) -> None:
@@ -445,7 +522,9 @@ class Link:
         """
 
         def found() -> int | None:
-            return self.nmt[node_id] if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
+            return (
+                self.nmt[node_id] if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
+            )
 
         if not self.wait(within_s, lambda: found() == state):
             shown = f"{nmt_name(found())} after {within_s:.3g} s"

@@ -1,4 +1,6 @@
-"""The amplifiers of one cell: found, checked, set up for recording and moving, and restored afterwards."""
+"""The amplifiers of one cell: found, checked, set up for recording and moving,
+and restored afterwards.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,16 @@ from typing import Self
 import can
 
 from drivers.canopen.bus import BusAddress
-from drivers.canopen.link import HEARTBEAT, LISTEN_S, LSS, Link, NmtCommand, NmtState, command_name, never
+from drivers.canopen.link import (
+    HEARTBEAT,
+    LISTEN_S,
+    LSS,
+    Link,
+    NmtCommand,
+    NmtState,
+    command_name,
+    never,
+)
 from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
@@ -39,13 +50,22 @@ from drivers.errors import (
     node_label,
 )
 from drivers.messages import Sample
-from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
+from drivers.profiles.cia402 import (
+    FAULT_RESET_SEQUENCE,
+    POWERLESS,
+    Goal,
+    State,
+    decode,
+    next_command,
+)
 from drivers.profiles.profile import Axis, Identity
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
-LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
+#: The recorder takes the highest free id: this one or a higher one on any usual bus
+LOWEST_USUAL_ID = 112
 SECOND_ANSWER_S = 0.05  #: For the answer of a second device with one node id
-STANDSTILL_COUNTS = 1024  #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
+#: An encoder at rest flickers, and an axis may sink onto its brake between two readings
+STANDSTILL_COUNTS = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,18 +80,20 @@ class Bounds:
     nmt_s: float = 2.0  #: until a heartbeat confirms an NMT state
     mode_s: float = 1.0  #: until 6061h shows the requested mode
     disable_s: float = 2.0  #: until an axis is without power when the network closes
-    #: For devices with the node ids that the recorder may take. With `listen_s` before it, longer than `guard_ms` of a
-    #: cell whose SYNC has a usual period: a slower heartbeat could not replace the recorder's.
+    #: For devices with the node ids that the recorder may take. With `listen_s` before it, longer
+    #: than `guard_ms` of a cell whose SYNC has a usual period: a slower heartbeat could not replace
+    #: the recorder's.
     free_s: float = 0.35
-    #: For everything from the stop of the axes to the last restored setting. The stop comes first; whatever is not
-    #: restored by then is named.
+    #: For everything from the stop of the axes to the last restored setting. The stop comes first;
+    #: whatever is not restored by then is named.
     closing_s: float = 10.0
 
 
 SignalBlocker = Callable[[], AbstractContextManager[Callable[[], bool] | None]]
 """Returns a context in which no signal interrupts stopping and restoring the axes.
 
-It yields None, or a function that returns whether the operator has asked a second time: restoring is then given up.
+It yields None, or a function that returns whether the operator has asked a second time: restoring
+is then given up.
 """
 DEFAULT_BOUNDS = Bounds()
 DEFAULT_POLICY = SdoPolicy()
@@ -80,7 +102,10 @@ DEFAULT_POLICY = SdoPolicy()
 def _unrestored(axes: Sequence[Axis]) -> str:
     """Return the note on the error of axes that could not be reached."""
     settings = f"settings of {', '.join(map(node_label, axes))} not restored"
-    return f"{WHILE}closing the network: {settings}; switch these drives off and on before they are used"
+    return (
+        f"{WHILE}closing the network: {settings}; switch these drives off and on before "
+        "they are used"
+    )
 
 
 @contextmanager
@@ -93,7 +118,9 @@ def _collected(problems: list[DriverError]) -> Iterator[None]:
 
 
 @contextmanager
-def open_cell(address: CellAddress | str, axes: Sequence[Axis], *, guard_ms: int = 500) -> Iterator[CanopenNetwork]:
+def open_cell(
+    address: CellAddress | str, axes: Sequence[Axis], *, guard_ms: int = 500
+) -> Iterator[CanopenNetwork]:
     """Open the bus of a cell and set up its amplifiers; no axis gets power.
 
     Leaving the context disables all axes and restores every changed object.
@@ -113,20 +140,25 @@ def open_cell(address: CellAddress | str, axes: Sequence[Axis], *, guard_ms: int
 
 
 class CanopenNetwork:
-    """The axes of a cell. Use as a context manager; leaving it disables all axes and restores all settings.
+    """The axes of a cell, as a context manager.
 
-    Methods that use the bus raise BusError when it is lost, and ObjectAccessError when an axis does not answer.
+    Leaving it disables all axes and restores all settings.
+
+    Methods that use the bus raise BusError when it is lost, and ObjectAccessError when an axis does
+    not answer.
 
     Args:
         address: of the bus, or of the buses that share the axes.
         axes: the amplifiers, in the order of the samples' columns.
         heartbeat_ms: period of every node's heartbeat, and of ours while axes have power.
-        guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/canopen/setup.py).
+        guard_ms: silence of ours after which the amplifiers stop by themselves
+            (drivers/canopen/setup.py).
         bounds, policy: time limits.
         clock: monotonic time [ns].
         opener: opens the bus of an address, or of several as one.
         block_signals: keeps signals from interrupting the stop of the axes.
-        profiles: those from which one is named that fits a drive, where the configured one does not.
+        profiles: those from which one is named that fits a drive, where the configured one does
+            not.
     """
 
     def __init__(
@@ -153,7 +185,8 @@ class CanopenNetwork:
         self.node_ids = tuple(axis.node_id for axis in axes)
         self.link.names = {axis.node_id: axis.name for axis in axes}
         # The highest id is the least likely to be a drive's; `prepare` checks that it is free.
-        self.powered: set[int] = set()  #: Nodes that have had power, and are not confirmed without it since
+        #: Nodes that have had power, and are not confirmed without it since
+        self.powered: set[int] = set()
         self.recorder_id = next((n for n in range(127, 0, -1) if n not in self.node_ids), 0)
         self._setups: dict[int, AxisSetup] = {}
         self._readback: dict[str, object] = {}
@@ -166,9 +199,15 @@ class CanopenNetwork:
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         try:
             with self.block_signals() as asked_again:
-                problems = self._restore(asked_again or never) if self._setups else []
+                if self._setups:
+                    problems = self._restore(asked_again or never)
+                else:
+                    problems = []
         except BaseException as cut:
-            cut.add_note(f"{WHILE}closing the network: it was cut short, and not every axis has its settings back")
+            cut.add_note(
+                f"{WHILE}closing the network: it was cut short, and not every axis has "
+                "its settings back"
+            )
             self._note(cut, ())
             raise
         finally:
@@ -180,7 +219,9 @@ class CanopenNetwork:
             raise problems[0]
 
     def _note(self, error: BaseException, problems: Sequence[DriverError]) -> None:
-        """Attach failures to close the network, with their own notes, and the axes that may still have power."""
+        """Attach failures to close the network, with their own notes,
+        and the axes that may still have power.
+        """
         for problem in problems:
             error.add_note(f"{WHILE}closing the network: {problem}")
             for note in getattr(problem, "__notes__", ()):
@@ -206,10 +247,14 @@ class CanopenNetwork:
             self.link.deadline_ns = self.link.clock() + round(self.bounds.closing_s * 1e9)
 
     def end_closing(self) -> None:
-        """Lift the time limit of `begin_closing`: the axes have no power, and the network stays open."""
+        """Lift the time limit of `begin_closing`:
+        the axes have no power, and the network stays open.
+        """
         self.link.deadline_ns = None
 
-    def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
+    def scan(
+        self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5
+    ) -> tuple[FoundNode, ...]:
         """Find the nodes on the bus; changes nothing.
 
         Raises:
@@ -236,14 +281,16 @@ class CanopenNetwork:
             if axis.identity is not None and (differing := axis.identity.differences(found)):
                 raise SetupRefused(
                     axis,
-                    f"{differing[0]}; was an amplifier exchanged? correct the configuration only after checking the "
-                    "hardware",
+                    f"{differing[0]}; was an amplifier exchanged? correct the configuration only "
+                    "after checking the hardware",
                 )
         return identities
 
     @contextmanager
     def _second_device_named(self) -> Iterator[None]:
-        """Where a node refuses, look for a second device with its node id first: that one may have refused."""
+        """Where a node refuses, look for a second device with its node id first:
+        that one may have refused.
+        """
         try:
             yield
         except (ObjectAccessError, SetupRefused):
@@ -263,24 +310,31 @@ class CanopenNetwork:
             raise refusal(error, axis) from error
 
     def _require_own_ids(self, period_ms: int) -> None:
-        """Refuse an axis whose node id another device has too; `period_ms` is that of its heartbeat, 0 if unknown."""
+        """Refuse an axis whose node id another device has too;
+        `period_ms` is that of its heartbeat, 0 if unknown.
+        """
         for axis in self.axes:
             if shared := self.link.shared_id(axis.node_id, period_ms):
                 raise SetupRefused(
                     axis,
                     f"found {shared}",
                     expected="one device with this node id",
-                    remedy="two have it, and both would move: nothing has moved, give one of them another node id",
+                    remedy="two have it, and both would move: nothing has moved, give one of them "
+                    "another node id",
                 )
 
     def prepare(self) -> None:
-        """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
+        """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode,
+        OPERATIONAL.
 
-        No axis gets power. The original values are restored when the network is left, also after an error.
+        No axis gets power. The original values are restored when the network is left, also after an
+        error.
 
         Raises:
-            BusBusy: another master commands this bus (nothing was sent), or no node id is free for the recorder.
-            NodeMissing, SetupRefused, StateRefused, ObjectAccessError, BusError: see drivers/errors.py.
+            BusBusy: another master commands this bus (nothing was sent), or no node id is free for
+                the recorder.
+            NodeMissing, SetupRefused, StateRefused, ObjectAccessError, BusError: see
+                drivers/errors.py.
         """
         self.require_quiet()
         with self._second_device_named(), self._refusals_named():
@@ -292,7 +346,9 @@ class CanopenNetwork:
         if self.link.own_id is None:
             self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
         new = {
-            axis.node_id: AxisSetup(self.link, axis, HeartbeatGuard(self.objects(axis), entries, self.was_ours))
+            axis.node_id: AxisSetup(
+                self.link, axis, HeartbeatGuard(self.objects(axis), entries, self.was_ours)
+            )
             for axis, entries in zip(self.axes, consumers, strict=True)
             if axis.node_id not in self._setups
         }
@@ -311,10 +367,13 @@ class CanopenNetwork:
             setup.map_pdos()
             setup.set_mode(self.bounds.mode_s)
         for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
-            self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
+            self._readback[axis.name] = self._setups[axis.node_id].describe(
+                identity, scale, self.guard_ms
+            )
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
         for node_id in self.node_ids:
-            # SYNC has been sent meanwhile: with it a cell in lockstep, and its heartbeats, may be faster than time.
+            # SYNC has been sent meanwhile: with it a cell in lockstep, and its heartbeats, may be
+            # faster than time.
             self.link.count_beats(node_id)
         self.link.hear_beats(self.heartbeat_ms)
         self._require_own_ids(self.heartbeat_ms)
@@ -322,14 +381,20 @@ class CanopenNetwork:
 
     @property
     def pdos(self) -> tuple[AxisPdos, ...]:
-        """PDOs of each axis: as they are mapped, or before `prepare` as they will be on most drives."""
+        """PDOs of each axis: as they are mapped, or before `prepare` as they will be on most
+        drives.
+        """
         return tuple(
-            self._setups[axis.node_id].pdos if axis.node_id in self._setups else wanted_pdos(axis) for axis in self.axes
+            self._setups[axis.node_id].pdos if axis.node_id in self._setups else wanted_pdos(axis)
+            for axis in self.axes
         )
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
-        """Choose the highest node id that no device uses, and that no amplifier waits for by its entries of 1016h."""
-        # An amplifier that waits for a device which is off now would take our heartbeat for that device's.
+        """Choose the highest node id that no device uses,
+        and that no amplifier waits for by its entries of 1016h.
+        """
+        # An amplifier that waits for a device which is off now would take our heartbeat for that
+        # device's.
         awaited = {producer_of(value) for value in watched if value & 0xFFFF != self.guard_ms}
         left = [n for n in range(127, 0, -1) if n not in awaited and n not in self.node_ids]
         while left := [n for n in left if n not in self.link.heard]:
@@ -340,14 +405,16 @@ class CanopenNetwork:
                 return
         raise BusBusy(
             str(self.link.address),
-            "no free node id for the recorder: all of 1 to 127 belong to axes or other devices, or an axis waits for "
-            "them (1016h)",
-            "an id that only the recorder uses, because another device's heartbeat would keep the axes running",
+            "no free node id for the recorder: all of 1 to 127 belong to axes or other devices, or "
+            "an axis waits for them (1016h)",
+            "an id that only the recorder uses, because another device's heartbeat would keep the "
+            "axes running",
             "nothing has moved; take one of the other devices off the bus while recording",
         )
 
     def was_ours(self, value: int) -> bool:
-        """Whether an entry of 1016h still watches a recorder that was killed, and no device that is present.
+        """Whether an entry of 1016h still watches a recorder that was killed,
+        and no device that is present.
 
         That recorder may have used another node id, because of another device.
         """
@@ -368,10 +435,13 @@ class CanopenNetwork:
         """Describe SDO requests of another master since `require_quiet`; empty without any."""
         asked = [number for number in sorted(self.link.foreign) if SDO_REQUEST < number < HEARTBEAT]
         seen = [command_name(number, self.link.names) for number in asked if number not in LSS]
-        return f"another master was on the bus: {', '.join(seen)}" if seen else ""
+        if seen:
+            return f"another master was on the bus: {', '.join(seen)}"
+        return ""
 
     def guard(self) -> None:
-        """Start our heartbeat: from now on the amplifiers quick stop by themselves when we fall silent.
+        """Start our heartbeat: from now on the amplifiers quick stop by themselves when we fall
+        silent.
 
         Raises:
             BusBusy: a device has come that has the same node id.
@@ -381,7 +451,8 @@ class CanopenNetwork:
         self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
 
     def unguard(self) -> None:
-        """End the guard once all axes are known to stand still, so that a slow end of a run does not trip it.
+        """End the guard once all axes are known to stand still,
+        so that a slow end of a run does not trip it.
 
         Without it the guard ends when the network closes, axis by axis, after each was disabled.
         """
@@ -393,21 +464,35 @@ class CanopenNetwork:
         self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:
-        """Report the amplifiers of the prepared network that do not stop by themselves when the recorder is killed."""
-        lacks = {axis.name: self._setups[axis.node_id].guard.lack for axis in self.axes if axis.node_id in self._setups}
+        """Report the amplifiers of the prepared network that do not stop by themselves when the
+        recorder is killed.
+        """
+        lacks = {
+            axis.name: self._setups[axis.node_id].guard.lack
+            for axis in self.axes
+            if axis.node_id in self._setups
+        }
         return tuple(f"{name}: {lack}" for name, lack in lacks.items() if lack)
 
     def without_guard(self) -> tuple[str, ...]:
-        """Return the names of the axes of the prepared network that go on moving when the recorder is killed."""
-        return tuple(axis.name for axis in self.axes if not self._setups[axis.node_id].guard.watching)
+        """Return the names of the axes of the prepared network that go on moving when the recorder
+        is killed.
+        """
+        return tuple(
+            axis.name for axis in self.axes if not self._setups[axis.node_id].guard.watching
+        )
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
         """Ask all these axes at once for an answer; those without one are skipped from then on."""
         asked = tuple(axis.node_id for axis in axes)
-        answered = answering(self.link, [n for n in asked if n not in self.link.silent], self.bounds.silence_s)
+        answered = answering(
+            self.link, [n for n in asked if n not in self.link.silent], self.bounds.silence_s
+        )
         missing = [axis for axis in axes if axis.node_id not in answered]
         self.link.silent.update(axis.node_id for axis in missing)
-        return NodeMissing(missing, answered, self.bounds.silence_s) if missing else None
+        if missing:
+            return NodeMissing(missing, answered, self.bounds.silence_s)
+        return None
 
     def check_feedback(self, sample: Sample) -> None:
         """Compare the positions in a sample of axes at standstill with those read by SDO.
@@ -422,9 +507,9 @@ class CanopenNetwork:
             if abs(by_sdo - by_pdo) > STANDSTILL_COUNTS:
                 raise SetupRefused(
                     axis,
-                    f"object {entry} is {by_sdo} by SDO and {by_pdo} in its PDO at standstill, expected at most "
-                    f"{STANDSTILL_COUNTS} apart; another device sends with this COB-ID, or the mapping is not what it "
-                    "reads back as",
+                    f"object {entry} is {by_sdo} by SDO and {by_pdo} in its PDO at standstill, "
+                    f"expected at most {STANDSTILL_COUNTS} apart; another device sends with this "
+                    "COB-ID, or the mapping is not what it reads back as",
                 )
 
     def _command_all(self, command: NmtCommand, state: NmtState) -> None:
@@ -433,15 +518,20 @@ class CanopenNetwork:
         for node_id, since_ns in since.items():
             waited_s = (self.link.clock() - since_ns) * 1e-9
             try:
-                self.link.confirm_nmt(node_id, state, since_ns, max(self.bounds.nmt_s - waited_s, 0.0))
+                self.link.confirm_nmt(
+                    node_id, state, since_ns, max(self.bounds.nmt_s - waited_s, 0.0)
+                )
             except StateRefused as refused:
                 access = self.link.objects(node_id)
                 if node_id in self.link.nmt:
                     raise
-                raise StateRefused(access, refused.asked, refused.found, remedy=why_no_heartbeat(access)) from refused
+                raise StateRefused(
+                    access, refused.asked, refused.found, remedy=why_no_heartbeat(access)
+                ) from refused
 
     def ampere_per_unit(self) -> tuple[float, ...]:
-        """Return ampere per raw unit of each axis' current object, from the drives' own scale objects.
+        """Return ampere per raw unit of each axis' current object,
+        from the drives' own scale objects.
 
         Raises:
             ObjectAccessError, SetupRefused: as `scales`.
@@ -484,7 +574,9 @@ class CanopenNetwork:
                 raise StateRefused(axis, "fault reset", str(State.FAULT), statusword)
 
     def begin_stop(self, axes: Sequence[Axis]) -> None:
-        """Request quick stop by SDO of all these axes; `disable`, which waits for each, reports failures."""
+        """Request quick stop by SDO of all these axes;
+        `disable`, which waits for each, reports failures.
+        """
         for axis in axes:
             access = self.objects(axis)
             with suppress(DriverError):
@@ -498,7 +590,8 @@ class CanopenNetwork:
 
         Args:
             axis: to disable.
-            goal: SWITCH_ON_DISABLED removes the power of an axis that is known to stand still, without quick stop.
+            goal: SWITCH_ON_DISABLED removes the power of an axis that is known to stand still,
+                without quick stop.
 
         Raises:
             StateRefused: not reached within ``bounds.disable_s``.
@@ -514,20 +607,25 @@ class CanopenNetwork:
             if self.link.clock() >= deadline:
                 if goal is Goal.SWITCH_ON_DISABLED:
                     raise StateRefused(axis, str(State.SWITCH_ON_DISABLED), str(state), statusword)
-                # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE (605Ah = 5..8).
+                # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE (605Ah =
+                # 5..8).
                 goal = Goal.SWITCH_ON_DISABLED
                 deadline += round(self.bounds.disable_s * 1e9)
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 
     def _restore(self, asked_again: Callable[[], bool]) -> list[DriverError]:
-        """Disable, PRE-OPERATIONAL, restore, all within one time limit; every axis is tried. Returns the failures."""
+        """Disable, PRE-OPERATIONAL, restore, all within one time limit; every axis is tried.
+
+        Returns the failures.
+        """
         self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
         for _ in range(2):
             try:
-                # One time limit for all: asked in turn, six dead nodes would take a minute and more.
+                # One time limit for all: asked in turn, six dead nodes would take a minute and
+                # more.
                 silent = self.find_silent(axes)
                 break
             except DriverError as problem:
@@ -559,9 +657,18 @@ class CanopenNetwork:
                     self.link.confirm_nmt(axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, left_s)
             left[axis.name] = self._setups[axis.node_id].restore(problems)
         if any(left.values()):
-            cause = "asked a second time" if asked_again() else "some did not answer, or the time limit was over"
-            names = "; ".join(f"{name}: {', '.join(steps)}" for name, steps in left.items() if steps)
+            if asked_again():
+                cause = "asked a second time"
+            else:
+                cause = "some did not answer, or the time limit was over"
+            names = "; ".join(
+                f"{name}: {', '.join(steps)}" for name, steps in left.items() if steps
+            )
             remedy = "switch these drives off and on before they are used"
-            problems.append(BusError(str(self.link.address), f"settings not restored ({cause}): {names}; {remedy}"))
+            problems.append(
+                BusError(
+                    str(self.link.address), f"settings not restored ({cause}): {names}; {remedy}"
+                )
+            )
         self._setups.clear()
         return problems

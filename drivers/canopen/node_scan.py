@@ -46,7 +46,9 @@ class FoundNode:
     @property
     def state(self) -> State | None:
         """CiA 402 state, or None when it is no drive."""
-        return None if self.statusword is None else decode(self.statusword)
+        if self.statusword is None:
+            return None
+        return decode(self.statusword)
 
 
 def scan(
@@ -82,7 +84,9 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
     several = {n for n in answered if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign}
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
     nothing = (None, None, None, None, None)
-    found = [_describe(link, n, end_ns) if n in answered else (FoundNode(n, *nothing), 0) for n in alive]
+    found = [
+        _describe(link, n, end_ns) if n in answered else (FoundNode(n, *nothing), 0) for n in alive
+    ]
     link.hear_beats(max((period_ms for _, period_ms in found), default=0))  # of all nodes at once
     nodes = []
     for node, period_ms in found:
@@ -94,7 +98,8 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
 
 
 def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, int]:
-    """Read what a node reports of itself until the scan ends, and the period of its heartbeat [ms]; 0 for none.
+    """Read what a node reports of itself until the scan ends, and the period of its heartbeat [ms];
+    0 for none.
 
     An object that it reports badly does not keep the others from it.
     """
@@ -103,7 +108,9 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
     end_ns = min(link.clock() + round(NODE_S * 1e9), scan_end_ns)
     unasked = f"the rest was not asked: its answers took longer than {NODE_S:g} s"
     if link.clock() >= scan_end_ns:
-        unasked = f"nothing was asked of it: the scan was over after {SCAN_S:g} s; is the bus flooded?"
+        unasked = (
+            f"nothing was asked of it: the scan was over after {SCAN_S:g} s; is the bus flooded?"
+        )
 
     def reported(read: Callable[[], T]) -> T | None:
         if link.clock() >= end_ns:
@@ -119,15 +126,22 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
 
     identity = reported(partial(read_identity, access))
     data = reported(partial(access.read_bytes, 0x1008, 0))
-    name = None if data is None else data.rstrip(b"\0 ").decode("utf-8", "replace")
+    if data is None:
+        name = None
+    else:
+        name = data.rstrip(b"\0 ").decode("utf-8", "replace")
     revision, statusword, period_ms = (
         reported(partial(access.read, entry)) for entry in (REVISION, STATUSWORD, HEARTBEAT_TIME)
     )
-    return FoundNode(node_id, identity, revision, name, None, statusword, problems=tuple(problems)), period_ms or 0
+    return FoundNode(
+        node_id, identity, revision, name, None, statusword, problems=tuple(problems)
+    ), period_ms or 0
 
 
 def read_identity(access: ObjectAccess) -> Identity:
-    """Read object 1018h; product code and serial are None where a node has none (CiA 301 requires the vendor only)."""
+    """Read object 1018h; product code and serial are None where a node has none (CiA 301 requires
+    the vendor only).
+    """
     vendor_id = access.read(VENDOR_ID)
     product_code = access.read_optional(PRODUCT_CODE, any_abort=True)
     serial = access.read_optional(SERIAL, any_abort=True)
@@ -137,7 +151,8 @@ def read_identity(access: ObjectAccess) -> Identity:
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
     """Return the nodes that answer an SDO request; all are asked at once, and share the time.
 
-    One that sends its boot-up message meanwhile is asked again: it was still booting when it was asked.
+    One that sends its boot-up message meanwhile is asked again: it was still booting when it was
+    asked.
     """
     asked = set(node_ids)
     link.answered.clear()
@@ -145,11 +160,17 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
     again: set[int] = set()
 
     def booted() -> list[int]:
-        return [n for n in sorted(asked - again - link.answered.keys()) if link.booted_since(n, began_ns)]
+        return [
+            n
+            for n in sorted(asked - again - link.answered.keys())
+            if link.booted_since(n, began_ns)
+        ]
 
     _ask(link, node_ids)
     end_ns = began_ns + round(wait_s * 1e9)
-    while link.wait((end_ns - link.clock()) * 1e-9, lambda: asked <= link.answered.keys() or bool(booted())):
+    while link.wait(
+        (end_ns - link.clock()) * 1e-9, lambda: asked <= link.answered.keys() or bool(booted())
+    ):
         up = booted()
         if not up:
             break
@@ -159,7 +180,9 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
 
 
 def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
-    """Return the node ids of which no frame came since the bus was opened, nor an SDO answer within a time."""
+    """Return the node ids of which no frame came since the bus was opened,
+    nor an SDO answer within a time.
+    """
     _ask(link, node_ids)
     link.wait(wait_s)  # all of it: a device without SDO server is known by its heartbeat alone
     return tuple(node_id for node_id in node_ids if node_id not in link.heard)

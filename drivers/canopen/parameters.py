@@ -1,8 +1,9 @@
 """Read and write parameters in the drives of a cell while no axis has power: all of them or none.
 
-Nothing moves: no NMT command, no PDO and no controlword is sent. Each write is read back and, where requested, saved.
-After a failure the previous values are restored in every drive that was touched. A save may store more than the
-parameter: where it would store the PDO mapping, that must not be a mapping which a recording left behind.
+Nothing moves: no NMT command, no PDO and no controlword is sent. Each write is read back and, where
+requested, saved. After a failure the previous values are restored in every drive that was touched.
+A save may store more than the parameter: where it would store the PDO mapping, that must not be a
+mapping which a recording left behind.
 """
 
 from __future__ import annotations
@@ -15,18 +16,26 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import STATUSWORD, read_pdo_record, wanted_pdos
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.setup import CONSUMERS
-from drivers.errors import DriverError, NodeError, ObjectAccessError, ParameterRefused, ParametersMixed
+from drivers.errors import (
+    DriverError,
+    NodeError,
+    ObjectAccessError,
+    ParameterRefused,
+    ParametersMixed,
+)
 from drivers.profiles.cia402 import POWERLESS, decode
 from drivers.profiles.profile import Axis, DriveParameter, Identity, Mapping, ObjectEntry
 
-SAVE_TIMEOUT_S = 10.0  #: Drives write their whole memory, which takes 0.4 s and more, and answer when it is done
+#: Drives write their whole memory, which takes 0.4 s and more, and answer when it is done
+SAVE_TIMEOUT_S = 10.0
 
 
 class Saving(Enum):
     """Whether the parameters outlive the drives' power.
 
-    KNOWN: every drive saves, and it is known what that stores. ANY: a drive whose save is not fully known saves too, as
-    if it stored the mapping. RAM: no drive saves; the values are lost with its power.
+    KNOWN: every drive saves, and it is known what that stores. ANY: a drive whose save is not fully
+    known saves too, as if it stored the mapping. RAM: no drive saves; the values are lost with its
+    power.
     """
 
     KNOWN = "known"
@@ -103,13 +112,14 @@ def write_parameters(
         network: open, and not prepared for recording.
         writes: at most one an axis; the network's own axes define how an axis saves.
         saving: whether the drives save.
-        begin: called with the previous values after all checks and before the first write; an exception stops it.
+        begin: called with the previous values after all checks and before the first write; an
+            exception stops it.
 
     Raises:
-        ParameterRefused: an axis has power (checked before and after each write), a drive cannot save, or a value reads
-            back differently. The previous values are in force.
-        BusBusy, NodeMissing, SetupRefused, ObjectAccessError, BusError: see drivers/errors.py; the previous values are
-            in force.
+        ParameterRefused: an axis has power (checked before and after each write), a drive cannot
+            save, or a value reads back differently. The previous values are in force.
+        BusBusy, NodeMissing, SetupRefused, ObjectAccessError, BusError: see drivers/errors.py; the
+            previous values are in force.
         ParametersMixed: as these, and the previous values could not be restored everywhere.
     """
     axes = {axis.node_id: axis for axis in network.axes}
@@ -146,12 +156,15 @@ def write_parameters(
         for axis in network.axes:
             _require_powerless(network, axis)
         network.link.require_alone()
-    except BaseException as error:  # an interrupt too: a cell with half of the new gains has no valid set
+    # An interrupt too: a cell with half of the new gains has no valid set.
+    except BaseException as error:
         with network.block_signals():
             _undo(network, tried, saved, error)
         raise
     return tuple(
-        ParameterChange(write.axis.name, write.parameter, value.word, write.word, saving is not Saving.RAM)
+        ParameterChange(
+            write.axis.name, write.parameter, value.word, write.word, saving is not Saving.RAM
+        )
         for value, write in zip(old, writes, strict=True)
     )
 
@@ -162,8 +175,8 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
     They are lost with the drive's power, and a save would keep them.
     """
     access = network.objects(axis)
-    # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h proves that there
-    # is no watch; any other refusal may hide one.
+    # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h
+    # proves that there is no watch; any other refusal may hide one.
     for sub in range(1, (access.read_optional(CONSUMERS) or 0) + 1):
         value = access.read_optional(ObjectEntry(CONSUMERS.index, sub, 32))
         if value is None:
@@ -176,7 +189,10 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
         return ""  # this drive cannot be recorded
     for ours in pdos.feedback + pdos.setpoints:
         found = read_pdo_record(access, ours.direction, ours.number)
-        if found is not None and (found.entries, found.transmission) == (ours.entries, ours.transmission):
+        if found is not None and (found.entries, found.transmission) == (
+            ours.entries,
+            ours.transmission,
+        ):
             return str(found)
     return ""
 
@@ -184,11 +200,13 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
 def _check(network: CanopenNetwork, write: ParameterWrite | ParameterValue) -> None:
     found = network.objects(write.axis).read(write.parameter.entry)
     if found != write.word:
-        written, read = (f"{write.parameter.value(word):.9g} ({word:#x})" for word in (write.word, found))
+        written, read = (
+            f"{write.parameter.value(word):.9g} ({word:#x})" for word in (write.word, found)
+        )
         raise ParameterRefused(
             write.axis,
-            f"object {write.parameter} reads back as {read}, written was {written}; does the drive limit or round it, "
-            "or is it another object?",
+            f"object {write.parameter} reads back as {read}, written was {written}; does the drive "
+            "limit or round it, or is it another object?",
         )
 
 
@@ -197,7 +215,9 @@ def _save(network: CanopenNetwork, axis: Axis) -> None:
     if save is not None:
         _require_powerless(network, axis)
         # One attempt: a drive that is late is still busy with the first.
-        network.link.objects(axis.node_id, SdoPolicy(SAVE_TIMEOUT_S, 1)).write(save.command, save.signature)
+        network.link.objects(axis.node_id, SdoPolicy(SAVE_TIMEOUT_S, 1)).write(
+            save.command, save.signature
+        )
 
 
 def _require_powerless(network: CanopenNetwork, axis: Axis) -> None:
@@ -206,8 +226,9 @@ def _require_powerless(network: CanopenNetwork, axis: Axis) -> None:
     if state not in POWERLESS:
         raise ParameterRefused(
             axis,
-            f"{state} (statusword {statusword:#06x}): its power stage is not off, and no parameter is written while it "
-            "is on; disable the axes with the controller that enabled them, then try again",
+            f"{state} (statusword {statusword:#06x}): its power stage is not off, and no parameter "
+            "is written while it is on; disable the axes with the controller that enabled them, "
+            "then try again",
         )
 
 
@@ -215,13 +236,20 @@ def _require_savable(network: CanopenNetwork, axis: Axis, saving: Saving) -> Non
     save = axis.profile.save
     if save is None:
         reason = f"is not described in its profile {axis.profile.name}"
-        remedy = "describe it there, or write to its RAM alone (`Saving.RAM`): the gain is then lost with its power"
+        remedy = (
+            "describe it there, or write to its RAM alone (`Saving.RAM`): the gain is then "
+            "lost with its power"
+        )
     elif save.mapping is Mapping.UNKNOWN and saving is Saving.KNOWN:
-        reason = f"may store more than the gain ({axis.profile.name}: {axis.profile.save_semantics})"
+        reason = (
+            f"may store more than the gain ({axis.profile.name}: {axis.profile.save_semantics})"
+        )
         remedy = "write to its RAM alone (`Saving.RAM`), or let it save all the same (`Saving.ANY`)"
     elif save.mapping is not Mapping.SEPARATE and (left := recording_leftover(network, axis)):
         reason = f"would keep settings of a recording that was killed ({left})"
-        remedy = "switch the drive off and on, so that it starts with its own settings, and try again"
+        remedy = (
+            "switch the drive off and on, so that it starts with its own settings, and try again"
+        )
     else:
         return
     raise ParameterRefused(axis, f"nothing was written, because saving it {reason}; {remedy}")
@@ -233,7 +261,9 @@ def _undo(
     saved: Sequence[Axis],
     error: BaseException,
 ) -> None:
-    """Restore the previous values, and save them where new ones may have been saved; ParametersMixed if not all are."""
+    """Restore the previous values, and save them where new ones may have been saved;
+    ParametersMixed if not all are.
+    """
     restored = []
     problems = []
     try:
@@ -246,7 +276,9 @@ def _undo(
             _put_back(network, value, save=value.axis in saved)
             restored.append(value.axis.name)
         except DriverError as problem:
-            problems.append(str(problem) if isinstance(problem, NodeError) else f"{value.axis.name}: {problem}")
+            problems.append(
+                str(problem) if isinstance(problem, NodeError) else f"{value.axis.name}: {problem}"
+            )
     if problems and tried:
         raise ParametersMixed(tuple(restored), tuple(problems)) from error
     if restored:
@@ -255,7 +287,9 @@ def _undo(
 
 def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool) -> None:
     if value.axis.node_id in network.link.silent:
-        raise ObjectAccessError(value.axis, str(value.parameter), "the node does not answer any more")
+        raise ObjectAccessError(
+            value.axis, str(value.parameter), "the node does not answer any more"
+        )
     access = network.objects(value.axis)
     if access.read(value.parameter.entry) != value.word:
         _require_powerless(network, value.axis)

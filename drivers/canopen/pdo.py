@@ -1,7 +1,8 @@
-"""PDO mapping: pack objects into frames, write the mapping in the order that drives accept, and restore it.
+"""PDO mapping: pack objects into frames, write the mapping in the order that drives accept,
+and restore it.
 
-Source: CiA 301, objects 1400h–1BFFh: communication parameters (COB-ID with bit 31 = not valid, transmission type) and
-mapping parameters (count, then index << 16 | subindex << 8 | bits).
+Source: CiA 301, objects 1400h–1BFFh: communication parameters (COB-ID with bit 31 = not valid,
+transmission type) and mapping parameters (count, then index << 16 | subindex << 8 | bits).
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the record
 PDO_BYTES = 8
 MAPPABLE = "a PDO that can be mapped for the recording"
 NOT_MAPPABLE = (
-    "is it fixed by the maker, or does another tool set the drive up now? end that tool, or switch the drive off and on"
+    "is it fixed by the maker, or does another tool set the drive up now? end that tool, or switch "
+    "the drive off and on"
 )
 PDOS = 4  #: PDOs of the predefined connection set, in each direction
 MOST_ENTRIES = 64  #: Objects that one PDO can carry, a bit each (CiA 301)
@@ -40,11 +42,20 @@ PROFILE_VELOCITY = ObjectEntry(0x6081, 0, 32)
 PROFILE_ACCELERATION = ObjectEntry(0x6083, 0, 32)
 PROFILE_DECELERATION = ObjectEntry(0x6084, 0, 32)
 
-_CODES = {(8, True): "b", (8, False): "B", (16, True): "h", (16, False): "H", (32, True): "i", (32, False): "I"}
+_CODES = {
+    (8, True): "b",
+    (8, False): "B",
+    (16, True): "h",
+    (16, False): "H",
+    (32, True): "i",
+    (32, False): "I",
+}
 
 
 class Direction(Enum):
-    """Direction seen from the drive; the value is (communication index, mapping index, first COB-ID)."""
+    """Direction seen from the drive; the value is (communication index, mapping index,
+    first COB-ID).
+    """
 
     TPDO = (0x1800, 0x1A00, 0x180)
     RPDO = (0x1400, 0x1600, 0x200)
@@ -75,7 +86,9 @@ def word(entry: ObjectEntry) -> int:
     return entry.index << 16 | entry.subindex << 8 | entry.bits
 
 
-def pack(entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES) -> tuple[tuple[ObjectEntry, ...], ...]:
+def pack(
+    entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES
+) -> tuple[tuple[ObjectEntry, ...], ...]:
     """Distribute objects over PDOs of at most so many bytes, each into the first that has room.
 
     Raises:
@@ -84,7 +97,9 @@ def pack(entries: Sequence[ObjectEntry], most_bytes: int = PDO_BYTES) -> tuple[t
     pdos: list[list[ObjectEntry]] = []
     for entry in entries:
         if (entry.bits, entry.signed) not in _CODES:
-            raise ValueError(f"object {entry} has {entry.bits} bits; only 8, 16 and 32 can be decoded")
+            raise ValueError(
+                f"object {entry} has {entry.bits} bits; only 8, 16 and 32 can be decoded"
+            )
         for pdo in pdos:
             if sum(other.bits for other in pdo) + entry.bits <= 8 * most_bytes:
                 pdo.append(entry)
@@ -102,15 +117,24 @@ def records(
     pdos: Sequence[Sequence[ObjectEntry]],
     numbers: Sequence[int] = range(PDOS),
 ) -> tuple[PdoRecord, ...]:
-    """Return synchronous PDOs with the predefined COB-IDs of a node; `numbers` are those of the PDOs that it has.
+    """Return synchronous PDOs with the predefined COB-IDs of a node;
+    `numbers` are those of the PDOs that it has.
 
     Raises:
         ValueError: it has too few.
     """
     if len(pdos) > len(numbers):
-        raise ValueError(f"found {len(numbers)} {direction.name}s in the drive; expected {len(pdos)}")
+        raise ValueError(
+            f"found {len(numbers)} {direction.name}s in the drive; expected {len(pdos)}"
+        )
     return tuple(
-        PdoRecord(direction, number, direction.value[2] + 0x100 * number + node_id, SYNCHRONOUS, tuple(map(word, pdo)))
+        PdoRecord(
+            direction,
+            number,
+            direction.value[2] + 0x100 * number + node_id,
+            SYNCHRONOUS,
+            tuple(map(word, pdo)),
+        )
         for number, pdo in zip(numbers, pdos, strict=False)
     )
 
@@ -121,10 +145,16 @@ def feedback_entries(axis: Axis) -> tuple[ObjectEntry, ...]:
 
 
 COMMAND = (TARGET_POSITION, CONTROLWORD)
-"""Set-point that starts a move. The target comes first: a drive may act as soon as it has read the controlword."""
+"""Set-point that starts a move.
+
+The target comes first: a drive may act as soon as it has read the controlword.
+"""
 MOTION_PROFILE = (PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION)
 SETPOINT_PDOS = (*pack(COMMAND), *pack(MOTION_PROFILE))
-"""Set-points of an axis. Only those of the command are sent in the cycle in which all axes start."""
+"""Set-points of an axis.
+
+Only those of the command are sent in the cycle in which all axes start.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +165,9 @@ class AxisPdos:
     setpoints: tuple[PdoRecord, ...]  #: RPDOs with those of a set-point
 
     def payloads(self, values: Mapping[ObjectEntry, int]) -> Iterator[tuple[int, bytes]]:
-        """Yield COB-ID and payload of each RPDO all of whose objects have a value, in the order of their numbers."""
+        """Yield COB-ID and payload of each RPDO all of whose objects have a value,
+        in the order of their numbers.
+        """
         for record in self.setpoints:
             layout, entries = record_payload(record, tuple(values))
             if len(entries) == len(record.entries):
@@ -152,7 +184,8 @@ def wanted_pdos(
 
     Args:
         axis: with its profile.
-        numbers: of the PDOs that the drive has, from 0; None for the four of the predefined connection set.
+        numbers: of the PDOs that the drive has, from 0; None for the four of the predefined
+            connection set.
         absent: objects of `MOTION_PROFILE` that the drive does not have.
         most_bytes: in one PDO.
 
@@ -160,27 +193,41 @@ def wanted_pdos(
         ValueError: the drive has too few PDOs, or an object is no integer.
     """
     have = dict.fromkeys(Direction, range(PDOS)) if numbers is None else numbers
-    setpoints = pack(COMMAND, most_bytes) + pack([entry for entry in MOTION_PROFILE if entry not in absent], most_bytes)
+    setpoints = pack(COMMAND, most_bytes) + pack(
+        [entry for entry in MOTION_PROFILE if entry not in absent], most_bytes
+    )
     return AxisPdos(
-        records(Direction.TPDO, axis.node_id, pack(feedback_entries(axis), most_bytes), have[Direction.TPDO]),
+        records(
+            Direction.TPDO,
+            axis.node_id,
+            pack(feedback_entries(axis), most_bytes),
+            have[Direction.TPDO],
+        ),
         records(Direction.RPDO, axis.node_id, setpoints, have[Direction.RPDO]),
     )
 
 
 def fixed_feedback(axis: Axis, found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
-    """Return those of a drive's own TPDOs that carry every object of a Sample, synchronous; empty where they do not."""
+    """Return those of a drive's own TPDOs that carry every object of a Sample, synchronous;
+    empty where they do not.
+    """
     return _carrying(set(map(word, feedback_entries(axis))), found)
 
 
-def fixed_setpoints(found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = ()) -> tuple[PdoRecord, ...]:
-    """Return those of a drive's own RPDOs that carry every object of a set-point and no other, synchronous.
+def fixed_setpoints(
+    found: Sequence[PdoRecord], absent: Sequence[ObjectEntry] = ()
+) -> tuple[PdoRecord, ...]:
+    """Return those of a drive's own RPDOs that carry every object of a set-point and no other,
+    synchronous.
 
     Empty where they do not, or where a controlword comes before its target.
     """
     command = set(map(word, COMMAND))
     profile = {word(entry) for entry in MOTION_PROFILE if entry not in absent}
     used = _carrying(command | profile, found)
-    if any(not (set(record.entries) <= command or set(record.entries) <= profile) for record in used):
+    if any(
+        not (set(record.entries) <= command or set(record.entries) <= profile) for record in used
+    ):
         return ()
     order = [mapped for mapped in _all_mapped(used) if mapped in command]
     return used if order == list(map(word, COMMAND)) else ()
@@ -191,7 +238,11 @@ def _all_mapped(pdos: Sequence[PdoRecord]) -> tuple[int, ...]:
 
 
 def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
-    used = [record for record in found if needed & set(record.entries) and not record.cob_id & (NOT_VALID | _EXTENDED)]
+    used = [
+        record
+        for record in found
+        if needed & set(record.entries) and not record.cob_id & (NOT_VALID | _EXTENDED)
+    ]
     every = _all_mapped(used)
     whole_bytes = all((mapped & 0xFF) % 8 == 0 for mapped in every)
     if sorted(mapped for mapped in every if mapped in needed) != sorted(needed) or not whole_bytes:
@@ -199,14 +250,22 @@ def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, 
     return tuple(replace(record, transmission=SYNCHRONOUS) for record in used)
 
 
-def record_payload(record: PdoRecord, entries: Sequence[ObjectEntry]) -> tuple[struct.Struct, tuple[ObjectEntry, ...]]:
-    """Return the layout of a TPDO, and those of the given objects that it carries, in its order; it skips others."""
+def record_payload(
+    record: PdoRecord, entries: Sequence[ObjectEntry]
+) -> tuple[struct.Struct, tuple[ObjectEntry, ...]]:
+    """Return the layout of a TPDO, and those of the given objects that it carries, in its order;
+    it skips others.
+    """
     known = {word(entry): entry for entry in entries}
     codes = [
-        _CODES[known[mapped].bits, known[mapped].signed] if mapped in known else f"{(mapped & 0xFF) // 8}x"
+        _CODES[known[mapped].bits, known[mapped].signed]
+        if mapped in known
+        else f"{(mapped & 0xFF) // 8}x"
         for mapped in record.entries
     ]
-    return struct.Struct("<" + "".join(codes)), tuple(known[mapped] for mapped in record.entries if mapped in known)
+    return struct.Struct("<" + "".join(codes)), tuple(
+        known[mapped] for mapped in record.entries if mapped in known
+    )
 
 
 def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
@@ -226,7 +285,10 @@ def read_pdo_record(access: ObjectAccess, direction: Direction, number: int) -> 
     """Read one PDO of a drive; None when the drive has no such PDO."""
     cob_id, transmission, count = _parameters(direction, number)
     identifier = access.read_optional(cob_id)
-    mapped = None if identifier is None else access.read_optional(count)
+    if identifier is None:
+        mapped = None
+    else:
+        mapped = access.read_optional(count)
     if identifier is None or mapped is None:
         return None
     # 254 and 255 mean a multiplexed PDO, which has no entries (CiA 301).
@@ -238,8 +300,8 @@ def read_pdo_record(access: ObjectAccess, direction: Direction, number: int) -> 
 def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
     """Write what differs of one PDO, read it back and compare.
 
-    Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid. A drive
-    with a fixed COB-ID gets the rest.
+    Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count,
+    COB-ID valid. A drive with a fixed COB-ID gets the rest.
 
     Raises:
         SetupRefused: a step was aborted, or the PDO reads back differently.
@@ -254,7 +316,10 @@ def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
     fixed = False
     steps = [(cob_id, off)]
     if not mapped:
-        steps += [(count, 0), *((_entry(count, sub), word) for sub, word in enumerate(record.entries, start=1))]
+        steps += [
+            (count, 0),
+            *((_entry(count, sub), word) for sub, word in enumerate(record.entries, start=1)),
+        ]
     if before is None or before.transmission != record.transmission:
         steps.append((transmission, record.transmission))
     if not mapped:
@@ -272,18 +337,23 @@ def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
                 reason = f"{record.name}: writing {value:#x} to {entry}: {error.reason}"
                 if error.abort_code is None:
                     raise SetupRefused(access, reason) from error
-                raise SetupRefused(access, reason, expected=MAPPABLE, remedy=NOT_MAPPABLE) from error
+                raise SetupRefused(
+                    access, reason, expected=MAPPABLE, remedy=NOT_MAPPABLE
+                ) from error
     found = read_pdo_record(access, record.direction, record.number)
     if (
         found is None
         or (found.entries, found.transmission) != (record.entries, record.transmission)
         or (found.cob_id ^ record.cob_id) & _COB_ID_BITS
     ):
-        raise SetupRefused(access, f"{record.name}: reads back as '{found}', written was '{record}'")
+        raise SetupRefused(
+            access, f"{record.name}: reads back as '{found}', written was '{record}'"
+        )
 
 
 def turn_off(access: ObjectAccess, record: PdoRecord) -> None:
-    """Set a PDO of a drive, as it was read, to not valid; where its COB-ID is fixed, leave it without objects.
+    """Set a PDO of a drive, as it was read, to not valid;
+    where its COB-ID is fixed, leave it without objects.
 
     Raises:
         SetupRefused: the drive refuses both.

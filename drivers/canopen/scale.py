@@ -1,7 +1,9 @@
-"""The ampere value of a drive's raw unit, read at connect and compared with the motor's rated values.
+"""The ampere value of a drive's raw unit, read at connect and compared with the motor's rated
+values.
 
-A gain is Nm per ampere. A wrong ampere value passes every later check and makes all gains of the axis wrong by one
-factor, so it is compared with the motor's rated values in the drive and with the nameplate in the cell configuration.
+A gain is Nm per ampere. A wrong ampere value passes every later check and makes all gains of the
+axis wrong by one factor, so it is compared with the motor's rated values in the drive and with the
+nameplate in the cell configuration.
 """
 
 from __future__ import annotations
@@ -13,9 +15,11 @@ from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import SetupRefused
 from drivers.profiles.profile import Amplitude, DriveProfile
 
-SMALLEST_RATED_A, LARGEST_RATED_A = 0.01, 1000.0
+SMALLEST_RATED_A = 0.01
+LARGEST_RATED_A = 1000.0
 """Range of servo motors; a value outside was entered in another unit than mA."""
-MIN_STEPS = 20.0  #: Least number of raw units in the rated current; with fewer, rounding alone is 5 % of it
+#: Least number of raw units in the rated current; with fewer, rounding alone is 5 % of it
+MIN_STEPS = 20.0
 FINE = 1.25  #: Ratio that tolerances of Kt and a gear's efficiency explain
 
 
@@ -41,13 +45,15 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     """Read the scale of a drive's current, and check it against the rated current in the drive.
 
     Raises:
-        SetupRefused: a scale object is zero, the rated current is not that of a servo motor, or it does not fit the
-            range or the resolution of the current object.
+        SetupRefused: a scale object is zero, the rated current is not that of a servo motor, or it
+            does not fit the range or the resolution of the current object.
         ObjectAccessError: a scale object cannot be read.
     """
 
     def implausible(found: str, expected: str, remedy: str) -> SetupRefused:
-        return SetupRefused(access, f"profile {profile.name}: found {found}", expected=expected, remedy=remedy)
+        return SetupRefused(
+            access, f"profile {profile.name}: found {found}", expected=expected, remedy=remedy
+        )
 
     scale = profile.current_scale
     entry = profile.current
@@ -55,16 +61,21 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     for name, value in values.items():
         if value <= 0:
             remedy = (
-                "the drive was not set up for its motor, so its current has no scale: enter the motor's rated current "
-                "and torque in the drive"
+                "the drive was not set up for its motor, so its current has no scale: enter the "
+                "motor's rated current and torque in the drive"
             )
             raise implausible(f"{name} = {value}", "the motor's rated value", remedy)
     choice = 0 if scale.switch is None else access.read(scale.switch)
     try:
         ampere = scale.ampere_per_unit(tuple(values.values()), choice)
     except IndexError as error:
-        remedy = "this firmware scales its current in a way that is not in the profile; complete the profile"
-        raise implausible(f"{scale.switch} = {choice}", f"0 to {len(scale.weights) - 1}", remedy) from error
+        remedy = (
+            "this firmware scales its current in a way that is not in the profile; complete "
+            "the profile"
+        )
+        raise implausible(
+            f"{scale.switch} = {choice}", f"0 to {len(scale.weights) - 1}", remedy
+        ) from error
     if scale.switch is not None:
         values[str(scale.switch)] = choice
     rated_a, rated_nm, warnings = _read_rated(access, profile)
@@ -79,20 +90,25 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
             raise implausible(
                 f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
                 f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
-                "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
+                "the scale is not this drive's, or the rated current is not its motor's: check "
+                "profile and set-up",
             )
     return ScaleReading(ampere, values, rated_a, rated_nm, warnings)
 
 
-def check_nameplate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float) -> tuple[str, ...]:
-    """Compare the drive's Kt = rated torque / rated current with that of the nameplate, |nameplate gain / N|.
+def check_nameplate(
+    reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float
+) -> tuple[str, ...]:
+    """Compare the drive's Kt = rated torque / rated current with that of the nameplate,
+    |nameplate gain / N|.
 
     Args:
         reading, amplitude: of the drive, and of its profile.
         motor_nm_per_a: torque constant of the motor by the nameplate [Nm/A], sign irrelevant.
 
     Returns:
-        Warnings for a poor fit; none where the drive does not report both values, of which the reading warns.
+        Warnings for a poor fit; none where the drive does not report both values, of which the
+        reading warns.
     """
     reported = reading.torque_constant_nm_per_a
     declared = abs(motor_nm_per_a)
@@ -100,32 +116,58 @@ def check_nameplate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a:
         return ()
     ratio = reported / declared
     evidence = (
-        f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / {reading.rated_current_a:g} A), "
-        f"{declared:.4g} Nm/A by the nameplate in the cell file, {ratio:.3g} times"
+        f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / "
+        f"{reading.rated_current_a:g} A), {declared:.4g} Nm/A by the nameplate in the cell file, "
+        f"{ratio:.3g} times"
     )
     if 1.0 / FINE < ratio < FINE:
         return ()
-    if any(abs(math.log(ratio * root)) < math.log(1.08) for root in (math.sqrt(2.0), math.sqrt(0.5))):
-        hint = f"near √2: one of them counts peak and the other RMS ampere (this profile: {amplitude.value})"
+    if any(
+        abs(math.log(ratio * root)) < math.log(1.08) for root in (math.sqrt(2.0), math.sqrt(0.5))
+    ):
+        hint = (
+            "near √2: one of them counts peak and the other RMS ampere (this profile: "
+            f"{amplitude.value})"
+        )
     else:
         hint = "another motor, or a wrong nameplate"
     return (f"torque constants differ: {evidence}; {hint}",)
 
 
-def _read_rated(access: ObjectAccess, profile: DriveProfile) -> tuple[float | None, float | None, tuple[str, ...]]:
-    """Read rated current [A] and torque [Nm] of the motor, None where the drive reports none, and warnings."""
+def _read_rated(
+    access: ObjectAccess, profile: DriveProfile
+) -> tuple[float | None, float | None, tuple[str, ...]]:
+    """Read rated current [A] and torque [Nm] of the motor, None where the drive reports none,
+    and warnings.
+    """
     if profile.rated is None:
-        return None, None, (f"profile {profile.name} has no rated current; the ampere cannot be checked",)
+        return (
+            None,
+            None,
+            (f"profile {profile.name} has no rated current; the ampere cannot be checked",),
+        )
     rated = profile.rated
     current = access.read_optional(rated.current)
     # The drive's torque is in thousandths of its rated torque.
-    unlogged = "" if profile.torque is None else f", and its torque ({profile.torque}) is not logged"
+    if profile.torque is None:
+        unlogged = ""
+    else:
+        unlogged = f", and its torque ({profile.torque}) is not logged"
     if not current:  # 0 is "not entered"
-        found = f"drive reports no rated current ({rated.current}); the ampere cannot be checked{unlogged}"
+        found = (
+            f"drive reports no rated current ({rated.current}); the ampere cannot be "
+            f"checked{unlogged}"
+        )
         return None, None, (found,)
-    torque = None if rated.torque is None else access.read_optional(rated.torque)
+    if rated.torque is None:
+        torque = None
+    else:
+        torque = access.read_optional(rated.torque)
     if not torque:
-        missing = "no rated torque" if rated.torque is None else f"drive reports no rated torque ({rated.torque})"
+        if rated.torque is None:
+            missing = "no rated torque"
+        else:
+            missing = f"drive reports no rated torque ({rated.torque})"
         found = f"{missing}; the torque constant cannot be checked{unlogged}"
         return current * rated.ampere_per_unit, None, (found,)
     return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()

@@ -17,19 +17,23 @@ from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import ObjectEntry
 
 NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
-"""Aborts of a drive that lacks the object or its sub-index (CiA 301); any other may be gone at the next request."""
+"""Aborts of a drive that lacks the object or its sub-index (CiA 301);
+any other may be gone at the next request.
+"""
 SDO_REQUEST, SDO_ANSWER = 0x600, 0x580  #: COB-IDs, to which the node id is added (CiA 301)
 _ABORT_TIMED_OUT = 0x0504_0000
 _ABORT_UNKNOWN_COMMAND = 0x0504_0001
 _ABORT_OUT_OF_MEMORY = 0x0504_0005
 _ABORT = 0x80
 _SEGMENT_BYTES = 7
-MOST_SURPLUS = 64  #: Answers to other requests that are skipped, before a node counts as one that does not answer
+#: Answers to other requests that are skipped, before a node counts as one that does not answer
+MOST_SURPLUS = 64
 _INITIATE_DOWNLOAD = 1
 _INITIATE_UPLOAD = 2
 _INITIATE_BLOCK_UPLOAD = 5
 _UPLOAD_REQUEST = _INITIATE_UPLOAD << 5
-_EXPEDITED, _SIZE_INDICATED = 0x42, 0x01  #: Bits of an upload answer with its data, and of one that says their size
+#: Bits of an upload answer with its data, and of one that says their size
+_EXPEDITED, _SIZE_INDICATED = 0x42, 0x01
 _HEAD = struct.Struct("<BHB")
 
 T = TypeVar("T")
@@ -54,13 +58,15 @@ def upload_request(node_id: int, entry: ObjectEntry) -> can.Message:
 
 def download_request(node_id: int, entry: ObjectEntry, value: int) -> can.Message:
     """Return the request to write an object of at most four bytes."""
-    command = _INITIATE_DOWNLOAD << 5 | (4 - entry.bits // 8) << 2 | 0x03  # expedited, with its size
+    # Expedited, with its size
+    command = _INITIATE_DOWNLOAD << 5 | (4 - entry.bits // 8) << 2 | 0x03
     data = _HEAD.pack(command, entry.index, entry.subindex) + struct.pack("<L", value)
     return base_frame(SDO_REQUEST + node_id, data)
 
 
 def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
-    """Read an SDO answer (CiA 301, SDO upload initiate); None for one that is not about this object.
+    """Read an SDO answer (CiA 301, SDO upload initiate);
+    None for one that is not about this object.
 
     Data longer than the object are cut: some drives send four bytes whatever its size is.
     """
@@ -95,7 +101,9 @@ class TransferUnboundedError(Exception):
 class ObjectAccess:
     """Reads and writes the object dictionary of one node; every failure is an ObjectAccessError."""
 
-    def __init__(self, node_id: int, client: SynchronousSdoClient, policy: SdoPolicy, name: str = "") -> None:
+    def __init__(
+        self, node_id: int, client: SynchronousSdoClient, policy: SdoPolicy, name: str = ""
+    ) -> None:
         self.node_id = node_id
         self.name = name
         self._client = client
@@ -109,12 +117,16 @@ class ObjectAccess:
         """
         data = self.read_bytes(entry.index, entry.subindex)
         if 8 * len(data) < entry.bits:
-            raise ObjectAccessError(self, str(entry), f"has {8 * len(data)} bits, expected {entry.bits}")
+            raise ObjectAccessError(
+                self, str(entry), f"has {8 * len(data)} bits, expected {entry.bits}"
+            )
         # Some drives send four bytes whatever the object's size is.
         return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
 
     def read_optional(self, entry: ObjectEntry, *, any_abort: bool = False) -> int | None:
-        """Read an integer object that a drive need not have; None where it has none, or aborts for any reason."""
+        """Read an integer object that a drive need not have;
+        None where it has none, or aborts for any reason.
+        """
         try:
             return self.read(entry)
         except ObjectAccessError as error:
@@ -131,7 +143,9 @@ class ObjectAccess:
         try:
             data = value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
         except OverflowError as error:
-            raise ObjectAccessError(self, str(entry), f"{value} does not fit {entry.bits} bits") from error
+            raise ObjectAccessError(
+                self, str(entry), f"{value} does not fit {entry.bits} bits"
+            ) from error
         self._attempt(str(entry), lambda: self._client.download(entry.index, entry.subindex, data))
 
     def read_bytes(self, index: int, subindex: int) -> bytes:
@@ -184,8 +198,8 @@ def _unaborted(response: bytes) -> bytes:
 class SynchronousSdoClient(SdoClient):
     """canopen's SDO client without its thread: it reads the bus while it waits.
 
-    canopen leaves reading to a Notifier thread, which dies silently of an exception and would be a second reader beside
-    the stream. Here the caller is the only reader.
+    canopen leaves reading to a Notifier thread, which dies silently of an exception and would be a
+    second reader beside the stream. Here the caller is the only reader.
     """
 
     def __init__(self, node_id: int, bus: _Bus, policy: SdoPolicy) -> None:
@@ -193,13 +207,15 @@ class SynchronousSdoClient(SdoClient):
         self._bus = bus
         self._policy = policy
         self._answered = b""  # the last answer, if only one can have been sent for it
-        self._unanswered: set[bytes] = set()  # objects whose request was given up: its answer may still come
+        # Objects whose request was given up: its answer may still come
+        self._unanswered: set[bytes] = set()
 
     def upload(self, index: int, subindex: int) -> bytes:
         """Read an object; by block transfer where the node has it that way alone.
 
         Raises:
-            TransferUnboundedError: it is longer, or takes longer, than the policy allows; the transfer was aborted.
+            TransferUnboundedError: it is longer, or takes longer, than the policy allows; the
+                transfer was aborted.
             SdoAbortedError, SdoCommunicationError: the node refuses, or does not answer.
         """
         try:
@@ -214,7 +230,11 @@ class SynchronousSdoClient(SdoClient):
         most = self._policy.most_bytes
         data = bytearray()
         try:
-            with BlockUploadStream(self, index, subindex) if block else ReadableStream(self, index, subindex) as stream:
+            with (
+                BlockUploadStream(self, index, subindex)
+                if block
+                else ReadableStream(self, index, subindex) as stream
+            ):
                 size = stream.size or 0
                 read = cast("Callable[[int], bytes]", stream.read)
                 while size <= most and (segment := read(_SEGMENT_BYTES)):
@@ -229,7 +249,9 @@ class SynchronousSdoClient(SdoClient):
             raise SdoCommunicationError("the block transfer was not ended") from error
         self.abort(_ABORT_OUT_OF_MEMORY)
         limits = f"at most {most} bytes within {self._policy.transfer_s:g} s"
-        raise TransferUnboundedError(f"found {size} bytes and no end, expected {limits}; the transfer was aborted")
+        raise TransferUnboundedError(
+            f"found {size} bytes and no end, expected {limits}; the transfer was aborted"
+        )
 
     @property
     def closing_is_over(self) -> bool:
@@ -268,7 +290,9 @@ class SynchronousSdoClient(SdoClient):
         return response
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
+        """Send a request and return the answer that belongs to it, or raise SdoAbortedError,
+        SdoCommunicationError.
+        """
         self._bus.pump(0.0)
         self.responses.queue.clear()
         before = self._answered
@@ -277,7 +301,11 @@ class SynchronousSdoClient(SdoClient):
             before = b""
         self.send_request(sdo_request)
         requested = bytes(sdo_request[1:4])
-        names_object = sdo_request[0] >> 5 in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD)
+        names_object = sdo_request[0] >> 5 in (
+            _INITIATE_DOWNLOAD,
+            _INITIATE_UPLOAD,
+            _INITIATE_BLOCK_UPLOAD,
+        )
         deadline = self._deadline()
         for _ in range(MOST_SURPLUS):
             try:
@@ -286,10 +314,17 @@ class SynchronousSdoClient(SdoClient):
                 self._give_up(requested)
                 raise
             about = response[1:4]
-            if names_object and about != requested and not (response[0] == _ABORT and about == b"\0\0\0"):
+            if (
+                names_object
+                and about != requested
+                and not (response[0] == _ABORT and about == b"\0\0\0")
+            ):
                 self._note_surplus(before, response)  # or a late answer to an earlier request
                 continue
-            self._answered = response if names_object and requested not in self._unanswered else b""
+            if names_object and requested not in self._unanswered:
+                self._answered = response
+            else:
+                self._answered = b""
             self._unanswered.discard(requested)
             return _unaborted(response)
         self._give_up(requested)

@@ -1,15 +1,17 @@
 """Set one amplifier up for a recording, and restore afterwards the settings that it had before.
 
-The objects that a recording needs are compared with those that the drive has, before anything is written.
+The objects that a recording needs are compared with those that the drive has, before anything is
+written.
 
-The amplifier also watches the recorder, so that it stops by itself when the recorder is killed, hangs or is cut off.
-The recorder sends a heartbeat while axes have power; the amplifier watches it (CiA 301, consumer heartbeat time 1016h,
-which begins with the first heartbeat). When none comes, it acts by its abort connection option code (CiA 402-2, 6007h):
-quick stop.
+The amplifier also watches the recorder, so that it stops by itself when the recorder is killed,
+hangs or is cut off. The recorder sends a heartbeat while axes have power; the amplifier watches it
+(CiA 301, consumer heartbeat time 1016h, which begins with the first heartbeat). When none comes, it
+acts by its abort connection option code (CiA 402-2, 6007h): quick stop.
 
-A heartbeat does not identify its sender. Another device with the recorder's node id would keep the axes running after
-the recorder was killed. The recorder therefore takes an id that no device uses, and a foreign heartbeat with it is a
-fault. The watch raises ObjectAccessError only when the amplifier does not answer; a refusal is no reason not to record.
+A heartbeat does not identify its sender. Another device with the recorder's node id would keep the
+axes running after the recorder was killed. The recorder therefore takes an id that no device uses,
+and a foreign heartbeat with it is a fault. The watch raises ObjectAccessError only when the
+amplifier does not answer; a refusal is no reason not to record.
 """
 
 from __future__ import annotations
@@ -59,11 +61,14 @@ SMALL_PDO_BYTES = 6  #: Tried where a drive refuses PDOs of eight bytes
 MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
 
 HEARTBEATS_NEEDED = (
-    "its NMT state and its loss would not be known without heartbeats, and node guarding (100Ch) is not supported: use "
-    "a firmware of the drive that has heartbeats"
+    "its NMT state and its loss would not be known without heartbeats, and node guarding (100Ch) "
+    "is not supported: use a firmware of the drive that has heartbeats"
 )
 
-MODE_REMEDY = "is another controller, a fault or a switch of the drive in the way? choose the mode with its own tool"
+MODE_REMEDY = (
+    "is another controller, a fault or a switch of the drive in the way? choose the mode with its "
+    "own tool"
+)
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
@@ -75,7 +80,9 @@ def producer_of(value: int) -> int:
 
 
 def read_consumers(access: ObjectAccess) -> Consumers | None:
-    """Read 1016h up to the first entry that cannot be read; None where the amplifier has no such object."""
+    """Read 1016h up to the first entry that cannot be read;
+    None where the amplifier has no such object.
+    """
     found: list[tuple[ObjectEntry, int]] = []
     try:
         for sub in range(1, min(access.read(CONSUMERS), MOST_CONSUMERS) + 1):
@@ -93,7 +100,8 @@ Profiles = Callable[[], Sequence[DriveProfile]]
 
 
 def needs_of(profile: DriveProfile) -> dict[ObjectEntry, str]:
-    """Return the objects without which a drive cannot be recorded with a profile, and what each is for, in messages.
+    """Return the objects without which a drive cannot be recorded with a profile,
+    and what each is for, in messages.
 
     1016h, 6007h and 6084h may be missing.
     """
@@ -129,7 +137,9 @@ _PURPOSES = {
 
 
 def purpose_of(entry: str, profile: DriveProfile) -> str:
-    """Say what a recording needs an object for, as `ObjectAccessError.entry` names it; empty for one of no purpose."""
+    """Say what a recording needs an object for, as `ObjectAccessError.entry` names it;
+    empty for one of no purpose.
+    """
     for needed, purpose in needs_of(profile).items():
         if str(needed) == entry:
             return purpose
@@ -144,15 +154,17 @@ def purpose_of(entry: str, profile: DriveProfile) -> str:
 
 
 def refusal(error: ObjectAccessError, axis: Axis) -> SetupRefused:
-    """Return the error of an object without which a drive cannot be set up, with what it is for and what to do."""
+    """Return the error of an object without which a drive cannot be set up,
+    with what it is for and what to do.
+    """
     purpose = purpose_of(error.entry, axis.profile)
     what = f" ({purpose})" if purpose else ""
     return SetupRefused(
         axis,
         f"found object {error.entry}{what} refused: {error.reason}",
         expected="an answer, as from the other objects that a recording needs",
-        remedy="nothing has moved: is the drive being set up or updated by another tool, or in a state that locks its "
-        "objects? switch it off and on, then try again",
+        remedy="nothing has moved: is the drive being set up or updated by another tool, or in a "
+        "state that locks its objects? switch it off and on, then try again",
     )
 
 
@@ -169,7 +181,8 @@ class Misfit:
 
 
 def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple) -> Misfit | None:
-    """Describe the objects of a profile that a drive does not have, and name a profile that fits; None if it has all.
+    """Describe the objects of a profile that a drive does not have, and name a profile that fits;
+    None if it has all.
 
     Raises:
         ObjectAccessError: the drive does not answer.
@@ -181,7 +194,9 @@ def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple
     expected = f"every object of profile {profile.name}"
     if any(str(HEARTBEAT_TIME) in one for one in lacking):
         return Misfit(found, expected, HEARTBEATS_NEEDED)
-    fitting = [other for other in others() if other.name != profile.name and not _lacking(access, other)]
+    fitting = [
+        other for other in others() if other.name != profile.name and not _lacking(access, other)
+    ]
     if fitting:
         advice = " or ".join(f"`{other.name}` ({_difference(other, profile)})" for other in fitting)
         remedy = f"use a profile that fits this drive: {advice}"
@@ -197,7 +212,10 @@ def why_no_heartbeat(access: ObjectAccess) -> str:
         ObjectAccessError: the drive does not answer.
     """
     period_ms = access.read_optional(HEARTBEAT_TIME, any_abort=True)
-    found = f"it answers SDO and sends no heartbeat (1017h = {'none' if period_ms is None else period_ms})"
+    found = (
+        "it answers SDO and sends no heartbeat (1017h = "
+        f"{'none' if period_ms is None else period_ms})"
+    )
     guard_ms = access.read_optional(GUARD_TIME, any_abort=True)
     if guard_ms is not None:
         found += f", and has node guarding (100Ch = {guard_ms})"
@@ -223,8 +241,14 @@ def _lacking(access: ObjectAccess, profile: DriveProfile) -> tuple[str, ...]:
 def _difference(other: DriveProfile, profile: DriveProfile) -> str:
     """Describe the objects by which another profile differs."""
     same = needs_of(profile)
-    parts = [f"{purpose} from {entry}" for entry, purpose in needs_of(other).items() if same.get(entry) != purpose]
-    if other.rated is not None and (profile.rated is None or other.rated.current != profile.rated.current):
+    parts = [
+        f"{purpose} from {entry}"
+        for entry, purpose in needs_of(other).items()
+        if same.get(entry) != purpose
+    ]
+    if other.rated is not None and (
+        profile.rated is None or other.rated.current != profile.rated.current
+    ):
         parts.append(f"rated current from {other.rated.current}")
     return ", ".join(parts) or "the same objects in other units"
 
@@ -235,7 +259,9 @@ class HeartbeatGuard:
     The entry is free, or `left_over` shows that it watches a killed recorder.
     """
 
-    def __init__(self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> None:
+    def __init__(
+        self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]
+    ) -> None:
         self.lack = ""  #: Missing capability, in words; empty when nothing is missing
         self._access = access
         self._consumer: ObjectEntry | None = None
@@ -252,7 +278,9 @@ class HeartbeatGuard:
             return
         self._option_before = access.read_optional(ABORT_CONNECTION, any_abort=True)
         if self._option_before is None:
-            self.lack = "no 6007h: when the recorder is killed it stops in the way that its maker decided"
+            self.lack = (
+                "no 6007h: when the recorder is killed it stops in the way that its maker decided"
+            )
 
     @property
     def watching(self) -> bool:
@@ -263,23 +291,32 @@ class HeartbeatGuard:
         """Describe the guard in words, for the log."""
         if self._consumer is None:
             return self.lack
-        return f"watches the recorder by {self._consumer}, {silence_ms} ms" + (f"; {self.lack}" if self.lack else "")
+        return (f"watches the recorder by {self._consumer}, {silence_ms} ms") + (
+            f"; {self.lack}" if self.lack else ""
+        )
 
     def arm(self, recorder_id: int, silence_ms: int) -> None:
-        """Let the amplifier quick stop after this silence of the recorder, counted from its first heartbeat.
+        """Let the amplifier quick stop after this silence of the recorder,
+        counted from its first heartbeat.
 
         A refused write is reported in `lack`; the recording goes on.
         """
         if self._consumer is None:
             return
-        if self._option_before is not None and (refused := self._refused(ABORT_CONNECTION, QUICK_STOP_ON_LOSS)):
+        if self._option_before is not None and (
+            refused := self._refused(ABORT_CONNECTION, QUICK_STOP_ON_LOSS)
+        ):
             before = self._option_before
             self._option_before = None
-            self.lack = f"6007h = {before} rules how it stops when the recorder is killed: 3 is {refused}"
+            self.lack = (
+                f"6007h = {before} rules how it stops when the recorder is killed: 3 is {refused}"
+            )
         if refused := self._refused(self._consumer, recorder_id << 16 | silence_ms):
             if self._option_before is not None:
                 self._access.write(ABORT_CONNECTION, self._option_before)
-            self.lack = f"it does NOT stop by itself when the recorder is killed: 1016h is {refused}"
+            self.lack = (
+                f"it does NOT stop by itself when the recorder is killed: 1016h is {refused}"
+            )
             self._consumer = None
 
     def _refused(self, entry: ObjectEntry, value: int) -> str:
@@ -300,7 +337,9 @@ class HeartbeatGuard:
 
 
 class AxisSetup:
-    """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone."""
+    """The settings of one amplifier; each step keeps the original value first,
+    so a half-done setup can be undone.
+    """
 
     def __init__(self, link: Link, axis: Axis, guard: HeartbeatGuard) -> None:
         self.guard = guard  #: How the amplifier watches the recorder
@@ -319,7 +358,8 @@ class AxisSetup:
         return HEARTBEAT_TIME in self._before
 
     def check(self, profiles: Profiles) -> None:
-        """Check, before anything is written, that the drive has the objects and the PDOs that its profile needs.
+        """Check, before anything is written, that the drive has the objects and the PDOs that its
+        profile needs.
 
         Raises:
             SetupRefused: it does not; `profiles` are those from which one that fits is named.
@@ -329,20 +369,28 @@ class AxisSetup:
         axis = self._axis
         lacking = misfit(access, axis.profile, profiles)
         if lacking is not None:
-            raise SetupRefused(axis, f"found {lacking.found}", expected=lacking.expected, remedy=lacking.remedy)
+            raise SetupRefused(
+                axis, f"found {lacking.found}", expected=lacking.expected, remedy=lacking.remedy
+            )
         if access.read_optional(PROFILE_DECELERATION) is None:
-            self._absent = (PROFILE_DECELERATION,)  # such a drive brakes with its profile acceleration
+            # Such a drive brakes with its profile acceleration
+            self._absent = (PROFILE_DECELERATION,)
         for direction in Direction:
             read = (read_pdo_record(access, direction, number) for number in range(PDOS))
             self._found[direction] = tuple(record for record in read if record is not None)
         self.pdos = self._wanted(PDO_BYTES)
 
     def _wanted(self, most_bytes: int) -> AxisPdos:
-        numbers = {direction: [record.number for record in found] for direction, found in self._found.items()}
+        numbers = {
+            direction: [record.number for record in found]
+            for direction, found in self._found.items()
+        }
         try:
             return wanted_pdos(self._axis, numbers, self._absent, most_bytes)
         except ValueError as error:
-            raise SetupRefused(self._axis, f"PDO: profile {self._axis.profile.name}: {error}") from error
+            raise SetupRefused(
+                self._axis, f"PDO: profile {self._axis.profile.name}: {error}"
+            ) from error
 
     def send_heartbeats(self, period_ms: int) -> None:
         """Let the amplifier send heartbeats.
@@ -363,7 +411,10 @@ class AxisSetup:
         """
         counter = self._access.read_optional(SYNC_COUNTER, any_abort=True)
         if counter:
-            remedy = f"it waits for SYNC with a counter (1019h = {counter}): set it to 0 with the drive's own tool"
+            remedy = (
+                f"it waits for SYNC with a counter (1019h = {counter}): set it to 0 with the "
+                "drive's own tool"
+            )
             self._change(SYNC_COUNTER, 0, "SYNC without a counter, 0", remedy)
 
     def _read(self, entry: ObjectEntry, expected: str, remedy: str) -> int:
@@ -397,12 +448,16 @@ class AxisSetup:
             if error.abort_code is None:
                 raise
             found = f"{action} {entry} is refused ({error.reason})"
-            raise SetupRefused(self._axis, f"found {found}", expected=expected, remedy=remedy) from error
+            raise SetupRefused(
+                self._axis, f"found {found}", expected=expected, remedy=remedy
+            ) from error
 
     def map_pdos(self) -> None:
-        """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
+        """Map position, current and statusword into TPDOs and the set-points into RPDOs;
+        all other PDOs go off.
 
-        Where the drive refuses that, PDOs of six bytes are tried, and its own PDOs are used if they carry the same.
+        Where the drive refuses that, PDOs of six bytes are tried, and its own PDOs are used if they
+        carry the same.
 
         Raises:
             SetupRefused: a mapping is impossible, was refused, or reads back differently.
@@ -419,7 +474,9 @@ class AxisSetup:
         found: Sequence[PdoRecord],
         own: tuple[PdoRecord, ...],
     ) -> tuple[PdoRecord, ...]:
-        """Map the PDOs of one direction; returns those of its own where the drive refuses others."""
+        """Map the PDOs of one direction; returns those of its own where the drive refuses
+        others.
+        """
         try:
             return self._write(used(self._wanted(PDO_BYTES)), found)
         except SetupRefused as refused:
@@ -431,7 +488,9 @@ class AxisSetup:
                         return self._write(pdos, found)
             raise
 
-    def _write(self, pdos: tuple[PdoRecord, ...], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
+    def _write(
+        self, pdos: tuple[PdoRecord, ...], found: Sequence[PdoRecord]
+    ) -> tuple[PdoRecord, ...]:
         wanted = {record.number: record for record in pdos}
         for before in found:
             if before.number in wanted:
@@ -460,18 +519,26 @@ class AxisSetup:
                 return
             if self._link.clock() >= deadline:
                 found = f"mode {shown} in 6061h"
-                raise StateRefused(self._axis, "profile position mode (1)", found, access.read(STATUSWORD))
+                raise StateRefused(
+                    self._axis, "profile position mode (1)", found, access.read(STATUSWORD)
+                )
             self._link.pass_time()
 
     def _mode_remedy(self) -> str:
-        """Say what to do where the mode is refused, by the modes that the drive reports (6502h; bit 0: this one)."""
+        """Say what to do where the mode is refused, by the modes that the drive reports (6502h;
+        bit 0: this one).
+        """
         supported = self._access.read_optional(SUPPORTED_MODES, any_abort=True)
         if supported is None or supported & 1:
             return MODE_REMEDY
-        return f"the drive does not have it (6502h = {supported:#x}, bit 0 is 0): this firmware cannot be recorded"
+        return (
+            f"the drive does not have it (6502h = {supported:#x}, bit 0 is 0): this firmware "
+            "cannot be recorded"
+        )
 
     def restore(self, problems: list[DriverError]) -> tuple[str, ...]:
-        """Restore all settings; returns the names of those that are left when the amplifier falls silent.
+        """Restore all settings; returns the names of those that are left when the amplifier falls
+        silent.
 
         The same is returned when the time for closing is over. Failures are appended to `problems`.
         """
@@ -502,14 +569,17 @@ class AxisSetup:
         if HEARTBEAT_TIME in self._before:
             yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._before[HEARTBEAT_TIME])
 
-    def describe(self, identity: Identity, scale: ScaleReading, silence_ms: int) -> dict[str, object]:
+    def describe(
+        self, identity: Identity, scale: ScaleReading, silence_ms: int
+    ) -> dict[str, object]:
         """Return what the drive reported during the setup, for the log."""
         profile = self._axis.profile
         return {
             "node_id": self._axis.node_id,
             **asdict(identity),
             "profile": profile.name,
-            # The recorded current: without both, a gain of this log cannot be compared with another's.
+            # The recorded current: without both, a gain of this log cannot be compared with
+            # another's.
             "amplitude": profile.amplitude.value,
             "tap": profile.tap.value,
             "signal": profile.signal,

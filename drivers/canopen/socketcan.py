@@ -1,4 +1,5 @@
-"""One end of a SocketCAN bus: a separate process reads it (drivers/canopen/capture.py), this one sends.
+"""One end of a SocketCAN bus: a separate process reads it (drivers/canopen/capture.py),
+this one sends.
 
 See docs/decisions/0017-capture-in-its-own-process.md.
 """
@@ -27,8 +28,10 @@ import can
 from drivers.canopen import capture
 from drivers.canopen.capture import FRAME, RECORD, RecordKind
 
-RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
-START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter
+#: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
+RECEIVE_BUFFER_BYTES = 4 << 20
+#: Time for the capture process to start; a loaded machine is slow to start an interpreter
+START_S = 20.0
 END_S = 1.0
 SEND_S = 0.1  #: Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms
 RETRY_S = 0.0002
@@ -37,8 +40,10 @@ SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
 ERROR_CLASSES = 0x4 | 0x40 | 0x100
-"""Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not
-requested: a bus without a second node sends thousands a second."""
+"""Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h.
+
+Single bus errors are not requested: a bus without a second node sends thousands a second.
+"""
 _EXTENDED = 0x8000_0000
 _REMOTE = 0x4000_0000
 _ERROR = 0x2000_0000
@@ -50,8 +55,8 @@ class Losses(NamedTuple):
     """Frames that came over the wire and were lost in this machine."""
 
     kernel: int = 0  #: in the socket's receive buffer (SO_RXQ_OVFL)
-    #: Before any socket, in the controller or in the kernel's queue behind its driver (the interface's counters, which
-    #: are read five times a second).
+    #: Before any socket, in the controller or in the kernel's queue behind its driver (the
+    #: interface's counters, which are read five times a second).
     interface: int = 0
     backlog: int = 0  #: in the capture process, because this process did not read them for minutes
 
@@ -83,14 +88,17 @@ def losses_of(bus: can.BusABC) -> Losses:
 
 
 def receive_only(bus: can.BusABC, wanted: Sequence[tuple[int, int]]) -> None:
-    """Let the kernel discard what a bus does not need, where it can: see `SocketcanBus.receive_only`."""
+    """Let the kernel discard what a bus does not need, where it can:
+    see `SocketcanBus.receive_only`.
+    """
     narrow: Callable[[Sequence[tuple[int, int]]], None] | None = getattr(bus, "receive_only", None)
     if narrow is not None:
         narrow(wanted)
 
 
 def read_until_ns(bus: can.BusABC) -> int | None:
-    """Return the monotonic time up to which every frame of a bus has been received; None where frames have no stamps.
+    """Return the monotonic time up to which every frame of a bus has been received;
+    None where frames have no stamps.
 
     On a bus with stamps our own SYNC comes back, in its place among the other frames.
     """
@@ -99,7 +107,8 @@ def read_until_ns(bus: can.BusABC) -> int | None:
 
 
 def lags_behind(bus: can.BusABC, time_ns: int) -> bool:
-    """Return whether frames from before a monotonic time may still come; never on a bus whose frames have no stamps.
+    """Return whether frames from before a monotonic time may still come;
+    never on a bus whose frames have no stamps.
 
     A bus that has received nothing yet has read until 0, and is behind too.
     """
@@ -113,7 +122,9 @@ def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
 
 
 def open_socketcan(
-    channel: str, receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES, backlog_records: int = capture.BACKLOG_RECORDS
+    channel: str,
+    receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES,
+    backlog_records: int = capture.BACKLOG_RECORDS,
 ) -> SocketcanBus:
     """Open one end of an interface of the kernel.
 
@@ -133,8 +144,8 @@ def open_socketcan(
 def receive_within(bus: can.BusABC, timeout: float | None = None) -> can.Message | None:
     """Return the next frame of a bus; None if none comes within a time [s].
 
-    This is `can.BusABC.recv` by the monotonic clock. The one of python-can waits by the wall clock: one that is set
-    back meanwhile makes it wait so much longer, and SYNC is not sent until then.
+    This is `can.BusABC.recv` by the monotonic clock. The one of python-can waits by the wall clock:
+    one that is set back meanwhile makes it wait so much longer, and SYNC is not sent until then.
     """
     left_s = timeout
     end_s = None if timeout is None else time.monotonic() + timeout
@@ -150,13 +161,19 @@ def receive_within(bus: can.BusABC, timeout: float | None = None) -> can.Message
 
 
 class BurstBus(can.BusABC):
-    """A bus of which one call reads a burst; its other frames are returned without python-can's clock and logging."""
+    """A bus of which one call reads a burst;
+    its other frames are returned without python-can's clock and logging.
+    """
 
     _received: deque[can.Message]
 
     def take(self) -> can.Message | None:
-        """Return a frame that was received with the one before; None where the bus has to be asked."""
-        return self._received.popleft() if self._received and self._filters is None else None
+        """Return a frame that was received with the one before;
+        None where the bus has to be asked.
+        """
+        if self._received and self._filters is None:
+            return self._received.popleft()
+        return None
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         if self._received and self._filters is None:
@@ -222,7 +239,9 @@ class SocketcanBus(BurstBus):
         while not self._ready:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
-                raise can.CanInitializationError(f"the capture process did not start within {START_S:g} s")
+                raise can.CanInitializationError(
+                    f"the capture process did not start within {START_S:g} s"
+                )
             self._fill(left_s)
 
     def fileno(self) -> int:
@@ -231,7 +250,11 @@ class SocketcanBus(BurstBus):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if msg.is_fd:
             raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
-        flags = _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
+        flags = (
+            _EXTENDED * msg.is_extended_id
+            | _REMOTE * msg.is_remote_frame
+            | _ERROR * msg.is_error_frame
+        )
         frame = FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
         deadline = time.monotonic() + (SEND_S if timeout is None else timeout)
         while True:
@@ -241,21 +264,26 @@ class SocketcanBus(BurstBus):
                 # The queue of the interface, or the buffer of the socket, is full.
                 if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
                     raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
-                # The interface's queue holds ten frames by default; a burst of set-points is longer.
+                # The interface's queue holds ten frames by default; a burst of set-points is
+                # longer.
                 if time.monotonic() >= deadline:
                     raise can.CanOperationError(
-                        f"the transmit queue stays full for {SEND_S:g} s: does any node acknowledge frames?"
+                        f"the transmit queue stays full for {SEND_S:g} s: does any node "
+                        "acknowledge frames?"
                     ) from error
                 time.sleep(RETRY_S)
             else:
                 return
 
     def receive_only(self, wanted: Sequence[tuple[int, int]]) -> None:
-        """Let the kernel discard base frames other than these, given as identifier and mask, however many come.
+        """Let the kernel discard base frames other than these, given as identifier and mask,
+        however many come.
 
         Error frames are still received.
         """
-        filters = b"".join(_FILTER.pack(number, mask | _EXTENDED | _REMOTE) for number, mask in wanted)
+        filters = b"".join(
+            _FILTER.pack(number, mask | _EXTENDED | _REMOTE) for number, mask in wanted
+        )
         with suppress(OSError):  # a socket that is no CAN_RAW has no filters: it receives all
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
 
@@ -270,7 +298,9 @@ class SocketcanBus(BurstBus):
         except (OSError, ValueError) as error:
             raise can.CanOperationError(str(error)) from error
         if not self._chunks[-1]:
-            self._end = f"the capture process ended by itself ({self._wait()}); frames since then are lost"
+            self._end = (
+                f"the capture process ended by itself ({self._wait()}); frames since then are lost"
+            )
             raise can.CanOperationError(self._end)
         self._parse()
         if self._end is not None and not self._received:
@@ -278,10 +308,12 @@ class SocketcanBus(BurstBus):
 
     def _take(self, timeout_s: float | None) -> bool:
         """Append the bytes of the capture process to the chunks; returns whether there were any."""
-        # One call into C, so that no signal handler's exception comes between receiving and appending.
+        # One call into C, so that no signal handler's exception comes between receiving and
+        # appending.
         receive = partial(map, self._pair.recv, (_PAIR_BYTES,))
         try:
-            # Beside a busy thread each system call may wait for the interpreter lock: try without select first.
+            # Beside a busy thread each system call may wait for the interpreter lock: try without
+            # select first.
             self._chunks.extend(receive((socket.MSG_DONTWAIT,)))
         except BlockingIOError:
             if timeout_s == 0 or not select.select((self._pair,), (), (), timeout_s)[0]:
@@ -290,7 +322,9 @@ class SocketcanBus(BurstBus):
         return True
 
     def _parse(self) -> None:
-        """Parse the chunks into frames; an exception meanwhile, such as Ctrl-C, leaves them for the next time."""
+        """Parse the chunks into frames; an exception meanwhile, such as Ctrl-C,
+        leaves them for the next time.
+        """
         chunk = b"".join(self._chunks)
         whole = len(chunk) - len(chunk) % RECORD.size
         rest = deque((chunk[whole:],))
@@ -302,7 +336,9 @@ class SocketcanBus(BurstBus):
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == RecordKind.FRAME:
-                received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
+                received.append(
+                    self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local)
+                )
             elif kind == RecordKind.READY:
                 ready = True
             elif kind == RecordKind.END:
@@ -310,7 +346,11 @@ class SocketcanBus(BurstBus):
         losses = Losses(*lost)
         until_ns = max(monotonic_ns, self.read_until_ns)
         # No call from here on: the state changes whole, or not at all.
-        self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
+        self._chunks = rest
+        self._received = received
+        self._ready = ready
+        self._end = end
+        self.losses = losses
         self.read_until_ns = until_ns
 
     def _message(
@@ -356,16 +396,24 @@ class SocketcanBus(BurstBus):
             return self._process.wait()
 
 
-def _spawn(bus: socket.socket, out: socket.socket, channel: str, backlog_records: int) -> subprocess.Popen[bytes]:
+def _spawn(
+    bus: socket.socket, out: socket.socket, channel: str, backlog_records: int
+) -> subprocess.Popen[bytes]:
     numbers = (bus.fileno(), out.fileno())
-    program = (str(Path(capture.__file__).resolve()), *map(str, numbers), channel, str(backlog_records))
+    program = (
+        str(Path(capture.__file__).resolve()),
+        *map(str, numbers),
+        channel,
+        str(backlog_records),
+    )
     return subprocess.Popen(
         # Isolated from the user's environment, and without the packages of this one.
         [sys.executable, "-I", "-S", *program],
         pass_fds=numbers,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        # A terminal's Ctrl-C goes to the whole process group, but stopping the axes needs the frames.
+        # A terminal's Ctrl-C goes to the whole process group, but stopping the axes needs the
+        # frames.
         start_new_session=True,
     )
 
@@ -391,8 +439,9 @@ def _configure(handle: socket.socket, channel: str, receive_buffer_bytes: int) -
     if given >= receive_buffer_bytes:
         return ()
     return (
-        f"the kernel gave {given >> 10} KiB of receive buffer instead of {receive_buffer_bytes >> 10} KiB: "
-        "raise net.core.rmem_max, or let the recorder have CAP_NET_ADMIN",
+        f"the kernel gave {given >> 10} KiB of receive buffer instead of "
+        f"{receive_buffer_bytes >> 10} KiB: raise net.core.rmem_max, or let the recorder have "
+        "CAP_NET_ADMIN",
     )
 
 

@@ -1,13 +1,14 @@
 """Several CAN buses that one cell is wired to, read and written as one.
 
-A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven bits of their COB-ID
-(CiA 301, predefined connection set), NMT by its second byte. Frames without a node go to all buses: SYNC, NMT to all,
-and the heartbeat of the recorder. Received frames come in the order of their time stamps, which all interfaces take
-from clocks of this computer: monotonic where all have such stamps, else wall time. Where all have such stamps, our own
-SYNC comes when it has been received from every bus: all frames that arrived on their bus before it have come by then.
+A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven
+bits of their COB-ID (CiA 301, predefined connection set), NMT by its second byte. Frames without a
+node go to all buses: SYNC, NMT to all, and the heartbeat of the recorder. Received frames come in
+the order of their time stamps, which all interfaces take from clocks of this computer: monotonic
+where all have such stamps, else wall time. Where all have such stamps, our own SYNC comes when it
+has been received from every bus: all frames that arrived on their bus before it have come by then.
 
-A bus that fails is reported once, as a BusError with its name. The others go on, so that their axes can be stopped and
-restored; the nodes of the failed bus are silent from then on.
+A bus that fails is reported once, as a BusError with its name. The others go on, so that their axes
+can be stopped and restored; the nodes of the failed bus are silent from then on.
 """
 
 from __future__ import annotations
@@ -21,12 +22,22 @@ from itertools import groupby
 import can
 
 from drivers.canopen.bus import BusAddress, open_bus, send_burst
-from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, read_until_ns, receive_only, remarks_of
+from drivers.canopen.socketcan import (
+    CapturedMessage,
+    Losses,
+    losses_of,
+    read_until_ns,
+    receive_only,
+    remarks_of,
+)
 from drivers.errors import BusError, NodeMisplaced, node_label
 
-ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
-LONGEST_LEFT_OUT_S = 0.1  #: Time after a time-out in which frames that are left out may still be read: a flood of them
-LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
+#: Time to wait at one bus while another may receive, where one of them has no file descriptor
+ALTERNATION_S = 0.0005
+#: Time after a time-out in which frames that are left out may still be read: a flood of them
+LONGEST_LEFT_OUT_S = 0.1
+#: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
+LARGEST_RUN = 64
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
 _FAILURES = (can.CanError, OSError, BusError)
@@ -41,7 +52,8 @@ class BusPart:
     name: str  #: for messages
     address: BusAddress  #: of the bus
     node_ids: frozenset[int]  #: of the amplifiers on it
-    axis_names: Mapping[int, str] = field(default_factory=dict, compare=False)  #: by node id, for messages
+    #: by node id, for messages
+    axis_names: Mapping[int, str] = field(default_factory=dict, compare=False)
 
     def __str__(self) -> str:
         return f"{self.name} ({self.address})"
@@ -76,7 +88,8 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
     """Open one end of the bus of a cell, or of every bus as one.
 
     Raises:
-        BusError: one cannot be opened (those before it are closed again), or two have a node id in common.
+        BusError: one cannot be opened (those before it are closed again), or two have a node id in
+            common.
     """
     if isinstance(address, BusAddress):
         return open_bus(address)
@@ -84,7 +97,9 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
     for part in address.parts:
         for node_id in part.node_ids:
             if (other := homes.setdefault(node_id, part)) is not part:
-                shared = f"{node_label(node_id, part.axis_names)} is on {other.name} and on {part.name}"
+                shared = (
+                    f"{node_label(node_id, part.axis_names)} is on {other.name} and on {part.name}"
+                )
                 raise BusError(str(address), f"{shared}; give one of the two another node id")
     ends: list[can.BusABC] = []
     for part in address.parts:
@@ -98,13 +113,17 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
 
 
 class SplitBus(can.BusABC):
-    """Ends of several buses as one, which closes them; ``channel`` of a received frame names its bus.
+    """Ends of several buses as one, which closes them;
+    ``channel`` of a received frame names its bus.
 
     The ends are in the order of the address; the clock, for time-outs, is monotonic [s].
     """
 
     def __init__(
-        self, address: SplitAddress, ends: Sequence[can.BusABC], clock: Callable[[], float] = time.monotonic
+        self,
+        address: SplitAddress,
+        ends: Sequence[can.BusABC],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.address = address
         self.channel_info = str(address)
@@ -136,16 +155,26 @@ class SplitBus(can.BusABC):
 
     @property
     def read_until_ns(self) -> int | None:
-        """Monotonic time up to which every frame of every bus has been received; None where one has no stamps."""
-        times = [read_until_ns(end) for index, end in enumerate(self._ends) if index not in self._failed]
+        """Monotonic time up to which every frame of every bus has been received;
+        None where one has no stamps.
+        """
+        times = [
+            read_until_ns(end) for index, end in enumerate(self._ends) if index not in self._failed
+        ]
         known = [time_ns for time_ns in times if time_ns is not None]
-        return min(known) if known and len(known) == len(times) else None
+        if known and len(known) == len(times):
+            return min(known)
+        return None
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks for the operator on how each bus was opened."""
         named = zip(self._names, map(remarks_of, self._ends), strict=True)
-        return tuple(f"{name}: {remark}" for name, remarks in named for remark in remarks)
+        found = []
+        for name, remarks in named:
+            for remark in remarks:
+                found.append(f"{name}: {remark}")
+        return tuple(found)
 
     def receive_only(self, wanted: Sequence[tuple[int, int]]) -> None:
         """Let the kernel discard other frames of every bus."""
@@ -159,8 +188,9 @@ class SplitBus(can.BusABC):
     def send_burst(self, messages: Sequence[can.Message]) -> None:
         """Send several frames in their order; consecutive frames of one bus go there in one call.
 
-        A frame for all buses goes to one right after the other, when everything before it has been sent: this keeps the
-        SYNCs close together. A bus that fails raises BusError after the others got their frames.
+        A frame for all buses goes to one right after the other, when everything before it has been
+        sent: this keeps the SYNCs close together. A bus that fails raises BusError after the others
+        got their frames.
         """
         failures: list[BusError] = []
         for route, run in groupby(messages, self.address.route):
@@ -182,7 +212,8 @@ class SplitBus(can.BusABC):
 
         Raises:
             BusError: one of the buses has just failed, or went off; or all have failed.
-            NodeMisplaced: a node is heard on another bus than its own; raised once, its frames there are left out.
+            NodeMisplaced: a node is heard on another bus than its own; raised once, its frames
+                there are left out.
         """
         end_s = None if timeout is None else self._clock() + timeout
         while True:
@@ -217,16 +248,23 @@ class SplitBus(can.BusABC):
         return message
 
     def _oldest(self) -> int | None:
-        """Return the bus of the oldest waiting frame; None where there is none, or only our SYNC of some buses."""
-        waiting = [(message, index) for index, message in enumerate(self._waiting) if message is not None]
+        """Return the bus of the oldest waiting frame;
+        None where there is none, or only our SYNC of some buses.
+        """
+        waiting = [
+            (message, index) for index, message in enumerate(self._waiting) if message is not None
+        ]
         if self._stamped:
             received = [(message, index) for message, index in waiting if message.is_rx]
             if waiting and not received and len(waiting) == len(self._ends) - len(self._failed):
                 first = waiting[0][1]
-                self._waiting = [head if index == first else None for index, head in enumerate(self._waiting)]
+                self._waiting = [
+                    head if index == first else None for index, head in enumerate(self._waiting)
+                ]
                 return first
             waiting = received
-        # The wall clock can be set between two frames, and a float of its seconds has steps of 200 ns.
+        # The wall clock can be set between two frames, and a float of its seconds has steps of 200
+        # ns.
         heads: list[tuple[float, int]] = [
             (m.monotonic_ns, index) for m, index in waiting if isinstance(m, CapturedMessage)
         ]
@@ -242,16 +280,24 @@ class SplitBus(can.BusABC):
         return index
 
     def _belongs(self, message: can.Message, index: int) -> bool:
-        """Whether a frame comes from the bus of its node; our own SYNC, received for its time, from the first bus."""
+        """Whether a frame comes from the bus of its node;
+        our own SYNC, received for its time, from the first bus.
+        """
         if not message.is_rx:
             return index == min(set(range(len(self._ends))) - self._failed, default=index)
-        if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in FROM_NODES:
+        if (
+            message.is_extended_id
+            or message.is_error_frame
+            or message.arbitration_id & 0x780 not in FROM_NODES
+        ):
             return True
         node_id = message.arbitration_id & 0x7F
         home = self._homes.get(node_id, index)
         if home != index and (node_id, index) not in self._misplaced:
             self._misplaced.add((node_id, index))
-            raise NodeMisplaced(node_id, self._names[home], self._names[index], self._axis_names.get(node_id, ""))
+            raise NodeMisplaced(
+                node_id, self._names[home], self._names[index], self._axis_names.get(node_id, "")
+            )
         return home == index
 
     def _wait(self, left_s: float | None) -> None:
@@ -263,15 +309,23 @@ class SplitBus(can.BusABC):
             return
         self._turn += 1
         index = live[self._turn % len(live)]
-        timeout_s = ALTERNATION_S if left_s is None or len(live) > 1 else left_s
-        self._waiting[index] = self._take(index, timeout_s if left_s is None else min(left_s, timeout_s))
+        if left_s is None or len(live) > 1:
+            timeout_s = ALTERNATION_S
+        else:
+            timeout_s = left_s
+        self._waiting[index] = self._take(
+            index, timeout_s if left_s is None else min(left_s, timeout_s)
+        )
 
     def _failure(self, index: int, error: Exception) -> BusError:
         """Leave this bus out from now on."""
         self._failed.add(index)
         if (head := self._waiting[index]) is not None and not head.is_rx:
             self._waiting[index] = None
-        reason = error.reason if isinstance(error, BusError) else str(error) or type(error).__name__
+        if isinstance(error, BusError):
+            reason = error.reason
+        else:
+            reason = str(error) or type(error).__name__
         failure = BusError(self._names[index], reason)
         failure.__cause__ = error
         return failure

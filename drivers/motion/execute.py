@@ -1,7 +1,8 @@
 """Make a list of moves in CiA 402 profile position mode, one Sample after the other.
 
-Source: CiA 402-2, profile position mode: a set-point is taken on the rising edge of controlword bit 4, acknowledged by
-statusword bit 12, and reached at bit 10. Set-points go by synchronous RPDOs, so that all axes start on the same SYNC.
+Source: CiA 402-2, profile position mode: a set-point is taken on the rising edge of controlword bit
+4, acknowledged by statusword bit 12, and reached at bit 10. Set-points go by synchronous RPDOs, so
+that all axes start on the same SYNC.
 """
 
 from __future__ import annotations
@@ -53,20 +54,24 @@ _NEW_SETPOINT = ControlCommand.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL
 
 @dataclass(frozen=True, slots=True)
 class MotionBounds:
-    """Time limits in the time of the samples [s], and distances that count as standstill and as arrival."""
+    """Time limits in the time of the samples [s], and distances that count as standstill and as
+    arrival.
+    """
 
     enable_s: float = 3.0  #: from the first controlword to OPERATION ENABLED
     acknowledge_s: float = 0.5  #: from a set-point to bit 12, and from its end to bit 12 cleared
     settle_s: float = 3.0  #: added to a move's computed duration
     stop_s: float = 3.0  #: from the quick stop to standstill without power
-    #: An axis that stays in QUICK STOP ACTIVE is at standstill, and loses its power, when its position has kept within
-    #: this many counts for this many cycles. An encoder of 20 bits a turn flickers by several counts at rest. 16 counts
-    #: in 20 cycles of 1 ms are at most 800 counts/s, 0.3 deg/s of such a motor, which is harmless to a brake.
+    #: An axis that stays in QUICK STOP ACTIVE is at standstill, and loses its power, when its
+    #: position has kept within this many counts for this many cycles. An encoder of 20 bits a turn
+    #: flickers by several counts at rest. 16 counts in 20 cycles of 1 ms are at most 800 counts/s,
+    #: 0.3 deg/s of such a motor, which is harmless to a brake.
     standstill_cycles: int = 20
     standstill_counts: int = 16  #: largest step between two of those cycles
-    #: Largest distance from a target that bit 10 reports as reached: these counts plus `arrival_fraction` of the way.
-    #: It catches a drive whose bit 10 is still that of the move before. A short way lies within it from the start, so
-    #: no move ends before the duration of its profile either.
+    #: Largest distance from a target that bit 10 reports as reached: these counts plus
+    #: `arrival_fraction` of the way. It catches a drive whose bit 10 is still that of the move
+    #: before. A short way lies within it from the start, so no move ends before the duration of its
+    #: profile either.
     arrival_counts: int = 2000
     arrival_fraction: float = 0.05  #: see `arrival_counts`
 
@@ -83,8 +88,9 @@ def execute(
 ) -> Generator[Sample, None, None]:
     """Enable all axes, make the moves, disable all axes; yields every Sample on the way.
 
-    However it ends, all axes get quick stop, then power off, confirmed as far as the bus allows. Close it
-    (``contextlib.closing``) when the loop around it may be left early; leaving the network stops the axes as well.
+    However it ends, all axes get quick stop, then power off, confirmed as far as the bus allows.
+    Close it (``contextlib.closing``) when the loop around it may be left early; leaving the network
+    stops the axes as well.
 
     Raises:
         MotionRefused: no permission, or a move outside of it; nothing has moved.
@@ -114,7 +120,8 @@ def execute(
             network.unguard()
             network.end_closing()
     except BaseException as error:
-        # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
+        # Also a closed generator and an interrupt, during the stop above as well: it then runs
+        # without yielding.
         with network.block_signals():
             try:
                 ended_by = f"{type(error).__name__}: {text_of(error)}".removesuffix(": ")
@@ -135,7 +142,9 @@ def execute(
 class _Execution:
     """One run of ``execute``: the stream, the last sample and the last command of each axis."""
 
-    def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
+    def __init__(
+        self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample
+    ) -> None:
         self.problems: list[DriverError] = []  #: Failures to confirm the last stop
         self.unreported: Exception | None = None  #: First failure to report an event of a stop
         self._network = network
@@ -156,15 +165,21 @@ class _Execution:
         return decode(self._sample.statusword[axis])
 
     def _send_command(self, axis: int, controlword: int, repeat: bool = False) -> None:
-        """Send controlword and target of one axis with the next SYNC; an unchanged pair only on request."""
+        """Send controlword and target of one axis with the next SYNC;
+        an unchanged pair only on request.
+        """
         command = (controlword, self._targets[axis])
         if repeat or self._sent[axis] != command:
             self._sent[axis] = command
             self._send(axis, {TARGET_POSITION: self._targets[axis], CONTROLWORD: controlword})
 
     def _send(self, axis: int, values: Mapping[ObjectEntry, int]) -> None:
-        """Send values of one axis with the next SYNC, in its RPDOs; those of objects that it does not have are left."""
-        self._bus.outgoing += [base_frame(cob_id, data) for cob_id, data in self._pdos[axis].payloads(values)]
+        """Send values of one axis with the next SYNC, in its RPDOs;
+        those of objects that it does not have are left.
+        """
+        self._bus.outgoing += [
+            base_frame(cob_id, data) for cob_id, data in self._pdos[axis].payloads(values)
+        ]
 
     def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         """Emit an event of a stop, which goes on where the event cannot be logged or shown."""
@@ -197,7 +212,9 @@ class _Execution:
                 raise self._refusal(axis)
         self._network.powered.update(self._network.node_ids)
         for cycle in range(self._cycles(self._bounds.enable_s)):
-            waiting = [axis for axis in self._axes if self._state(axis) is not State.OPERATION_ENABLED]
+            waiting = [
+                axis for axis in self._axes if self._state(axis) is not State.OPERATION_ENABLED
+            ]
             if not waiting:
                 return
             for axis in waiting:
@@ -213,7 +230,9 @@ class _Execution:
 
     def _refusal(self, axis: int) -> StateRefused:
         word = self._sample.statusword[axis]
-        return StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
+        return StateRefused(
+            self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word
+        )
 
     def move(self, number: int, move: Move) -> Iterator[Sample]:
         """Make one move of all axes with a distance to go, and the dwell after it."""
@@ -233,7 +252,9 @@ class _Execution:
             self._targets[axis] = move.target_counts[axis]
             self._send_command(axis, _NEW_SETPOINT)
         sample = self._checked()
-        self._bus.report(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
+        self._bus.report(
+            None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}"
+        )
         yield sample
         yield from self._handshake(number, moving)
         duration_s = max(move.duration_s(start))
@@ -242,10 +263,14 @@ class _Execution:
         data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
         for _ in range(self._cycles(allowed_s)):
             for axis in data.frozen(self._sample):
-                if not self._arrived(axis, start[axis]):  # a stiff axis may be there before its profile ends
+                # A stiff axis may be there before its profile ends
+                if not self._arrived(axis, start[axis]):
                     position = self._sample.position_counts[axis]
                     current = self._sample.current_raw[axis]
-                    reason = f"move {number}: position {position} and current {current} do not change during the move"
+                    reason = (
+                        f"move {number}: position {position} and current {current} do not "
+                        "change during the move"
+                    )
                     remedy = "is its data frozen, its encoder or its motor cable off?"
                     error = DriveFault(self._nodes[axis], reason, remedy=remedy)
                     self._bus.report(axis, EventKind.FROZEN, number, str(error))
@@ -261,19 +286,27 @@ class _Execution:
             held = self._held(moving)
             if held:
                 raise self._timeout(number, held, allowed_s, acknowledge=0)
-        self._bus.report(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
+        self._bus.report(
+            None,
+            EventKind.MOVE_END,
+            number,
+            f"move {number} ended at {self._sample.position_counts}",
+        )
         for _ in range(move.dwell_cycles):
             yield self._checked()
 
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
-        """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements.
+        """Set and clear the new set-point of all axes, each with the same SYNC,
+        and wait for the acknowledgements.
 
-        A drive without a buffer holds its acknowledgement until it has arrived; the move waits for that at its end.
+        A drive without a buffer holds its acknowledgement until it has arrived; the move waits for
+        that at its end.
         """
         waiting = tuple(moving)
         for _ in range(self._cycles(self._bounds.acknowledge_s)):
             for axis in waiting:
-                # Repeated every cycle until acknowledged: some drives act on the second controlword only.
+                # Repeated every cycle until acknowledged: some drives act on the second controlword
+                # only.
                 self._send_command(axis, _NEW_SETPOINT, repeat=True)
             if not waiting:
                 break
@@ -288,13 +321,16 @@ class _Execution:
         yield from self._release(moving)
 
     def _release(self, moving: Sequence[int]) -> Generator[Sample, None, tuple[int, ...]]:
-        """Clear the new set-point until no axis holds its acknowledgement; return those that still do in the end."""
+        """Clear the new set-point until no axis holds its acknowledgement;
+        return those that still do in the end.
+        """
         held = self._held(moving)
         for cycle in range(self._cycles(self._bounds.acknowledge_s)):
             if not held:
                 break
             for axis in held:
-                # Less often after a while: where it is held until the drive has arrived, the bus has other work.
+                # Less often after a while: where it is held until the drive has arrived, the bus
+                # has other work.
                 is_due = cycle < _URGENT_CYCLES or cycle % _URGENT_CYCLES == 0
                 self._send_command(axis, int(ControlCommand.ENABLE_OPERATION), repeat=is_due)
             yield self._checked()
@@ -303,17 +339,25 @@ class _Execution:
 
     def _held(self, axes: Sequence[int]) -> tuple[int, ...]:
         """Return the axes that acknowledge a set-point now."""
-        return tuple(axis for axis in axes if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE)
+        return tuple(
+            axis for axis in axes if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE
+        )
 
     def _timeout(
         self, number: int, late: tuple[int, ...], waited_s: float, acknowledge: int | None = None
     ) -> MotionTimeout:
         nodes = [self._nodes[axis] for axis in late]
-        return MotionTimeout(number, late, nodes, waited_s, acknowledge, self._network.other_master())
+        return MotionTimeout(
+            number, late, nodes, waited_s, acknowledge, self._network.other_master()
+        )
 
     def _arrived(self, axis: int, start: int) -> bool:
-        """Return whether bit 10 is set near the target; on a short way it may be that of the move before."""
-        tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * abs(self._targets[axis] - start)
+        """Return whether bit 10 is set near the target;
+        on a short way it may be that of the move before.
+        """
+        tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * abs(
+            self._targets[axis] - start
+        )
         near = abs(self._sample.position_counts[axis] - self._targets[axis]) <= tolerance
         return near and bool(self._sample.statusword[axis] & STATUS_TARGET_REACHED)
 
@@ -324,11 +368,15 @@ class _Execution:
             if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
                 word = sample.statusword[axis]
                 self._stream.check()  # the drive's own report says more
-                raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
+                raise DriveFault(
+                    self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word
+                )
         return sample
 
     def stop(self) -> Iterator[Sample]:
-        """Quick stop all axes, then remove their power; failures to confirm it are in `problems`."""
+        """Quick stop all axes, then remove their power;
+        failures to confirm it are in `problems`.
+        """
         self._bus.outgoing.clear()  # a set-point that was not sent yet must not start a move now
         self._bus.spare = nothing_to_send
         self.report(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
@@ -337,12 +385,21 @@ class _Execution:
         unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
-            # What is left is counted before SDO answers are read; axes that may have power do not wait for it.
-            periods, lag_s = (1, 0.0) if unconfirmed else (MAX_MISSING_CYCLES + 2, LARGEST_LAG_NS * 1e-9)
+            # What is left is counted before SDO answers are read; axes that may have power do not
+            # wait for it.
+            if unconfirmed:
+                periods = 1
+                lag_s = 0.0
+            else:
+                periods = MAX_MISSING_CYCLES + 2
+                lag_s = LARGEST_LAG_NS * 1e-9
             self._stream.read_on(periods * self._stream.pacing.period_ns * 1e-9, lag_s)
         except DriverError as error:
-            # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
-            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
+            # One of several buses may have failed, or a node is misplaced: the others are stopped
+            # by SDO.
+            self.report(
+                None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}"
+            )
             self.problems.append(error)
         try:
             silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
@@ -368,7 +425,9 @@ class _Execution:
             self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
-        """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
+        """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the
+        stop.
+        """
         still = [0] * len(self._sent)
         rest = list(self._sample.position_counts)
         silent = 0
@@ -376,21 +435,34 @@ class _Execution:
         for cycle in range(self._cycles(self._bounds.stop_s)):
             for axis in powered:
                 state = self._state(axis)
-                resting = state is State.QUICK_STOP_ACTIVE and still[axis] >= self._bounds.standstill_cycles
-                goal = Goal.SWITCH_ON_DISABLED if resting else Goal.QUICK_STOP
+                resting = (
+                    state is State.QUICK_STOP_ACTIVE
+                    and still[axis] >= self._bounds.standstill_cycles
+                )
+                if resting:
+                    goal = Goal.SWITCH_ON_DISABLED
+                else:
+                    goal = Goal.QUICK_STOP
                 self._send_command(axis, next_command(state, goal), repeat=cycle % 10 == 0)
             self._sample = self._stream.advance()
             yield self._sample
             for axis, position in enumerate(self._sample.position_counts):
-                # Compared with the position of rest, not with the cycle before: creeping is no standstill.
+                # Compared with the position of rest, not with the cycle before: creeping is no
+                # standstill.
                 near = abs(position - rest[axis]) <= self._bounds.standstill_counts
                 known = not self._sample.missing >> axis & 1
                 still[axis] = still[axis] + 1 if near and known else 0
                 rest[axis] = rest[axis] if near else position
             missing = self._sample.missing
             silent = silent + 1 if missing else 0
-            powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
-            self._network.powered -= {self._nodes[axis].node_id for axis in self._axes if axis not in powered}
+            powered = [
+                axis
+                for axis in self._axes
+                if missing >> axis & 1 or self._state(axis) not in POWERLESS
+            ]
+            self._network.powered -= {
+                self._nodes[axis].node_id for axis in self._axes if axis not in powered
+            }
             # A stream that waits for answers has waited long enough in one cycle.
             waited = self._bus.silent and self._stream.pacing.waits_for_answers
             tolerated = 0 if waited else MAX_MISSING_CYCLES

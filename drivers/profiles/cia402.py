@@ -1,6 +1,7 @@
 """The CiA 402 state machine: the state in a statusword, and the controlword that leads to a goal.
 
-Source: CiA 402-2 (IEC 61800-7-201), finite state automaton of the power drive system, objects 6040h and 6041h.
+Source: CiA 402-2 (IEC 61800-7-201), finite state automaton of the power drive system, objects 6040h
+and 6041h.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ class State(Enum):
 
 
 POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT)
-"""States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does, in UNKNOWN it may."""
+"""States in which a drive gives its motor no power;
+in FAULT REACTION ACTIVE it still does, in UNKNOWN it may.
+"""
 
 ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 """States in which the drive function is enabled and the motor has torque."""
@@ -86,7 +89,8 @@ _PATHS = {
         State.SWITCHED_ON: ControlCommand.ENABLE_OPERATION,
         State.OPERATION_ENABLED: ControlCommand.ENABLE_OPERATION,
     },
-    # One step at a time: voltage is removed only after the drive has stopped and its brake could close.
+    # One step at a time: voltage is removed only after the drive has stopped and its brake could
+    # close.
     Goal.SWITCH_ON_DISABLED: {
         State.OPERATION_ENABLED: ControlCommand.DISABLE_OPERATION,
         State.SWITCHED_ON: ControlCommand.SHUTDOWN,
@@ -101,12 +105,18 @@ _PATHS = {
 def next_command(state: State, goal: Goal) -> ControlCommand:
     """Return the next command on the path from a state to a goal.
 
-    From FAULT, and from every state without a path, it is DISABLE VOLTAGE. A fault is left by ``FAULT_RESET_SEQUENCE``
-    alone, so nothing re-enables an axis by itself. DISABLE VOLTAGE is also a harmless first controlword for drives that
-    show statusword 0000h until they receive one.
+    From FAULT, and from every state without a path, it is DISABLE VOLTAGE. A fault is left by
+    ``FAULT_RESET_SEQUENCE`` alone, so nothing re-enables an axis by itself. DISABLE VOLTAGE is also
+    a harmless first controlword for drives that show statusword 0000h until they receive one.
     """
     return _PATHS[goal].get(state, ControlCommand.DISABLE_VOLTAGE)
 
 
-FAULT_RESET_SEQUENCE = (ControlCommand.DISABLE_VOLTAGE, ControlCommand.FAULT_RESET, ControlCommand.DISABLE_VOLTAGE)
-"""Bit 7 acts on its rising edge; the sequence ends in SWITCH ON DISABLED, never in OPERATION ENABLED."""
+FAULT_RESET_SEQUENCE = (
+    ControlCommand.DISABLE_VOLTAGE,
+    ControlCommand.FAULT_RESET,
+    ControlCommand.DISABLE_VOLTAGE,
+)
+"""Bit 7 acts on its rising edge; the sequence ends in SWITCH ON DISABLED,
+never in OPERATION ENABLED.
+"""

@@ -1,4 +1,6 @@
-"""Describe a make of amplifier: its objects for position and current, their units, and the source of each fact."""
+"""Describe a make of amplifier: its objects for position and current, their units,
+and the source of each fact.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,9 @@ from enum import Enum
 class Amplitude(Enum):
     """Convention of a current value; peak against RMS alone is a 41 % gain error.
 
-    QUADRATURE is the torque-making component of a field-oriented loop, in the length that the drive's transformation
-    gives it. UNSTATED is a convention that was chosen when the drive was set up and that it does not report.
+    QUADRATURE is the torque-making component of a field-oriented loop, in the length that the
+    drive's transformation gives it. UNSTATED is a convention that was chosen when the drive was set
+    up and that it does not report.
     """
 
     PEAK = "peak"
@@ -34,9 +37,9 @@ class TapPoint(Enum):
 class FactBasis(Enum):
     """Evidence for a fact of a profile, the strongest first.
 
-    EDS: the manufacturer's electronic data sheet. MANUAL: the manufacturer's text, read. STANDARD: required by CiA 301
-    or 402, not checked for this drive. NOTES: this project's notes on amplifiers, not traced to a text of the
-    manufacturer. ASSUMED: not checked at all.
+    EDS: the manufacturer's electronic data sheet. MANUAL: the manufacturer's text, read. STANDARD:
+    required by CiA 301 or 402, not checked for this drive. NOTES: this project's notes on
+    amplifiers, not traced to a text of the manufacturer. ASSUMED: not checked at all.
     """
 
     EDS = "eds"
@@ -57,9 +60,12 @@ class Mapping(Enum):
 class ScaleForm(Enum):
     """Known conversions from a raw number to ampere; each becomes a `CurrentScale`.
 
-    PRODUCT: factor × objects. PER_MILLE: of a rated current in the drive [mA]. FIXED_STEP: ampere per digit.
-    DIGITS_OF_PEAK: digits of the drive's peak current, which the operator enters. DIGITS_OF_REPORTED_PEAK: the same,
-    with the peak current in the drive [mA]. SWITCHED_PER_MILLE: of the rated current or of it over √2, by an object.
+    - PRODUCT: factor × objects.
+    - PER_MILLE: of a rated current in the drive [mA].
+    - FIXED_STEP: ampere per digit.
+    - DIGITS_OF_PEAK: digits of the drive's peak current, which the operator enters.
+    - DIGITS_OF_REPORTED_PEAK: the same, with the peak current in the drive [mA].
+    - SWITCHED_PER_MILLE: of the rated current or of it over √2, by an object.
     """
 
     PRODUCT = "product"
@@ -93,11 +99,14 @@ class CurrentScale:
     factor: float  #: of the product
     objects: tuple[ObjectEntry, ...]  #: of the product; they are read by SDO at connect
     form: ScaleForm = ScaleForm.PRODUCT  #: in a profile file
-    switch: ObjectEntry | None = None  #: object whose value selects a weight, None where there is no choice
+    #: object whose value selects a weight, None where there is no choice
+    switch: ObjectEntry | None = None
     weights: tuple[float, ...] = (1.0,)  #: for the switch's values 0, 1, and so on
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
-        """Return the scale for the values of the objects and of the switch; IndexError for an unknown one."""
+        """Return the scale for the values of the objects and of the switch;
+        IndexError for an unknown one.
+        """
         if not 0 <= choice < len(self.weights):
             raise IndexError(choice)
         return self.factor * math.prod(values) * self.weights[choice]
@@ -127,7 +136,8 @@ class Save:
 
     command: ObjectEntry  #: object to write
     signature: int  #: its value ("save" of CiA 301)
-    mapping: Mapping  #: whether it saves PDO mappings too; those of a recording must then be restored before
+    #: whether it saves PDO mappings too; those of a recording must then be restored before
+    mapping: Mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +151,9 @@ class Fact:
 
 @dataclass(frozen=True, slots=True)
 class DriveProfile:
-    """Objects, types, scales and conventions of one make of amplifier, each fact with its source."""
+    """Objects, types, scales and conventions of one make of amplifier,
+    each fact with its source.
+    """
 
     name: str
     position: ObjectEntry  #: encoder position [counts], motor side
@@ -149,20 +161,25 @@ class DriveProfile:
     current_scale: CurrentScale  #: from raw unit to ampere in the stated amplitude convention
     amplitude: Amplitude
     tap: TapPoint
-    saturation_bit: int | None  #: bit of statusword 6041h that shows an active limit, None when the drive has none
+    #: bit of statusword 6041h that shows an active limit, None when the drive has none
+    saturation_bit: int | None
     update_period_us: int  #: period in which the drive refreshes the mapped objects
-    save_semantics: str  #: content of a save, in words; it decides what must be restored before a save
+    #: content of a save, in words; it decides what must be restored before a save
+    save_semantics: str
     source: str  #: documents, in short
     facts: tuple[Fact, ...] = ()  #: the same for each key of the profile
-    rated: RatedMotor | None = None  #: the motor's rated values in the drive, None where it has none
+    #: the motor's rated values in the drive, None where it has none
+    rated: RatedMotor | None = None
     save: Save | None = None  #: command that saves, None where there is none or it is unknown
-    #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none: then frozen
-    #: data show as values that do not change in a move (drivers/stream/watch.py).
+    #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it
+    #: has none: then frozen data show as values that do not change in a move
+    #: (drivers/stream/watch.py).
     toggle_bit: int | None = None
-    #: Torque actual value [per mille of the rated torque], None where the drive has none. It is compared with the
-    #: identified gain, and no fit uses it.
+    #: Torque actual value [per mille of the rated torque], None where the drive has none. It is
+    #: compared with the identified gain, and no fit uses it.
     torque: ObjectEntry | None = None
-    temperature: Thermometer | None = None  #: of the motor or the drive, None where the drive reports none
+    #: of the motor or the drive, None where the drive reports none
+    temperature: Thermometer | None = None
 
     @property
     def signal(self) -> str:
@@ -188,15 +205,17 @@ CIA402 = DriveProfile(
     source="CiA 402-2 (objects 6041h, 6064h, 6074h, 6075h, 6076h)",
     rated=RatedMotor(ObjectEntry(0x6075, 0, 32), torque=ObjectEntry(0x6076, 0, 32)),
 )
-"""An amplifier that follows the standard: position in 6064h, torque demand in 6074h as per mille of rated current."""
+"""An amplifier that follows the standard: position in 6064h,
+torque demand in 6074h as per mille of rated current.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
     """Object 1018h (CiA 301).
 
-    The vendor alone is mandatory. None stands for a field that a drive does not have, or that a configuration leaves
-    open.
+    The vendor alone is mandatory. None stands for a field that a drive does not have, or that a
+    configuration leaves open.
     """
 
     vendor_id: int
@@ -204,7 +223,9 @@ class Identity:
     serial: int | None = None
 
     def differences(self, found: Identity) -> tuple[str, ...]:
-        """Describe each field in which a drive differs from this configuration; a serial number is decimal."""
+        """Describe each field in which a drive differs from this configuration;
+        a serial number is decimal.
+        """
         fields = (
             ("vendor id 1018h:01", "#x", self.vendor_id, found.vendor_id),
             ("product code 1018h:02", "#x", self.product_code, found.product_code),
@@ -214,8 +235,13 @@ class Identity:
         for name, notation, expected, reported in fields:
             if expected is None or expected == reported:
                 continue
-            number = "not reported" if reported is None else format(reported, notation)
-            described.append(f"{name} is {number}, the cell configuration expects {expected:{notation}}")
+            if reported is None:
+                number = "not reported"
+            else:
+                number = format(reported, notation)
+            described.append(
+                f"{name} is {number}, the cell configuration expects {expected:{notation}}"
+            )
         return tuple(described)
 
 
@@ -278,7 +304,9 @@ class DriveParameter:
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for {self}")
         try:
-            data = struct.pack(_CODES[self.kind], value if self.kind is ParameterKind.F32 else round(value))
+            data = struct.pack(
+                _CODES[self.kind], value if self.kind is ParameterKind.F32 else round(value)
+            )
         except (struct.error, OverflowError) as error:
             raise ValueError(f"{value:g} does not fit {self.kind.value} {self}") from error
         return int.from_bytes(data, "little")

@@ -1,4 +1,6 @@
-"""Control loops of a set of amplifiers: tuning, set-point, position and velocity loop, limits, monitoring."""
+"""Control loops of a set of amplifiers:
+tuning, set-point, position and velocity loop, limits, monitoring.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +18,24 @@ from drivers.simulation.plant import Plant, reduction
 from drivers.simulation.spec import CellSpec, FloatArray, IntArray
 
 VELOCITY_BANDWIDTH_RAD_S = 220.0
-"""Bandwidth of the closed velocity loop at the tuned inertia; an axis a few times lighter is still stable."""
+"""Bandwidth of the closed velocity loop at the tuned inertia;
+an axis a few times lighter is still stable.
+"""
 
 POSITION_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 4.0
 INTEGRAL_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 5.0
 
 REDUNDANT_BANDWIDTH_RAD_S = 48.0
-"""Bandwidth of the velocity loops of redundant drives. Each drive follows a trapezoid of its own, and between two poses
-these agree only nearly: what they disagree about becomes preload, in proportion to the stiffness of the loops. Such
-drives have no integral part either, for their integrals would wind up against each other (Müller and Hufnagel 2012)."""
+"""Bandwidth of the velocity loops of redundant drives.
 
-VELOCITY_FILTER_S = 0.0008  #: Time constant of the velocity filter: one encoder count a substep is a coarse velocity
+Each drive follows a trapezoid of its own, and between two poses these agree only nearly: what they
+disagree about becomes preload, in proportion to the stiffness of the loops. Such drives have no
+integral part either, for their integrals would wind up against each other (Müller and Hufnagel
+2012).
+"""
+
+#: Time constant of the velocity filter: one encoder count a substep is a coarse velocity
+VELOCITY_FILTER_S = 0.0008
 
 POSTURES = 3  #: Positions tried for each joint in tuning
 
@@ -57,11 +66,14 @@ STATE = (
     "inside_for_s",
 )
 COUNTERS = ("enabled", "piece", "counts")
-STATUS_BITS = ("reached", "limited", "following_error")  #: `limited` stays set for the rest of a sample period
+#: `limited` stays set for the rest of a sample period
+STATUS_BITS = ("reached", "limited", "following_error")
 _FLOATS = [(name, "f8") for name in SETTINGS + STATE]
 _INTEGERS = [(name, "i8") for name in COUNTERS + STATUS_BITS]
 LOOP = np.dtype([*_FLOATS, *_INTEGERS], align=True)
-"""One record an axis; positions in motor counts, velocities in counts/s, accelerations in counts/s²."""
+"""One record an axis; positions in motor counts, velocities in counts/s,
+accelerations in counts/s².
+"""
 
 
 def counts_per_rad(spec: CellSpec) -> FloatArray:
@@ -70,11 +82,12 @@ def counts_per_rad(spec: CellSpec) -> FloatArray:
 
 
 def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
-    """Return the current per motor acceleration [A per count/s²] to which the loops are tuned, shape (n,).
+    """Return the current per motor acceleration [A per count/s²] to which the loops are tuned,
+    shape (n,).
 
-    It is the geometric mean of the smallest and largest inertia that each motor meets over the postures, and without
-    and with `CellSpec.tuned_with`, signed as the axis is wired. A closed chain has only the posture of its start: in
-    others its loops would have to be closed.
+    It is the geometric mean of the smallest and largest inertia that each motor meets over the
+    postures, and without and with `CellSpec.tuned_with`, signed as the axis is wired. A closed
+    chain has only the posture of its start: in others its loops would have to be closed.
     """
     if spec.tuned_with is None:
         inertias = _inertias(spec, plant)
@@ -84,13 +97,17 @@ def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
         inertias = _inertias(spec, Plant(bare)) + _inertias(spec, Plant(loaded))
     inertia = np.sqrt(np.min(inertias, axis=0) * np.max(inertias, axis=0))
     gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
-    # Joint-side rad/s² of a motor is its own over N; g/N keeps the sign of gear and wiring together.
+    # Joint-side rad/s² of a motor is its own over N; g/N keeps the sign of gear and wiring
+    # together.
     return np.asarray(inertia / (gain * reduction(spec.ratio) * counts_per_rad(spec)))
 
 
 def _inertias(spec: CellSpec, plant: Plant) -> list[FloatArray]:
-    """Inertia that each motor meets in postures of the arm with what is mounted, shape (m,) each."""
-    # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
+    """Inertia that each motor meets in postures of the arm with what is mounted, shape (m,)
+    each.
+    """
+    # The first joint's position changes no inertia; of long chains the joints behind the seventh
+    # stay where they are.
     swept = range(1, 1 if spec.closures else min(len(spec.axes), 7))
     tried = plant.postures(spec.start_rad, POSTURES)
     inertias: list[FloatArray] = []
@@ -111,7 +128,12 @@ class ProfileMove:
 
 
 def plan(
-    start: float, velocity: float, target: float, speed: float, acceleration: float, deceleration: float
+    start: float,
+    velocity: float,
+    target: float,
+    speed: float,
+    acceleration: float,
+    deceleration: float,
 ) -> ProfileMove:
     """Return the fastest velocity trapezoid from a moving set-point to a target (CiA 402-2).
 
@@ -137,7 +159,8 @@ def plan(
         pieces.append((slow_s, -sign * deceleration))
         distance -= 0.5 * (moving + speed) * slow_s
         moving = speed
-    # Distance of accelerating from `moving` to the peak p and stopping: (p² − moving²) / 2a + p² / 2d.
+    # Distance of accelerating from `moving` to the peak p and stopping: (p² − moving²) / 2a + p² /
+    # 2d.
     squared_speeds = 2.0 * distance + moving**2 / acceleration
     peak_squared = squared_speeds / (1.0 / acceleration + 1.0 / deceleration)
     reachable = math.sqrt(max(peak_squared, 0.0))
@@ -178,11 +201,13 @@ def control(
     counts_per_rad: FloatArray,
     step_s: float,
 ) -> None:
-    """Run one substep of every axis: read the encoder, move the set-point, compute the current for the next substep.
+    """Run one substep of every axis: read the encoder, move the set-point,
+    compute the current for the next substep.
 
     Args:
         loops: LOOP records, changed in place, shape (n,).
-        piece_s, piece_acceleration: pieces of constant acceleration of each set-point, shape (n, SEGMENTS).
+        piece_s, piece_acceleration: pieces of constant acceleration of each set-point, shape (n,
+            SEGMENTS).
         motor_rad: angle of each rotor, shape (n,).
         counts_per_rad: of the encoders, shape (n,).
         step_s: substep.
@@ -205,8 +230,12 @@ def control(
 
 
 @compiled
-def _move_demand(axis: np.void, piece_s: FloatArray, piece_acceleration: FloatArray, step_s: float) -> None:
-    """Move the piecewise quadratic set-point, exactly also where a piece ends inside the substep."""
+def _move_demand(
+    axis: np.void, piece_s: FloatArray, piece_acceleration: FloatArray, step_s: float
+) -> None:
+    """Move the piecewise quadratic set-point, exactly also where a piece ends inside the
+    substep.
+    """
     left = step_s
     while left > 0.0 and axis["piece"] < len(piece_s):
         k = axis["piece"]
@@ -229,13 +258,17 @@ def _move_demand(axis: np.void, piece_s: FloatArray, piece_acceleration: FloatAr
 
 @compiled
 def _follow(axis: np.void, error: float, step_s: float) -> None:
-    """Control the position (P over velocity PI, velocity and acceleration feed-forward); the error in counts."""
+    """Control the position (P over velocity PI, velocity and acceleration feed-forward);
+    the error in counts.
+    """
     wanted = axis["demand_velocity"] + axis["position_1_s"] * error
     velocity_error = wanted - axis["velocity"]
     wanted_acceleration = axis["velocity_1_s"] * velocity_error + axis["demand_acceleration"]
     current = axis["inertia_a_s2"] * wanted_acceleration + axis["integral_a"]
     limit = axis["limit_a"]
-    push = axis["inertia_a_s2"] * axis["velocity_1_s"] * axis["integral_1_s"] * velocity_error * step_s
+    push = (
+        axis["inertia_a_s2"] * axis["velocity_1_s"] * axis["integral_1_s"] * velocity_error * step_s
+    )
     limited = abs(current) >= limit
     if limited:
         axis["limited"] = 1
@@ -248,7 +281,9 @@ def _follow(axis: np.void, error: float, step_s: float) -> None:
 
 @compiled
 def _watch(axis: np.void, error: float, arrived: bool, step_s: float) -> None:
-    """Monitor the following error (6065h, 6066h) and target window (6067h, 6068h); the error in counts."""
+    """Monitor the following error (6065h, 6066h) and target window (6067h, 6068h);
+    the error in counts.
+    """
     if abs(error) > axis["error_window"]:
         axis["error_for_s"] += step_s
         if axis["error_for_s"] >= axis["error_time_s"]:
@@ -279,7 +314,9 @@ class Readings:
 
 
 @compiled
-def _fill(loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: IntArray) -> None:
+def _fill(
+    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: IntArray
+) -> None:
     """Fill one row for each field of Readings, in their order, shape (8, n)."""
     for i in range(len(loops)):
         axis = loops[i]
@@ -300,7 +337,9 @@ def _fill(loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: Floa
 
 
 class AmplifierSet:
-    """Loops of the n amplifiers of one cell, at rest where the plant is, and the currents that they report."""
+    """Loops of the n amplifiers of one cell, at rest where the plant is,
+    and the currents that they report.
+    """
 
     def __init__(self, spec: CellSpec, plant: Plant) -> None:
         n = len(spec.axes)
@@ -318,7 +357,8 @@ class AmplifierSet:
         self.loops["filter"] = -np.expm1(-self.step_s / VELOCITY_FILTER_S)
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
-        self.reported_a = np.zeros(n)  #: current reference with its noise, as in 6074h [A]; renewed once a SYNC
+        #: current reference with its noise, as in 6074h [A]; renewed once a SYNC
+        self.reported_a = np.zeros(n)
         self.actual_a = np.zeros(n)  #: current of the motor at the same moment [A]
         self.temperature_c = plant.temperature_c  #: of the motors [°C]; the plant's own array
         self._counts_per_rad = counts_per_rad(spec)
@@ -339,7 +379,14 @@ class AmplifierSet:
 
     def control(self, motor_rad: FloatArray) -> None:
         """Run one substep; ``loops["current_a"]`` then holds the currents for the next one."""
-        control(self.loops, self._piece_s, self._piece_acceleration, motor_rad, self._counts_per_rad, self.step_s)
+        control(
+            self.loops,
+            self._piece_s,
+            self._piece_acceleration,
+            motor_rad,
+            self._counts_per_rad,
+            self.step_s,
+        )
         if self._lags:
             self._lagged_a[:] = self.loops["current_a"]
             for lag in self._lags:

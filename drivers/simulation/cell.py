@@ -1,4 +1,6 @@
-"""Simulated cell on one or several CAN buses: n nodes and one plant that advance in lockstep with SYNC."""
+"""Simulated cell on one or several CAN buses:
+n nodes and one plant that advance in lockstep with SYNC.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +27,16 @@ SYNC_ID = 0x080
 
 IDLE_S = 0.02  #: Longest wait for a frame [s]; it limits the punctuality of heartbeats by wall time
 
-LONE_REST_S = 0.1  #: Plant time without a moving axis after which time that runs without SYNC stops again
-LONE_CYCLES = 100  #: Most cycles without SYNC between two looks at the bus: a busy machine goes on answering
+#: Plant time without a moving axis after which time that runs without SYNC stops again
+LONE_REST_S = 0.1
+#: Most cycles without SYNC between two looks at the bus: a busy machine goes on answering
+LONE_CYCLES = 100
 
-PATIENCE = 3  #: SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first
+#: SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first
+PATIENCE = 3
 
-Cycles = tuple[frozenset[int], ...]  #: Cycles to run now, each given by the buses whose nodes take part
+#: Cycles to run now, each given by the buses whose nodes take part
+Cycles = tuple[frozenset[int], ...]
 
 
 POWERED = (
@@ -40,14 +46,17 @@ POWERED = (
     PowerState.FAULT_REACTION_ACTIVE,
 )
 
-Mounted = Callable[[], CellSpec | None]  #: Return the cell with its present payload, or None if unchanged
+#: Return the cell with its present payload, or None if unchanged
+Mounted = Callable[[], CellSpec | None]
 
 
 class SyncGate:
-    """Combines the SYNCs of several buses into cycles: a cycle begins when each bus has received one.
+    """Combines the SYNCs of several buses into cycles:
+    a cycle begins when each bus has received one.
 
-    A bus without SYNC is left out when too many of another bus wait, or when the cell closes the gate after `IDLE_S`.
-    Its next SYNC is late: its nodes answer it, time does not advance, and later cycles include the bus again.
+    A bus without SYNC is left out when too many of another bus wait, or when the cell closes the
+    gate after `IDLE_S`. Its next SYNC is late: its nodes answer it, time does not advance, and
+    later cycles include the bus again.
     """
 
     def __init__(self, buses: int) -> None:
@@ -98,14 +107,15 @@ class _LoneTime:
 class SimulatedCell:
     """Cell that answers on a bus until it is closed.
 
-    Each SYNC (COB-ID 80h) advances the plant by one sync period and is answered with the transmit PDOs, so equal frames
-    give equal answers. SDO, NMT and heartbeats need no SYNC. On several buses the plant advances when SYNC has come on
-    all of them, and each node receives its own bus only.
+    Each SYNC (COB-ID 80h) advances the plant by one sync period and is answered with the transmit
+    PDOs, so equal frames give equal answers. SDO, NMT and heartbeats need no SYNC. On several buses
+    the plant advances when SYNC has come on all of them, and each node receives its own bus only.
 
-    When the heartbeat that a node monitors (1016h) stays away, its master is gone and sends no SYNC either: the plant
-    then advances by the clock until no axis moves any more, or a SYNC comes.
+    When the heartbeat that a node monitors (1016h) stays away, its master is gone and sends no SYNC
+    either: the plant then advances by the clock until no axis moves any more, or a SYNC comes.
 
-    As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread.
+    As a context manager it answers in a thread of its own; ``serve_forever`` answers in the
+    caller's thread.
     """
 
     def __init__(
@@ -119,10 +129,13 @@ class SimulatedCell:
 
         Args:
             spec: description of the cell.
-            bus: any python-can bus that does not receive its own messages, or a split bus; the caller shuts it down.
-            clock: seconds, for heartbeats while no SYNC comes, and for the end of the motion of a master that is gone.
-            mounted: exchanges the payload while no axis has power; called after each wait for a frame, so it must be
-                fast, and another object is another payload. The loops keep their tuning, as those of real drives do.
+            bus: any python-can bus that does not receive its own messages, or a split bus; the
+                caller shuts it down.
+            clock: seconds, for heartbeats while no SYNC comes, and for the end of the motion of a
+                master that is gone.
+            mounted: exchanges the payload while no axis has power; called after each wait for a
+                frame, so it must be fast, and another object is another payload. The loops keep
+                their tuning, as those of real drives do.
 
         Raises:
             SpecInvalid: the description is wrong, or a node is on none of the buses.
@@ -132,11 +145,13 @@ class SimulatedCell:
             raise SpecInvalid(f"node ids must differ and lie in 1 to 127, found {ids}")
         if spec.sync_period_us < 1 or spec.substeps < 1:
             raise SpecInvalid(
-                f"sync period {spec.sync_period_us} us in {spec.substeps} substeps; both must be at least 1"
+                f"sync period {spec.sync_period_us} us in {spec.substeps} substeps; both must be "
+                "at least 1"
             )
         self._spec = spec
         self._mounted = mounted
-        self.plant = Plant(spec)  #: its mechanics (read it when the cell is closed, or between answers)
+        #: its mechanics (read it when the cell is closed, or between answers)
+        self.plant = Plant(spec)
         self.cycles = 0  #: SYNCs since power-on
         self._amplifiers = AmplifierSet(spec, self.plant)
         # Compile with numba on copies: the first SYNC must not wait for it.
@@ -168,7 +183,9 @@ class SimulatedCell:
         self._failure: Exception | None = None
 
     def __enter__(self) -> SimulatedCell:
-        self._thread = threading.Thread(target=self._serve_in_thread, name="simulated cell", daemon=True)
+        self._thread = threading.Thread(
+            target=self._serve_in_thread, name="simulated cell", daemon=True
+        )
         self._thread.start()
         return self
 
@@ -263,7 +280,9 @@ class SimulatedCell:
                 node.receive(message.arbitration_id, bytes(message.data), self._clock)
 
     def _run_alone(self, wall_s: float) -> None:
-        """Advance by wall time while the axes of a master that is gone come to rest; no node receives a SYNC."""
+        """Advance by wall time while the axes of a master that is gone come to rest;
+        no node receives a SYNC.
+        """
         lone = self._lone
         period_s = self._spec.sync_period_us * 1e-6
         for _ in range(LONE_CYCLES):
@@ -311,7 +330,9 @@ class SimulatedCell:
                     node.strike(fault, self._clock())
             if fault.kind in ERROR_FRAMES:
                 error_class, data = ERROR_FRAMES[fault.kind]
-                error_frame = can.Message(is_error_frame=True, arbitration_id=error_class, data=data)
+                error_frame = can.Message(
+                    is_error_frame=True, arbitration_id=error_class, data=data
+                )
                 self._bus.send(error_frame)
 
     def _advance(self, wires: Collection[int]) -> None:
@@ -337,13 +358,15 @@ class SimulatedCell:
         current_a = loops["current_a"]
         for _ in range(self._spec.substeps):
             plant.step(current_a)
-            # The loops read the position at the end of the step: a reported current belongs to its reported position.
+            # The loops read the position at the end of the step: a reported current belongs to its
+            # reported position.
             amplifiers.control(plant.motor_rad)
         self.cycles += 1
         amplifiers.report()
         for node in self.nodes:
             node.end_cycle()
-        # The answers to a SYNC are one burst: on a hub one system call instead of one for each frame.
+        # The answers to a SYNC are one burst: on a hub one system call instead of one for each
+        # frame.
         self._burst = []
         for node in synchronised:
             node.send_sync(self.time_us)
@@ -371,26 +394,35 @@ class SimulatedCell:
                 raise
 
 
-def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], tuple[frozenset[int], ...]]:
+def _wires(
+    bus: can.BusABC, node_ids: Sequence[int]
+) -> tuple[tuple[str, ...], tuple[frozenset[int], ...]]:
     """Return the names of the buses, as in received frames, and the node ids on each."""
     if not isinstance(bus, SplitBus):
         return ("",), (frozenset(node_ids),)
     there = tuple(part.node_ids for part in bus.address.parts)
     alone = sorted(set(node_ids).difference(*there))
     if alone:
-        raise SpecInvalid(f"node {', '.join(map(str, alone))} is on none of the buses {bus.address}")
+        raise SpecInvalid(
+            f"node {', '.join(map(str, alone))} is on none of the buses {bus.address}"
+        )
     return tuple(map(str, bus.address.parts)), there
 
 
 def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
-    """Refuse error frames that the bus cannot carry: they would end the cell in the middle of a run."""
+    """Refuse error frames that the bus cannot carry:
+    they would end the cell in the middle of a run.
+    """
     if isinstance(bus, SplitBus):
         hub = any(part.address.kind.has_server for part in bus.address.parts)
     else:
         hub = isinstance(bus, SocketcandBus)
-    error_frame_faults = sorted({fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES})
+    error_frame_faults = sorted(
+        {fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES}
+    )
     if hub and error_frame_faults:
         raise SpecInvalid(
-            f"the faults {', '.join(error_frame_faults)} are error frames, which the socketcand protocol does not "
-            "have: leave them out (`silent` without an axis is bus-off without its error frame), or take another bus"
+            f"the faults {', '.join(error_frame_faults)} are error frames, which the socketcand "
+            "protocol does not have: leave them out (`silent` without an axis is bus-off without "
+            "its error frame), or take another bus"
         )

@@ -1,16 +1,18 @@
 """Loop closures of a simulated plant: what keeps the tree of a URDF together as a closed chain.
 
-A closure says that two frames of the tree coincide in some directions of the first. With R₁, p₁ and R₂, p₂ of the two
-frames in the base and R = R₁ᵀ R₂,
+A closure says that two frames of the tree coincide in some directions of the first. With R₁, p₁ and
+R₂, p₂ of the two frames in the base and R = R₁ᵀ R₂,
 
     φ = (R₁ᵀ (p₂ − p₁),  ½ vee(R − Rᵀ)) in the chosen directions,     J_c = ∂φ/∂q,
 
-so that a closure of two rotations leaves the third free below 180°. J_c has rank r, also where closures are
-redundant (the parallelograms of an Orthoglide hold its platform twice). Elimination with full pivots splits the joints
-into r dependent and d = n − r independent ones: J_c G = 0 with G the identity in the independent rows, and Newton's
-method on the dependent joints alone returns positions to φ = 0 (coordinate partitioning, Wehage and Haug 1982).
+so that a closure of two rotations leaves the third free below 180°. J_c has rank r, also where
+closures are redundant (the parallelograms of an Orthoglide hold its platform twice). Elimination
+with full pivots splits the joints into r dependent and d = n − r independent ones: J_c G = 0 with G
+the identity in the independent rows, and Newton's method on the dependent joints alone returns
+positions to φ = 0 (coordinate partitioning, Wehage and Haug 1982).
 
-Joints are in the order of the plant: those of the motors first, in the order of the axes, then the passive ones.
+Joints are in the order of the plant: those of the motors first, in the order of the axes, then the
+passive ones.
 """
 
 from __future__ import annotations
@@ -22,13 +24,21 @@ import numpy as np
 import pinocchio as pin
 
 from drivers.simulation.dynamics import compiled
-from drivers.simulation.spec import DIRECTIONS, BoolArray, CellSpec, FloatArray, IntArray, SpecInvalid
+from drivers.simulation.spec import (
+    DIRECTIONS,
+    BoolArray,
+    CellSpec,
+    FloatArray,
+    IntArray,
+    SpecInvalid,
+)
 
 CLOSED = 1e-12  #: Largest |φ| [m or rad] at which Newton's method stops
 
 OPEN = 1e-10  #: Largest |φ| [m or rad] that the plant accepts at the end of a step
 
-SINGULAR = 1e-7  #: Smallest pivot of the closures over the largest; below it the mechanism is in a singular pose
+#: Smallest pivot of the closures over the largest; below it the mechanism is in a singular pose
+SINGULAR = 1e-7
 
 MAX_NEWTON = 8  #: Newton steps after one step of the plant; two are usual
 
@@ -38,24 +48,31 @@ ASSEMBLY_STEP = 0.2  #: Largest change of a joint in one of them [rad or m]
 
 ASSEMBLY_LEAPS = 50  #: Poses on the way from the assembly to the start
 
-PLANAR = 1e-6  #: Largest part of a pivot's turning about another axis than its own, or that changes with the pose
+#: Largest part of a pivot's turning about another axis than its own, or that changes with the pose
+PLANAR = 1e-6
 
 START_TOLERANCE = 1e-3  #: Largest correction of a start position of redundant drives [rad or m]
 
 
 class Tree(NamedTuple):
-    """Geometry of n joints and k closures. The base is joint 0, the joints of the plant follow in their order."""
+    """Geometry of n joints and k closures.
+
+    The base is joint 0, the joints of the plant follow in their order.
+    """
 
     parent: IntArray  #: joint before each joint, shape (n + 1,)
     outwards: IntArray  #: the joints without the base, each after its parent, shape (n,)
     rotation: FloatArray  #: placement of each joint in the frame of its parent, shape (n + 1, 3, 3)
     offset: FloatArray  #: the same, its origin [m], shape (n + 1, 3)
-    slide: FloatArray  #: unit vector of each prismatic joint in its own frame, else zero, shape (n + 1, 3)
-    turn: FloatArray  #: unit vector of each revolute joint in its own frame, else zero, shape (n + 1, 3)
+    #: unit vector of each prismatic joint in its own frame, else zero, shape (n + 1, 3)
+    slide: FloatArray
+    #: unit vector of each revolute joint in its own frame, else zero, shape (n + 1, 3)
+    turn: FloatArray
     frame_joint: IntArray  #: joint that moves each frame, shape (k, 2)
     frame_rotation: FloatArray  #: placement of each frame in that joint's, shape (k, 2, 3, 3)
     frame_offset: FloatArray  #: the same, its origin [m], shape (k, 2, 3)
-    #: Closure of each of the c closed directions, and number of the direction: x, y, z, rx, ry, rz; shape (c, 2).
+    #: Closure of each of the c closed directions, and number of the direction: x, y, z, rx, ry, rz;
+    #: shape (c, 2).
     closed: IntArray
 
 
@@ -69,7 +86,9 @@ class Placed(NamedTuple):
 
 
 @compiled
-def evaluate(constants: tuple[Any, ...], position: FloatArray, error: FloatArray, jacobian: FloatArray) -> None:
+def evaluate(
+    constants: tuple[Any, ...], position: FloatArray, error: FloatArray, jacobian: FloatArray
+) -> None:
     """Compute φ, shape (c,), and J_c, shape (c, n), in place at the first n positions."""
     tree = Tree(*constants)
     joints = len(tree.parent)
@@ -130,7 +149,9 @@ def _place_joint(tree: Tree, i: int, position: float, placed: Placed) -> None:
 
 @compiled
 def _turned(axis: FloatArray, angle: float) -> FloatArray:
-    """Return the rotation about a unit vector (Rodrigues); the identity for a zero vector, a joint that slides."""
+    """Return the rotation about a unit vector (Rodrigues);
+    the identity for a zero vector, a joint that slides.
+    """
     x, y, z = axis
     if x == 0.0 and y == 0.0 and z == 0.0:
         angle = 0.0
@@ -152,7 +173,8 @@ def _turned(axis: FloatArray, angle: float) -> FloatArray:
 
 @compiled
 def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatArray) -> None:
-    """Compute φ of closure k in all six directions, shape (6,), and what each joint does to it, shape (n + 1, 6).
+    """Compute φ of closure k in all six directions, shape (6,), and what each joint does to it,
+    shape (n + 1, 6).
 
     With Ṙ = [ω] R the second part of φ changes by ½ (tr(R) I − R) ω, ω in the first frame: `spin`.
     """
@@ -190,7 +212,8 @@ def _close(tree: Tree, k: int, placed: Placed, error: FloatArray, motion: FloatA
             for a in range(3):
                 b = (a + 1) % 3
                 c = (a + 2) % 3
-                # Seen from the first frame, so that its own turning moves the second frame's origin as well.
+                # Seen from the first frame, so that its own turning moves the second frame's origin
+                # as well.
                 lever_b = p[1, b] - placed.origin[j, b]
                 lever_c = p[1, c] - placed.origin[j, c]
                 across = placed.turn[j, b] * lever_c - placed.turn[j, c] * lever_b
@@ -206,7 +229,8 @@ def eliminate(matrix: FloatArray, rank: int, held: BoolArray, pivots: IntArray) 
     """Reduce [J_c | φ], shape (c, n + 1), in place by Gauss-Jordan steps with full pivots.
 
     Args:
-        matrix: afterwards row i of the first `rank` has 1 in the column of pivot i, where all other rows have 0.
+        matrix: afterwards row i of the first `rank` has 1 in the column of pivot i, where all other
+            rows have 0.
         rank: number of pivots, r.
         held: joints that become dependent only where no other can, shape (n,).
         pivots: column of each pivot, shape (r,), output.
@@ -248,7 +272,9 @@ def eliminate(matrix: FloatArray, rank: int, held: BoolArray, pivots: IntArray) 
 
 @compiled
 def _find_pivot(matrix: FloatArray, first: int, barred: BoolArray) -> tuple[float, int, int]:
-    """Return the largest value from a row on outside the barred columns and the last one, its row and column."""
+    """Return the largest value from a row on outside the barred columns and the last one,
+    its row and column.
+    """
     best = 0.0
     at_row = first
     at_column = 0
@@ -332,8 +358,8 @@ class Mechanism:
         """Close the mechanism at its start.
 
         Raises:
-            SpecInvalid: a joint or link does not exist, the closures cannot be closed, or the motors do not move all
-                degrees of freedom.
+            SpecInvalid: a joint or link does not exist, the closures cannot be closed, or the
+                motors do not move all degrees of freedom.
         """
         names = list(model.names)[1:]
         _refuse_wrong_names(names, spec)
@@ -352,30 +378,35 @@ class Mechanism:
         jacobian = self.at(self.start_rad)[1]
         if self.mobility < 1 or motors < self.mobility:
             raise SpecInvalid(
-                f"closures: {len(ids)} joints and {len(tree.closed)} closed directions of rank {_rank(jacobian)} leave "
-                f"{self.mobility} degrees of freedom; expected at least 1 and at most the {motors} motors; correct "
-                "closures or motors"
+                f"closures: {len(ids)} joints and {len(tree.closed)} closed directions of rank "
+                f"{_rank(jacobian)} leave {self.mobility} degrees of freedom; expected at least 1 "
+                f"and at most the {motors} motors; correct closures or motors"
             )
         _, _, rows = np.linalg.svd(jacobian)
         directions = rows[-self.mobility :].T[:motors]
         if _rank(directions) < self.mobility:
             raise SpecInvalid(
-                f"motors: {', '.join(spec.motors)} move {_rank(directions)} of {self.mobility} degrees of freedom at "
-                "the start; name the joints that have motors, or start away from the singular pose"
+                f"motors: {', '.join(spec.motors)} move {_rank(directions)} of {self.mobility} "
+                "degrees of freedom at the start; name the joints that have motors, or start away "
+                "from the singular pose"
             )
 
     def at(self, position_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return φ, shape (c,), and J_c, shape (c, n)."""
         error = np.zeros(len(self._closed_directions))
         jacobian = np.zeros((len(error), len(self.joints)))
-        evaluate(self.constants, np.ascontiguousarray(position_rad, dtype=np.float64), error, jacobian)
+        evaluate(
+            self.constants, np.ascontiguousarray(position_rad, dtype=np.float64), error, jacobian
+        )
         return error, jacobian
 
     def turning(self, model: pin.Model, closure: str) -> FloatArray:
-        """Return how the two links of a planar pivot turn against each other with each joint, shape (n,).
+        """Return how the two links of a planar pivot turn against each other with each joint,
+        shape (n,).
 
-        They are entries 1, -1 and 0 at every pose where all joints of the loop turn about one direction; the links of
-        any other closure turn against each other by a row that changes with the pose.
+        They are entries 1, -1 and 0 at every pose where all joints of the loop turn about one
+        direction; the links of any other closure turn against each other by a row that changes with
+        the pose.
 
         Raises:
             SpecInvalid: there is no such closure, or it is no planar pivot.
@@ -384,14 +415,19 @@ class Mechanism:
         if not found:
             names = ", ".join(one.name for one in self._closures)
             raise SpecInvalid(f"no closure {closure!r}; there are {names}")
-        ends = [model.getFrameId(link, pin.FrameType.BODY) for link in (found[0].first, found[0].second)]
+        ends = [
+            model.getFrameId(link, pin.FrameType.BODY) for link in (found[0].first, found[0].second)
+        ]
         # A second pose, to see whether the rows stay.
         poses = (self.start_rad, self.start_rad + np.linspace(0.2, 0.4, len(self.joints)))
         rows = [_relative_turning(model, ends, self.order, pose) for pose in poses]
         about = int(np.argmax(np.abs(rows[0]).sum(axis=1)))
         others = np.delete(rows[0], about, axis=0)
         if np.abs(others).max() > PLANAR or np.abs(rows[1] - rows[0]).max() > PLANAR:
-            raise SpecInvalid(f"closure {closure}: its links turn against each other about more than one direction")
+            raise SpecInvalid(
+                f"closure {closure}: its links turn against each other about more than one "
+                "direction"
+            )
         return np.asarray(np.round(rows[0][about]))
 
     def closed(self, position_rad: FloatArray, held: Sequence[int] = (0,)) -> FloatArray:
@@ -399,7 +435,8 @@ class Mechanism:
 
         Args:
             position_rad: shape (n,).
-            held: number of joints that stay, the first ones; the next number is tried where one cannot close it.
+            held: number of joints that stay, the first ones; the next number is tried where one
+                cannot close it.
 
         Raises:
             SpecInvalid: it does not close.
@@ -421,12 +458,14 @@ class Mechanism:
         worst, _ = self._closed_directions[np.argmax(np.abs(error))]
         name = self._closures[worst].name
         raise SpecInvalid(
-            f"closures: {name} stays open by {float(np.abs(error).max()):.3g} m or rad; expected frames that can meet; "
-            "correct the assembly, the start, the frames or the directions"
+            f"closures: {name} stays open by {float(np.abs(error).max()):.3g} m or rad; expected "
+            "frames that can meet; correct the assembly, the start, the frames or the directions"
         )
 
     def _started(self, spec: CellSpec, assembled: FloatArray) -> FloatArray:
-        """Return the closed position that continues the assembly to the start of the motors, shape (n,)."""
+        """Return the closed position that continues the assembly to the start of the motors,
+        shape (n,).
+        """
         motors = len(spec.motors)
         # The rounded positions of redundant motors agree only nearly, so that these move as well.
         fixed: tuple[int, ...] = (motors,)
@@ -441,14 +480,19 @@ class Mechanism:
         if apart.max() > START_TOLERANCE:
             worst = int(apart.argmax())
             raise SpecInvalid(
-                f"start of {spec.motors[worst]}: {spec.start_rad[worst]:.6g} rad or m, where the closures allow "
-                f"{position[worst]:.6g} with the others; expected start positions that agree to {START_TOLERANCE:g}"
+                f"start of {spec.motors[worst]}: {spec.start_rad[worst]:.6g} rad or m, where the "
+                f"closures allow {position[worst]:.6g} with the others; expected start positions "
+                f"that agree to {START_TOLERANCE:g}"
             )
         return position
 
 
-def _relative_turning(model: pin.Model, ends: Sequence[int], order: IntArray, position_rad: FloatArray) -> FloatArray:
-    """Return the angular velocity of the second frame less that of the first, in the first, per joint, shape (3, n)."""
+def _relative_turning(
+    model: pin.Model, ends: Sequence[int], order: IntArray, position_rad: FloatArray
+) -> FloatArray:
+    """Return the angular velocity of the second frame less that of the first, in the first,
+    per joint, shape (3, n).
+    """
     data = model.createData()
     configuration = np.empty(len(order))
     configuration[order] = position_rad
@@ -467,20 +511,31 @@ def _rank(matrix: FloatArray) -> int:
 
 def _refuse_wrong_names(joints: Sequence[str], spec: CellSpec) -> None:
     """Refuse joints that the URDF lacks or that are missing, given its joints."""
-    for key, given in (("motors", spec.motors), ("assembly", spec.assembly_rad), ("passive", spec.passive)):
+    for key, given in (
+        ("motors", spec.motors),
+        ("assembly", spec.assembly_rad),
+        ("passive", spec.passive),
+    ):
         if unknown := sorted(set(given) - set(joints)):
             raise SpecInvalid(
-                f"{key}: the URDF has no joint {', '.join(unknown)}; expected some of {', '.join(joints)}"
+                f"{key}: the URDF has no joint {', '.join(unknown)}; expected some of "
+                f"{', '.join(joints)}"
             )
     different = len(set(spec.motors))
     if different != len(spec.motors) or different != len(spec.axes):
-        raise SpecInvalid(f"motors: {different} joints for {len(spec.axes)} axes; name one for each axis")
+        raise SpecInvalid(
+            f"motors: {different} joints for {len(spec.axes)} axes; name one for each axis"
+        )
     missing = sorted(set(joints) - set(spec.assembly_rad))
     if missing:
-        raise SpecInvalid(f"assembly: no position of {', '.join(missing)}; give a rough one of every joint")
+        raise SpecInvalid(
+            f"assembly: no position of {', '.join(missing)}; give a rough one of every joint"
+        )
     driven = sorted(set(spec.passive) & set(spec.motors))
     if driven:
-        raise SpecInvalid(f"passive: {', '.join(driven)} has a motor; its friction belongs to its axis")
+        raise SpecInvalid(
+            f"passive: {', '.join(driven)} has a motor; its friction belongs to its axis"
+        )
 
 
 def _tree(model: pin.Model, ids: Sequence[int], spec: CellSpec) -> Tree:
@@ -499,7 +554,11 @@ def _tree(model: pin.Model, ids: Sequence[int], spec: CellSpec) -> Tree:
     closed: list[tuple[int, int]] = []
     for k, closure in enumerate(spec.closures):
         frames += [link_frame(model, closure.first), link_frame(model, closure.second)]
-        closed += [(k, number) for number, direction in enumerate(DIRECTIONS) if direction in closure.directions]
+        closed += [
+            (k, number)
+            for number, direction in enumerate(DIRECTIONS)
+            if direction in closure.directions
+        ]
     parents = [place[model.parents[joint]] for joint in with_base]
     # Two frames a closure.
     frame_joint = np.array([place[frame.parentJoint] for frame in frames], dtype=np.int64)

@@ -21,14 +21,17 @@ class PowerState(Enum):
     FAULT = 0x08
 
 
-def next_state(state: PowerState, controlword: int, previous: int, stays_in_quick_stop: bool) -> PowerState:
+def next_state(
+    state: PowerState, controlword: int, previous: int, stays_in_quick_stop: bool
+) -> PowerState:
     """Return the state after a controlword (finite state automaton of CiA 402-2).
 
     Args:
         state: present state.
         controlword: object 6040h as written.
         previous: controlword before; fault reset acts on the rising edge of bit 7 alone.
-        stays_in_quick_stop: quick stop option 605Ah is 5 or 6, the only case in which transition 16 exists.
+        stays_in_quick_stop: quick stop option 605Ah is 5 or 6, the only case in which transition 16
+            exists.
     """
     after: PowerState
     if state is PowerState.FAULT:
@@ -54,7 +57,7 @@ def next_state(state: PowerState, controlword: int, previous: int, stays_in_quic
         after = PowerState.READY_TO_SWITCH_ON
     elif state is PowerState.SWITCH_ON_DISABLED:
         after = state  # switch on needs READY TO SWITCH ON first
-    else:  # switch on (3, 5); enable operation (4, and from READY TO SWITCH ON through SWITCHED ON, which is allowed)
+    else:  # switch on (3, 5); enable operation (4, and from READY TO SWITCH ON through SWITCHED ON, which is allowed)  # noqa: E501
         after = PowerState.SWITCHED_ON
         if controlword & 0x08:
             after = PowerState.OPERATION_ENABLED
@@ -72,11 +75,15 @@ class ErrorCode(IntEnum):
 
 
 Setpoint = tuple[float, float, float, float]
-"""Target, speed, acceleration and deceleration [counts, s]: objects 607Ah, 6081h, 6083h and 6084h when it was set."""
+"""Target, speed, acceleration and deceleration [counts, s]:
+objects 607Ah, 6081h, 6083h and 6084h when it was set.
+"""
 
 
 class Drive:
-    """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet."""
+    """Power state and profile position mode of one axis;
+    the loops themselves are in the AmplifierSet.
+    """
 
     def __init__(self, index: int, amplifiers: AmplifierSet, number: Callable[[int], int]) -> None:
         self._index = index
@@ -117,7 +124,9 @@ class Drive:
             self._request(controlword)
 
     def monitor(self) -> ErrorCode:
-        """Update faults, quick stop and waiting set-point after a SYNC period; return the code of a new fault."""
+        """Update faults, quick stop and waiting set-point after a SYNC period;
+        return the code of a new fault.
+        """
         if self.state is PowerState.QUICK_STOP_ACTIVE:
             if not self._stays_in_quick_stop and not self.moving:
                 self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
@@ -173,7 +182,8 @@ class Drive:
                 return
             self._waiting = None
             self._acknowledged = False
-            self._stop(self._number(0x6084 if option in (1, 5) else 0x6085))  # slow down, or quick stop
+            # Slow down, or quick stop
+            self._stop(self._number(0x6084 if option in (1, 5) else 0x6085))
             self.state = state
             return
         if state is PowerState.OPERATION_ENABLED and self.state is PowerState.QUICK_STOP_ACTIVE:
@@ -182,7 +192,9 @@ class Drive:
         self._enter(state)
 
     def _enter(self, state: PowerState) -> None:
-        """Enter a state with the power stage on or off; the set-point then holds the present position."""
+        """Enter a state with the power stage on or off;
+        the set-point then holds the present position.
+        """
         axis = self._axis
         axis["enabled"] = int(state is PowerState.OPERATION_ENABLED)
         axis["reached"] = axis["following_error"] = 0
@@ -211,7 +223,8 @@ class Drive:
             return
         self._waiting = None
         self._start(setpoint)
-        # Reported at once, so that a master does not take the end of the last move for the end of this one.
+        # Reported at once, so that a master does not take the end of the last move for the end of
+        # this one.
         self._amplifiers.readings.reached[self._index] = 0
 
     @property

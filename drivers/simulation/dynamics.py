@@ -1,24 +1,26 @@
 """One step of the equations of motion with dry friction that really sticks.
 
-With M the inertia of the links, P the motors' directions (τ = Pᵀ τ_m, Ia and motor friction act along its rows) and
-h the step:
+With M the inertia of the links, P the motors' directions (τ = Pᵀ τ_m, Ia and motor friction act
+along its rows) and h the step:
 
     A = M + Pᵀ diag(Ia + h Fv_m) P + h diag(Fv),     A v_free = (M + Pᵀ diag(Ia) P) v + h (Pᵀ τ_m + τ − c(q, q̇)),
 
-that is semi-implicit Euler with implicit viscous friction; dry friction adds A⁻¹ Dᵀ λ. Along each direction d_k (a
-joint, or a motor that turns with several joints) it gives an impulse λ_k with
+that is semi-implicit Euler with implicit viscous friction; dry friction adds A⁻¹ Dᵀ λ. Along each
+direction d_k (a joint, or a motor that turns with several joints) it gives an impulse λ_k with
 
     |λ_k| ≤ b_k,     w_k > 0 ⇒ λ_k = −b_k,     w_k < 0 ⇒ λ_k = +b_k,     w = w_free + W λ,     W = D A⁻¹ Dᵀ,
 
-where w = D v⁺ are the speeds at the end of the step and b_k is the bound [Nm] times the step [s]. This is the
-optimality condition of the convex problem min ½ λᵀ W λ + w_freeᵀ λ over the box |λ| ≤ b, so v⁺ is unique even where λ
-is not (dependent directions, eq. 25 of the seed paper), and no smoothing constant enters.
+where w = D v⁺ are the speeds at the end of the step and b_k is the bound [Nm] times the step [s].
+This is the optimality condition of the convex problem min ½ λᵀ W λ + w_freeᵀ λ over the box |λ| ≤
+b, so v⁺ is unique even where λ is not (dependent directions, eq. 25 of the seed paper), and no
+smoothing constant enters.
 
-In a closed chain the speeds are v⁺ = G x, G the basis of the speeds that its closures allow. That is the same step with
-Gᵀ A G, Gᵀ of the right side and D G in place of A, the right side and D: the impulses of the closures, of any size,
-drop out exactly, however many of them are redundant. Directions depend on each other then (a passive joint turns with
-the motors), which the solver is made for.
-"""
+In a closed chain the speeds are v⁺ = G x, G the basis of the speeds that its closures allow. That
+is the same step with Gᵀ A G, Gᵀ of the right side and D G in place of A, the right side and D: the
+impulses of the closures, of any size, drop out exactly, however many of them are redundant.
+Directions depend on each other then (a passive joint turns with the motors), which the solver is
+made for.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -34,23 +36,29 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """Compile with numba, cached in the ``__pycache__`` beside the function's file (NUMBA_CACHE_DIR overrides it).
+    """Compile with numba, cached in the ``__pycache__`` beside the function's file (NUMBA_CACHE_DIR
+    overrides it).
 
-    numba invalidates a cached function when its own file changes, not when a function it calls in another file does:
-    so compiled functions call only compiled functions of their own file.
+    numba invalidates a cached function when its own file changes, not when a function it calls in
+    another file does: so compiled functions call only compiled functions of their own file.
 
-    They loop over numbers instead of arrays, and take no optional arguments: an expression of arrays compiles numba's
-    own functions with it, each second of which a new machine waits for at its first simulated cell.
+    They loop over numbers instead of arrays, and take no optional arguments: an expression of
+    arrays compiles numba's own functions with it, each second of which a new machine waits for at
+    its first simulated cell.
     """
     return cast(F, numba.njit(cache=True)(function))
 
 
-TOLERANCE_RAD_S = 1e-10  #: Largest speed that a direction may keep while its friction is inside its bound [rad/s]
+#: Largest speed that a direction may keep while its friction is inside its bound [rad/s]
+TOLERANCE_RAD_S = 1e-10
 MAX_SWEEPS = 2_000
-SWEEPS_A_ROUND = 10  #: Sweeps that find which directions stick, before these are solved for directly
+#: Sweeps that find which directions stick, before these are solved for directly
+SWEEPS_A_ROUND = 10
 DEPENDENT = 1e-9  #: Relative pivot below which a sticking direction depends on those before it
-DEPENDENT_CLOSED = 1e-13  #: The same in a closed chain, where joints turn nearly alike close to a symmetric pose
-TOLERANCE_CLOSED = 1e-6  #: Speed that a direction of a closed chain may keep in addition, over the largest speed
+#: The same in a closed chain, where joints turn nearly alike close to a symmetric pose
+DEPENDENT_CLOSED = 1e-13
+#: Speed that a direction of a closed chain may keep in addition, over the largest speed
+TOLERANCE_CLOSED = 1e-6
 IMMOBILE = 1e-14  #: Relative mobility below which the closures of a closed chain hold a direction
 SPANNED = 1e-6  #: Sine of the angle below which a direction lies in the span of others
 
@@ -87,12 +95,14 @@ def advance(
 ) -> float:
     """Advance by one step unless dry friction stays unsolved; return its certificate [rad/s].
 
-    A direction whose friction is inside its bound sticks: the solver left it at most its tolerance of speed. Where that
-    pins a coordinate, its speed becomes exactly zero here, so that a resting axis does not creep.
+    A direction whose friction is inside its bound sticks: the solver left it at most its tolerance
+    of speed. Where that pins a coordinate, its speed becomes exactly zero here, so that a resting
+    axis does not creep.
 
     Args:
         constants: of the plant, its Mechanics as a plain tuple, which numba recognises faster.
-        mass, bias: M and c of the links, shapes (n, n) and (n,); the coordinates after the n-th have no link.
+        mass, bias: M and c of the links, shapes (n, n) and (n,); the coordinates after the n-th
+            have no link.
         viscous, torque: on each coordinate, shape (N,).
         motor_torque: along the rows of P, shape (n,).
         bound: largest impulse of each direction [Nm s], shape (m,).
@@ -115,7 +125,10 @@ def advance(
     resting = _resting(impulse, bound, directions, mechanics.lone)
     for i in range(len(velocity)):
         # Written so that v + change is exactly zero.
-        change[i] = -velocity[i] if resting[i] else after[i] - velocity[i]
+        if resting[i]:
+            change[i] = -velocity[i]
+        else:
+            change[i] = after[i] - velocity[i]
     for i in range(len(bias)):
         load_torque[i] = bias[i]
         for j in range(len(bias)):
@@ -128,7 +141,9 @@ def advance(
 
 @compiled
 def turn_rotors(rotor_direction: FloatArray, position: FloatArray, motor_rad: FloatArray) -> None:
-    """Compute the rotor angles at the end of a step, shape (m,), output, from the positions, shape (N,)."""
+    """Compute the rotor angles at the end of a step, shape (m,), output, from the positions,
+    shape (N,).
+    """
     motor_rad[:] = 0.0
     _add_times(rotor_direction, position, motor_rad)
 
@@ -149,10 +164,12 @@ def advance_closed(
     basis: FloatArray,
     resting: BoolArray,
 ) -> float:
-    """Advance a closed chain as `advance` does; the positions still have to be settled on its closures.
+    """Advance a closed chain as `advance` does;
+    the positions still have to be settled on its closures.
 
     Args:
-        constants, mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as for `advance`.
+        constants, mass, bias, viscous, motor_torque, torque, bound, impulse, position, velocity: as
+            for `advance`.
         load_torque: torque that passes from each joint to the links [Nm], shape (n,), output.
         basis: G at the position, shape (n, d).
         resting: coordinates whose speed became exactly zero, shape (N,), output.
@@ -177,7 +194,8 @@ def advance_closed(
     _substitute(reduced, free)
     response, free_speed, delassus = _respond(reduced, free, directions)
     _leave_out_immobile(delassus, free_speed, impulse, directions, response)
-    # Of two joints that turn alike but for 1e-8, one may slide while the other still sticks: too fine to solve for.
+    # Of two joints that turn alike but for 1e-8, one may slide while the other still sticks: too
+    # fine to solve for.
     largest = 0.0
     for k in range(len(free_speed)):
         largest = max(largest, abs(free_speed[k]))
@@ -202,9 +220,15 @@ def advance_closed(
 
 @compiled
 def _leave_out_immobile(
-    delassus: FloatArray, free_speed: FloatArray, impulse: FloatArray, directions: FloatArray, response: FloatArray
+    delassus: FloatArray,
+    free_speed: FloatArray,
+    impulse: FloatArray,
+    directions: FloatArray,
+    response: FloatArray,
 ) -> None:
-    """Leave out the directions that the closures hold: any impulse is a solution there, and none does anything."""
+    """Leave out the directions that the closures hold:
+    any impulse is a solution there, and none does anything.
+    """
     largest = 0.0
     for k in range(len(impulse)):
         largest = max(largest, delassus[k, k])
@@ -229,7 +253,9 @@ def _pass_on(
     after: FloatArray,
     load_torque: FloatArray,
 ) -> None:
-    """Compute what each joint passes to the links in a step: torques less rotors and friction, λ with them."""
+    """Compute what each joint passes to the links in a step:
+    torques less rotors and friction, λ with them.
+    """
     step_s = mechanics.step_s
     for i in range(len(load_torque)):
         load_torque[i] = torque[i] - viscous[i] * after[i]
@@ -238,7 +264,10 @@ def _pass_on(
     for k in range(len(motor_torque)):
         given = motor_torque[k]
         for j in range(len(after)):
-            rotor = mechanics.motor_inertia[k] * (after[j] - before[j]) / step_s + mechanics.motor_viscous[k] * after[j]
+            rotor = (
+                mechanics.motor_inertia[k] * (after[j] - before[j]) / step_s
+                + mechanics.motor_viscous[k] * after[j]
+            )
             given -= mechanics.motor_direction[k, j] * rotor
         for i in range(len(load_torque)):
             load_torque[i] += mechanics.motor_direction[k, i] * given
@@ -280,7 +309,9 @@ def _resting_closed(
     lone: IntArray,
     resting: BoolArray,
 ) -> None:
-    """Find the coordinates at rest: all where the sticking directions span the speeds, else those that stick alone."""
+    """Find the coordinates at rest: all where the sticking directions span the speeds,
+    else those that stick alone.
+    """
     size = directions.shape[1]
     span = np.zeros((size, size))
     rest = np.empty(size)
@@ -376,7 +407,9 @@ def _respond(
 
 @compiled
 def _factorise(matrix: FloatArray) -> None:
-    """Cholesky factorisation in place, lower triangle; for these sizes faster than a library call."""
+    """Cholesky factorisation in place, lower triangle;
+    for these sizes faster than a library call.
+    """
     for i in range(len(matrix)):
         for j in range(i + 1):
             s = matrix[i, j]
@@ -402,7 +435,9 @@ def _substitute(lower: FloatArray, vector: FloatArray) -> None:
 
 
 @compiled
-def _resting(impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: IntArray) -> BoolArray:
+def _resting(
+    impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: IntArray
+) -> BoolArray:
     """Return the coordinates held at rest by sticking directions, shape (N,)."""
     resting = np.zeros(directions.shape[1], dtype=np.bool_)
     for k in range(len(impulse)):
@@ -410,7 +445,8 @@ def _resting(impulse: FloatArray, bound: FloatArray, directions: FloatArray, lon
             resting[lone[k]] = True
     for k in range(len(impulse)):
         if lone[k] < 0 and abs(impulse[k]) < bound[k]:
-            # It holds its last moving coordinate: a coupled motor's brake while the other joint rests.
+            # It holds its last moving coordinate: a coupled motor's brake while the other joint
+            # rests.
             free = 0
             last = 0
             for i in range(directions.shape[1]):
@@ -434,8 +470,9 @@ def solve(
 ) -> float:
     """Solve for the impulses in place, starting from those of the step before.
 
-    Gauss-Seidel sweeps find which directions stick; where they converge slowly (ill-conditioned inertias), the sticking
-    ones are solved for directly, stopping at the first bound. Both only lower the convex cost, so together they end.
+    Gauss-Seidel sweeps find which directions stick; where they converge slowly (ill-conditioned
+    inertias), the sticking ones are solved for directly, stopping at the first bound. Both only
+    lower the convex cost, so together they end.
 
     Args:
         delassus: W, shape (m, m), symmetric, positive on the diagonal.
@@ -447,8 +484,9 @@ def solve(
         dependent: relative pivot below which a sticking direction depends on those before it.
 
     Returns:
-        the certificate: the largest |λ_k − clip(λ_k − w_k/W_kk, −b_k, b_k)| W_kk [rad/s], recomputed after the last
-        sweep. It is zero exactly at the solution; a direction inside its bound has |w_k| at most this.
+        the certificate: the largest |λ_k − clip(λ_k − w_k/W_kk, −b_k, b_k)| W_kk [rad/s],
+        recomputed after the last sweep. It is zero exactly at the solution; a direction inside its
+        bound has |w_k| at most this.
     """
     for k in range(len(free)):
         if not np.isfinite(free[k]):
@@ -475,7 +513,9 @@ def solve(
 
 
 @compiled
-def _relaxed(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, k: int) -> float:
+def _relaxed(
+    delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, k: int
+) -> float:
     """Return the impulse of direction k for given impulses of the others."""
     w = free[k]
     for j in range(len(free)):
@@ -484,14 +524,19 @@ def _relaxed(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse:
 
 
 @compiled
-def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, dependent: float) -> None:
-    """Bring the directions inside their bounds to rest by Cholesky, in as many pieces as bounds are met on the way."""
+def _stick(
+    delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, dependent: float
+) -> None:
+    """Bring the directions inside their bounds to rest by Cholesky,
+    in as many pieces as bounds are met on the way.
+    """
     m = len(free)
     lower = np.zeros((m, m))
     step = np.zeros(m)
     inside = np.zeros(m, dtype=np.bool_)
     for _ in range(m):
-        # Factorise W over the free directions; a dependent one keeps its impulse, the others can stop it as well.
+        # Factorise W over the free directions; a dependent one keeps its impulse, the others can
+        # stop it as well.
         for i in range(m):
             inside[i] = abs(impulse[i]) < bound[i]
             step[i] = 0.0
@@ -524,7 +569,9 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
 def _step_to_bound(
     lower: FloatArray, inside: BoolArray, bound: FloatArray, impulse: FloatArray, step: FloatArray
 ) -> bool:
-    """Finish the substitution, step as far as the bounds allow, and return whether a bound was met."""
+    """Finish the substitution, step as far as the bounds allow,
+    and return whether a bound was met.
+    """
     m = len(step)
     length = 1.0
     blocking = -1
@@ -542,5 +589,8 @@ def _step_to_bound(
         if inside[i]:
             impulse[i] = min(max(impulse[i] + length * step[i], -bound[i]), bound[i])
     if blocking >= 0:
-        impulse[blocking] = bound[blocking] if step[blocking] > 0.0 else -bound[blocking]
+        if step[blocking] > 0.0:
+            impulse[blocking] = bound[blocking]
+        else:
+            impulse[blocking] = -bound[blocking]
     return blocking >= 0

@@ -39,7 +39,8 @@ class FaultKind(Enum):
     FALLS_BACK = "falls-back"  # PRE-OPERATIONAL with EMCY 8130h
     REBOOTS = "reboots"  # boot-up message, settings lost
     LOSES_POWER = "loses-power"  # SWITCH ON DISABLED, as after STO
-    ERROR_PASSIVE = "error-passive"  # error frame: the controller counts too many errors, every axis
+    # Error frame: the controller counts too many errors, every axis
+    ERROR_PASSIVE = "error-passive"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +71,17 @@ ERROR_FRAMES = {
     FaultKind.BUS_OFF: (0x040, bytes(8)),
     FaultKind.ERROR_PASSIVE: (0x004, bytes((0, 0x30, 0, 0, 0, 0, 0, 0))),
 }
-"""Class and data of an error frame of this end's controller (linux/can/error.h): bus-off; both counters passive."""
-_FROZEN_BYTES = 6  #: Bytes of a TPDO that hold position and current; the statusword behind them is not frozen
+"""Class and data of an error frame of this end's controller (linux/can/error.h): bus-off;
+both counters passive.
+"""
+#: Bytes of a TPDO that hold position and current; the statusword behind them is not frozen
+_FROZEN_BYTES = 6
 
 
 class Disturbance:
-    """Faults of a cell, applied to each cycle and each frame; `cycle` is the number of the last SYNC, from 0."""
+    """Faults of a cell, applied to each cycle and each frame;
+    `cycle` is the number of the last SYNC, from 0.
+    """
 
     def __init__(self, faults: Sequence[FaultSpec]) -> None:
         self._faults = tuple(faults)
@@ -88,7 +94,9 @@ class Disturbance:
 
     def active(self, kind: FaultKind, axis: int) -> bool:
         """Return whether a lasting fault affects an axis now."""
-        return any(f.kind is kind and f.concerns(axis) and f.active(self.cycle) for f in self._faults)
+        return any(
+            f.kind is kind and f.concerns(axis) and f.active(self.cycle) for f in self._faults
+        )
 
     def beginning(self) -> tuple[FaultSpec, ...]:
         """Return the faults that begin in this cycle."""

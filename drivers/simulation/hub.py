@@ -1,12 +1,14 @@
-"""A small socketcand-protocol server: a CAN bus between processes of one machine, without any kernel driver.
+"""A small socketcand-protocol server: a CAN bus between processes of one machine,
+without any kernel driver.
 
-Every frame of one client goes to all other clients of its channel; one that no CAN bus carries is refused to its sender
-and reaches no client. The server listens on the loopback interface alone. A client that does not read is disconnected
-when ``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its next call fails.
+Every frame of one client goes to all other clients of its channel; one that no CAN bus carries is
+refused to its sender and reaches no client. The server listens on the loopback interface alone. A
+client that does not read is disconnected when ``BACKLOG_BYTES`` wait for it, so that no frame is
+lost silently: its next call fails.
 
-The first client of a channel is the cell that the hub was started for, and is never disconnected. While it has more to
-read than ``FULL_BYTES``, the others are not read: they cannot send faster than it lives, as on a wire. Neither is a
-client that does not read the hub's own answers.
+The first client of a channel is the cell that the hub was started for, and is never disconnected.
+While it has more to read than ``FULL_BYTES``, the others are not read: they cannot send faster than
+it lives, as on a wire. Neither is a client that does not read the hub's own answers.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ _BASE_DIGITS = 3
 _EXTENDED_DIGITS = 8
 _LONGEST_DATA = 8  #: Bytes of a CAN frame
 _REMEDIES = {
-    errno.EADDRINUSE: ": another hub runs on this port; use that one, end it, or choose another port (0: a free one)",
+    errno.EADDRINUSE: ": another hub runs on this port; use that one, end it, or choose another "
+    "port (0: a free one)",
     errno.EACCES: ": ports below 1024 are the system's; choose another port (0: a free one)",
 }
 
@@ -42,8 +45,8 @@ class Hub:
     """The server; runs in a thread of its own between ``__enter__`` and ``__exit__``.
 
     Args:
-        channels: names that clients may open; each is a bus of its own. Another name is refused, so that a typing
-            error does not open an empty bus.
+        channels: names that clients may open; each is a bus of its own. Another name is refused, so
+            that a typing error does not open an empty bus.
         port: to listen on; 0 chooses a free one, see ``address``.
     """
 
@@ -71,7 +74,9 @@ class Hub:
             remedy = _REMEDIES.get(error.errno or 0, "")
             reason = f"{error.strerror or error}{remedy}"
             raise BusError(f"hub {HOST}:{self._port}", reason) from error
-        self._thread = threading.Thread(target=self._loop.run_forever, name="socketcand hub", daemon=True)
+        self._thread = threading.Thread(
+            target=self._loop.run_forever, name="socketcand hub", daemon=True
+        )
         self._thread.start()
         return self
 
@@ -82,7 +87,8 @@ class Hub:
             self._server.close()
         for client in tuple(self.clients):
             client.drop()
-        self._loop.run_until_complete(asyncio.sleep(0))  # aborted connections close in the loop's next turn
+        # Aborted connections close in the loop's next turn
+        self._loop.run_until_complete(asyncio.sleep(0))
         self._loop.close()
         self._server = None
 
@@ -157,7 +163,9 @@ class _Client(asyncio.Protocol):
             self.drop()
 
     def _say(self, answers: list[bytes]) -> None:
-        """Write answers of the hub itself at once: asyncio counts all that waits again with each write."""
+        """Write answers of the hub itself at once:
+        asyncio counts all that waits again with each write.
+        """
         if answers:
             self._answered = True
             self._write(b"".join(answers))
@@ -175,7 +183,9 @@ class _Client(asyncio.Protocol):
             identifier, length, payload, command = match.groups()
             if command is not None or not self._raw:
                 answers.append(self._answer_to(command))
-            elif len(match[0]) <= _MAX_COMMAND_BYTES and (frame := _frame(identifier, int(length, 16), payload, stamp)):
+            elif len(match[0]) <= _MAX_COMMAND_BYTES and (
+                frame := _frame(identifier, int(length, 16), payload, stamp)
+            ):
                 frames.append(frame)
             else:
                 answers.append(b"< error malformed frame >")
@@ -191,7 +201,9 @@ class _Client(asyncio.Protocol):
         self._throttle()
 
     def _answer_to(self, command: bytes | None) -> bytes:
-        """Do what a command says, and return the answer; None is a frame that is sent before the raw mode."""
+        """Do what a command says, and return the answer;
+        None is a frame that is sent before the raw mode.
+        """
         words = b"send"
         if command is not None:
             words = command[:_MAX_COMMAND_BYTES]
@@ -217,7 +229,8 @@ def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> byte
     """Return a frame as the other clients receive it, or None where no CAN bus carries it.
 
     Args:
-        identifier: hexadecimal digits, up to three for a base one (11 bits) and eight for an extended one (29 bits).
+        identifier: hexadecimal digits, up to three for a base one (11 bits) and eight for an
+            extended one (29 bits).
         length: stated number of data bytes.
         payload: the data, two digits a byte, or one for a small byte between spaces.
         stamp: seconds since 1970.

@@ -73,7 +73,9 @@ class Node:
         self._amplifiers = amplifiers
         self._send = send
         self._dictionary = amplifier_dictionary(axis)
-        self._signals = {current.key: current.source(amplifiers, index) for current in vendor(axis).currents}
+        self._signals = {
+            current.key: current.source(amplifiers, index) for current in vendor(axis).currents
+        }
         self._values = {key: entry.default for key, entry in self._dictionary.items()}
         self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary, self._source)
         self.saved = self._stored()  #: parameters that become valid with the next power-on
@@ -145,12 +147,14 @@ class Node:
             self._heard_wall_s = wall_s
 
     def keep_time(self, now_us: int, wall_s: float) -> bool:
-        """React by 6007h when the monitored heartbeat is overdue, and send the own one when it is due.
+        """React by 6007h when the monitored heartbeat is overdue,
+        and send the own one when it is due.
 
         Returns:
             whether the monitored heartbeat has become overdue now.
         """
-        # Without SYNC plant time is stopped: the first is judged by wall time, the second by the faster of both.
+        # Without SYNC plant time is stopped: the first is judged by wall time, the second by the
+        # faster of both.
         allowed_ms = self._values[0x1016, 1] & 0xFFFF
         heard_s = self._heard_wall_s
         lost = False
@@ -174,7 +178,9 @@ class Node:
         return lost
 
     def fall_back(self) -> None:
-        """React to a heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""
+        """React to a heartbeat error: EMCY, the reaction of 6007h,
+        and PRE-OPERATIONAL (the default of 1029h).
+        """
         self._emergency(ErrorCode.HEARTBEAT_LOST)
         self._connection_lost()
         self.nmt = NmtState.PRE_OPERATIONAL
@@ -198,7 +204,8 @@ class Node:
                 self._values[0x1005, 0] |= 1 << 30  # the cell sends the SYNC
             case FaultKind.NO_GUARD:
                 for subindex in range(2):
-                    del self._dictionary[0x1016, subindex]  # its value stays zero: no heartbeat is monitored
+                    # Its value stays zero: no heartbeat is monitored
+                    del self._dictionary[0x1016, subindex]
             case FaultKind.REFUSES_WRITE:
                 self._refused.add(GAIN)
             case FaultKind.REFUSES_SAVE:
@@ -369,7 +376,9 @@ class Node:
         return self._values[index, subindex]
 
     def _unpack(self, pdo: Pdo, data: bytes) -> None:
-        """Set the values of a receive PDO; a controlword last, so that it acts on its companions."""
+        """Set the values of a receive PDO;
+        a controlword last, so that it acts on its companions.
+        """
         values = dict(zip(pdo.mapped, pdo.layout.unpack_from(data), strict=True))
         for key in sorted(values, key=lambda key: key == (0x6040, 0)):
             if self._dictionary[key].accepts(values[key]):
@@ -415,7 +424,9 @@ class Node:
             self._send(0x80 + self.node_id, struct.pack("<HB5x", code, register))
 
     def _stored(self) -> Stored:
-        return Stored(dict(self._values), tuple(pdo.parameters for pdo in self._receive + self._transmit))
+        return Stored(
+            dict(self._values), tuple(pdo.parameters for pdo in self._receive + self._transmit)
+        )
 
     def _restore(self, stored: Stored, first: int, last: int) -> None:
         for key, value in stored.values.items():

@@ -1,6 +1,8 @@
-"""Coloured noise of a simulated cell: of its reported currents, and of the torque that disturbs its motors.
+"""Coloured noise of a simulated cell: of its reported currents,
+and of the torque that disturbs its motors.
 
-A first-order Gauss-Markov process n of standard deviation σ and correlation time T, at steps h apart:
+A first-order Gauss-Markov process n of standard deviation σ and correlation time T, at steps h
+apart:
 
     n⁺ = m n + σ √(1 − m²) w,     m = exp(−h/T),     w standard normal,
 
@@ -61,7 +63,9 @@ class ColouredNoise:
 
 
 def random_streams(seed: int, axes: int, *kind: int) -> list[np.random.Generator]:
-    """Return a stream for each axis: its noise depends neither on the other axes nor on noise of another kind."""
+    """Return a stream for each axis: its noise depends neither on the other axes nor on noise of
+    another kind.
+    """
     streams = []
     for axis in range(axes):
         sequence = np.random.SeedSequence(seed, spawn_key=(axis, *kind))

@@ -1,8 +1,9 @@
-"""Object dictionary of a simulated CiA 402 amplifier and its SDO server (CiA 301 §7.2 and §7.5, CiA 402-2).
+"""Object dictionary of a simulated CiA 402 amplifier and its SDO server (CiA 301 §7.2 and §7.5,
+CiA 402-2).
 
-Amplifiers of a vendor differ only in the objects that a recording reads (current, rated values); states, moves and
-limits are those of CiA 402. Their units are written here from the vendors' manuals, not taken from the drive profiles,
-so that tests detect a wrong scale.
+Amplifiers of a vendor differ only in the objects that a recording reads (current, rated values);
+states, moves and limits are those of CiA 402. Their units are written here from the vendors'
+manuals, not taken from the drive profiles, so that tests detect a wrong scale.
 """
 
 from __future__ import annotations
@@ -137,7 +138,13 @@ def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
         # Manufacturer specific: the entered joint drive gain, for masters only.
         Entry(0x2003, 0, u8, ro, 2),
         Entry(0x2003, 1, i32, rw, round(1000 * axis.entered_gain_nm_per_a)),
-        Entry(0x2003, 2, u32, rw, int.from_bytes(struct.pack("<f", axis.entered_gain_nm_per_a), "little")),
+        Entry(
+            0x2003,
+            2,
+            u32,
+            rw,
+            int.from_bytes(struct.pack("<f", axis.entered_gain_nm_per_a), "little"),
+        ),
         Entry(0x2005, 0, i16),  # manufacturer specific: temperature of the motor [0.1 °C]
         Entry(0x6007, 0, i16, rw, 1, lowest=0, highest=3),
         Entry(0x603F, 0, u16, tpdo),
@@ -157,7 +164,8 @@ def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
         Entry(0x6073, 0, u16, rpdo, peak_per_mille, highest=peak_per_mille),
         Entry(0x6074, 0, i16, tpdo),
         Entry(0x6075, 0, u32, ro, round(1000 * axis.rated_current_a)),
-        # Zero unless the motor's rated torque was entered: the cell must not reveal its true torque constant.
+        # Zero unless the motor's rated torque was entered: the cell must not reveal its true torque
+        # constant.
         Entry(0x6076, 0, u32, rw, round(1000 * axis.entered_torque_nm)),
         Entry(0x6077, 0, i16, tpdo),
         Entry(0x6078, 0, i16, tpdo),
@@ -195,7 +203,9 @@ UNKNOWN_COMMAND = 0x05040001
 class SdoServer:
     """SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3)."""
 
-    def __init__(self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]) -> None:
+    def __init__(
+        self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]
+    ) -> None:
         self._read = read
         self._write = write
         self._entry = (0, 0)
@@ -204,7 +214,9 @@ class SdoServer:
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes | None:
-        """Return the response to a request of 8 bytes, or None where none is due (an abort of the client)."""
+        """Return the response to a request of 8 bytes,
+        or None where none is due (an abort of the client).
+        """
         if len(request) < 8:
             return None
         command = request[0] >> 5
@@ -215,7 +227,12 @@ class SdoServer:
             self._upload = self._download = None
         if command == 4:
             return None
-        serve = (self._continue_download, self._start_download, self._start_upload, self._continue_upload)
+        serve = (
+            self._continue_download,
+            self._start_download,
+            self._start_upload,
+            self._continue_upload,
+        )
         try:
             return (serve[command] if command < len(serve) else self._refuse)(request)
         except SdoAbort as abort:
@@ -306,7 +323,8 @@ class Vendor(NamedTuple):
     """Differences of a vendor's amplifiers from the CiA 402 dictionary."""
 
     absent: frozenset[int] = frozenset()  #: objects that they lack
-    currents: tuple[CurrentObject, ...] = ()  #: in addition to, or in place of, 6074h, 6077h and 6078h
+    #: in addition to, or in place of, 6074h, 6077h and 6078h
+    currents: tuple[CurrentObject, ...] = ()
     others: tuple[Entry, ...] = ()  #: further objects
 
 
@@ -334,12 +352,20 @@ def vendor(axis: AxisSpec) -> Vendor:
         Dialect.IPOS: Vendor(
             frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6078}),
             # 65520 internal units are twice the peak current.
-            (CurrentObject((0x6077, 0), Kind.I16, 2.0 * axis.peak_current_a / 65520.0, is_reference=False),),
+            (
+                CurrentObject(
+                    (0x6077, 0), Kind.I16, 2.0 * axis.peak_current_a / 65520.0, is_reference=False
+                ),
+            ),
         ),
         Dialect.AX2000: Vendor(
             frozenset({0x6073, 0x6075, 0x6076, 0x6078}),
             # 3280 digits are the peak current.
-            (CurrentObject((0x6074, 0), Kind.I16, axis.peak_current_a / 3280.0, is_reference=True),),
+            (
+                CurrentObject(
+                    (0x6074, 0), Kind.I16, axis.peak_current_a / 3280.0, is_reference=True
+                ),
+            ),
             (Entry(0x3529, 1, Kind.I32, default=round(1000 * axis.peak_current_a)),),
         ),
     }
@@ -347,7 +373,9 @@ def vendor(axis: AxisSpec) -> Vendor:
 
 
 def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
-    """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh), which are in pdo.py."""
+    """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh),
+    which are in pdo.py.
+    """
     make = vendor(axis)
     entries = [entry for entry in _cia402(axis) if entry.index not in make.absent]
     entries += [Entry(*current.key, current.kind, Access.TPDO) for current in make.currents]

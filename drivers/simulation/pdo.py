@@ -1,4 +1,6 @@
-"""PDOs of a simulated node: parameters, the rules for changing them, and transmission (CiA 301 §7.5.2)."""
+"""PDOs of a simulated node: parameters, the rules for changing them,
+and transmission (CiA 301 §7.5.2).
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ class PdoParameters:
     """Communication and mapping parameters."""
 
     cob_id: int  #: with bit 31 (invalid) and bit 30 (no RTR)
-    transmission: int  #: type; 1 to 240 on that many SYNCs, 0 on the SYNC after a change, 254 and 255 on a change
+    #: type; 1 to 240 on that many SYNCs, 0 on the SYNC after a change, 254 and 255 on a change
+    transmission: int
     inhibit_100us: int  #: least time between two event-driven frames
     event_timer_ms: int  #: longest time between two event-driven frames, 0 for none
     entries: tuple[int, ...]  #: mapping entries (index, subindex, bits), MAX_ENTRIES long
@@ -47,7 +50,8 @@ class PdoParameters:
 
 
 class Pdo:
-    """One PDO; its parameters can be changed only in the order that CiA 301 allows, and decide when it is sent.
+    """One PDO; its parameters can be changed only in the order that CiA 301 allows,
+    and decide when it is sent.
 
     Attributes:
         valid: the PDO exists.
@@ -57,7 +61,9 @@ class Pdo:
         locked: the mapping cannot be written.
     """
 
-    def __init__(self, direction: Access, parameters: PdoParameters, dictionary: Dictionary, source: Finder) -> None:
+    def __init__(
+        self, direction: Access, parameters: PdoParameters, dictionary: Dictionary, source: Finder
+    ) -> None:
         self._direction = direction
         self._dictionary = dictionary
         self._source = source
@@ -124,7 +130,11 @@ class Pdo:
         since_us = None
         if self._last_us is not None:
             since_us = now_us - self._last_us
-        timer = parameters.event_timer_ms and since_us is not None and since_us >= 1000 * parameters.event_timer_ms
+        timer = (
+            parameters.event_timer_ms
+            and since_us is not None
+            and since_us >= 1000 * parameters.event_timer_ms
+        )
         if data == self._last and not timer:
             return None
         if since_us is not None and since_us < 100 * parameters.inhibit_100us:
@@ -170,21 +180,27 @@ class Pdo:
             raise SdoAbort(READ_ONLY)
         kind, name = self._field(subindex)
         if name == "inhibit_100us" and self.valid:
-            raise SdoAbort(UNSUPPORTED_ACCESS)  # the inhibit time shall not change while the PDO exists
+            # The inhibit time shall not change while the PDO exists
+            raise SdoAbort(UNSUPPORTED_ACCESS)
         value = kind.decode(data)
         if name == "cob_id":
             if value & (1 << 29) or not 0x180 < (value & 0x7FF) < 0x580 or value >> 11 & 0x3FFFF:
-                raise SdoAbort(INVALID_VALUE)  # base frames alone, and no identifier that CiA 301 restricts
+                # Base frames alone, and no identifier that CiA 301 restricts
+                raise SdoAbort(INVALID_VALUE)
             if self.valid and not value & INVALID and (value ^ self.parameters.cob_id) & 0x7FF:
-                raise SdoAbort(INVALID_VALUE)  # the identifier shall not change while the PDO exists
+                # The identifier shall not change while the PDO exists
+                raise SdoAbort(INVALID_VALUE)
         elif name == "transmission" and 241 <= value <= 253:
-            raise SdoAbort(INVALID_VALUE)  # reserved, or on remote request, which these nodes do not serve
+            # Reserved, or on remote request, which these nodes do not serve
+            raise SdoAbort(INVALID_VALUE)
         change: dict[str, Any] = {name: value}
         self.parameters = replace(self.parameters, **change)
         self.reset()
 
     def write_mapping(self, subindex: int, data: bytes) -> None:
-        """Write an entry of 1600h or 1A00h; the order is COB-ID invalid, count 0, entries, count, COB-ID valid."""
+        """Write an entry of 1600h or 1A00h; the order is COB-ID invalid, count 0, entries, count,
+        COB-ID valid.
+        """
         if self.locked:
             raise SdoAbort(READ_ONLY)
         if self.valid:
@@ -219,10 +235,16 @@ class Pdo:
             raise SdoAbort(NOT_MAPPABLE)
 
 
-def default_pdos(node_id: int, dictionary: Dictionary, source: Finder) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
-    """Return receive and transmit PDOs with the default mapping of CiA 402-2; only the first of each is valid."""
+def default_pdos(
+    node_id: int, dictionary: Dictionary, source: Finder
+) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
+    """Return receive and transmit PDOs with the default mapping of CiA 402-2;
+    only the first of each is valid.
+    """
 
-    def made(direction: Access, first_cob_id: int, mappings: tuple[tuple[int, ...], ...]) -> tuple[Pdo, ...]:
+    def made(
+        direction: Access, first_cob_id: int, mappings: tuple[tuple[int, ...], ...]
+    ) -> tuple[Pdo, ...]:
         pdos = []
         for number, mapping in enumerate(mappings):
             cob_id = first_cob_id + 0x100 * number + node_id
@@ -234,5 +256,10 @@ def default_pdos(node_id: int, dictionary: Dictionary, source: Finder) -> tuple[
         return tuple(pdos)
 
     receive = ((0x60400010,), (0x60400010, 0x60600008), (0x60400010, 0x607A0020), (0x60400010,))
-    transmit = ((0x60410010,), (0x60410010, 0x60610008), (0x60410010, 0x60640020), (0x60410010, 0x606C0020))
+    transmit = (
+        (0x60410010,),
+        (0x60410010, 0x60610008),
+        (0x60410010, 0x60640020),
+        (0x60410010, 0x606C0020),
+    )
     return made(Access.RPDO, 0x200, receive), made(Access.TPDO, 0x180 | NO_RTR, transmit)

@@ -9,8 +9,23 @@ import numpy as np
 import pinocchio as pin
 
 from drivers.simulation.closures import OPEN, SINGULAR, Mechanism, link_frame, settle
-from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance, advance_closed, turn_rotors
-from drivers.simulation.effects import AMBIENT_C, Coupling, Effect, Elasticity, Lag, Moment, PivotFriction, build_effect
+from drivers.simulation.dynamics import (
+    TOLERANCE_RAD_S,
+    Mechanics,
+    advance,
+    advance_closed,
+    turn_rotors,
+)
+from drivers.simulation.effects import (
+    AMBIENT_C,
+    Coupling,
+    Effect,
+    Elasticity,
+    Lag,
+    Moment,
+    PivotFriction,
+    build_effect,
+)
 from drivers.simulation.noise import ColouredNoise, random_streams
 from drivers.simulation.spec import (
     AxisSpec,
@@ -27,7 +42,8 @@ from drivers.simulation.spec import (
 POSTURES = 8  #: Postures in which the inertia behind a flexible drive is computed
 BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
 
-DISTURBANCE = 1  #: Kind of the random streams of the torque disturbance; those of the current noise have none
+#: Kind of the random streams of the torque disturbance; those of the current noise have none
+DISTURBANCE = 1
 
 
 def _brake_nm(axis: AxisSpec) -> float:
@@ -43,7 +59,9 @@ def _only_joint(direction: FloatArray) -> int:
     return -1
 
 
-def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tuple[Mechanics, tuple[Elasticity, ...]]:
+def lay_out(
+    spec: CellSpec, effects: Sequence[Effect | Lag], joints: int
+) -> tuple[Mechanics, tuple[Elasticity, ...]]:
     """Assign coordinates and directions, and set them in the effects that add some.
 
     Args:
@@ -52,7 +70,8 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
         joints: number of joints, those of the motors first.
 
     Returns:
-        the mechanics, and the drives between a motor and its joints in the order of their coordinates.
+        the mechanics, and the drives between a motor and its joints in the order of their
+        coordinates.
 
     Raises:
         SpecInvalid: the drive train is wrong, or two flexible drives are given for one motor.
@@ -62,7 +81,9 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
     step_s = spec.sync_period_us * 1e-6 / spec.substeps
     flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity))
     if len({drive.axis for drive in flexible}) < len(flexible):
-        raise SpecInvalid("two flexible drives on one motor; give elasticity and gap in one backlash effect")
+        raise SpecInvalid(
+            "two flexible drives on one motor; give elasticity and gap in one backlash effect"
+        )
     total = joints + len(flexible)
     motor_direction = np.hstack([rows, np.zeros((n, total - n))])
     for coordinate, drive in enumerate(flexible, start=joints):
@@ -74,7 +95,8 @@ def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag], joints: int) -> tup
     for motor, row in enumerate(motor_direction):
         moved = np.flatnonzero(row)
         if len(moved) == 1 and moved[0] < joints:
-            # A motor that turns with one joint alone shares that joint's direction; r_i is 1 there by its making.
+            # A motor that turns with one joint alone shares that joint's direction; r_i is 1 there
+            # by its making.
             own_row[motor] = moved[0]
         else:
             own_row[motor] = len(directions)
@@ -122,23 +144,27 @@ def reduction(ratio: FloatArray) -> FloatArray:
 
 
 def motor_rows(ratio: FloatArray) -> FloatArray:
-    """Return r_i = R_i / N_i, shape (n, n): a motor's torque in joint units acts on the joints along r_i (eq. 24)."""
+    """Return r_i = R_i / N_i, shape (n, n): a motor's torque in joint units acts on the joints
+    along r_i (eq. 24).
+    """
     return np.asarray(ratio / reduction(ratio)[:, None], dtype=np.float64)
 
 
 class Plant:
     """Robot of n joints, revolute or prismatic, driven by the currents of m motors.
 
-    A serial robot has as many motors as joints. The joints of a closed chain are in the order of its `Mechanism`: those
-    of the motors first, then the passive ones. The coordinates are the joints, then each motor behind a flexible drive.
-    Motor torques are in joint units (τ_joint = Σ r_i g_i i_i). At power-on the robot is at rest with closed brakes.
+    A serial robot has as many motors as joints. The joints of a closed chain are in the order of
+    its `Mechanism`: those of the motors first, then the passive ones. The coordinates are the
+    joints, then each motor behind a flexible drive. Motor torques are in joint units (τ_joint = Σ
+    r_i g_i i_i). At power-on the robot is at rest with closed brakes.
 
     Attributes:
         mechanism: the closed chain, or None for a serial robot.
         position_rad, velocity_rad_s: of the coordinates, shape (N,).
         load_torque_nm: torque of the links on the joints in the last step, shape (n,).
         motor_rad: angle of each rotor [rad], shape (m,); zero at joint position zero.
-        temperature_c: temperature of each motor [°C], shape (m,); AMBIENT_C without an effect that warms it.
+        temperature_c: temperature of each motor [°C], shape (m,); AMBIENT_C without an effect that
+            warms it.
         disturbance_nm: random torque on each motor in the last step, in joint units, shape (m,).
         time_s: since power-on.
     """
@@ -147,8 +173,8 @@ class Plant:
         """Build the equations of motion.
 
         Raises:
-            SpecInvalid: URDF, drive train, axes, closures and start position do not fit together, or an undeclared
-                effect or its parameters do not exist.
+            SpecInvalid: URDF, drive train, axes, closures and start position do not fit together,
+                or an undeclared effect or its parameters do not exist.
         """
         self.mount(spec)
         n = len(spec.axes)
@@ -187,7 +213,9 @@ class Plant:
         self._torque[:n] = [-a.offset_nm for a in spec.axes]
         self._free_bound = np.zeros(m)
         self._free_bound[: self._joints] = [joint.coulomb_nm for joint in with_friction]
-        np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in spec.axes])
+        np.add.at(
+            self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in spec.axes]
+        )
         self._brake_nm = np.array([_brake_nm(axis) for axis in spec.axes])
         self._bound = self._free_bound.copy()
         self._moment = Moment(
@@ -226,15 +254,17 @@ class Plant:
         fits = self.mechanism is not None or joints == n
         if not fits or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
             raise SpecInvalid(
-                f"{n} axes, a URDF of {joints} joints, a drive train of shape {spec.ratio.shape} and a start "
-                f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
+                f"{n} axes, a URDF of {joints} joints, a drive train of shape {spec.ratio.shape} "
+                f"and a start position of shape {spec.start_rad.shape}; all must have the same "
+                "number of axes"
             )
 
     def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
         """Build the undeclared effects; pivots with friction learn how they turn with the joints.
 
         Raises:
-            SpecInvalid: an effect or its parameters do not exist, or a closure is missing or no planar pivot.
+            SpecInvalid: an effect or its parameters do not exist, or a closure is missing or no
+                planar pivot.
         """
         effects = [build_effect(effect, len(spec.axes), passive_joints) for effect in spec.effects]
         for effect in effects:
@@ -248,9 +278,10 @@ class Plant:
     def _refuse_stiff(self, flexible: Sequence[Elasticity], spec: CellSpec) -> None:
         """Refuse a drive whose motor and links would swing faster than the steps can follow.
 
-        The spring k and the damper c act with the speeds and the angle at the begin of a step h. Between two masses of
-        reduced inertia μ, that is stable for 2ch + kh² < 4μ (z² - (2 - ch/μ - kh²/μ) z + 1 - ch/μ has its roots in the
-        unit circle). The limit here is half of it, for the arm without payload.
+        The spring k and the damper c act with the speeds and the angle at the begin of a step h.
+        Between two masses of reduced inertia μ, that is stable for 2ch + kh² < 4μ (z² - (2 - ch/μ -
+        kh²/μ) z + 1 - ch/μ has its roots in the unit circle). The limit here is half of it, for the
+        arm without payload.
 
         Raises:
             SpecInvalid: a drive is too stiff.
@@ -263,16 +294,21 @@ class Plant:
         if self.mechanism is None:
             postures = list(np.transpose(self.postures(spec.start_rad, POSTURES)))
         basis = self._basis
-        masses = [basis.T @ self._mass(bare, bare.createData(), position) @ basis for position in postures]
+        masses = [
+            basis.T @ self._mass(bare, bare.createData(), position) @ basis for position in postures
+        ]
         for drive in flexible:
             row = drive.row @ basis[: len(spec.axes)]
             links = min(1.0 / float(row @ np.linalg.solve(mass, row)) for mass in masses)
             motor = spec.axes[drive.axis].motor_inertia_kg_m2
-            stiff = (2.0 * drive.damping_nm_s_per_rad + drive.stiffness_nm_per_rad * step_s) * step_s
+            stiff = (
+                2.0 * drive.damping_nm_s_per_rad + drive.stiffness_nm_per_rad * step_s
+            ) * step_s
             if stiff * (1.0 / motor + 1.0 / links) > 2.0:
                 raise SpecInvalid(
-                    f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us, a "
-                    f"motor inertia of {motor:g} kg m² and {links:.3g} kg m² behind it; lower stiffness or damping"
+                    f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of "
+                    f"{step_s * 1e6:g} us, a motor inertia of {motor:g} kg m² and {links:.3g} kg "
+                    "m² behind it; lower stiffness or damping"
                 )
 
     def set_brakes(self, closed: BoolArray) -> None:
@@ -281,20 +317,26 @@ class Plant:
         np.add.at(self._bound, self._mechanics.own_row, np.where(closed, self._brake_nm, 0.0))
 
     def mount(self, spec: CellSpec) -> None:
-        """Replace the payload by that of another description of the same cell; the state is kept."""
+        """Replace the payload by that of another description of the same cell;
+        the state is kept.
+        """
         self._model = link_model(spec)
         self._data = self._model.createData()
 
     def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
         """Return `count` positions of each joint that cover its inertia.
 
-        They are spread over one revolution from the start of a revolute joint, or over the travel of a prismatic one.
+        They are spread over one revolution from the start of a revolute joint, or over the travel
+        of a prismatic one.
         """
         angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
         lower = self._model.lowerPositionLimit
         upper = self._model.upperPositionLimit
-        # Pinocchio has a joint type for each sliding axis, as JointModelPX, or JointModelPrismaticUnaligned.
-        sliding = [str(joint.shortname()).startswith("JointModelP") for joint in self._model.joints[1:]]
+        # Pinocchio has a joint type for each sliding axis, as JointModelPX, or
+        # JointModelPrismaticUnaligned.
+        sliding = [
+            str(joint.shortname()).startswith("JointModelP") for joint in self._model.joints[1:]
+        ]
         postures = []
         for joint, start in enumerate(start_rad):
             posture = start + angles
@@ -304,20 +346,26 @@ class Plant:
         return tuple(postures)
 
     def motor_inertia_at(self, position_rad: FloatArray) -> FloatArray:
-        """Return the inertia seen by each motor with the others at rest, in joint units [kg m²], shape (m,).
+        """Return the inertia seen by each motor with the others at rest, in joint units [kg m²],
+        shape (m,).
 
-        Redundant drives cannot rest alone: with A = P G theirs is (A⁺ᵀ Gᵀ M G A⁺)ᵢᵢ / (A A⁺)ᵢᵢ, the share of motor i by
-        least squares in the motion that turns it most. A closed chain has the position of its last step alone.
+        Redundant drives cannot rest alone: with A = P G theirs is (A⁺ᵀ Gᵀ M G A⁺)ᵢᵢ / (A A⁺)ᵢᵢ, the
+        share of motor i by least squares in the motion that turns it most. A closed chain has the
+        position of its last step alone.
         """
         if self.mechanism is None:
             to_joint = np.linalg.inv(self._rows)
             links = self._mass(self._model, self._data, position_rad)
-            return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
+            return np.asarray(
+                np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia
+            )
         links = self._mass(self._model, self._data, self.position_rad[: self._joints])
         motors = self._rows @ self._basis[: len(self._gain)]
         to_speed = np.linalg.pinv(motors)
         shared = to_speed.T @ self._basis.T @ links @ self._basis @ to_speed
-        return np.asarray(np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia)
+        return np.asarray(
+            np.diag(shared) / np.diag(motors @ to_speed) + self._mechanics.motor_inertia
+        )
 
     def step(self, current_a: FloatArray) -> None:
         """Advance by one substep with the motor currents, shape (m,).
@@ -342,9 +390,9 @@ class Plant:
         residual = self._advance()
         if not residual <= TOLERANCE_RAD_S:
             raise FrictionUnsolved(
-                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
-                f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
-                "orders of magnitude"
+                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at "
+                f"most {TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for "
+                "values that differ by many orders of magnitude"
             )
         if not self._resting.all():
             self._settle()
@@ -378,15 +426,19 @@ class Plant:
         return advance_closed(*step, self._basis, self._resting)
 
     def _settle(self) -> None:
-        """Return the joints of a closed chain to its closures; nothing is done for a serial robot."""
+        """Return the joints of a closed chain to its closures;
+        nothing is done for a serial robot.
+        """
         if self.mechanism is None:
             return
-        open_by, pivot = settle(self.mechanism.constants, self._resting, self.position_rad, self._basis)
+        open_by, pivot = settle(
+            self.mechanism.constants, self._resting, self.position_rad, self._basis
+        )
         if not (open_by <= OPEN and pivot >= SINGULAR):
             raise ClosureLost(
-                f"closures at {self.time_s:.6f} s: open by {open_by:.3g} m or rad, smallest pivot {pivot:.3g} of the "
-                f"largest; expected at most {OPEN:g} and at least {SINGULAR:g}; the mechanism ran into a singular "
-                "pose: keep the limits of motion away from it"
+                f"closures at {self.time_s:.6f} s: open by {open_by:.3g} m or rad, smallest pivot "
+                f"{pivot:.3g} of the largest; expected at most {OPEN:g} and at least {SINGULAR:g}; "
+                "the mechanism ran into a singular pose: keep the limits of motion away from it"
             )
 
     def _mass(self, model: pin.Model, data: pin.Data, position_rad: FloatArray) -> FloatArray:
@@ -404,15 +456,18 @@ def _disturbance(spec: CellSpec, step_s: float) -> ColouredNoise | None:
     if not sigma_nm.any():
         return None
     correlation_s = np.array([axis.disturbance_correlation_s for axis in spec.axes])
-    return ColouredNoise(random_streams(spec.seed, len(spec.axes), DISTURBANCE), sigma_nm, correlation_s, step_s)
+    return ColouredNoise(
+        random_streams(spec.seed, len(spec.axes), DISTURBANCE), sigma_nm, correlation_s, step_s
+    )
 
 
 def link_model(spec: CellSpec) -> pin.Model:
-    """Return the links of a cell, with its payload fixed to the last joint or to the link `platform`.
+    """Return the links of a cell, with its payload fixed to the last joint or to the link
+    `platform`.
 
     Raises:
-        SpecInvalid: the text is no URDF, a joint is neither revolute nor prismatic with limits, or there is no such
-            link.
+        SpecInvalid: the text is no URDF, a joint is neither revolute nor prismatic with limits, or
+            there is no such link.
     """
     try:
         model = pin.buildModelFromXML(spec.urdf)
@@ -420,8 +475,9 @@ def link_model(spec: CellSpec) -> pin.Model:
         raise SpecInvalid(f"the URDF of the plant cannot be read: {error}") from error
     if model.nq != model.nv or model.nv != model.njoints - 1:
         raise SpecInvalid(
-            f"the URDF has {model.njoints - 1} joints with {model.nq} coordinates and {model.nv} degrees of freedom; "
-            "expected revolute or prismatic joints alone (a continuous joint is written as revolute with wide limits)"
+            f"the URDF has {model.njoints - 1} joints with {model.nq} coordinates and {model.nv} "
+            "degrees of freedom; expected revolute or prismatic joints alone (a continuous joint "
+            "is written as revolute with wide limits)"
         )
     model.gravity.linear = np.asarray(spec.gravity_m_s2, dtype=np.float64)
     payload = spec.payload

@@ -1,4 +1,7 @@
-"""Cycles of a stream: one SYNC each, and the frames until the next. Each pacing has its own in sync.py."""
+"""Cycles of a stream: one SYNC each, and the frames until the next.
+
+Each pacing has its own in sync.py.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,10 @@ from drivers.canopen.socketcan import CapturedMessage
 from drivers.errors import BusError, DriverError
 from drivers.messages import CellEvent, EventKind, EventSink
 
-LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
-LOOK_EVERY = 64  #: Frames between two looks at the clock while frames are waiting: each is a system call
+#: Largest delay of the reader behind the bus; older data cannot protect moving axes
+LARGEST_LAG_NS = 1_000_000_000
+#: Frames between two looks at the clock while frames are waiting: each is a system call
+LOOK_EVERY = 64
 
 
 def nothing_to_send(_: int) -> Sequence[can.Message]:
@@ -30,19 +35,25 @@ def is_sync(message: can.Message) -> bool:
 
 
 def arrived_ns(message: can.Message, now_ns: int) -> int:
-    """Return the monotonic time at which a frame arrived [ns]: the kernel's, or the present one without its stamp."""
-    return message.monotonic_ns if isinstance(message, CapturedMessage) else now_ns
+    """Return the monotonic time at which a frame arrived [ns]:
+    the kernel's, or the present one without its stamp.
+    """
+    if isinstance(message, CapturedMessage):
+        return message.monotonic_ns
+    return now_ns
 
 
 class CycleBus:
-    """The bus as the cycles of a stream use it: frames that arrive, frames to send, and the count of the cycles.
+    """The bus as the cycles of a stream use it:
+    frames that arrive, frames to send, and the count of the cycles.
 
     Args:
         link: its bus is open once the stream begins.
         clock: monotonic [ns].
         start_ns: time of the first SYNC in the samples [ns since 1970].
         emit: receives events.
-        between: processes a frame that is read before the next SYNC, and so answers none that is open.
+        between: processes a frame that is read before the next SYNC, and so answers none that is
+            open.
     """
 
     def __init__(
@@ -55,19 +66,20 @@ class CycleBus:
     ) -> None:
         self.link = link
         self.clock = clock
-        self.faults: deque[DriverError] = (
-            deque()
-        )  #: What must stop a recording and was not raised yet, the oldest first
+        #: What must stop a recording and was not raised yet, the oldest first.
+        self.faults: deque[DriverError] = deque()
         self.emit = emit
         self.between = between
         self.cycles = 0  #: SYNCs sent, or followed
         self.skipped = 0  #: Periods without a SYNC
-        self.time_ns = start_ns  #: Time of the last SYNC in the samples [ns since 1970]; the start before the first one
+        #: Time of the last SYNC in the samples [ns since 1970]; the start before the first one
+        self.time_ns = start_ns
         self.answered_ns = 0  #: Time of the last answer by the clock [ns], or of the first SYNC
         self.silent = False  #: Whether no axis answered the last SYNC
         #: Frames to send right before the next SYNC, which triggers synchronous RPDOs.
         self.outgoing: list[can.Message] = []
-        #: Returns frames that may wait, for a cycle that has no others to send; receives the last SYNC's time [ns].
+        #: Returns frames that may wait, for a cycle that has no others to send; receives the last
+        #: SYNC's time [ns].
         self.spare: Callable[[int], Sequence[can.Message]] = nothing_to_send
         self._start_ns = start_ns
         self._first_sync_ns = 0
@@ -105,14 +117,18 @@ class CycleBus:
             self.between(message)
 
     def batched(self) -> can.Message | None:
-        """Return a frame that was received with the one before, without a look at the clock; now and then None."""
+        """Return a frame that was received with the one before, without a look at the clock;
+        now and then None.
+        """
         self._unlooked = (self._unlooked + 1) % LOOK_EVERY
         if self._take_batched is None or self._unlooked == 0:
             return None
         return self._take_batched()
 
     def too_late(self, behind_ns: int) -> bool:
-        """Return whether the reader is too late; reported once, because the counters show whether frames were lost."""
+        """Return whether the reader is too late;
+        reported once, because the counters show whether frames were lost.
+        """
         late = behind_ns > LARGEST_LAG_NS
         if late and not self._reported_late:
             self._reported_late = True
@@ -137,16 +153,21 @@ class Cycles(ABC):
 
     def __init__(self, bus: CycleBus) -> None:
         self.bus = bus
-        self.early_sync: can.Message | None = None  #: SYNC of the next cycle, if it ended the last one
+        #: SYNC of the next cycle, if it ended the last one
+        self.early_sync: can.Message | None = None
 
     def begin(self) -> Cycles:
-        """Discard the frames from before the first SYNC; returns the cycles that fit the open bus."""
+        """Discard the frames from before the first SYNC;
+        returns the cycles that fit the open bus.
+        """
         self.bus.read_waiting()
         return self
 
     @abstractmethod
     def open(self) -> Cycles | None:
-        """Begin a cycle with its SYNC; where that SYNC comes no more, return the cycles that begin it instead."""
+        """Begin a cycle with its SYNC; where that SYNC comes no more,
+        return the cycles that begin it instead.
+        """
 
     @abstractmethod
     def next_frame(self) -> can.Message | None:

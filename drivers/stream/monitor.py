@@ -1,8 +1,8 @@
 """Watch a cell without changing it: reports of its axes, their rate, and the load of the bus.
 
-While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are overheard, each cycle a
-`Sample`. On a quiet bus the axes are read by SDO uploads, one open request a node; then a sample has the last values of
-all axes, every READING_S. Nothing is ever written.
+While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are
+overheard, each cycle a `Sample`. On a quiet bus the axes are read by SDO uploads, one open request
+a node; then a sample has the last values of all axes, every READING_S. Nothing is ever written.
 """
 
 from __future__ import annotations
@@ -25,9 +25,11 @@ from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.answers import slots_of
 
 QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
-ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
+#: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
+ANSWER_S = 0.3
 ABANDONED_S = 1.0  #: A request without an answer for so long is lost, and the axis is asked anew
-READING_S = 0.1  #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
+#: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
+READING_S = 0.1
 
 
 class ReadingSource(Enum):
@@ -55,8 +57,10 @@ class AxisReading:
     nmt: int | None  #: state in its last heartbeat, None before the first
     rate_hz: float  #: of complete readings since the last reading
     lost: int  #: SYNCs or requests without an answer since the monitor began
-    heard: bool = True  #: whether the axis sent anything since the last reading, or in the last ABANDONED_S
-    delay_s: float | None = None  #: longest time until an answer to a request since the last reading, None without one
+    #: whether the axis sent anything since the last reading, or in the last ABANDONED_S
+    heard: bool = True
+    #: longest time until an answer to a request since the last reading, None without one
+    delay_s: float | None = None
     refused: tuple[ObjectRefusal, ...] = ()  #: objects that its last answers did not give
 
     @property
@@ -112,7 +116,8 @@ class _AxisWatch:
             nmt,
             self.readings / max((now_ns - since_ns) * 1e-9, 1e-9),
             self.lost,
-            self.heard_ns is not None and self.heard_ns >= min(since_ns, now_ns - round(ABANDONED_S * 1e9)),
+            self.heard_ns is not None
+            and self.heard_ns >= min(since_ns, now_ns - round(ABANDONED_S * 1e9)),
             None if self.delay_ns is None else self.delay_ns * 1e-9,
             tuple(self.refused[column] for column in sorted(self.refused)),
         )
@@ -131,7 +136,9 @@ class _AxisWatch:
         self.readings += self.seen == self.slots.keys()
 
     def sync(self) -> None:
-        """End the time for answers to the SYNC before; losses count from an axis's first complete answer on."""
+        """End the time for answers to the SYNC before;
+        losses count from an axis's first complete answer on.
+        """
         self.lost += self.followed and self.seen != self.slots.keys()
         self.followed = self.followed or self.seen == self.slots.keys()
         self.seen.clear()
@@ -174,7 +181,9 @@ class _AxisWatch:
 
 
 class CellMonitor:
-    """Reads a bus and, where no other master is on it, its axes by SDO; nothing else may read the link meanwhile."""
+    """Reads a bus and, where no other master is on it, its axes by SDO;
+    nothing else may read the link meanwhile.
+    """
 
     def __init__(
         self,
@@ -189,13 +198,18 @@ class CellMonitor:
         Args:
             link: open bus.
             axes: of the cell.
-            on_sample: receives every sample while the bus is watched. An axis that did not answer is marked missing.
-            wall_minus_monotonic_ns: offset of the stamps of samples and events from the link's clock [ns].
-            taken: whether a recorder has taken the bus and listens before it sends; from then on nothing is sent,
-                because the recorder refuses a bus on which it hears requests.
+            on_sample: receives every sample while the bus is watched. An axis that did not answer
+                is marked missing.
+            wall_minus_monotonic_ns: offset of the stamps of samples and events from the link's
+                clock [ns].
+            taken: whether a recorder has taken the bus and listens before it sends; from then on
+                nothing is sent, because the recorder refuses a bus on which it hears requests.
         """
         self.period_ns: int | None = None
-        """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles. None counts SYNCs."""
+        """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles.
+
+        None counts SYNCs.
+        """
         self._link = link
         self._on_sample = on_sample
         self._offset_ns = wall_minus_monotonic_ns
@@ -208,7 +222,8 @@ class CellMonitor:
         self._frames: Counter[tuple[int, int]] = Counter()
         self._syncs = 0
         self._cycle = 0
-        self._sync: tuple[int, float] | None = None  # clock and stamp of the last SYNC, until its sample is complete
+        # Clock and stamp of the last SYNC, until its sample is complete
+        self._sync: tuple[int, float] | None = None
         self._sample_due_ns = 0
         self._master_ns: int | None = None
         self._began_ns = self._since_ns = link.clock()
@@ -216,8 +231,13 @@ class CellMonitor:
     @property
     def source(self) -> ReadingSource:
         """Origin of the values now; overheard until the absence of another master is certain."""
-        last_ns = self._began_ns if self._master_ns is None else self._master_ns
-        return ReadingSource.OVERHEARD if self._link.clock() - last_ns < QUIET_S * 1e9 else ReadingSource.ASKED
+        if self._master_ns is None:
+            last_ns = self._began_ns
+        else:
+            last_ns = self._master_ns
+        if self._link.clock() - last_ns < QUIET_S * 1e9:
+            return ReadingSource.OVERHEARD
+        return ReadingSource.ASKED
 
     def watch(self, seconds: float) -> CellReading:
         """Read the bus for a time and return a reading."""
@@ -233,9 +253,15 @@ class CellMonitor:
                     self._hear(message)
         now_ns = clock()
         lasted_s = max((now_ns - self._since_ns) * 1e-9, 1e-9)
-        axes = tuple(axis.take(self._link.nmt.get(axis.node_id), self._since_ns, now_ns) for axis in self._axes)
+        axes = tuple(
+            axis.take(self._link.nmt.get(axis.node_id), self._since_ns, now_ns)
+            for axis in self._axes
+        )
         self._since_ns = now_ns
-        frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
+        frames = tuple(
+            tuple(self._frames[bus, length] for length in range(9))
+            for bus in range(len(self._buses))
+        )
         sync_hz = self._syncs / lasted_s
         self._syncs = 0
         self._frames.clear()
@@ -249,7 +275,9 @@ class CellMonitor:
 
     def _ask(self) -> None:
         now_ns = self._link.clock()
-        due = [(axis, entry) for axis in self._axes if (entry := axis.next_request(now_ns)) is not None]
+        due = [
+            (axis, entry) for axis in self._axes if (entry := axis.next_request(now_ns)) is not None
+        ]
         if due and self._taken():
             self._lead()
             return
@@ -311,11 +339,16 @@ class CellMonitor:
             return
         self._sample_due_ns = now_ns + round(READING_S * 1e9)
         oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
-        self._emit(now_ns, [axis.complete_ns is None or axis.complete_ns < oldest_ns for axis in self._axes])
+        self._emit(
+            now_ns,
+            [axis.complete_ns is None or axis.complete_ns < oldest_ns for axis in self._axes],
+        )
 
     def _emit(self, time_ns: int, missing: list[bool]) -> None:
         columns = zip(*([value or 0 for value in axis.values] for axis in self._axes), strict=True)
         position, current, statusword = columns
         bits = sum(1 << number for number, absent in enumerate(missing) if absent)
-        self._on_sample(Sample(self._cycle, time_ns + self._offset_ns, position, current, statusword, bits))
+        self._on_sample(
+            Sample(self._cycle, time_ns + self._offset_ns, position, current, statusword, bits)
+        )
         self._cycle += 1

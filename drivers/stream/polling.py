@@ -1,10 +1,11 @@
 """Torque and temperature of the drives, read a few times a second by SDO beside the stream.
 
-Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without set-points, and its answer
-is taken from the frames that the stream reads anyway. SDO has a lower priority than SYNC and PDOs, so a request or an
-answer delays the frames of a cycle by its own length at most; `daq.config.cell_buses` decides whether a period has room
-for both. A lost answer is a missing reading, and so is an abort: the object is read again at its next turn, unless the
-drive says that it has none.
+Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without
+set-points, and its answer is taken from the frames that the stream reads anyway. SDO has a lower
+priority than SYNC and PDOs, so a request or an answer delays the frames of a cycle by its own
+length at most; `daq.config.cell_buses` decides whether a period has room for both. A lost answer is
+a missing reading, and so is an abort: the object is read again at its next turn, unless the drive
+says that it has none.
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.stream import SyncStream
 
 PERIOD_NS = {Quantity.TORQUE: 200_000_000, Quantity.TEMPERATURE: 1_000_000_000}
-"""Time between two readings of an axis: some hundred torques give a slope to a percent; a motor warms in minutes."""
-GIVEN_UP_NS = 250_000_000  #: Time after which an answer is lost: the SDO servers of drives need some milliseconds
+"""Time between two readings of an axis: some hundred torques give a slope to a percent;
+a motor warms in minutes.
+"""
+#: Time after which an answer is lost: the SDO servers of drives need some milliseconds
+GIVEN_UP_NS = 250_000_000
 
 
 @dataclass(eq=False, slots=True)
@@ -73,9 +77,13 @@ class Polling:
                     network.objects(axis).read(entry)
                 except ObjectAccessError as error:
                     if error.abort_code is None or error.abort_code in NO_SUCH_OBJECT:
-                        why = "" if error.abort_code is not None else f" that can be read ({error.reason})"
+                        if error.abort_code is not None:
+                            why = ""
+                        else:
+                            why = f" that can be read ({error.reason})"
                         polling._remarks.append(
-                            f"{axis.name}: the drive has no {quantity.value} in {entry}{why}; it is not logged"
+                            f"{axis.name}: the drive has no {quantity.value} in {entry}{why}; it "
+                            "is not logged"
                         )
                         continue
                     polling._remarks.append(
@@ -97,7 +105,8 @@ class Polling:
         return bool(self._sources)
 
     def temperatures(self, time_ns: int) -> tuple[SlowReading, ...]:
-        """Read every temperature now, while no stream runs; what cannot be read is missing, a lost bus included.
+        """Read every temperature now, while no stream runs;
+        what cannot be read is missing, a lost bus included.
 
         After a run all samples are there: a temperature must not cost them.
 
@@ -110,11 +119,15 @@ class Polling:
             if source.quantity is Quantity.TEMPERATURE:
                 with suppress(ObjectAccessError, BusError):
                     raw = self._network.link.objects(source.node_id).read(source.entry)
-                    found.append(SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit))
+                    found.append(
+                        SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit)
+                    )
         return tuple(found)
 
     def begin(self, stream: SyncStream, keep: Callable[[SlowReading], None]) -> None:
-        """Pass readings on from now on, made beside a stream until it stops the axes, if the bus has room."""
+        """Pass readings on from now on, made beside a stream until it stops the axes,
+        if the bus has room.
+        """
         if self._beside_stream:
             self._stream = stream
             self._keep = keep
@@ -128,13 +141,16 @@ class Polling:
         source = min(self._sources, key=lambda one: one.due_ns, default=None)
         if source is None or source.due_ns > now_ns:
             return ()
-        source.due_ns = now_ns + PERIOD_NS[source.quantity]  # from now on: after a pause nothing is caught up
+        # From now on: after a pause nothing is caught up
+        source.due_ns = now_ns + PERIOD_NS[source.quantity]
         self._asked = source
         self._asked_ns = now_ns
         return (upload_request(source.node_id, source.entry),)
 
     def _take(self, source: _Source, data: bytearray) -> None:
-        """Keep the value of an answer to the request on its way; other answers are the business of others."""
+        """Keep the value of an answer to the request on its way;
+        other answers are the business of others.
+        """
         answer = upload_answer(bytes(data), source.entry)
         if answer is None or source is not self._asked or self._stream is None:
             return
@@ -142,7 +158,9 @@ class Polling:
         if answer.value is not None:
             # The drive read its object somewhere between the request and this answer.
             time_ns = (self._asked_ns + self._stream.time_ns) // 2
-            self._keep(SlowReading(time_ns, source.axis, source.quantity, answer.value * source.per_unit))
+            self._keep(
+                SlowReading(time_ns, source.axis, source.quantity, answer.value * source.per_unit)
+            )
         elif answer.bits is not None:
             bits = f"{answer.bits} bits, expected {source.entry.bits}"
             self._drop(source, f"answers with {bits}: correct the drive profile")
@@ -163,7 +181,8 @@ class Polling:
 def slow_objects(axis: Axis, scale: ScaleReading) -> dict[Quantity, tuple[ObjectEntry, float]]:
     """Return the slow objects of an axis, each with its unit.
 
-    A torque has a unit only where the drive reports the rated torque: it is in thousandths of it (CiA 402-2, 6077h).
+    A torque has a unit only where the drive reports the rated torque: it is in thousandths of it
+    (CiA 402-2, 6077h).
     """
     found: dict[Quantity, tuple[ObjectEntry, float]] = {}
     profile = axis.profile

@@ -1,4 +1,6 @@
-"""SYNC producers other than this process: the kernel, or a drive. A stream follows them (`FollowedSync`).
+"""SYNC producers other than this process: the kernel, or a drive.
+
+A stream follows them (`FollowedSync`).
 
 A producer is started once the network is prepared and stopped before the network is left:
 
@@ -29,32 +31,43 @@ SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32)
 """Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
 PRODUCES = 1 << 30
-LEASE_S = 0.4  #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
+#: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
+LEASE_S = 0.4
 LEAST_SYNCS = 3
 RENEWAL_S = 0.025  #: Time between two renewals
 STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
 LARGEST_CORRECTION = 0.2
-"""Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
+"""Fraction of the period; a kernel that is later than that produces time stamps which are
+refused.
+"""
 # linux/can/bcm.h
 _TX_SETUP = 1
 _SET_TIMER = 0x1
 _SET_AND_START_TIMER = 0x3
-# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
+# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames;
+# then can_frame.
 _HEAD = struct.Struct("@3I4l2I0q")
 
 
 def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
     """Return the kernel's interval for the next window of so many periods [us].
 
-    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC in the whole
-    schedule (`phase_ns`) is to be corrected within one window.
+    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC
+    in the whole schedule (`phase_ns`) is to be corrected within one window.
     """
     wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
-    return round(min(max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us), (1.0 + LARGEST_CORRECTION) * period_us))
+    return round(
+        min(
+            max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us),
+            (1.0 + LARGEST_CORRECTION) * period_us,
+        )
+    )
 
 
 def setup_message(flags: int, interval_us: int) -> bytes:
-    """Return a message to the broadcast manager: send so many SYNCs as last for `LEASE_S`, then none."""
+    """Return a message to the broadcast manager:
+    send so many SYNCs as last for `LEASE_S`, then none.
+    """
     seconds, rest_us = divmod(interval_us, 1_000_000)
     count = max(LEAST_SYNCS, ceil(LEASE_S * 1e6 / interval_us))
     head = _HEAD.pack(_TX_SETUP, flags, count, seconds, rest_us, 0, 0, SYNC_COB_ID, 1)
@@ -64,10 +77,10 @@ def setup_message(flags: int, interval_us: int) -> bytes:
 class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
     """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
-    It ends with the process that started it, and `LEASE_S` after that process has seen its last SYNC: a recorder that
-    hangs must not keep the axes running, one that is stopped for 300 ms must lose nothing. Each interval counts from
-    the actual time of the last SYNC, so the period is too long by the lateness of the timer: `seen` measures that and
-    shortens the interval.
+    It ends with the process that started it, and `LEASE_S` after that process has seen its last
+    SYNC: a recorder that hangs must not keep the axes running, one that is stopped for 300 ms must
+    lose nothing. Each interval counts from the actual time of the last SYNC, so the period is too
+    long by the lateness of the timer: `seen` measures that and shortens the interval.
     """
 
     in_kernel = True
@@ -101,13 +114,18 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
         except OSError as error:
             self.stop()
             name = errno.errorcode.get(error.errno or 0, "")
-            reason = f"SYNC by the kernel: {os.strerror(error.errno or 0)} {name}; modprobe can-bcm?"
+            reason = (
+                f"SYNC by the kernel: {os.strerror(error.errno or 0)} {name}; modprobe can-bcm?"
+            )
             raise BusError(str(address), reason) from error
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
+        """Process a SYNC and its periods since the one before, 0 for the first;
+        keeps average period and phase.
+        """
         if self._socket is not None and not 0 <= monotonic_ns - self._renewed_ns < RENEWAL_S * 1e9:
-            # The timer itself is not started again, if it has ended: the recorder was stopped for too long.
+            # The timer itself is not started again, if it has ended: the recorder was stopped for
+            # too long.
             self._renewed_ns = monotonic_ns
             self._socket.send(setup_message(_SET_TIMER, self._interval_us))
         if periods == 0:
@@ -120,7 +138,9 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
             return
         late_ns = monotonic_ns - self._begun_ns - 1000 * self.period_us * self._periods
         self._phase_ns += late_ns
-        interval_us = steered_us(self.period_us, self._interval_us, late_ns, self._phase_ns, self._periods)
+        interval_us = steered_us(
+            self.period_us, self._interval_us, late_ns, self._phase_ns, self._periods
+        )
         self._begun_ns = monotonic_ns
         self._periods = 0
         if interval_us != self._interval_us:
@@ -140,7 +160,9 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
 
 
 class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
-    """SYNC by a drive of the cell, `axis` by its index: objects 1005h (bit 30) and 1006h, which are restored."""
+    """SYNC by a drive of the cell, `axis` by its index:
+    objects 1005h (bit 30) and 1006h, which are restored.
+    """
 
     def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
         super().__init__(network.axes[axis].name, period_us)
@@ -167,7 +189,8 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         if self._before is None:
             self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
         self._network.link.sync_producer = self.name
-        # CiA 301: the period may be refused while the drive produces, so production begins last and ends first.
+        # CiA 301: the period may be refused while the drive produces, so production begins last and
+        # ends first.
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
         access.write(CYCLE_PERIOD, self.period_us)
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
@@ -176,7 +199,9 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
     def pause(self) -> None:
         """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
         if self._before is not None:
-            self._network.link.send((download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),))
+            self._network.link.send(
+                (download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),)
+            )
             self._produces = False
 
     def stop(self) -> None:

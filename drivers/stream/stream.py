@@ -1,9 +1,10 @@
 """The SYNC-grouped stream: one SYNC, sent or followed, the answers of all axes, one Sample.
 
-The stream is the only reader of the bus while it runs. Where frames have the kernel's stamps, our own SYNC comes back
-among them, and a cycle lasts from one SYNC to the next in the order of the frames, however late they are read: SYNC is
-sent on schedule while the stream waits for frames. Where they have none, a cycle ends by the clock, after everything
-that has arrived was read. Which answer belongs to which SYNC is decided in answers.py, the pacings are in sync.py.
+The stream is the only reader of the bus while it runs. Where frames have the kernel's stamps, our
+own SYNC comes back among them, and a cycle lasts from one SYNC to the next in the order of the
+frames, however late they are read: SYNC is sent on schedule while the stream waits for frames.
+Where they have none, a cycle ends by the clock, after everything that has arrived was read. Which
+answer belongs to which SYNC is decided in answers.py, the pacings are in sync.py.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from drivers.stream.cycles import CycleBus, Cycles
 from drivers.stream.sync import PATIENCE_S, Pacing
 from drivers.stream.watch import Watch
 
-MAX_MISSING_CYCLES = 3  #: Tolerated incomplete cycles in a row; they are counted, and marked in the samples
+#: Tolerated incomplete cycles in a row; they are counted, and marked in the samples
+MAX_MISSING_CYCLES = 3
 
 
 class SyncStream:
@@ -31,15 +33,18 @@ class SyncStream:
     Args:
         network: a prepared network; only the stream may read its bus meanwhile.
         pacing: schedule of SYNC.
-        on_event: receives EMCY, NMT and CiA 402 changes and losses before the sample of their cycle is returned.
+        on_event: receives EMCY, NMT and CiA 402 changes and losses before the sample of their cycle
+            is returned.
 
     Raises:
-        SampleLost: by ``next``, as all of these: more incomplete cycles in a row than `MAX_MISSING_CYCLES`.
-        DriveFault: an EMCY, a new fault or following error, a node that left OPERATIONAL or sends no heartbeat for two
-            of its periods, an active limit, stale data, or a PDO of wrong length twice in a row.
+        SampleLost: by ``next``, as all of these: more incomplete cycles in a row than
+            `MAX_MISSING_CYCLES`.
+        DriveFault: an EMCY, a new fault or following error, a node that left OPERATIONAL or sends
+            no heartbeat for two of its periods, an active limit, stale data, or a PDO of wrong
+            length twice in a row.
         BusBusy: another master sends SYNC, NMT commands or set-points of an axis.
-        BusError: the bus, one of its parts or the capture process is lost, the followed SYNC stopped, or the bus is
-            read more than a second late.
+        BusError: the bus, one of its parts or the capture process is lost, the followed SYNC
+            stopped, or the bus is read more than a second late.
         NodeMisplaced: a node is heard on another of the cell's buses than its own.
     """
 
@@ -54,7 +59,8 @@ class SyncStream:
         self._link = network.link
         self._answers = Answers(network.axes, network.pdos, certain=pacing.waits_for_answers)
         self._counts = self._answers.counts
-        #: What its cycles run on: frames to send with the next SYNC, and whether an axis answered the last one.
+        #: What its cycles run on: frames to send with the next SYNC, and whether an axis answered
+        #: the last one.
         self.bus = CycleBus(
             network.link,
             pacing.clock,
@@ -132,7 +138,9 @@ class SyncStream:
 
     def _slot_of(self, message: can.Message) -> Slot | None:
         """Return the slot of a TPDO of an axis; None for every other frame."""
-        return self._answers.slots.get(message.arbitration_id) if is_plain(message) else None
+        if is_plain(message):
+            return self._answers.slots.get(message.arbitration_id)
+        return None
 
     def _collect(self) -> None:
         """Receive until all answers are there, or the cycle is over."""
@@ -160,7 +168,9 @@ class SyncStream:
             self.bus.answered_ns = self.bus.clock()
 
     def _note_length(self, slot: Slot, identifier: int, found: int) -> None:
-        """Report a PDO of wrong length: the first may have been corrupted, one with the next SYNC too is a fault."""
+        """Report a PDO of wrong length: the first may have been corrupted,
+        one with the next SYNC too is a fault.
+        """
         self._counts["wrong_length"] += 1
         axis = self.network.axes[slot.axis]
         reason = f"PDO {identifier:03X}h has {found} bytes, its mapping has {slot.length}"
@@ -170,21 +180,25 @@ class SyncStream:
             text = f"{node_label(axis)}: {reason}"
             self.bus.report(slot.axis, EventKind.PDO_LENGTH, identifier, text)
         elif last == cycle - 1:
-            remedy = "did another program change the mapping, or does another device use this COB-ID?"
+            remedy = (
+                "did another program change the mapping, or does another device use this COB-ID?"
+            )
             self.bus.faults.append(DriveFault(axis, reason, remedy=remedy))
         self._last_wrong_length[identifier] = cycle
 
     def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
-        """Count the frames left after the last cycle, and losses that are reported late. Sends no SYNC.
+        """Count the frames left after the last cycle, and losses that are reported late.
 
-        The first call stops the SYNC that is followed. An answer more than SYNCs shows that earlier ones were late
-        (answers.py). Answers after the first call do not count: another SYNC may have been sent by then, to stop axes
-        by SDO.
+        Sends no SYNC.
+
+        The first call stops the SYNC that is followed. An answer more than SYNCs shows that earlier
+        ones were late (answers.py). Answers after the first call do not count: another SYNC may
+        have been sent by then, to stop axes by SDO.
 
         Args:
             seconds: to read on; counted from the last SYNC, if more SYNCs come.
-            lag_s: longest further time to wait for these SYNCs, and for a capture process that has not received what
-                came in time.
+            lag_s: longest further time to wait for these SYNCs, and for a capture process that has
+                not received what came in time.
 
         Raises:
             BusError: the bus is lost, and with it the last reports.
@@ -263,7 +277,9 @@ class SyncStream:
         return Sample(cycle, self.time_ns, position, current, statuswords, missing)
 
     def _report_missing(self, cycle: int, missing: int) -> None:
-        """Report the axes without a complete answer, bit i for axis i; too many such cycles in a row are a fault."""
+        """Report the axes without a complete answer, bit i for axis i;
+        too many such cycles in a row are a fault.
+        """
         absent = tuple(axis for axis in range(len(self.network.axes)) if missing >> axis & 1)
         names = [node_label(self.network.axes[axis]) for axis in absent]
         for axis, name in zip(absent, names, strict=True):
@@ -273,7 +289,8 @@ class SyncStream:
             return
         silent_s = None  # doubtful answers are answers
         if self.bus.silent:
-            # A reader that is late takes many cycles at once; those waited for no answer by the clock.
+            # A reader that is late takes many cycles at once; those waited for no answer by the
+            # clock.
             by_clock_ns = self.bus.clock() - self.bus.answered_ns
             by_cycles_ns = self._silent_cycles * self.pacing.period_ns
             silent_s = max(by_clock_ns, by_cycles_ns) * 1e-9

@@ -1,11 +1,13 @@
 """The pacings of a stream: the schedule of SYNC, and how the frames between two SYNCs are read.
 
-Samples and events of all pacings have one epoch: wall time [ns since 1970] at the stream's first SYNC, plus monotonic
-time since, so that setting the wall clock has no effect. On SocketCAN the time of a SYNC is the kernel's, converted to
-the monotonic clock (drivers/canopen/capture.py); `clock` must then be that clock.
+Samples and events of all pacings have one epoch: wall time [ns since 1970] at the stream's first
+SYNC, plus monotonic time since, so that setting the wall clock has no effect. On SocketCAN the time
+of a SYNC is the kernel's, converted to the monotonic clock (drivers/canopen/capture.py); `clock`
+must then be that clock.
 
-A pacing is frozen data; `cycles` returns what a stream runs on. Cycles end by the clock (`LockstepCycles`,
-`TimedCycles`) or by the next SYNC in the order of the frames (`EchoedCycles`, `FollowedCycles`).
+A pacing is frozen data; `cycles` returns what a stream runs on. Cycles end by the clock
+(`LockstepCycles`, `TimedCycles`) or by the next SYNC in the order of the frames (`EchoedCycles`,
+`FollowedCycles`).
 """
 
 from __future__ import annotations
@@ -25,19 +27,29 @@ from drivers.errors import BusError
 from drivers.messages import EventKind
 from drivers.stream.cycles import LARGEST_LAG_NS, CycleBus, Cycles, arrived_ns, is_sync
 
-SHORTENED, STRAGGLING = 16, 4
-"""Divisors of a lockstep time-out: if no axis answered the last SYNC, and once another axis has answered this one."""
-PATIENCE_S = 0.02  #: Time between two looks whether the capture process has received what came before a deadline
+SHORTENED = 16
+STRAGGLING = 4
+"""Divisors of a lockstep time-out: if no axis answered the last SYNC,
+and once another axis has answered this one.
+"""
+#: Time between two looks whether the capture process has received what came before a deadline
+PATIENCE_S = 0.02
 FRAMES_PER_S = 50_000
-"""Frames per second of time-out to read past the deadline before a producer is dead; two full buses carry fewer."""
-SURPLUS = 3.0  #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
+"""Frames per second of time-out to read past the deadline before a producer is dead;
+two full buses carry fewer.
+"""
+#: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
+SURPLUS = 3.0
 DECAY = 0.99
-"""Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm, then adds up to nothing."""
+"""Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm,
+then adds up to nothing.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class LockstepSync:
-    """Send the next SYNC when the last one is answered: for a simulated cell, whose time is the SYNC itself.
+    """Send the next SYNC when the last one is answered:
+    for a simulated cell, whose time is the SYNC itself.
 
     The time of the samples is made up, one period a cycle.
     """
@@ -46,7 +58,8 @@ class LockstepSync:
     timeout_s: float = 1.0  #: time in which one cycle must be answered [s of the clock]
     start_ns: int = 0  #: wall time of cycle 0 [ns since 1970]
     clock: Clock = time.monotonic_ns  #: for the time-out and the heartbeats [ns]
-    #: Whether SYNC waits for the answers to the one before: none is late, and the samples' time is not the clock's.
+    #: Whether SYNC waits for the answers to the one before: none is late, and the samples' time is
+    #: not the clock's.
     waits_for_answers: ClassVar[bool] = True
 
     def cycles(self, bus: CycleBus) -> Cycles:
@@ -56,14 +69,16 @@ class LockstepSync:
 
 @dataclass(frozen=True, slots=True)
 class TimedSync:
-    """Send a SYNC every period by the clock, on an absolute schedule that starts with the first one.
+    """Send a SYNC every period by the clock, on an absolute schedule that starts with the first
+    one.
 
     Whole periods that were missed are counted and left out; there is never a burst to catch up.
     """
 
     period_ns: int  #: of the schedule [ns]
     start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
-    clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
+    #: monotonic [ns]; the time since the first SYNC is added to start_ns
+    clock: Clock = time.monotonic_ns
     waits_for_answers: ClassVar[bool] = False  #: see `LockstepSync`
 
     def cycles(self, bus: CycleBus) -> Cycles:
@@ -72,9 +87,12 @@ class TimedSync:
 
 
 class Producer:
-    """Sends SYNC on our behalf; this one keeps its period by itself, and goes on after the last cycle."""
+    """Sends SYNC on our behalf; this one keeps its period by itself,
+    and goes on after the last cycle.
+    """
 
-    in_kernel = False  #: Whether it is this machine's kernel; a SYNC from the wire is then another device's
+    #: Whether it is this machine's kernel; a SYNC from the wire is then another device's
+    in_kernel = False
 
     def __init__(self, name: str, period_us: int) -> None:
         self.name = name  #: For messages
@@ -85,7 +103,9 @@ class Producer:
         return FollowedSync(1000 * self.period_us, self, timeout_s, start_ns, clock)
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC by its time [ns], and its periods since the one before, 0 for the first."""
+        """Process a SYNC by its time [ns], and its periods since the one before,
+        0 for the first.
+        """
 
     def pause(self) -> None:
         """Stop sending, without waiting for an answer."""
@@ -95,16 +115,18 @@ class Producer:
 class FollowedSync:
     """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
 
-    The order of the frames on the bus decides which cycle they belong to: a late reader loses nothing.
+    The order of the frames on the bus decides which cycle they belong to: a late reader loses
+    nothing.
     """
 
     period_ns: int  #: of the producer [ns]
     producer: Producer  #: is paused after the last cycle
-    #: Time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself, because the axes
-    #: are stopped by frames that act on SYNC.
+    #: Time without a SYNC after which the producer counts as dead; the stream then sends SYNC
+    #: itself, because the axes are stopped by frames that act on SYNC.
     timeout_s: float = 0.1
     start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
-    clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
+    #: monotonic [ns]; the time since the first SYNC is added to start_ns
+    clock: Clock = time.monotonic_ns
     waits_for_answers: ClassVar[bool] = False  #: see `LockstepSync`
 
     def cycles(self, bus: CycleBus) -> Cycles:
@@ -156,8 +178,12 @@ class LockstepCycles(_CyclesByClock):
         pacing = self._pacing
         now_ns = self._read_the_rest()
         bus.time_ns = pacing.start_ns + bus.cycles * pacing.period_ns
-        # A cell that was silent for the whole time gets less the next time: the stop must not take minutes.
-        bound_s = pacing.timeout_s / SHORTENED if bus.silent else pacing.timeout_s
+        # A cell that was silent for the whole time gets less the next time: the stop must not take
+        # minutes.
+        if bus.silent:
+            bound_s = pacing.timeout_s / SHORTENED
+        else:
+            bound_s = pacing.timeout_s
         self._deadline_ns = now_ns + round(bound_s * 1e9)
         bus.send_sync()
         bus.cycles += 1
@@ -169,7 +195,8 @@ class LockstepCycles(_CyclesByClock):
 
 
 class TimedCycles(_CyclesByClock):
-    """A cycle lasts from one SYNC to the time of the next one; for a bus whose frames have no stamps.
+    """A cycle lasts from one SYNC to the time of the next one;
+    for a bus whose frames have no stamps.
 
     Args:
         bus: of the stream.
@@ -237,7 +264,8 @@ class _CyclesByOrder(Cycles):
 
 
 class EchoedCycles(_CyclesByOrder):
-    """A cycle lasts from our SYNC to our next one: both come back among the frames of a bus with stamps.
+    """A cycle lasts from our SYNC to our next one:
+    both come back among the frames of a bus with stamps.
 
     SYNC is sent on schedule while frames are waited for.
 
@@ -250,7 +278,8 @@ class EchoedCycles(_CyclesByOrder):
         super().__init__(bus)
         self._period_ns = period_ns
         self._due_ns = 0
-        # Each SYNC that was sent and has not come back: its time by the clock [ns], and the periods left out before it.
+        # Each SYNC that was sent and has not come back: its time by the clock [ns], and the periods
+        # left out before it.
         self._sent: deque[tuple[int, int]] = deque()
         self._comes_back = True
 
@@ -273,7 +302,9 @@ class EchoedCycles(_CyclesByOrder):
         return None
 
     def _read(self) -> can.Message | None:
-        """Return the next frame, and send SYNC when it is due; None once SYNC does not come back."""
+        """Return the next frame, and send SYNC when it is due;
+        None once SYNC does not come back.
+        """
         bus = self.bus
         if self._comes_back and (taken := bus.batched()) is not None:
             return taken
@@ -312,8 +343,13 @@ class FollowedCycles(_CyclesByOrder):
         bus = self.bus
         begun_ns = bus.clock()
         for message in bus.waiting():
-            if is_sync(message) and isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns:
-                self.early_sync = message  # if frames arrive as fast as they are read, the loop would not end
+            if (
+                is_sync(message)
+                and isinstance(message, CapturedMessage)
+                and message.monotonic_ns > begun_ns
+            ):
+                # If frames arrive as fast as they are read, the loop would not end
+                self.early_sync = message
                 break
             bus.between(message)
         return self
@@ -324,8 +360,12 @@ class FollowedCycles(_CyclesByOrder):
         if outgoing := bus.take_outgoing():
             # As early in the period as possible: all of it should arrive before the next SYNC.
             bus.link.send(outgoing)
-        # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is enough.
-        bound_ns = self._timeout_ns // 2 if self._waited else self._timeout_ns
+        # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is
+        # enough.
+        if self._waited:
+            bound_ns = self._timeout_ns // 2
+        else:
+            bound_ns = self._timeout_ns
         self._deadline_ns = bus.clock() + bound_ns
         sync = self._next_sync()
         if sync is None:
@@ -383,9 +423,11 @@ class FollowedCycles(_CyclesByOrder):
         return message
 
     def _read(self) -> can.Message | None:
-        """Return the next frame that arrived before the deadline, even if it is read late; None without any.
+        """Return the next frame that arrived before the deadline, even if it is read late;
+        None without any.
 
-        Only the order on the bus counts: frames that have arrived are read first, whatever the clock shows.
+        Only the order on the bus counts: frames that have arrived are read first, whatever the
+        clock shows.
         """
         bus = self.bus
         end_ns = self._deadline_ns
@@ -401,7 +443,11 @@ class FollowedCycles(_CyclesByOrder):
             return None
         message = recv(0.0)
         # A capture process that was stopped has not received all of it yet.
-        while message is None and now_ns < end_ns + LARGEST_LAG_NS and lags_behind(bus.link.bus, end_ns):
+        while (
+            message is None
+            and now_ns < end_ns + LARGEST_LAG_NS
+            and lags_behind(bus.link.bus, end_ns)
+        ):
             bus.link.beat()
             message = recv(PATIENCE_S)
             now_ns = bus.clock()
@@ -416,7 +462,8 @@ class FollowedCycles(_CyclesByOrder):
 
 
 class SyncRate:
-    """Detects a second SYNC producer: its SYNCs look like the expected producer's, but then too many arrive.
+    """Detects a second SYNC producer: its SYNCs look like the expected producer's,
+    but then too many arrive.
 
     Jitter cancels out: a late SYNC is followed by an early one.
     """

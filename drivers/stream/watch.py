@@ -1,7 +1,8 @@
 """Watch the drives while a stream runs: their reports become events, and some of them faults.
 
-Watching never raises: a fault waits until the sample that shows it has been returned. Frozen data are recognised in two
-ways: neither position nor current of a moving axis changes by one count, or an amplifier's toggle bit does not toggle.
+Watching never raises: a fault waits until the sample that shows it has been returned. Frozen data
+are recognised in two ways: neither position nor current of a moving axis changes by one count, or
+an amplifier's toggle bit does not toggle.
 """
 
 from __future__ import annotations
@@ -21,21 +22,32 @@ from drivers.profiles.profile import Axis
 from drivers.stream.cycles import CycleBus
 
 FROZEN_S = 0.05
-"""Duration of exactly equal values, in the time of the samples. A loop that fights friction changes its current at
-once, and a measured current has noise."""
-FROZEN_COUNTS = 64  #: Least distance of the set-point meanwhile: one that creeps or has just begun proves nothing
+"""Duration of exactly equal values, in the time of the samples.
+
+A loop that fights friction changes its current at once, and a measured current has noise.
+"""
+#: Least distance of the set-point meanwhile: one that creeps or has just begun proves nothing
+FROZEN_COUNTS = 64
 STALE_PERIODS = 2
-"""Of the amplifier's update period, and of SYNC, without a toggle; less may be the difference of two timers."""
+"""Of the amplifier's update period, and of SYNC, without a toggle;
+less may be the difference of two timers.
+"""
 HEARTBEAT_PERIODS = 2.0  #: Silence after which a node is lost
 LIMIT_S = 0.5
-"""A current that saturates in a ramp is masked by the fit; a limit that is active longer is no ramp any more."""
+"""A current that saturates in a ramp is masked by the fit;
+a limit that is active longer is no ramp any more.
+"""
 _WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
 
 
 class FrozenData:
-    """Finds moving axes whose data do not change; made when the set-points of a move are sent, from these positions."""
+    """Finds moving axes whose data do not change;
+    made when the set-points of a move are sent, from these positions.
+    """
 
-    def __init__(self, move: Move, start_counts: Sequence[int], axes: Sequence[int], period_ns: int) -> None:
+    def __init__(
+        self, move: Move, start_counts: Sequence[int], axes: Sequence[int], period_ns: int
+    ) -> None:
         self._paths = {axis: move.path(axis, start_counts[axis]) for axis in axes}
         self._period_s = period_ns * 1e-9
         self._begin: int | None = None
@@ -43,7 +55,8 @@ class FrozenData:
 
     def frozen(self, sample: Sample) -> tuple[int, ...]:
         """Return the axes whose values have not changed for too long; takes every sample once."""
-        self._begin = sample.cycle if self._begin is None else self._begin
+        if self._begin is None:
+            self._begin = sample.cycle
         found = []
         for axis, path in self._paths.items():
             values = (sample.position_counts[axis], sample.current_raw[axis])
@@ -51,7 +64,9 @@ class FrozenData:
             if last is None or last[:2] != values or sample.missing >> axis & 1:
                 self._last[axis] = (*values, sample.cycle)
                 continue
-            since_s, now_s = ((cycle - self._begin) * self._period_s for cycle in (last[2], sample.cycle))
+            since_s, now_s = (
+                (cycle - self._begin) * self._period_s for cycle in (last[2], sample.cycle)
+            )
             if now_s - since_s >= FROZEN_S:
                 positions, _, _ = path.at(np.array([since_s, now_s]))
                 if abs(positions[1, 0] - positions[0, 0]) >= FROZEN_COUNTS:
@@ -64,15 +79,24 @@ class ToggleBits:
 
     def __init__(self, axes: Sequence[Axis]) -> None:
         self._bits = tuple(
-            (number, axis, axis.profile.toggle_bit, STALE_PERIODS * 1000 * axis.profile.update_period_us)
+            (
+                number,
+                axis,
+                axis.profile.toggle_bit,
+                STALE_PERIODS * 1000 * axis.profile.update_period_us,
+            )
             for number, axis in enumerate(axes)
             if axis.profile.toggle_bit is not None
         )
-        # For each axis: the bit, the time of its last change, cycles since, whether that was reported.
+        # For each axis: the bit, the time of its last change, cycles since, whether that was
+        # reported.
         self._last: dict[int, tuple[int, int, int, bool]] = {}
 
-    def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, int, DriveFault]]:
-        """Yield (index, bit, fault) of each axis whose bit has not toggled for too long; call in every cycle.
+    def stale(
+        self, time_ns: int, statuswords: Sequence[int], missing: int
+    ) -> Iterator[tuple[int, int, DriveFault]]:
+        """Yield (index, bit, fault) of each axis whose bit has not toggled for too long;
+        call in every cycle.
 
         The interval of a missing axis (bit i for axis i) starts anew.
         """
@@ -90,7 +114,9 @@ class ToggleBits:
             if stale and not reported:
                 still = f"{cycles + 1} cycles, {(time_ns - since_ns) * 1e-6:g} ms"
                 reason = f"statusword bit {bit} has not toggled for {still}; its data are old"
-                remedy = "restart the drive, and check toggle_bit and update_period_us of its profile"
+                remedy = (
+                    "restart the drive, and check toggle_bit and update_period_us of its profile"
+                )
                 yield axis, bit, DriveFault(node, reason, remedy=remedy)
 
 
@@ -100,7 +126,8 @@ class Watch:
     Args:
         network: of the drives.
         bus: receives what they report, and the faults.
-        real_time: whether the drives' time is that of the clock; in lockstep their heartbeats may come faster.
+        real_time: whether the drives' time is that of the clock; in lockstep their heartbeats may
+            come faster.
     """
 
     def __init__(self, network: CanopenNetwork, bus: CycleBus, *, real_time: bool) -> None:
@@ -127,14 +154,17 @@ class Watch:
         for axis, since_ns in tuple(self._limited_since_ns.items()):
             word = self._statuswords[axis]
             if decode(word) is not State.OPERATION_ENABLED:
-                self._limited_since_ns[axis] = time_ns  # a limit without motion is no reason to stop
+                # A limit without motion is no reason to stop
+                self._limited_since_ns[axis] = time_ns
             elif (active_ns := time_ns - since_ns) > LIMIT_S * 1e9:
                 del self._limited_since_ns[axis]
                 node = self._network.axes[axis]
                 text = f"{node.name}: a limit has been active for {active_ns * 1e-9:.3f} s"
                 self._bus.report(axis, EventKind.LIMIT, word, text)
                 reason = f"a limit has been active for {LIMIT_S:g} s, statusword {word:#06x}"
-                remedy = "check limit switches, position, speed and current limits, or use slower moves"
+                remedy = (
+                    "check limit switches, position, speed and current limits, or use slower moves"
+                )
                 self._bus.faults.append(DriveFault(node, reason, word, remedy=remedy))
         for axis, bit, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
             self._bus.report(axis, EventKind.FROZEN, bit, str(stale))
@@ -153,7 +183,8 @@ class Watch:
             if first and missing >> axis & 1:
                 continue  # no word was received yet
             self._unheard &= ~(1 << axis)
-            # The first answer of an axis is reported whole, but a fault from before is not this recording's.
+            # The first answer of an axis is reported whole, but a fault from before is not this
+            # recording's.
             changed = _WATCHED_BITS if first else word ^ before[axis]
             node = self._network.axes[axis]
             saturation = node.profile.saturation_bit
@@ -161,13 +192,20 @@ class Watch:
                 state = decode(word)
                 text = f"{node.name}: {state}, statusword {word:04X}h"
                 self._bus.report(axis, EventKind.STATE, word, text)
-                if not first and changed & STATUS_FAULT and state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+                if (
+                    not first
+                    and changed & STATUS_FAULT
+                    and state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
+                ):
                     self._bus.faults.append(DriveFault(node, str(state), word))
                 if not first and changed & word & STATUS_FOLLOWING_ERROR:
                     self._bus.report(axis, EventKind.FOLLOWING_ERROR, word, text)
                     self._bus.faults.append(DriveFault(node, "following error", word))
             if saturation is not None and (word ^ (0 if first else before[axis])) >> saturation & 1:
-                active = "a limit is active" if word >> saturation & 1 else "the limit is no longer active"
+                if word >> saturation & 1:
+                    active = "a limit is active"
+                else:
+                    active = "the limit is no longer active"
                 self._bus.report(axis, EventKind.LIMIT, word, f"{node.name}: {active}")
                 if word >> saturation & 1:
                     self._limited_since_ns[axis] = self._bus.time_ns
@@ -183,8 +221,11 @@ class Watch:
             elif event.kind is EventKind.BUS_BUSY and (
                 event.code < SDO_REQUEST or event.code in LSS or event.code in self._link.written
             ):
-                # A reader only disturbs, and is reported; a device that commands or writes could move the robot.
-                seen = self._link.written.get(event.code) or command_name(event.code, self._link.names)
+                # A reader only disturbs, and is reported; a device that commands or writes could
+                # move the robot.
+                seen = self._link.written.get(event.code) or command_name(
+                    event.code, self._link.names
+                )
                 self._bus.faults.append(BusBusy.by_master(self._link.address, seen))
             if event.axis is None:
                 continue
@@ -193,7 +234,9 @@ class Watch:
                 reason = event.text.removeprefix(f"{node_label(node)}: ")
                 self._bus.faults.append(DriveFault(node, reason, emcy_code=event.code))
             elif event.kind is EventKind.NMT and event.code != NmtState.OPERATIONAL and self._begun:
-                self._bus.faults.append(DriveFault(node, f"left OPERATIONAL, is {nmt_name(event.code)}"))
+                self._bus.faults.append(
+                    DriveFault(node, f"left OPERATIONAL, is {nmt_name(event.code)}")
+                )
 
     def _check_node_id(self, axis: int, node: Axis) -> None:
         """Report a second device with the node id of an axis."""
@@ -205,7 +248,8 @@ class Watch:
     def _check_heartbeats(self, time_ns: int, clock_ns: int) -> None:
         """Report nodes that are silent by the clock *and* in the time of the samples.
 
-        In lockstep the samples' time runs faster or slower than the clock, and either alone would be a false alarm.
+        In lockstep the samples' time runs faster or slower than the clock, and either alone would
+        be a false alarm.
         """
         for axis, node in enumerate(self._network.axes):
             node_id = node.node_id

@@ -1,10 +1,12 @@
-"""One judgement of the channels of a recording: what is wrong with single numbers, and whether it can be mended.
+"""One judgement of the channels of a recording:
+what is wrong with single numbers, and whether it can be mended.
 
-Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A stretch in which a
-channel froze, or stood at the limit of its range, is left out. Of a counter that wraps, a number that lost its sign,
-and an encoder that lost its place, nothing says what is right: such a recording is refused, and so is one of which too
-much is wrong. Held readings are `ident.data.held`, currents at a limit `ident.data.clipping`, currents without a
-sign `ident.data.unsigned_current`.
+Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A
+stretch in which a channel froze, or stood at the limit of its range, is left out. Of a counter that
+wraps, a number that lost its sign, and an encoder that lost its place, nothing says what is right:
+such a recording is refused, and so is one of which too much is wrong. Held readings are
+`ident.data.held`, currents at a limit `ident.data.clipping`, currents without a sign
+`ident.data.unsigned_current`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ from ident.data.held import fill_damaged, held_channel, longest_smooth
 LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
 LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
 LOST_PLACE = 3.0
-"""Least step of a position after which it does not return, in multiples of its largest usual step."""
+"""Least step of a position after which it does not return,
+in multiples of its largest usual step.
+"""
 USUAL_PERCENTILE = 99.0  #: Of the steps of a position
 MOTOR_UNIT = "rad of the motor"
 JOINT_UNIT = "rad or m of the joint"
@@ -56,7 +60,8 @@ class ChannelFault:
     quantity: ChannelKind
     axis: int  #: index
     stretches: IntArray  #: first sample and end of each, shape (s, 2)
-    size: float  #: largest distance from the course, or the range of a counter, in the unit of the channel
+    #: largest distance from the course, or the range of a counter, in the unit of the channel
+    size: float
     samples: int  #: of the recording
     rate_hz: float  #: of the recording
     count: float = 0.0  #: smallest change of the channel
@@ -107,9 +112,10 @@ def find_faults(
         position: of the joints, or of whatever was recorded, shape (k, n).
         current: of the motors, shape (k, n).
         rate_hz: sampling rate.
-        ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where each column was
-            recorded as it is.
-        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding. None for all.
+        ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where
+            each column was recorded as it is.
+        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding.
+            None for all.
         unit: of the columns of positions, for messages.
 
     Returns:
@@ -155,7 +161,8 @@ def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[Ch
 
 
 def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
-    """Return what the encoders of the motors have read, shape (k, n): a number that repeats repeats exactly.
+    """Return what the encoders of the motors have read, shape (k, n):
+    a number that repeats repeats exactly.
 
     Args:
         position: of the joints, shape (k, n).
@@ -186,7 +193,8 @@ def _with_joints(
 ) -> list[ChannelFault]:
     """Add the faults of joints that several motors turn, whose own encoders may have been read.
 
-    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are in each of them.
+    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are
+    in each of them.
 
     Args:
         motors: faults of the positions of the motors.
@@ -217,8 +225,8 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
     Args:
         faults: of the recording.
-        displaced: look for positions that go on displaced, of which the limits of the robot may say more; else for
-            all others.
+        displaced: look for positions that go on displaced, of which the limits of the robot may say
+            more; else for all others.
     """
     for one in faults:
         if one.is_refused and (one.kind is FaultKind.DISPLACED) is displaced:
@@ -227,12 +235,15 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
 
 def replaced_samples(
-    faults: Sequence[ChannelFault], quantity: ChannelKind, shape: tuple[int, ...], ratio: FloatArray | None = None
+    faults: Sequence[ChannelFault],
+    quantity: ChannelKind,
+    shape: tuple[int, ...],
+    ratio: FloatArray | None = None,
 ) -> BoolArray:
     """Samples of each column that are to be replaced by those around them, shape (k, n).
 
-    Currents that are left out stay as they are: nothing depends on them. Positions do not, because filters would spread
-    their steps.
+    Currents that are left out stay as they are: nothing depends on them. Positions do not, because
+    filters would spread their steps.
 
     Args:
         faults: of the recording.
@@ -266,7 +277,8 @@ def mended(
     quantity: ChannelKind = ChannelKind.POSITION,
     time: FloatArray | None = None,
 ) -> FloatArray:
-    """Return channels, shape (k, n), with the samples replaced that are no readings; the same array without any.
+    """Return channels, shape (k, n), with the samples replaced that are no readings;
+    the same array without any.
 
     Args:
         values: positions or currents, as of `find_faults`.
@@ -288,10 +300,13 @@ def mended(
     return np.stack(columns, axis=1)
 
 
-def left_out_samples(faults: Sequence[ChannelFault], shape: tuple[int, ...], margin: int) -> BoolArray:
+def left_out_samples(
+    faults: Sequence[ChannelFault], shape: tuple[int, ...], margin: int
+) -> BoolArray:
     """Samples of each axis that are to be left out, shape (k, n).
 
-    Every torque depends on every position. Around a position that is not known, filters spread what is assumed of it.
+    Every torque depends on every position. Around a position that is not known, filters spread what
+    is assumed of it.
 
     Args:
         faults: of the recording.
@@ -320,7 +335,9 @@ class ChannelPlace:
     samples: int  #: of the recording
     unit: str = ""  #: of the channel, for messages
 
-    def fault(self, kind: FaultKind, readings: Readings, stretches: IntArray, size: float = 0.0) -> ChannelFault:
+    def fault(
+        self, kind: FaultKind, readings: Readings, stretches: IntArray, size: float = 0.0
+    ) -> ChannelFault:
         """Make a fault of this channel."""
         return ChannelFault(
             kind=kind,
@@ -357,7 +374,9 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
         yield Readings(values[sample], sample, rate_hz, own_count)
 
 
-def _position_faults(readings: Readings, others: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
+def _position_faults(
+    readings: Readings, others: FloatArray, place: ChannelPlace
+) -> Iterator[ChannelFault]:
     """Judge a position, given those of the other columns, shape (k, n − 1)."""
     jumps = find_jumps(readings, is_position=True)
     counter_range = wrap_size(readings, jumps, is_position=True)
@@ -369,7 +388,9 @@ def _position_faults(readings: Readings, others: FloatArray, place: ChannelPlace
         stretches = _glitched(readings, jumps)
         yield place.fault(FaultKind.GLITCH, readings, stretches, _largest(jumps))
     without_glitches = _without(readings, jumps)
-    frozen = np.concatenate((frozen_position(without_glitches), frozen_to_the_end(without_glitches, others)))
+    frozen = np.concatenate(
+        (frozen_position(without_glitches), frozen_to_the_end(without_glitches, others))
+    )
     if len(frozen):
         yield place.fault(FaultKind.FROZEN, readings, frozen)
     else:
@@ -384,7 +405,9 @@ def _position_faults(readings: Readings, others: FloatArray, place: ChannelPlace
 
 
 def _lost_place(readings: Readings, jumps: Jumps, frozen: IntArray) -> BoolArray:
-    """Steps after which a position goes on displaced, shape (s,), without those at the ends of frozen stretches."""
+    """Steps after which a position goes on displaced, shape (s,),
+    without those at the ends of frozen stretches.
+    """
     steps = np.abs(np.diff(readings.values))
     usual = 0.0
     if len(steps):
@@ -395,7 +418,9 @@ def _lost_place(readings: Readings, jumps: Jumps, frozen: IntArray) -> BoolArray
     return np.asarray(is_large & ~(leaves_frozen | enters_frozen))
 
 
-def _current_faults(readings: Readings, motor_rad: FloatArray, place: ChannelPlace) -> Iterator[ChannelFault]:
+def _current_faults(
+    readings: Readings, motor_rad: FloatArray, place: ChannelPlace
+) -> Iterator[ChannelFault]:
     """Judge the current of a motor, given its positions, shape (k,)."""
     upper = is_split(readings.values)
     if upper is not None:

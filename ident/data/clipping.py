@@ -9,14 +9,17 @@ from ident.arrays import BoolArray, FloatArray
 LEAST_SAMPLES = 20  #: Least number of clipped samples of a run
 LEAST_CLIPPED = 0.002  #: Least share of the samples of a moving motor that a limit has clipped
 LONG_STRETCH = 5
-"""Least length of two stretches at a limit, in samples and in multiples of the longest stretch of one value elsewhere.
-A smooth current of few counts, or one that is repeated between slow readings, has stretches everywhere."""
+"""Least length of two stretches at a limit, in samples and in multiples of the longest stretch of
+one value elsewhere. A smooth current of few counts, or one that is repeated between slow readings,
+has stretches everywhere.
+"""
 LEAST_STRETCHES = 2
 SAME_LIMIT = 0.05  #: Largest relative difference of the limits of both directions
 
 
 def clipped_samples(current: FloatArray, usable: BoolArray) -> BoolArray:
-    """Find samples at a limit: a current that stays at exactly its largest or smallest value, again and again.
+    """Find samples at a limit: a current that stays at exactly its largest or smallest value,
+    again and again.
 
     Args:
         current: of the motors, in any unit, shape (k, m).

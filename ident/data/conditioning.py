@@ -1,8 +1,10 @@
-"""The filters between samples and rows (paper §2.3), chosen once and reported with every relative error.
+"""The filters between samples and rows (paper §2.3),
+chosen once and reported with every relative error.
 
-Positions go through a zero-phase Butterworth low-pass before they are differentiated. Every column of the equations,
-and the currents, then go through one decimator. Both are written out here: they are twenty lines each, and importing
-scipy.signal for them would take longer than fitting a minute of data. The tests compare both with scipy.signal.
+Positions go through a zero-phase Butterworth low-pass before they are differentiated. Every column
+of the equations, and the currents, then go through one decimator. Both are written out here: they
+are twenty lines each, and importing scipy.signal for them would take longer than fitting a minute
+of data. The tests compare both with scipy.signal.
 """
 
 from __future__ import annotations
@@ -19,25 +21,31 @@ from ident.arrays import FloatArray, IntArray
 from ident.errors import ModelError
 
 FULL_FILTER_HZ = 125.0
-"""Sampling rate from which the usual cut-offs hold, that of a real arm in the tests; below, they fall with it."""
+"""Sampling rate from which the usual cut-offs hold, that of a real arm in the tests;
+below, they fall with it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
     """How raw samples become rows."""
 
-    position_cutoff_hz: float = 40.0  #: zero-phase Butterworth on the position, before the central differences
+    #: zero-phase Butterworth on the position, before the central differences
+    position_cutoff_hz: float = 40.0
     position_order: int = 4  #: order of that filter
     #: Of the parallel decimation of every column; there is a row every 1/(2.5 cut-off).
     decimation_cutoff_hz: float = 20.0
-    #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty, it is derived from
-    #: each run (`ident.data.dataset.standstill_speed`).
+    #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty,
+    #: it is derived from each run (`ident.data.dataset.standstill_speed`).
     standstill_rad_s: tuple[float, ...] = ()
-    standstill_share: float = 0.1  #: a row is left out when standstill fills more than this share of its filter window
+    #: a row is left out when standstill fills more than this share of its filter window
+    standstill_share: float = 0.1
 
     @classmethod
     def for_rates(cls, rates_hz: Iterable[float]) -> Self:
-        """Return filters for recordings of some sampling rates: the usual ones, lower for slow recordings."""
+        """Return filters for recordings of some sampling rates:
+        the usual ones, lower for slow recordings.
+        """
         share = 1.0
         for rate_hz in rates_hz:
             share = min(share, rate_hz / FULL_FILTER_HZ)
@@ -61,8 +69,8 @@ class Conditioning:
             given = ", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing"
             numbers = ", ".join(sorted(expected.keys() - {"standstill_rad_s"}))
             raise ModelError(
-                f"the filter of the calibration: found {given}; expected a list standstill_rad_s and numbers "
-                f"{numbers}; give `conditioning`, or fit again"
+                f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
+                f"and numbers {numbers}; give `conditioning`, or fit again"
             )
         order = round(found.pop("position_order"))
         speeds = tuple(found.pop("standstill_rad_s"))
@@ -99,8 +107,12 @@ def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -
     return backwards[:, ::-1][:, pad:-pad]
 
 
-def central_differences(smooth: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Position, velocity and acceleration of all samples but the first and last; time last, (c, k) → (c, k − 2)."""
+def central_differences(
+    smooth: FloatArray, rate_hz: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, velocity and acceleration of all samples but the first and last;
+    time last, (c, k) → (c, k − 2).
+    """
     before = smooth[:, :-2]
     position = smooth[:, 1:-1]
     after = smooth[:, 2:]
@@ -171,10 +183,11 @@ def _filtered(sections: list[_Section], values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Decimator:
-    """A symmetric FIR low-pass of which every q-th output is used: zero phase, and a window of finite length.
+    """A symmetric FIR low-pass of which every q-th output is used:
+    zero phase, and a window of finite length.
 
-    The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of the window" a
-    definite statement.
+    The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of
+    the window" a definite statement.
     """
 
     taps: FloatArray  #: weights, odd number, summing to one
@@ -201,8 +214,8 @@ class Decimator:
         *leading, samples = columns.shape
         count = self.rows(samples)
         factor = self.factor
-        # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over blocks of samples: one
-        # matrix product that reads every sample once.
+        # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over
+        # blocks of samples: one matrix product that reads every sample once.
         blocks = ceil(len(self.taps) / factor)
         taps = np.zeros(blocks * factor)
         taps[: len(self.taps)] = self.taps
@@ -223,7 +236,9 @@ class Decimator:
 
 @lru_cache(maxsize=64)
 def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
-    """Decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off, transition as wide as the cut-off."""
+    """Decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off,
+    transition as wide as the cut-off.
+    """
     factor = max(1, round(rate_hz / (2.5 * cutoff_hz)))
     half = round(3.3 * rate_hz / cutoff_hz / 2.0)
     samples = np.arange(-half, half + 1)

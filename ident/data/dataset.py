@@ -1,4 +1,6 @@
-"""A run with its derivatives: low-passed positions, central differences, and samples at standstill."""
+"""A run with its derivatives: low-passed positions, central differences,
+and samples at standstill.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,16 @@ from functools import partial
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array, require_number, require_real, takes
+from ident.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Refusal,
+    as_array,
+    require_number,
+    require_real,
+    takes,
+)
 from ident.data.channel_faults import (
     ChannelFault,
     ChannelKind,
@@ -28,24 +39,34 @@ from ident.model.robot import Motion
 STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the 95 % quantile of the joint's speed."""
 STANDSTILL_SIGMAS = 6.0
-"""Least standstill speed in standard deviations of the encoder's noise after filter and difference."""
+"""Least standstill speed in standard deviations of the encoder's noise after filter and
+difference.
+"""
 
 SLOWEST_HZ = 10.0
-"""Sampling rate below which times are in another unit: no controller records the motion of an arm so rarely."""
+"""Sampling rate below which times are in another unit:
+no controller records the motion of an arm so rarely.
+"""
 
 SETTLED_PERIODS = 4.0
-"""Periods of the position low-pass after which its response to a wrong position is over: 1e-4 of it is left."""
+"""Periods of the position low-pass after which its response to a wrong position is over:
+1e-4 of it is left.
+"""
 
 LARGEST_JITTER = 0.01  #: Range of the steps of time, as a share of their median
 MEDIAN_OF_NORMAL = 0.6745  #: Median of |Z| of a standard normal Z
 
 LONGEST_MOVE_S = 2.0
-"""Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a second)."""
+"""Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a
+second).
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """A run with derivatives; arrays have the shape (k, n), and each axis is contiguous in memory."""
+    """A run with derivatives; arrays have the shape (k, n),
+    and each axis is contiguous in memory.
+    """
 
     name: str  #: of the run
     rate_hz: float  #: sampling rate
@@ -57,21 +78,27 @@ class Dataset:
     moving: BoolArray  #: joint faster than its standstill speed
     motor_moving: BoolArray  #: motor faster than its joint's standstill speed times the reduction
     valid: BoolArray  #: sample may be used
-    move: IntArray  #: number of the move of each sample, shape (k,); one longer than LONGEST_MOVE_S counts as several
+    #: number of the move of each sample, shape (k,); one longer than LONGEST_MOVE_S counts as
+    #: several
+    move: IntArray
     payload: Payload | None  #: what was mounted, None without load
     #: When the run began, on a clock that the runs of one session share; None without a clock.
     started_s: float | None = None
-    #: Motion that the drives were asked for, all k samples; None where it is not known (`ident.data.demand`).
+    #: Motion that the drives were asked for, all k samples; None where it is not known
+    #: (`ident.data.demand`).
     demanded: Motion | None = None
-    #: Temperature of each motor or its drive [°C], NaN for one without; None where none was recorded.
+    #: Temperature of each motor or its drive [°C], NaN for one without; None where none was
+    #: recorded.
     temperature_c: FloatArray | None = None
-    #: Samples whose current was clipped by a limit that the drive does not report; they are not valid. None where
-    #: clipping was not looked for.
+    #: Samples whose current was clipped by a limit that the drive does not report; they are not
+    #: valid. None where clipping was not looked for.
     clipped: BoolArray | None = None
-    held: HeldChannels | None = None  #: channels whose held readings were filled in; None where none was held
+    #: channels whose held readings were filled in; None where none was held
+    held: HeldChannels | None = None
     #: What is wrong with samples that count; glitches were filled in, what is frozen is not valid.
     faults: tuple[ChannelFault, ...] = ()
-    is_planned: bool = False  #: a motion that was asked for: nothing of a recording can be wrong with it
+    #: a motion that was asked for: nothing of a recording can be wrong with it
+    is_planned: bool = False
 
     def motion(self, part: slice = slice(None)) -> Motion:
         """Motion of the joints over some of the samples."""
@@ -83,24 +110,29 @@ class Dataset:
 
 
 @takes(run=Run, drive_train=DriveTrain, conditioning=Conditioning | None)
-def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning | None = None) -> Dataset:
+def differentiate(
+    run: Run, drive_train: DriveTrain, conditioning: Conditioning | None = None
+) -> Dataset:
     """Filter the positions without phase, then take central differences (paper §2.3).
 
     Args:
         run: a recording of n joints.
         drive_train: R, for the speed of coupled motors.
-        conditioning: cut-offs and standstill speeds; these are derived from the run where none are declared. Without
-            it, filters for the run's sampling rate (`Conditioning.for_rates`).
+        conditioning: cut-offs and standstill speeds; these are derived from the run where none are
+            declared. Without it, filters for the run's sampling rate (`Conditioning.for_rates`).
 
     Raises:
-        DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
+        DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short
+            a recording.
     """
     refuse = partial(DataUnfit, run.name)
     if conditioning is None:
         conditioning = usual_conditioning([run])
     time_s = as_array("time_s", run.time_s, refuse=refuse)
     if time_s.ndim != 1:
-        raise refuse(f"time_s has shape {time_s.shape}; expected (n_samples,), one entry per sample")
+        raise refuse(
+            f"time_s has shape {time_s.shape}; expected (n_samples,), one entry per sample"
+        )
     given = _checked(run, time_s, drive_train, conditioning, refuse)
     shape = given.current.shape
     rate_hz = replace(run, time_s=time_s).rate_hz
@@ -172,7 +204,11 @@ class _CheckedArrays:
 
 
 def _checked(
-    run: Run, time_s: FloatArray, drive_train: DriveTrain, conditioning: Conditioning, refuse: Refusal
+    run: Run,
+    time_s: FloatArray,
+    drive_train: DriveTrain,
+    conditioning: Conditioning,
+    refuse: Refusal,
 ) -> _CheckedArrays:
     """Check the arrays of a run, and its times against the filters.
 
@@ -196,14 +232,17 @@ def _checked(
 
 
 def _moves_between_standstills(moving: BoolArray) -> IntArray:
-    """Number of the move of each sample, shape (n, k) → (k,): a new one begins after every standstill of all joints."""
+    """Number of the move of each sample, shape (n, k) → (k,):
+    a new one begins after every standstill of all joints.
+    """
     any_moving = np.any(moving, axis=0).astype(np.int64)
     begins = np.diff(any_moving, prepend=1) > 0
     return np.cumsum(begins)
 
 
 def _split_moves(move: IntArray | FloatArray, longest: int) -> IntArray:
-    """Number of the move of each sample where long moves are split after so many samples, shape (k,).
+    """Number of the move of each sample where long moves are split after so many samples,
+    shape (k,).
 
     σ and folds need many moves, and continuous motion would be a single one.
     """
@@ -215,7 +254,9 @@ def _split_moves(move: IntArray | FloatArray, longest: int) -> IntArray:
     return np.cumsum(begins, dtype=np.int64) - 1
 
 
-def _temperature(values: object, shape: tuple[int, ...], each: str, refuse: Refusal) -> FloatArray | None:
+def _temperature(
+    values: object, shape: tuple[int, ...], each: str, refuse: Refusal
+) -> FloatArray | None:
     """Temperatures of a run, shape (k, n), NaN where a motor has none; None without any."""
     if values is None:
         return None
@@ -226,7 +267,9 @@ def _temperature(values: object, shape: tuple[int, ...], each: str, refuse: Refu
     return temperature_c
 
 
-def moving_samples(velocity: FloatArray, speed: FloatArray, drive_train: DriveTrain) -> tuple[BoolArray, BoolArray]:
+def moving_samples(
+    velocity: FloatArray, speed: FloatArray, drive_train: DriveTrain
+) -> tuple[BoolArray, BoolArray]:
     """Samples of each joint, and of each motor, that are not at standstill, shape (n, k) each.
 
     Args:
@@ -235,21 +278,27 @@ def moving_samples(velocity: FloatArray, speed: FloatArray, drive_train: DriveTr
         drive_train: R, for the speed of coupled motors.
     """
     moving = np.abs(velocity) >= speed[:, None]
-    # Motor speed divided by the reduction, compared at the motor's joint, which may have another number.
+    # Motor speed divided by the reduction, compared at the motor's joint, which may have another
+    # number.
     motor_velocity = drive_train.direction @ velocity
     motor_speed = speed[list(drive_train.joints), None]
     return moving, np.abs(motor_velocity) >= motor_speed
 
 
-def standstill_speed(raw: FloatArray, smooth: FloatArray, rate_hz: float, conditioning: Conditioning) -> FloatArray:
-    """Speed below which a joint of a run is at standstill, for callers that declare none, shape (n,).
+def standstill_speed(
+    raw: FloatArray, smooth: FloatArray, rate_hz: float, conditioning: Conditioning
+) -> FloatArray:
+    """Speed below which a joint of a run is at standstill, for callers that declare none,
+    shape (n,).
 
-    Dry friction is undetermined at standstill: rows of a resting joint bias its gain. The speed must lie above the
-    noise of a resting joint and well below the speeds that identify it, so it is the larger of
+    Dry friction is undetermined at standstill: rows of a resting joint bias its gain. The speed
+    must lie above the noise of a resting joint and well below the speeds that identify it, so it is
+    the larger of
 
     - STANDSTILL_SHARE_OF_SPEED of the 95 % quantile of |q̇|, and
-    - STANDSTILL_SIGMAS of the noise of q̇ that comes from the encoder. What the low-pass takes out of the positions
-      is white noise above its cut-off; its median absolute value gives σ_q, and the filters' impulse response σ_q̇.
+    - STANDSTILL_SIGMAS of the noise of q̇ that comes from the encoder. What the low-pass takes out
+      of the positions is white noise above its cut-off; its median absolute value gives σ_q, and
+      the filters' impulse response σ_q̇.
 
     Args:
         raw, smooth: positions before and after the low-pass, shape (n, k).
@@ -293,13 +342,17 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
         ModelError: an argument is of another type, or the rate is not above zero.
     """
     refuse = partial(DataUnfit, "planned motion")
-    rate_hz = require_number("rate_hz", rate_hz, above=0.0, remedy="give the rate of the samples, such as 500")
+    rate_hz = require_number(
+        "rate_hz", rate_hz, above=0.0, remedy="give the rate of the samples, such as 500"
+    )
     position = as_array("position_rad", motion.position_rad, refuse=refuse)
     velocity = as_array("velocity_rad_s", motion.velocity_rad_s, refuse=refuse)
     acceleration = as_array("acceleration_rad_s2", motion.acceleration_rad_s2, refuse=refuse)
     shape = position.shape
     if position.ndim != 2 or not shape == velocity.shape == acceleration.shape:
-        found = f"{shape}, {velocity.shape} and {acceleration.shape}; expected (n_samples, n_axes) each"
+        found = (
+            f"{shape}, {velocity.shape} and {acceleration.shape}; expected (n_samples, n_axes) each"
+        )
         raise refuse(f"position, velocity and acceleration have the shapes {found}")
     everywhere = np.ones(shape, dtype=np.bool_)
     return Dataset(
@@ -330,12 +383,14 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     if speeds not in (0, count):
         raise refuse(f"{speeds} standstill speeds for {count} joints; give one a joint")
     if samples < 3 or not _is_uniform(run.time_s):
-        raise refuse("the sampling times are not uniform; derivatives need a constant rate without gaps")
+        raise refuse(
+            "the sampling times are not uniform; derivatives need a constant rate without gaps"
+        )
     if run.rate_hz < SLOWEST_HZ:
         between_s = (run.time_s[-1] - run.time_s[0]) / (samples - 1)
         raise refuse(
-            f"time_s has {between_s:g} s between samples; expected seconds, and at most {1.0 / SLOWEST_HZ:g} s; "
-            "if these are milliseconds, divide them by 1000"
+            f"time_s has {between_s:g} s between samples; expected seconds, and at most "
+            f"{1.0 / SLOWEST_HZ:g} s; if these are milliseconds, divide them by 1000"
         )
     cutoffs_hz = {
         "position": conditioning.position_cutoff_hz,
@@ -343,11 +398,16 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     }
     lowest = min(cutoffs_hz.values())
     if not lowest > 0.0:
-        raise refuse(f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning")
+        raise refuse(
+            f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning"
+        )
     name, highest = max(cutoffs_hz.items(), key=lambda item: item[1])
     least_rate_hz = 2.5 * highest
     if not run.rate_hz > least_rate_hz:
-        needed = f"`conditioning.{name}_cutoff_hz` of {highest:g} Hz needs more than {least_rate_hz:g} Hz"
+        needed = (
+            f"`conditioning.{name}_cutoff_hz` of {highest:g} Hz needs more than "
+            f"{least_rate_hz:g} Hz"
+        )
         raise refuse(f"sampled at {run.rate_hz:g} Hz; {needed}: record faster, or lower it")
     if samples < 2.0 * run.rate_hz:
         long = f"only {samples / run.rate_hz:.2g} s long"

@@ -1,15 +1,16 @@
 """The motion that was asked for, rebuilt from a recording of point-to-point moves.
 
-A torque disturbance inside the position loop moves the arm, and comes back in the current: the recorded motion and the
-equation's error then share a cause, and least squares are biased (Söderström & Stoica, System Identification, §10). The
-set-point of the loop knows nothing of the disturbance. Its motion gives the *instruments* of
-`ident.estimators.maximum_likelihood.iv`.
+A torque disturbance inside the position loop moves the arm, and comes back in the current: the
+recorded motion and the equation's error then share a cause, and least squares are biased
+(Söderström & Stoica, System Identification, §10). The set-point of the loop knows nothing of the
+disturbance. Its motion gives the *instruments* of `ident.estimators.maximum_likelihood.iv`.
 
-A drive in profile position mode makes a trapezoid of velocity from each set-point (CiA 402-2). So every motion of a
-motor between two rests is fitted by one, with three unknowns: when it starts, how long it accelerates, how long it
-lasts. Three numbers out of some hundred samples carry next to nothing of the disturbance. The lag of the loop goes into
-the start; a smoother profile differs little from its trapezoid, and an instrument need only resemble the motion.
-Instruments from the recorded demand 6062h give the same gains (docs/decisions/0010).
+A drive in profile position mode makes a trapezoid of velocity from each set-point (CiA 402-2). So
+every motion of a motor between two rests is fitted by one, with three unknowns: when it starts, how
+long it accelerates, how long it lasts. Three numbers out of some hundred samples carry next to
+nothing of the disturbance. The lag of the loop goes into the start; a smoother profile differs
+little from its trapezoid, and an instrument need only resemble the motion. Instruments from the
+recorded demand 6062h give the same gains (docs/decisions/0010).
 """
 
 from __future__ import annotations
@@ -27,17 +28,24 @@ from ident.model.model import DriveTrain
 from ident.model.robot import Motion
 
 SLOW = (0.01, 0.03, 0.1)
-"""Share of a motor's speed (95 % quantile) below which it rests. The first one that finds its moves will do: a lower
-one overlooks rests of a disturbed motor, a higher one slow moves."""
+"""Share of a motor's speed (95 % quantile) below which it rests.
+
+The first one that finds its moves will do: a lower one overlooks rests of a disturbed motor, a
+higher one slow moves.
+"""
 REST_S = 0.05  #: Time over which that speed is a mean, and of the shortest rest
-SMALLEST_WAY = 0.01  #: Share of a motor's range: a shorter way between two rests is a settling or disturbed motor
+#: Share of a motor's range: a shorter way between two rests is a settling or disturbed motor
+SMALLEST_WAY = 0.01
 POINTS = 64  #: Samples of each move that the fit sees: twenty for each of its unknowns
 ITERATIONS = 25
-MAX_SPLITS = 4  #: Moves to each move that was found at first: continuous motion is not cut up for ever
+#: Moves to each move that was found at first: continuous motion is not cut up for ever
+MAX_SPLITS = 4
 FOUND = 0.98  #: Share of a motor's squared velocity that is followed when every move was found
 EXPLAINED = 0.9
-"""Least share of each motor's squared velocity that the trapezoids must follow; point-to-point moves reach 0.98 and
-more. A sine between two turning points may pass too: its trapezoid resembles it, which is all that is needed."""
+"""Least share of each motor's squared velocity that the trapezoids must follow; point-to-point
+moves reach 0.98 and more. A sine between two turning points may pass too: its trapezoid resembles
+it, which is all that is needed.
+"""
 SMALLEST_SQUARE = 1e-300  #: Of a velocity that is divided by
 NUDGE = 1e-4  #: Step of the differences of `_fitted`, as a share of a move's duration
 SEEN_FROM = 0.02  #: Share of a way at which a move is seen to have begun
@@ -45,7 +53,9 @@ SEEN_TO = 0.98  #: Share at which it is seen to be done
 
 
 class Demands:
-    """Set-points of runs, each rebuilt when it is first needed: a search needs those of the same runs often."""
+    """Set-points of runs, each rebuilt when it is first needed:
+    a search needs those of the same runs often.
+    """
 
     def __init__(self) -> None:
         self._found: dict[int, tuple[Dataset, FloatArray | None]] = {}
@@ -60,9 +70,13 @@ class Demands:
 
 
 def with_demand(
-    data: Dataset, drive_train: DriveTrain, conditioning: Conditioning, demands: Demands | None = None
+    data: Dataset,
+    drive_train: DriveTrain,
+    conditioning: Conditioning,
+    demands: Demands | None = None,
 ) -> Dataset:
-    """Add the motion that the drives were asked for, filtered as the recorded one; unchanged where it is unknown.
+    """Add the motion that the drives were asked for, filtered as the recorded one;
+    unchanged where it is unknown.
 
     Args:
         data: a run of n joints.
@@ -77,7 +91,9 @@ def with_demand(
     if position is None:
         return data
     rate_hz = data.rate_hz
-    smooth = low_pass(position.T, rate_hz, conditioning.position_cutoff_hz, conditioning.position_order)
+    smooth = low_pass(
+        position.T, rate_hz, conditioning.position_cutoff_hz, conditioning.position_order
+    )
     velocity = np.gradient(smooth, axis=1) * rate_hz
     acceleration = np.gradient(velocity, axis=1) * rate_hz
     demanded = Motion(smooth.T, velocity.T, acceleration.T)
@@ -85,7 +101,9 @@ def with_demand(
 
 
 def as_demanded(data: Dataset) -> Dataset:
-    """The run as it would have been if it had followed its set-points; the run itself where they are unknown."""
+    """The run as it would have been if it had followed its set-points;
+    the run itself where they are unknown.
+    """
     demanded = data.demanded
     if demanded is None:
         return data
@@ -105,8 +123,8 @@ def demanded_positions(data: Dataset, drive_train: DriveTrain) -> FloatArray | N
         drive_train: R: coupled motors make the trapezoids, not their joints.
 
     Returns:
-        demanded positions of the joints [rad; m for a prismatic joint], shape (k, n), delayed like the recorded ones;
-        None where the motion of a motor is not made of trapezoids between rests.
+        demanded positions of the joints [rad; m for a prismatic joint], shape (k, n), delayed like
+        the recorded ones; None where the motion of a motor is not made of trapezoids between rests.
     """
     recorded = drive_train.direction @ data.position_rad.T
     demanded = recorded.copy()
@@ -150,7 +168,9 @@ class _Rest:
 
 
 def _trapezoids(position: FloatArray, rate_hz: float, slow: float) -> FloatArray:
-    """Positions of one motor with each motion between two rests replaced by its trapezoid, shape (k,)."""
+    """Positions of one motor with each motion between two rests replaced by its trapezoid,
+    shape (k,).
+    """
     # A disturbed motor is never quite still: its speed is a mean over REST_S.
     half = max(1, round(0.5 * REST_S * rate_hz))
     speed = _mean_speed(position, half)
@@ -170,7 +190,8 @@ def _trapezoids(position: FloatArray, rate_hz: float, slow: float) -> FloatArray
             share = _way(time_s[None], parameters[None])[0]
             out[move] = start.level + (end.level - start.level) * share
             out[end.sample :] = out[end.sample - 1]
-            # Two moves with a rest between them that the disturbance has hidden: they part where it is slowest.
+            # Two moves with a rest between them that the disturbance has hidden: they part where it
+            # is slowest.
             margin = samples // 10
             if margin > half and _misfit(position[move], out[move]) > 1.0 - EXPLAINED:
                 inner = slice(start.sample + margin, end.sample - margin)
@@ -184,7 +205,9 @@ def _trapezoids(position: FloatArray, rate_hz: float, slow: float) -> FloatArray
 
 
 def _mean_speed(position: FloatArray, half: int) -> FloatArray:
-    """Speed of a motor around each sample [a sample], over so many samples on either side, shape (k,)."""
+    """Speed of a motor around each sample [a sample], over so many samples on either side,
+    shape (k,).
+    """
     samples = np.arange(len(position))
     last = len(position) - 1
     ahead = np.clip(samples + half, 0, last)
@@ -194,7 +217,9 @@ def _mean_speed(position: FloatArray, half: int) -> FloatArray:
 
 
 def _fitted_between(position: FloatArray, stops: Sequence[_Stop], rate_hz: float) -> FloatArray:
-    """Start, ramp and duration [s] of the move after each stop but the last, shape (m, 3); see `_fitted`."""
+    """Start, ramp and duration [s] of the move after each stop but the last, shape (m, 3);
+    see `_fitted`.
+    """
     shares = np.linspace(0.0, 1.0, POINTS)
     times: list[FloatArray] = []
     ways: list[FloatArray] = []
@@ -240,7 +265,8 @@ def _rests(position: FloatArray, slow: BoolArray, shortest: int) -> list[_Rest]:
 
 
 def _fitted(time_s: FloatArray, way: FloatArray) -> FloatArray:
-    """Start, ramp and duration [s] of each move by damped Gauss-Newton, all moves at once, shape (m, 3).
+    """Start, ramp and duration [s] of each move by damped Gauss-Newton, all moves at once,
+    shape (m, 3).
 
     Args:
         time_s: of the points of each move, shape (m, POINTS).

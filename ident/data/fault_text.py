@@ -75,22 +75,28 @@ def found(fault: ChannelFault) -> str:
             lengths = fault.stretches[:, 1] - fault.stretches[:, 0]
             longest_ms = 1e3 * int(lengths.max()) / fault.rate_hz
             return (
-                f"{what} that leaves its course by up to {_sized(fault)} and returns within {longest_ms:.3g} ms, "
-                f"{often}, {share}"
+                f"{what} that leaves its course by up to {_sized(fault)} and returns within "
+                f"{longest_ms:.3g} ms, {often}, {share}"
             )
         case FaultKind.FROZEN:
             return f"{what} that keeps one number while its motor moves, {share}, {often}"
         case FaultKind.CLIPPED:
             return f"{what} that ends at one number while its motor moves on, {share}, {often}"
         case FaultKind.WRAPPING:
-            return f"{what} that steps by {_sized(fault)} in one sample, {often}: a counter{_bits(fault)} that wraps"
+            return (
+                f"{what} that steps by {_sized(fault)} in one sample, {often}: a "
+                f"counter{_bits(fault)} that wraps"
+            )
         case FaultKind.UNSIGNED:
             return (
-                f"{what} of which one part is {_sized(fault)} above the other, with nothing between: negative numbers"
-                f"{_bits(fault)} that were read without their sign"
+                f"{what} of which one part is {_sized(fault)} above the other, with nothing "
+                f"between: negative numbers{_bits(fault)} that were read without their sign"
             )
         case FaultKind.DISPLACED:
-            return f"{what} that steps by {_sized(fault)} in one sample, and goes on displaced, {often}"
+            return (
+                f"{what} that steps by {_sized(fault)} in one sample, and goes on "
+                f"displaced, {often}"
+            )
 
 
 def expected(fault: ChannelFault) -> str:
@@ -106,15 +112,21 @@ def remedy(fault: ChannelFault) -> str:
     match fault.kind:
         case FaultKind.WRAPPING if is_position:
             return (
-                "record or export a counter of all turns (of 32 bits), or unwrap the column: nothing in it says in "
-                "which turn it began"
+                "record or export a counter of all turns (of 32 bits), or unwrap the column: "
+                "nothing in it says in which turn it began"
             )
         case FaultKind.WRAPPING | FaultKind.UNSIGNED:
-            return "read the object or the column as a signed number of enough bits, and record or import again"
+            return (
+                "read the object or the column as a signed number of enough bits, and record or "
+                "import again"
+            )
         case FaultKind.CLIPPED:
             return "widen the range of what recorded it, or move within it; record again"
         case _ if is_position:
-            return "check the encoder, its cable, and the object or column of the position; record again"
+            return (
+                "check the encoder, its cable, and the object or column of the position; "
+                "record again"
+            )
         case _:
             return "check the object or column of the current, and what sends it; record again"
 
@@ -125,7 +137,9 @@ def _sized(fault: ChannelFault) -> str:
 
 
 def _bits(fault: ChannelFault) -> str:
-    """Say how many bits a counter has, where its range is a power of two in counts; else nothing."""
+    """Say how many bits a counter has, where its range is a power of two in counts;
+    else nothing.
+    """
     count = fault.count
     if fault.unit == COUNTS:
         count = 1.0

@@ -1,10 +1,12 @@
-"""Stretches in which a channel keeps one number although its motor moves: an encoder that froze, a limit of a range.
+"""Stretches in which a channel keeps one number although its motor moves:
+an encoder that froze, a limit of a range.
 
-A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only stops from one sample
-to the next is none: a robot may run into something, and a simple device may know no acceleration. One that never goes
-on is frozen where every other stop and turn of its motor was far gentler, and the other motors still move. A position
-at the end of its range does not jump; it stops, and goes on, without any acceleration. A frozen current lacks its noise
-while its motor moves.
+A frozen position goes on with a jump, by the way that its motor has gone meanwhile. One that only
+stops from one sample to the next is none: a robot may run into something, and a simple device may
+know no acceleration. One that never goes on is frozen where every other stop and turn of its motor
+was far gentler, and the other motors still move. A position at the end of its range does not jump;
+it stops, and goes on, without any acceleration. A frozen current lacks its noise while its motor
+moves.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ from ident.data.held import ROUNDING
 LEAST_S = 0.05  #: Shortest stretch; shorter ones are held readings
 LEAST_CURRENT_S = 0.1  #: Likewise of a current
 ABRUPT = 3.0
-"""Way within BESIDE_S next to a stretch, in multiples of the largest usual change of it from one such time to the next:
-what a motor has on its way to a standstill is half of that."""
+"""Way within BESIDE_S next to a stretch, in multiples of the largest usual change of it from one
+such time to the next: what a motor has on its way to a standstill is half of that.
+"""
 USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
 ABRUPT_COUNTS = 10.0  #: And in counts
 JUMP = 3.0  #: Jump at the end of a frozen stretch, in multiples of the largest usual step
@@ -28,7 +31,8 @@ BESIDE_S = 0.01  #: Time over which that way is measured
 LEAST_BESIDE = 3  #: Least samples of that time
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
 LENGTH_PERCENTILE = 99.0  #: Of the lengths of what else is constant
-NOISY = 0.25  #: Least share of the changes of a current that turn back: without noise, constant shows nothing
+#: Least share of the changes of a current that turn back: without noise, constant shows nothing
+NOISY = 0.25
 MOVED = 0.02  #: Least way of a motor that moves in a stretch, as a share of its range
 LEAST_TURNS = 2  #: Changes of direction that show how gently a motor slows down
 LATER_S = 0.5  #: Time after a stop in which other motors may still come to rest with it
@@ -77,7 +81,8 @@ def frozen_to_the_end(readings: Readings, others: FloatArray) -> IntArray:
 
 
 def _stops_abruptly(course: FloatArray, span: int, count: float) -> bool:
-    """Whether a position stops at its last sample, and every other stop and turn before was far gentler.
+    """Whether a position stops at its last sample, and every other stop and turn before was far
+    gentler.
 
     Args:
         course: position at every sample, shape (k,).
@@ -110,7 +115,8 @@ def _go_on(others: FloatArray, sample: int) -> bool:
 
 
 def clipped_position(readings: Readings) -> IntArray:
-    """Stretches in which a position stands at the largest, or the smallest, value of its range, shape (s, 2).
+    """Stretches in which a position stands at the largest, or the smallest, value of its range,
+    shape (s, 2).
 
     Args:
         readings: of a motor's position.
@@ -122,7 +128,9 @@ def clipped_position(readings: Readings) -> IntArray:
 
 
 def _abrupt(readings: Readings) -> IntArray:
-    """Stretches in which a position is constant and that begin or end without any acceleration, shape (s, 2)."""
+    """Stretches in which a position is constant and that begin or end without any acceleration,
+    shape (s, 2).
+    """
     rounding = _rounding(readings)
     stretches = _constant(readings, rounding, LEAST_S)
     span = _samples_of_span(readings)
@@ -199,7 +207,9 @@ def _samples_of_span(readings: Readings) -> int:
 
 
 def _course(readings: Readings) -> FloatArray:
-    """A channel at every sample, from the first to the last reading; a held reading is on the way to the next one."""
+    """A channel at every sample, from the first to the last reading;
+    a held reading is on the way to the next one.
+    """
     samples = np.arange(int(readings.sample[-1]) + 1)
     return np.asarray(np.interp(samples, readings.sample, readings.values))
 
@@ -226,7 +236,9 @@ def _constant(readings: Readings, rounding: float, least_s: float) -> list[tuple
 
 
 def _samples(readings: Readings, found: list[tuple[int, int]]) -> IntArray:
-    """First sample and end of stretches that are given by their first and last reading, shape (s, 2)."""
+    """First sample and end of stretches that are given by their first and last reading, shape (s,
+    2).
+    """
     if not found:
         return _no_stretch()
     first, last = np.array(found).T

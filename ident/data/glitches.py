@@ -1,8 +1,10 @@
-"""Samples that leave the course of a channel and return to it, and steps after which it does not return.
+"""Samples that leave the course of a channel and return to it,
+and steps after which it does not return.
 
-A motor does not turn back within a few samples, and its position goes on from where it was. A reading that does neither
-is none: a flipped bit, a lost frame, a sign that is wrong for a sample, a reading of zero where nothing was read. Where
-the channel does not return, the encoder has lost its place, or its counter has wrapped: it goes on, a fixed step away.
+A motor does not turn back within a few samples, and its position goes on from where it was. A
+reading that does neither is none: a flipped bit, a lost frame, a sign that is wrong for a sample, a
+reading of zero where nothing was read. Where the channel does not return, the encoder has lost its
+place, or its counter has wrapped: it goes on, a fixed step away.
 
 A step is judged by the steps around it, so speed, noise and counts are those of the moment.
 """
@@ -20,26 +22,39 @@ SUSPECT = 10.0
 """A step is looked at whose change is so many times a percentile of the changes of a channel."""
 POSITION_PERCENTILE = 90.0  #: That percentile of a position, which is smooth at any time
 CURRENT_PERCENTILE = 98.0
-"""That percentile of a current. A controller may ask for one that lasts a sample: where a joint breaks loose, those of
-a real robot have up to 12 times the percentile, and ring on."""
+"""That percentile of a current.
+
+A controller may ask for one that lasts a sample: where a joint breaks loose, those of a real robot
+have up to 12 times the percentile, and ring on.
+"""
 JUMP = 10.0
-"""A jump differs from the steps around it by so many times their spread. Noise that is normal reaches 5 times."""
+"""A jump differs from the steps around it by so many times their spread.
+
+Noise that is normal reaches 5 times.
+"""
 SPREAD_PERCENTILE = 80.0
-"""Percentile of the distances of the steps around from their median: a current that goes up and down with friction has
-many small ones among its large ones; two other glitches may be near."""
+"""Percentile of the distances of the steps around from their median: a current that goes up and
+down with friction has many small ones among its large ones; two other glitches may be near.
+"""
 JUMP_COUNTS = 20.0  #: And by so many counts: an encoder at rest may flicker
-LEAST_CHANGES = 20  #: Of a channel that shows its counts: those of an axis at rest may be glitches alone
+#: Of a channel that shows its counts: those of an axis at rest may be glitches alone
+LEAST_CHANGES = 20
 NEAR = 5  #: Nearest step around a jump that is compared with it, on either side
 FAR = 14  #: Farthest one
 SHORT = 3  #: Readings that a glitch of any shape may have
-LONGEST_S = 0.05  #: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
+#: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
+LONGEST_S = 0.05
 USUAL_PERCENTILES = 1.0, 99.0
-"""Their distance is the usual range of a current. A short glitch of a current is larger: what a controller asks for
-where a joint breaks loose may last one reading, and nothing tells it from a smaller glitch, which bends no gain."""
+"""Their distance is the usual range of a current.
+
+A short glitch of a current is larger: what a controller asks for where a joint breaks loose may
+last one reading, and nothing tells it from a smaller glitch, which bends no gain.
+"""
 RETURN = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
 RETURNED = 2  #: Readings after it that are on the course; what rings on is a blow to the robot
 SAME_SIZE = 0.05  #: Largest relative difference of the steps of a counter that wraps
-EMPTY_FROM = 0.25  #: Beginning of the part of a range that is empty where negative numbers lost their sign
+#: Beginning of the part of a range that is empty where negative numbers lost their sign
+EMPTY_FROM = 0.25
 EMPTY_TO = 0.75  #: End of that part
 LEAST_SPLIT = 0.01  #: Least share of the values at either end of it
 WRAP_SHARE = 0.75  #: Least share of the range of a counter that was seen where it wraps
@@ -47,7 +62,9 @@ WRAP_SHARE = 0.75  #: Least share of the range of a counter that was seen where 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """The readings of a channel, without samples that repeat the one before because nothing was read."""
+    """The readings of a channel, without samples that repeat the one before because nothing was
+    read.
+    """
 
     values: FloatArray  #: shape (r,)
     sample: IntArray  #: number of the sample of each, increasing, shape (r,)
@@ -56,7 +73,9 @@ class Readings:
 
 
 def smallest_change(values: FloatArray) -> float | None:
-    """Return the smallest change of a channel, shape (k,); None where it changes too seldom to show one."""
+    """Return the smallest change of a channel, shape (k,);
+    None where it changes too seldom to show one.
+    """
     steps = np.abs(np.diff(values))
     rounding = ROUNDING * float(np.ptp(values))
     changes = steps[steps > rounding]
@@ -88,8 +107,8 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
 
     Args:
         readings: of the channel.
-        is_position: a position is continuous. A current may go up and down within some samples, so a longer glitch
-            of a current repeats one number.
+        is_position: a position is continuous. A current may go up and down within some samples, so
+            a longer glitch of a current repeats one number.
     """
     if is_position:
         percentile = POSITION_PERCENTILE
@@ -104,7 +123,9 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
     others: list[int] = []
     number = 0
     while number < len(step):
-        found = _glitch_from(readings, step[number:], size[number:], longest, smallest, is_position=is_position)
+        found = _glitch_from(
+            readings, step[number:], size[number:], longest, smallest, is_position=is_position
+        )
         if found is None:
             others.append(number)
             number += 1
@@ -157,7 +178,9 @@ def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
 
 
 def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
-    """Steps unlike those around them, by the number of the reading before, and their sizes less the motion."""
+    """Steps unlike those around them, by the number of the reading before,
+    and their sizes less the motion.
+    """
     no_jumps = (np.zeros(0, dtype=np.int64), np.zeros(0))
     steps = np.diff(readings.values)
     count = len(steps)
@@ -194,9 +217,16 @@ def _suspect_steps(steps: FloatArray, range_: float, percentile: float) -> IntAr
 
 
 def _glitch_from(
-    readings: Readings, step: IntArray, size: FloatArray, longest: int, smallest: float, *, is_position: bool
+    readings: Readings,
+    step: IntArray,
+    size: FloatArray,
+    longest: int,
+    smallest: float,
+    *,
+    is_position: bool,
 ) -> tuple[Glitch, int] | None:
-    """Return the glitch that begins with the first of the jumps, and how many of the jumps belong to it.
+    """Return the glitch that begins with the first of the jumps,
+    and how many of the jumps belong to it.
 
     Args:
         readings: of the channel.
@@ -212,7 +242,8 @@ def _glitch_from(
     signed_size = float(size[0])
     glitch_size = abs(signed_size)
     motion = float(values[first] - values[begin]) - signed_size
-    # A current steps where friction turns; one that does so near an end of the recording need not return.
+    # A current steps where friction turns; one that does so near an end of the recording need not
+    # return.
     is_alone = len(step) == 1 or step[1] - begin > longest
     if is_position and begin < SHORT and is_alone:
         return Glitch(0, first, glitch_size), 1
@@ -236,10 +267,12 @@ def _glitch_from(
 
 
 def is_split(values: FloatArray) -> BoolArray | None:
-    """Whether each value is in the upper part of a range whose middle is empty, shape (k,); None where it is not.
+    """Whether each value is in the upper part of a range whose middle is empty, shape (k,);
+    None where it is not.
 
-    A signed number that is read without its sign has its negative values at the other end of the counter's range, and
-    all have one sign: a current that friction alone turns between two values has both.
+    A signed number that is read without its sign has its negative values at the other end of the
+    counter's range, and all have one sign: a current that friction alone turns between two values
+    has both.
     """
     lowest = float(values.min())
     if lowest < 0.0 < float(values.max()):

@@ -1,12 +1,13 @@
-"""Readings that are held: a recorder that samples faster than the controller answers stores the same number again.
+"""Readings that are held: a recorder that samples faster than the controller answers stores the
+same number again.
 
-A held position is a staircase, and its derivatives are blows that no filter takes out again. Held samples are treated
-as missing: the position between two new readings is that of a cubic spline through them, the current that of a
-straight line. A reading is as old as its first sample says.
+A held position is a staircase, and its derivatives are blows that no filter takes out again. Held
+samples are treated as missing: the position between two new readings is that of a cubic spline
+through them, the current that of a straight line. A reading is as old as its first sample says.
 
-Repeated numbers alone show nothing: a joint at rest repeats its position, and a coarse encoder repeats each count until
-the next one comes. But where a reading stays for a while and then jumps by several counts, the counts between were not
-read.
+Repeated numbers alone show nothing: a joint at rest repeats its position, and a coarse encoder
+repeats each count until the next one comes. But where a reading stays for a while and then jumps by
+several counts, the counts between were not read.
 """
 
 from __future__ import annotations
@@ -18,18 +19,25 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray
 
 LEAST_HELD = 0.2
-"""Least share of the readings of a channel in motion that are held before it is treated. A noisy current repeats up to
-a twentieth of its readings by chance. A controller whose cycles are not even repeats a tenth of its positions, and
-a joint that two motors turn repeats what either of them does: 15 % on a real arm, which loses nothing by it."""
+"""Least share of the readings of a channel in motion that are held before it is treated.
+
+A noisy current repeats up to a twentieth of its readings by chance. A controller whose cycles are
+not even repeats a tenth of its positions, and a joint that two motors turn repeats what either of
+them does: 15 % on a real arm, which loses nothing by it.
+"""
 JUMP_COUNTS = 3.0  #: Smallest jump after a held reading, in counts of the channel
 ROUNDING = 1e-9  #: Of a channel's range: smaller changes are rounding, no counts
-BESIDE = 4  #: Readings on either side by which a damaged one is filled in; as many as it has samples, if these are more
+#: Readings on either side by which a damaged one is filled in; as many as it has samples, if these
+#: are more
+BESIDE = 4
 LONGEST_HOLD_S = 0.05  #: A reading that stays longer may be a joint at rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldChannels:
-    """Share of the readings in motion that were held, and how long a reading stays; 0 for channels left as they are."""
+    """Share of the readings in motion that were held, and how long a reading stays;
+    0 for channels left as they are.
+    """
 
     position_share: FloatArray  #: of each joint, shape (n,)
     position_hold_s: FloatArray  #: median, shape (n,)
@@ -42,7 +50,8 @@ class Channel:
     """One channel of a run without its held samples."""
 
     values: FloatArray  #: with what was held filled in, shape (k,)
-    share: float = 0.0  #: of the readings in motion that were held; 0 where the channel was left as it is
+    #: of the readings in motion that were held; 0 where the channel was left as it is
+    share: float = 0.0
     hold_s: float = 0.0  #: how long a reading stays, median; 0 where the channel was left as it is
 
 
@@ -59,10 +68,12 @@ def fill_held(
         position: of the joints, shape (k, n).
         current: of the motors, shape (k, n).
         rate_hz: sampling rate.
-        damaged_position, damaged_current: samples that are no readings, shape (k, n) each; None for none.
+        damaged_position, damaged_current: samples that are no readings, shape (k, n) each; None for
+            none.
 
     Returns:
-        position and current, the same arrays where nothing was filled in, and what was held, or None.
+        position and current, the same arrays where nothing was filled in, and what was held, or
+        None.
     """
     if damaged_position is None:
         damaged_position = np.zeros(position.shape, dtype=np.bool_)
@@ -87,7 +98,9 @@ def fill_held(
     return filled_position, filled_current, held
 
 
-def _without_held_of_each(columns: FloatArray, damaged: BoolArray, rate_hz: float, *, smooth: bool) -> list[Channel]:
+def _without_held_of_each(
+    columns: FloatArray, damaged: BoolArray, rate_hz: float, *, smooth: bool
+) -> list[Channel]:
     """`without_held` of each channel, shape (k, n)."""
     channels: list[Channel] = []
     for values, own_damaged in zip(columns.T, damaged.T, strict=True):
@@ -108,8 +121,11 @@ def held_channel(values: FloatArray, rate_hz: float) -> BoolArray | None:
     return held
 
 
-def without_held(values: FloatArray, rate_hz: float, *, smooth: bool, damaged: BoolArray | None = None) -> Channel:
-    """Fill in the held samples of a channel, unless fewer than LEAST_HELD are held, and the damaged ones.
+def without_held(
+    values: FloatArray, rate_hz: float, *, smooth: bool, damaged: BoolArray | None = None
+) -> Channel:
+    """Fill in the held samples of a channel, unless fewer than LEAST_HELD are held,
+    and the damaged ones.
 
     Args:
         values: of the channel, shape (k,).
@@ -147,14 +163,16 @@ def longest_smooth(rate_hz: float) -> int:
     return max(BESIDE, round(LONGEST_HOLD_S * rate_hz))
 
 
-def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int, time: FloatArray | None = None) -> FloatArray:
+def fill_damaged(
+    values: FloatArray, damaged: BoolArray, longest: int, time: FloatArray | None = None
+) -> FloatArray:
     """Fill in samples that are no readings, by those around them; the same array without any.
 
     Args:
         values: of a channel, shape (k,).
         damaged: shape (k,).
-        longest: so many samples and fewer are filled in by the cubic that fits BESIDE readings on either side best,
-            others by a straight line.
+        longest: so many samples and fewer are filled in by the cubic that fits BESIDE readings on
+            either side best, others by a straight line.
         time: of each sample, in any unit, shape (k,); None for a constant rate.
     """
     if not np.any(damaged) or np.all(damaged):
@@ -185,7 +203,8 @@ def fill_damaged(values: FloatArray, damaged: BoolArray, longest: int, time: Flo
 
 
 def held_samples(values: FloatArray, rate_hz: float) -> BoolArray:
-    """Return which samples repeat a reading that then jumps, shape (k,); its first sample is not one of them.
+    """Return which samples repeat a reading that then jumps, shape (k,);
+    its first sample is not one of them.
 
     Args:
         values: of a channel, shape (k,).

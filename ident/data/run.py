@@ -19,49 +19,63 @@ from ident.model.bodies import Payload
 class Recording:
     """How a log was made: evidence for the gates before a controller; axes in their order."""
 
-    recorded_s: float | None  #: Unix time of its first sample [s]; None where an imported log does not contain it
-    #: Mass of the payload as it was entered at the recording, from the scale; None without an entry.
+    #: Unix time of its first sample [s]; None where an imported log does not contain it
+    recorded_s: float | None
+    #: Mass of the payload as it was entered at the recording, from the scale; None without an
+    #: entry.
     entered_kg: float | None
-    serials: tuple[int | None, ...]  #: serial number of each amplifier, None for one that reports none
+    #: serial number of each amplifier, None for one that reports none
+    serials: tuple[int | None, ...]
     saturated_percent: tuple[float, ...]  #: share of each axis's samples in which a limit acted [%]
     lost_cycles: int  #: SYNC cycles that are not in it
     missing: tuple[int, ...]  #: samples in which each axis did not answer
     #: Digest of the controller's file when it was recorded; None where the cell named none.
     controller_sha256: str | None
-    operator: str | None = None  #: person or job responsible for it; None in calibrations of earlier versions
-    #: Digest of the description in the log, where a corrected description of the cell replaced it; None where none did,
-    #: and empty where the one in the log could not be read.
+    #: person or job responsible for it; None in calibrations of earlier versions
+    operator: str | None = None
+    #: Digest of the description in the log, where a corrected description of the cell replaced it;
+    #: None where none did, and empty where the one in the log could not be read.
     replaced_configuration_sha256: str | None = None
-    corrected: tuple[str, ...] = ()  #: sections in which the corrected description differs from the one in the log
+    #: sections in which the corrected description differs from the one in the log
+    corrected: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One recording of n joints over k samples at a constant rate; lists and data frames will do for arrays."""
+    """One recording of n joints over k samples at a constant rate;
+    lists and data frames will do for arrays.
+    """
 
-    name: str  #: for messages and reports (the log's stem); another one for each run that is of no log
+    #: for messages and reports (the log's stem); another one for each run that is of no log
+    name: str
     time_s: FloatArray  #: time of each sample [s], shape (k,), uniform
     position_rad: FloatArray  #: joint positions [rad; m for a prismatic joint], shape (k, n)
-    #: Input references of the current loops, one a motor [A, or whatever unit the drive speaks: a gain is Nm at the
-    #: joint per that unit], shape (k, n).
+    #: Input references of the current loops, one a motor [A, or whatever unit the drive speaks: a
+    #: gain is Nm at the joint per that unit], shape (k, n).
     current_a: FloatArray
     payload: Payload | None = None  #: what was mounted, or None without load
-    #: Number of the move that each sample belongs to, shape (k,), or None where it was not recorded.
+    #: Number of the move that each sample belongs to, shape (k,), or None where it was not
+    #: recorded.
     move: IntArray | None = None
     digest: str = ""  #: of the log it was read from (sha256, hex)
-    #: Whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
+    #: Whether each sample may be used, shape (k, n): False where a frame was missing or a limit
+    #: acted.
     valid: BoolArray | None = None
     #: When the run began, on a clock that the runs of one session share [s]; None without a clock.
     started_s: float | None = None
-    #: It is what was saved of a recording that was never finished, or one whose losses were accepted.
+    #: It is what was saved of a recording that was never finished, or one whose losses were
+    #: accepted.
     partial: bool = False
     recording: Recording | None = None  #: how the log was made; None where the run is from no log
-    #: Temperature of each motor or its drive [°C], shape (k, n), NaN for one without; None where none was recorded.
+    #: Temperature of each motor or its drive [°C], shape (k, n), NaN for one without; None where
+    #: none was recorded.
     temperature_c: FloatArray | None = None
-    #: The controller's own torque, one an axis, for a comparison with the gains that no fit uses; empty without any.
+    #: The controller's own torque, one an axis, for a comparison with the gains that no fit uses;
+    #: empty without any.
     torque_channels: tuple[TorqueChannel, ...] = ()
 
-    if TYPE_CHECKING:  # whatever becomes an array: the fields are converted where they are first used
+    # Whatever becomes an array: the fields are converted where they are first used
+    if TYPE_CHECKING:
 
         def __init__(
             self,

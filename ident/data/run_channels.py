@@ -1,7 +1,8 @@
-"""Faults of single channels of a run: a joint that never moves, a current that is constant, readings that are none.
+"""Faults of single channels of a run: a joint that never moves, a current that is constant,
+readings that are none.
 
-Each is plain in the channel itself. In the equations of a fit it looks like something else, such as a payload that was
-not mounted, so it is named from the channels before a cause is looked for there.
+Each is plain in the channel itself. In the equations of a fit it looks like something else, such as
+a payload that was not mounted, so it is named from the channels before a cause is looked for there.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ if TYPE_CHECKING:
     from ident.model.model import Model
 
 STILL_RANGE = {JointKind.REVOLUTE: 1e-3, JointKind.PRISMATIC: 1e-4}
-"""Range below which a joint has not moved, whatever its speed [rad or m]: an encoder's last count may flicker."""
-LEAST_MOVING = 0.01  #: Least share of a run in which a joint that moves is above its standstill speed
+"""Range below which a joint has not moved, whatever its speed [rad or m]:
+an encoder's last count may flicker.
+"""
+#: Least share of a run in which a joint that moves is above its standstill speed
+LEAST_MOVING = 0.01
 LEAST_SAMPLES = 20  #: Samples of a moving motor that show a constant current
 
 
@@ -36,16 +40,20 @@ class RunChannels:
     run: str  #: name of the run
     mounting: str | None  #: of the payload; None without load
     still: BoolArray  #: joints that never move, shape (m,)
-    range: FloatArray  #: from the smallest to the largest position of each joint [rad or m], shape (m,)
+    #: from the smallest to the largest position of each joint [rad or m], shape (m,)
+    range: FloatArray
     constant_current: BoolArray  #: motors that move with a current of one value, shape (m,)
     #: Share of the samples of each moving motor in which its current is clipped, shape (m,).
     clipped_percent: FloatArray
     held: HeldChannels | None  #: readings that were held; None where none was
     faults: tuple[ChannelFault, ...]  #: readings that are none (`ident.data.channel_faults`)
-    #: Share of the samples of each moving motor in which its drive gave less than the reference, shape (m,).
+    #: Share of the samples of each moving motor in which its drive gave less than the reference,
+    #: shape (m,).
     limited_percent: FloatArray
-    torque_limits: FloatArray  #: current that the torque of such a motor shows at most; NaN for others, shape (m,)
-    limits: FloatArray  #: largest current of each motor by size, in the unit of the currents, shape (m,)
+    #: current that the torque of such a motor shows at most; NaN for others, shape (m,)
+    torque_limits: FloatArray
+    #: largest current of each motor by size, in the unit of the currents, shape (m,)
+    limits: FloatArray
 
 
 def channels_of(model: Model, data: Dataset) -> RunChannels:
@@ -114,17 +122,21 @@ def clip_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator
 
 
 def limit_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
-    """Name drives that gave less current than their reference asked for; these samples were left out."""
+    """Name drives that gave less current than their reference asked for;
+    these samples were left out.
+    """
     for run in runs:
         for axis in np.flatnonzero(run.limited_percent > 0.0).tolist():
             yield Diagnosis(
                 "current-limited",
                 (run.run,),
                 (axes[axis],),
-                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque shows at most "
-                f"{run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the samples were left out",
+                f"a current reference of up to {run.limits[axis]:.4g}, of which the torque shows "
+                f"at most {run.torque_limits[axis]:.3g}; {run.limited_percent[axis]:.2g} % of the "
+                "samples were left out",
                 "a drive that gives the current that its reference asks for",
-                "raise the limit of the current in the drive, or record slower moves or with a lighter payload",
+                "raise the limit of the current in the drive, or record slower moves or with a "
+                "lighter payload",
             )
 
 
@@ -134,11 +146,11 @@ def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
         "current-clipped",
         (run.run,),
         (name,),
-        f"a current that is clipped at {run.limits[axis]:.4g} in {run.clipped_percent[axis]:.2g} % of the samples; "
-        "they were left out",
+        f"a current that is clipped at {run.limits[axis]:.4g} in {run.clipped_percent[axis]:.2g} % "
+        "of the samples; they were left out",
         "a current that follows the torque at every moment",
-        "record slower moves or with a lighter payload, or raise the limit of the current in the drive or in what "
-        "recorded it",
+        "record slower moves or with a lighter payload, or raise the limit of the current in the "
+        "drive or in what recorded it",
     )
 
 
@@ -156,12 +168,18 @@ def held_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator
         if held is None:
             continue
         if held.position_share.any():
-            yield _held_diagnosis(run.run, "positions", axes, held.position_share, held.position_hold_s)
+            yield _held_diagnosis(
+                run.run, "positions", axes, held.position_share, held.position_hold_s
+            )
         if held.current_share.any():
-            yield _held_diagnosis(run.run, "currents", axes, held.current_share, held.current_hold_s)
+            yield _held_diagnosis(
+                run.run, "currents", axes, held.current_share, held.current_hold_s
+            )
 
 
-def _held_diagnosis(run: str, quantity: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray) -> Diagnosis:
+def _held_diagnosis(
+    run: str, quantity: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray
+) -> Diagnosis:
     """Name readings of some axes that were held."""
     affected = np.flatnonzero(share).tolist()
     percent = 100.0 * float(np.max(share))
@@ -171,16 +189,19 @@ def _held_diagnosis(run: str, quantity: str, axes: Sequence[str], share: FloatAr
         "readings-held",
         (run,),
         names,
-        f"{quantity} that repeat the reading before while the robot moves, in up to {percent:.0f} % of the samples, "
-        f"for some {typical_ms:.3g} ms; what lies between two new readings was filled in",
+        f"{quantity} that repeat the reading before while the robot moves, in up to {percent:.0f} "
+        f"% of the samples, for some {typical_ms:.3g} ms; what lies between two new readings was "
+        "filled in",
         "a new reading in every sample",
-        "record at the rate at which the controller answers, or let it answer at the rate of the recording; noise of a "
-        "current between the readings is lost, and makes the error larger",
+        "record at the rate at which the controller answers, or let it answer at the rate of the "
+        "recording; noise of a current between the readings is lost, and makes the error larger",
     )
 
 
 def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStill | None:
-    """Return the error for a joint that never moves in any run of one mounting, while there are runs of others."""
+    """Return the error for a joint that never moves in any run of one mounting,
+    while there are runs of others.
+    """
     mountings = list(dict.fromkeys(run.mounting for run in runs))
     if len(mountings) < 2:
         return None
@@ -193,7 +214,9 @@ def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStil
     return None
 
 
-def still_joint(runs: Sequence[RunChannels], axes: Sequence[str], consequence: str) -> JointStill | None:
+def still_joint(
+    runs: Sequence[RunChannels], axes: Sequence[str], consequence: str
+) -> JointStill | None:
     """Return the error for runs in which a joint never moves, where the fit contradicts itself.
 
     Args:
@@ -216,7 +239,11 @@ def still_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> tuple[D
         if np.any(run.still):
             names = _still_axes(run.still, axes)
             error = JointStill(run.run, names, _still_text((run,), run.still, axes))
-            found.append(Diagnosis("joint-still", (run.run,), names, error.found, error.expected, error.remedy))
+            found.append(
+                Diagnosis(
+                    "joint-still", (run.run,), names, error.found, error.expected, error.remedy
+                )
+            )
     return tuple(found)
 
 

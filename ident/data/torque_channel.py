@@ -1,8 +1,8 @@
 """The controller's own torque against the current: its slope is a second opinion on the drive gain.
 
-A drive that reports a torque computes it, from its current and the torque constant that was entered at commissioning.
-The slope of that torque over the recorded current shows this constant. No fit uses it: an entered number must not look
-like a measured one.
+A drive that reports a torque computes it, from its current and the torque constant that was entered
+at commissioning. The slope of that torque over the recorded current shows this constant. No fit
+uses it: an entered number must not look like a measured one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from ident.arrays import FloatArray, IntArray
 
 BLOCK_S = 1.0  #: Residuals of one second are taken as correlated: loops and filters are far faster
 FEWEST_BLOCKS = 5  #: With fewer, their scatter gives no σ
-SMALLEST_SHARE = 0.1  #: Least standard deviation of the current over its root mean square: else there is no slope
+#: Least standard deviation of the current over its root mean square: else there is no slope
+SMALLEST_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,8 @@ class TorqueChannel:
     time_s: FloatArray  #: on the clock of the samples, increasing
     current_a: FloatArray  #: recorded current at that time
     nearby_a: FloatArray  #: recorded current shortly before and after, whose noise is independent
-    torque_nm: FloatArray  #: torque of the motor by its drive, seen at its joint (× N) [Nm; N for a prismatic joint]
+    #: torque of the motor by its drive, seen at its joint (× N) [Nm; N for a prismatic joint]
+    torque_nm: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +43,10 @@ class TorqueSlope:
 def torque_slope(channels: Sequence[TorqueChannel]) -> TorqueSlope | None:
     """Fit τ = s·v + o to the readings of an axis, with another offset o for each run.
 
-    By least squares the noise of the current v would make the slope too small (errors in variables). The current nearby
-    is the instrument z: it follows the same motion, and its noise is another. σ is that of a sandwich over blocks of
-    BLOCK_S (Liang & Zeger, Biometrika 73 (1986)), because neighbouring readings share their errors e:
+    By least squares the noise of the current v would make the slope too small (errors in
+    variables). The current nearby is the instrument z: it follows the same motion, and its noise is
+    another. σ is that of a sandwich over blocks of BLOCK_S (Liang & Zeger, Biometrika 73 (1986)),
+    because neighbouring readings share their errors e:
 
         s = Σ z τ / Σ z v,    σ² = B/(B − 1) · Σ_b (Σ_{k∈b} z_k e_k)² / (Σ z v)²,
 
@@ -53,8 +56,8 @@ def torque_slope(channels: Sequence[TorqueChannel]) -> TorqueSlope | None:
         channels: of one axis, one a run.
 
     Returns:
-        the slope; None with readings of fewer than FEWEST_BLOCKS seconds, or where the current hardly changes or the
-        torque not at all.
+        the slope; None with readings of fewer than FEWEST_BLOCKS seconds, or where the current
+        hardly changes or the torque not at all.
     """
     runs = [channel for channel in channels if len(channel.time_s) > 1]
     if not runs:

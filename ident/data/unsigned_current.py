@@ -1,8 +1,9 @@
 """Currents without their sign: drives that report the size of the current only.
 
-The current of an axis that moves both ways passes through zero. Its size comes down to zero there and turns back, as
-a ball that bounces. A current with a sign does not: either it is never near zero, as in the shoulder of an arm that
-always carries its weight, or noise, friction and acceleration take it below zero.
+The current of an axis that moves both ways passes through zero. Its size comes down to zero there
+and turns back, as a ball that bounces. A current with a sign does not: either it is never near
+zero, as in the shoulder of an arm that always carries its weight, or noise, friction and
+acceleration take it below zero.
 """
 
 from __future__ import annotations
@@ -19,15 +20,22 @@ USUAL_PERCENTILE = 99.0  #: Of the sizes of a current; what follows is a share o
 NEAR_ZERO = 0.02  #: Current of a visit to zero
 BELOW_ZERO = 0.005  #: Largest current of the other sign: of rounding, or of an offset
 VISITS = 6
-"""Least visits of a run to zero. The sizes of the currents of two real robots and a simulated one make 6 to 37 in 9 to
-40 s; the same currents with a sign, shifted until they have one sign alone, make 4 at most."""
+"""Least visits of a run to zero.
+
+The sizes of the currents of two real robots and a simulated one make 6 to 37 in 9 to 40 s; the same
+currents with a sign, shifted until they have one sign alone, make 4 at most.
+"""
 COARSE = 0.05  #: Largest share that one count is of a current that needs VISITS
-COARSE_VISITS = 12  #: Least visits of a coarser current: rounding takes others to zero, up to 6 times
+#: Least visits of a coarser current: rounding takes others to zero, up to 6 times
+COARSE_VISITS = 12
 APART_S = 0.1  #: Two visits are at least so far apart
 REST_S = 0.05  #: A value that stays so long is a brake's, or of a drive without power, and no visit
 BOUNCE = 3.0
-"""Largest rise after a visit over the time 2 t, relative to that over t. A size bounces with the ratio 2 and less; a
-smooth current that comes near zero by chance turns as a parabola, with 4."""
+"""Largest rise after a visit over the time 2 t, relative to that over t.
+
+A size bounces with the ratio 2 and less; a smooth current that comes near zero by chance turns as a
+parabola, with 4.
+"""
 RISE = 0.1  #: Rise over the time t
 LONGEST_RISE_S = 0.3  #: Largest t
 EACH_WAY = 0.1  #: Least share of the way of a motor in each direction
@@ -42,8 +50,8 @@ def require_signed_currents(run: Run, ratio: FloatArray, axes: Sequence[str]) ->
         axes: name of each axis.
 
     Raises:
-        CurrentUnsigned: a current is never of the other sign, and comes down to zero again and again, while its motor
-            turns both ways.
+        CurrentUnsigned: a current is never of the other sign, and comes down to zero again and
+            again, while its motor turns both ways.
     """
     unsigned = unsigned_currents(run, ratio)
     if unsigned.any():
@@ -59,7 +67,9 @@ def missing_sign(current: FloatArray) -> str:
 
 
 def unsigned_currents(run: Run, ratio: FloatArray) -> BoolArray:
-    """Whether the current of each axis is a size without a sign, shape (n,); arguments of `require_signed_currents`."""
+    """Whether the current of each axis is a size without a sign, shape (n,);
+    arguments of `require_signed_currents`.
+    """
     found = one_sided_currents(run, ratio)
     for axis in np.flatnonzero(found).tolist():
         used = _used_samples(run, axis)
@@ -107,7 +117,9 @@ def turns_both_ways(motor_rad: FloatArray) -> bool:
 
 
 def bounces(size: FloatArray, time_s: FloatArray) -> bool:
-    """Whether the size of a current, shape (k,), comes down to zero and turns there, VISITS times and more."""
+    """Whether the size of a current, shape (k,), comes down to zero and turns there,
+    VISITS times and more.
+    """
     usual = float(np.percentile(size, USUAL_PERCENTILE))
     # Of a value that stays, the first sample alone: a drive may report slower than the recording.
     start = np.flatnonzero(np.diff(size, prepend=np.nan) != 0.0)
@@ -139,7 +151,8 @@ def _visits(size: FloatArray, near: IntArray, time_s: FloatArray) -> IntArray:
 
 
 def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: float) -> float:
-    """Median rise of a current around its visits to zero over the time 2 t, relative to that over t.
+    """Median rise of a current around its visits to zero over the time 2 t,
+    relative to that over t.
 
     Args:
         size: of the current, shape (k,).
@@ -165,6 +178,8 @@ def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: flo
 
 
 def median_rise(size: FloatArray, visits: IntArray, lag: int) -> float:
-    """Median over the visits of the mean current, lag samples before and after, less that of the visit."""
+    """Median over the visits of the mean current, lag samples before and after,
+    less that of the visit.
+    """
     around = 0.5 * (size[visits - lag] + size[visits + lag])
     return float(np.median(around - size[visits]))

@@ -1,20 +1,23 @@
-"""Which effects held-out runs confirm: the others leave, one by one, and the rest is fitted again after each.
+"""Which effects held-out runs confirm: the others leave, one by one,
+and the rest is fitted again after each.
 
-`accept_on_holdout` is the entry, after `ident.discovery.loop.find_effects`, which has not seen these runs. The burden
-of proof is on the effect:
+`accept_on_holdout` is the entry, after `ident.discovery.loop.find_effects`, which has not seen
+these runs. The burden of proof is on the effect:
 
-1. every effect is taken out of the model in turn, everything else is refitted, and both models predict the held-out
-   runs; `judge_change` compares their errors on every motor;
-2. of what is refuted, the worst leaves, the rest is fitted and judged again: beside it, others may have seemed harmful;
-3. then of what is undecided, the least certain leaves likewise, because two effects of which either does the work seem
-   useless, each beside the other;
-4. what is left must together lower the held-out error of the model without effects, and raise it on no motor; else
-   all of it leaves.
+1. every effect is taken out of the model in turn, everything else is refitted, and both models
+   predict the held-out runs; `judge_change` compares their errors on every motor;
+2. of what is refuted, the worst leaves, the rest is fitted and judged again: beside it, others may
+   have seemed harmful;
+3. then of what is undecided, the least certain leaves likewise, because two effects of which either
+   does the work seem useless, each beside the other;
+4. what is left must together lower the held-out error of the model without effects, and raise it on
+   no motor; else all of it leaves.
 
 Effects that the cell declares are not judged: it is known that they are there.
 
-What left undecided may be true, and σ of the gains contains what it would move (`ident.discovery.choice`). What is left
-must pass the gates of the search again (`ident.discovery.loop.end_search`).
+What left undecided may be true, and σ of the gains contains what it would move
+(`ident.discovery.choice`). What is left must pass the gates of the search again
+(`ident.discovery.loop.end_search`).
 """
 
 from __future__ import annotations
@@ -60,8 +63,8 @@ def accept_on_holdout(
         axes: their names in it; those of the robot's joints when empty.
 
     Returns:
-        the same steps; the last one has the model with what is left, and the verdicts. The steps as they are where
-        nothing was found, or nothing was held out.
+        the same steps; the last one has the model with what is left, and the verdicts. The steps as
+        they are where nothing was found, or nothing was held out.
 
     Raises:
         NotConverged, RankDeficient: see `ident.identify`.
@@ -77,7 +80,14 @@ def accept_on_holdout(
     bootstrap = rng or np.random.default_rng(0)
     last = steps[-1]
     while True:
-        left = _judged(start, judged_model, verdicts, write_undecided=write_undecided, progress=progress, names=names)
+        left = _judged(
+            start,
+            judged_model,
+            verdicts,
+            write_undecided=write_undecided,
+            progress=progress,
+            names=names,
+        )
         if left.effects != last.after.effects:
             refitted = start
             if left is not start:
@@ -85,15 +95,20 @@ def accept_on_holdout(
             opened = dict.fromkeys((*last.left_open, *_undecided(found, left, verdicts)))
             dropped = last.set_aside[len(steps[-1].set_aside) :]
             model = linearised(refitted, ColumnCache())
-            last = end_search(steps, model, gates or Gates(), rng=bootstrap, left_open=tuple(opened))
+            last = end_search(
+                steps, model, gates or Gates(), rng=bootstrap, left_open=tuple(opened)
+            )
             last = replace(last, set_aside=(*last.set_aside, *dropped))
-        # An effect that passes no longer in this fit has left: those beside it are judged again without it.
+        # An effect that passes no longer in this fit has left: those beside it are judged again
+        # without it.
         if len(last.after.effects) >= len(left.effects):
             break
         judged_model = last.after
     written = last.after.effects
     ordered = tuple(
-        replace(verdicts[placed], written=placed in written) for placed in found.effects if placed in verdicts
+        replace(verdicts[placed], written=placed in written)
+        for placed in found.effects
+        if placed in verdicts
     )
     return (*steps[:-1], replace(last, verdicts=ordered))
 
@@ -105,7 +120,11 @@ def _undecided(
     undecided: list[PlacedEffect] = []
     for placed in found.effects:
         verdict = verdicts.get(placed)
-        if verdict is not None and verdict.judgement is Judgement.UNDECIDED and placed not in left.effects:
+        if (
+            verdict is not None
+            and verdict.judgement is Judgement.UNDECIDED
+            and placed not in left.effects
+        ):
             undecided.append(placed)
     return tuple(undecided)
 
@@ -119,22 +138,31 @@ def _judged(
     progress: Callable[[str], None],
     names: Sequence[str],
 ) -> Evidence:
-    """The model with those effects that held-out runs confirm; `verdicts` is given what they say of each."""
+    """The model with those effects that held-out runs confirm;
+    `verdicts` is given what they say of each.
+    """
     current = found
     while len(current.effects) > current.declared:
         searched = len(current.effects) - current.declared
         progress(f"judging {searched} {'effect' if searched == 1 else 'effects'} on held-out runs")
-        judged = [_verdict(start, current, placed) for placed in current.effects[current.declared :]]
+        judged = [
+            _verdict(start, current, placed) for placed in current.effects[current.declared :]
+        ]
         verdicts |= {one.placed: one for one in judged}
         leaving = _leaving(judged, write_undecided=write_undecided)
         if leaving is None:
             break
         progress(f"{leaving.placed.name_among(names)} leaves: {leaving.reason}")
         if leaving.is_needed:
-            reason = f"nothing can be fitted without {leaving.placed.name_among(names)}, which leaves: {leaving.reason}"
+            reason = (
+                f"nothing can be fitted without {leaving.placed.name_among(names)}, which "
+                f"leaves: {leaving.reason}"
+            )
             for one in judged:
                 if one.placed != leaving.placed:
-                    verdicts[one.placed] = replace(one, judgement=Judgement.UNDECIDED, reason=reason)
+                    verdicts[one.placed] = replace(
+                        one, judgement=Judgement.UNDECIDED, reason=reason
+                    )
             return start
         current = _without(current, leaving.placed)
     kept = current.effects[current.declared :]
@@ -148,7 +176,8 @@ def _judged(
 
 
 def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> ErrorChange:
-    """Compare two models of the same data on held-out rows, in units of the noise of a model without effects.
+    """Compare two models of the same data on held-out rows,
+    in units of the noise of a model without effects.
 
     Raises:
         ValueError: nothing was held out.
@@ -174,7 +203,9 @@ def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> Er
 
 
 def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> EffectVerdict:
-    """Judge an effect beside the others; together with them where they cannot be fitted without it."""
+    """Judge an effect beside the others;
+    together with them where they cannot be fitted without it.
+    """
     is_needed = False
     try:
         without = _without(current, placed)
@@ -182,8 +213,11 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
         without = start
         is_needed = True
     change = compare_on_holdout(start, without, current)
-    # A correction of the description changes all motors: that its own falls is no more than friction there does.
-    has_motor = placed.axis < len(change.motors) and placed.effect.has_axis and not is_correction(placed)
+    # A correction of the description changes all motors: that its own falls is no more than
+    # friction there does.
+    has_motor = (
+        placed.axis < len(change.motors) and placed.effect.has_axis and not is_correction(placed)
+    )
     judgement, reason = judge_change(change, placed.axis if has_motor else None)
     return EffectVerdict(
         placed=placed,
@@ -197,7 +231,9 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
 
 
 def _leaving(judged: Sequence[EffectVerdict], *, write_undecided: bool) -> EffectVerdict | None:
-    """The worst of what is refuted; then the least certain of what is undecided, unless that is to be written."""
+    """The worst of what is refuted; then the least certain of what is undecided,
+    unless that is to be written.
+    """
     refuted = [one for one in judged if one.judgement is Judgement.REFUTED]
     if refuted:
         return max(refuted, key=lambda one: one.change.largest_sigmas)
@@ -224,22 +260,29 @@ def _loses(start: Evidence, end: Evidence) -> str:
 def _without(evidence: Evidence, left_out: PlacedEffect) -> Evidence:
     """Refit without one effect, the columns of the others as they are.
 
-    These hold the load and the current that the model with it predicts, so that the comparison shows the effect alone.
+    These hold the load and the current that the model with it predicts, so that the comparison
+    shows the effect alone.
     """
     kept = tuple(placed for placed in evidence.effects if placed != left_out)
     if is_correction(left_out):
-        return with_effects(evidence, kept)  # the description is what it was without it, and with it all columns
+        # The description is what it was without it, and with it all columns
+        return with_effects(evidence, kept)
     names = {column.name for column in left_out.columns}
     bare = len(evidence.rows_without_effects.columns)
     added = evidence.training.columns[bare:]
     stays = np.array([column.name not in names for column in added], dtype=np.bool_)
     columns = tuple(column for column, stay in zip(added, stays, strict=True) if stay)
     first = evidence.training
-    training = replace(first, columns=(*first.columns[:bare], *columns), effects=first.effects[:, stays])
+    training = replace(
+        first, columns=(*first.columns[:bare], *columns), effects=first.effects[:, stays]
+    )
     holdout = evidence.holdout
     if holdout is not None:
         holdout = replace(holdout, columns=training.columns, effects=holdout.effects[:, stays])
-    fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
+    if evidence.estimate.gains_fixed:
+        fixed = evidence.estimate.gains
+    else:
+        fixed = None
     estimate = estimate_with(evidence.estimate.method, training.system(), fixed)
     return replace(evidence, training=training, holdout=holdout, effects=kept, estimate=estimate)
 

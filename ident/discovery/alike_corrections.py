@@ -1,7 +1,9 @@
-"""Corrections of the description that recordings do not tell apart, and which axes must move further for it.
+"""Corrections of the description that recordings do not tell apart,
+and which axes must move further for it.
 
-A zero that is off turns gravity for the arm behind its joint. Where the joints before it hardly move, a base that leans
-makes the same torques. Then neither is known, although each alone has a small σ.
+A zero that is off turns gravity for the arm behind its joint. Where the joints before it hardly
+move, a base that leans makes the same torques. Then neither is known, although each alone has a
+small σ.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain be
 WIDE_RAD = float(np.deg2rad(120.0))  #: Range of a joint that turns the arm behind it enough
 
 
-def explains_beside(problem: SearchProblem, torque_nm: FloatArray, held_out_fall: float, rival_nm: FloatArray) -> bool:
+def explains_beside(
+    problem: SearchProblem, torque_nm: FloatArray, held_out_fall: float, rival_nm: FloatArray
+) -> bool:
     """Whether a mistake explains most of what it does beside another effect, too.
 
     Args:
@@ -38,8 +42,11 @@ def explains_beside(problem: SearchProblem, torque_nm: FloatArray, held_out_fall
     return fall >= OWN_SHARE * held_out_fall
 
 
-def alike_corrections(problem: SearchProblem, correction: Finding, findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Corrections that folds do not distinguish from one that was found, and beside which it explains little more.
+def alike_corrections(
+    problem: SearchProblem, correction: Finding, findings: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """Corrections that folds do not distinguish from one that was found,
+    and beside which it explains little more.
 
     Args:
         problem: with rows that serve as signals.
@@ -57,10 +64,14 @@ def alike_corrections(problem: SearchProblem, correction: Finding, findings: Seq
     return tuple(alike)
 
 
-def axes_to_move(alike: Sequence[PlacedEffect], robot: Robot, datasets: Sequence[Dataset]) -> tuple[int, ...]:
-    """Axes that must turn further for recordings to tell corrections apart; empty where no motion of one axis does.
+def axes_to_move(
+    alike: Sequence[PlacedEffect], robot: Robot, datasets: Sequence[Dataset]
+) -> tuple[int, ...]:
+    """Axes that must turn further for recordings to tell corrections apart;
+    empty where no motion of one axis does.
 
-    A zero differs from a turn of gravity by the joints before it, and from another zero by their own joints.
+    A zero differs from a turn of gravity by the joints before it, and from another zero by their
+    own joints.
 
     Args:
         alike: corrections that the recordings do not tell apart.

@@ -1,8 +1,9 @@
 """Propose the geometry of a balancer: where its lever points, and the ratio of its two lengths.
 
-Both are settings on which the torque depends strongly, so no grid of a usual size comes close: a spline would always
-explain more, and the effect would get no name. They are fitted beside the model on each axis whose residual a member of
-the dictionary's grid explains a part of, and compete together with the grid, which represents the search over them.
+Both are settings on which the torque depends strongly, so no grid of a usual size comes close: a
+spline would always explain more, and the effect would get no name. They are fitted beside the model
+on each axis whose residual a member of the dictionary's grid explains a part of, and compete
+together with the grid, which represents the search over them.
 """
 
 from __future__ import annotations
@@ -48,7 +49,11 @@ def propose_balancers(
             for share, (effect, trial) in zip(shares, grid_trials, strict=True)
             if is_strictly_possible(effect, trial)
         ]
-        members = [effect for share, effect in sorted(found, key=lambda one: -one[0]) if share >= gates.smallest_share]
+        members = [
+            effect
+            for share, effect in sorted(found, key=lambda one: -one[0])
+            if share >= gates.smallest_share
+        ]
         refined = [refine_together(search_problem, start, axis) for start in _apart(members)]
         if refined:
             tried = (effect for effect, _ in grid_trials)
@@ -57,7 +62,9 @@ def propose_balancers(
 
 
 def _apart(members: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The best members of so many directions of the lever: the simplex does not find the way from one to another."""
+    """The best members of so many directions of the lever:
+    the simplex does not find the way from one to another.
+    """
     best: dict[float, Effect] = {}
     for member in members:
         best.setdefault(member.settings["phase_rad"], member)

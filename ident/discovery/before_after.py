@@ -1,35 +1,42 @@
-"""Change by accepted effects: the error of every motor in four ways, and every gain, before and after.
+"""Change by accepted effects: the error of every motor in four ways, and every gain,
+before and after.
 
-One error serves every model and every data set: the part of each motor's current that a model does not explain. For
-motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i and T from the drive train,
+One error serves every model and every data set: the part of each motor's current that a model does
+not explain. For motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i
+and T from the drive train,
 
     e_i = v_i − γ_i (T τ)_i,        ε_i = ‖e_i‖/‖v_i‖,        ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
 
-The current is measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper Table 6) scales with
-the gains that a model finds. No model explains the internal preload of a redundant drive: v and e are without the
-preload that is most likely under the model's g and σ, diag(σ) T_D V g and diag(σ) T_D (V g − τ)
-(ident/equations/currents.py), and e_i then shows the share P_ii of the variance of the current's noise. The weights w
-convert currents of different motors to torques at the joint, so that a robot without coupled axes has the ε of Table 6.
-They are one set of gains for all models that are compared; whitened by σ_i instead, ε would have a scale that an
-accepted effect moves. A robot with prismatic and revolute axes adds Nm to N in ε, as Table 6 would; its ε_i are not
-affected. The four ways differ in the data that the model has seen:
+The current is measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper
+Table 6) scales with the gains that a model finds. No model explains the internal preload of a
+redundant drive: v and e are without the preload that is most likely under the model's g and σ,
+diag(σ) T_D V g and diag(σ) T_D (V g − τ) (ident/equations/currents.py), and e_i then shows the
+share P_ii of the variance of the current's noise. The weights w convert currents of different
+motors to torques at the joint, so that a robot without coupled axes has the ε of Table 6. They are
+one set of gains for all models that are compared; whitened by σ_i instead, ε would have a scale
+that an accepted effect moves. A robot with prismatic and revolute axes adds Nm to N in ε, as Table
+6 would; its ε_i are not affected. The four ways differ in the data that the model has seen:
 
 - in-sample: all data; it cannot rise when an effect joins, so it proves nothing;
-- cross-validated: all moves but those predicted (`cut_into_folds`, one Gauss-Newton step around
-  the estimate, gains included); the choice of the effects has seen all moves, so the error is optimistic;
-- left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too; the
-  choice and the settings of the effects have seen the run;
-- hold-out: no fit and no search has seen these runs; they judge what was found, one effect at a time
-  (`ident.discovery.acceptance`), so the error of what is left is optimistic by that choice alone.
+- cross-validated: all moves but those predicted (`cut_into_folds`, one Gauss-Newton step around the
+  estimate, gains included); the choice of the effects has seen all moves, so the error is
+  optimistic;
+- left-out runs: all runs but the one predicted, everything refitted, load and current of the
+  effects' columns too; the choice and the settings of the effects have seen the run;
+- hold-out: no fit and no search has seen these runs; they judge what was found, one effect at a
+  time (`ident.discovery.acceptance`), so the error of what is left is optimistic by that choice
+  alone.
 
-Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It
-is the jackknife of the change itself: leaving out block c of moves shifts g by d_c = −(H − G_c)⁻¹ s_c
-(ident/equations/linearisation.py; the longer blocks of the two models serve both), and
+Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root
+of both squared. It is the jackknife of the change itself: leaving out block c of moves shifts g by
+d_c = −(H − G_c)⁻¹ s_c (ident/equations/linearisation.py; the longer blocks of the two models serve
+both), and
 
     σ_Δ² = (C − 1)/C Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before,        of C blocks.
 
-It takes the effects as given; σ after the whole search includes their choice (ident/discovery/choice.py).
-"""
+It takes the effects as given; σ after the whole search includes their choice
+(ident/discovery/choice.py).
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -82,34 +89,45 @@ class CurrentError:
 
 def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
     """Error of an estimate on rows, those of its fit or others with the same columns."""
-    use, seen = observation.motor_use, _currents(observation, estimate)
-    return CurrentError(np.sum(seen.measured**2, axis=1, where=use), np.sum(seen.left**2, axis=1, where=use))
+    use = observation.motor_use
+    seen = _currents(observation, estimate)
+    return CurrentError(
+        np.sum(seen.measured**2, axis=1, where=use), np.sum(seen.left**2, axis=1, where=use)
+    )
 
 
 def left_on(observation: Observation, estimate: Estimate) -> FloatArray:
-    """Root mean square of each motor's e_i [A], shape (m,), of a redundant drive over √P_ii; NaN without a row.
+    """Root mean square of each motor's e_i [A], shape (m,), of a redundant drive over √P_ii;
+    NaN without a row.
 
     It compares with the noise of the current.
     """
     rows = np.sum(_currents(observation, estimate).shown, axis=1, where=observation.motor_use)
     left = error_on(observation, estimate).left
-    return np.asarray(np.sqrt(np.divide(left, rows, out=np.full(len(rows), np.nan), where=rows > 0)))
+    return np.asarray(
+        np.sqrt(np.divide(left, rows, out=np.full(len(rows), np.nan), where=rows > 0))
+    )
 
 
 def squares_left(observation: Observation, estimate: Estimate) -> FloatArray:
-    """Squared error e_i² of each motor and row [A²], shape (m, r), whether the row counts or not."""
+    """Squared error e_i² of each motor and row [A²], shape (m, r),
+    whether the row counts or not.
+    """
     return np.square(_currents(observation, estimate).left)
 
 
 def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:
-    """Compare the squared errors of two models on held-out rows by move, currents weighted by the gains before [Nm²].
+    """Compare the squared errors of two models on held-out rows by move,
+    currents weighted by the gains before [Nm²].
 
     None without held-out runs.
     """
     if before.holdout is None or after.holdout is None:
         return None
     rows = before.holdout
-    first, second = (np.square(_currents(one.holdout or rows, one.estimate).left) for one in (before, after))
+    first, second = (
+        np.square(_currents(one.holdout or rows, one.estimate).left) for one in (before, after)
+    )
     weights = np.square(before.estimate.gains)[:, None] * rows.motor_use
     return compare_by_move(np.sum(weights * (second - first), axis=0), rows.move)
 
@@ -120,17 +138,22 @@ class _Currents:
 
     measured: FloatArray  #: v [A], shape (m, r)
     left: FloatArray  #: e [A], same shape
-    shown: FloatArray  #: share of the variance of the current's noise that e shows, P_ii, same shape
+    #: share of the variance of the current's noise that e shows, P_ii, same shape
+    shown: FloatArray
 
 
 def _currents(observation: Observation, estimate: Estimate) -> _Currents:
     """Currents of rows under an estimate."""
-    predicted, measured = estimate.predicted_torque(observation), observation.current
+    predicted = estimate.predicted_torque(observation)
+    measured = observation.current
     if not observation.preload.size:
         left = measured - observation.drive_train.to_motor @ predicted / estimate.gains[:, None]
         return _Currents(measured, left, np.ones_like(measured))
-    noise, torque = estimate.axis_noise, observation.torque(estimate.gains)
-    seen = noise[:, None] * whitening_transform(observation.preload.transpose(2, 0, 1), estimate.gains, noise)
+    noise = estimate.axis_noise
+    torque = observation.torque(estimate.gains)
+    seen = noise[:, None] * whitening_transform(
+        observation.preload.transpose(2, 0, 1), estimate.gains, noise
+    )
     return _Currents(
         measured=np.einsum("rij,jr->ir", seen, torque),
         left=np.einsum("rij,jr->ir", seen, torque - predicted),
@@ -141,7 +164,8 @@ def _currents(observation: Observation, estimate: Estimate) -> _Currents:
 def error_left_out(folds: Folds) -> CurrentError:
     """Error on each fold's rows, predicted by a fit that has not seen their moves."""
     problem = folds.linearisation
-    size, left = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
+    size = np.zeros(len(problem.noise))
+    left = np.zeros(len(problem.noise))
     np.add.at(size, problem.motor, (problem.current * problem.noise[problem.motor]) ** 2)
     np.add.at(left, problem.motor, (folds.residual * problem.noise[problem.motor]) ** 2)
     return CurrentError(size, left)
@@ -149,7 +173,9 @@ def error_left_out(folds: Folds) -> CurrentError:
 
 @dataclass(frozen=True, slots=True)
 class RunError:
-    """One run of the fit, predicted by the others; `error` is None where they cannot be fitted, with the reason."""
+    """One run of the fit, predicted by the others;
+    `error` is None where they cannot be fitted, with the reason.
+    """
 
     run: str  #: its name
     error: RelativeError | None  #: on its rows [%]
@@ -161,13 +187,15 @@ class RunErrors:
     """Errors on each run of the fit, left out in turn."""
 
     runs: tuple[RunError, ...]  #: in the order of the fit
-    together: RelativeError | None  #: over the rows of all runs that could be predicted; None without any
+    #: over the rows of all runs that could be predicted; None without any
+    together: RelativeError | None
 
 
 def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> RunErrors:
     """Refit everything without each run of the fit in turn, and predict that run.
 
-    The only run with the known payload, or the only one without, cannot be left out: it is listed with the reason.
+    The only run with the known payload, or the only one without, cannot be left out: it is listed
+    with the reason.
     """
     runs: list[RunError] = []
     errors: list[CurrentError] = []
@@ -186,8 +214,12 @@ def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
     order = [index for index in range(len(evidence.fit_runs)) if index != left_out] + [left_out]
     observation = _in_order(evidence.rows_without_effects, order)
     last = observation.run == len(order) - 1
-    training, held = observation.only(~last), observation.only(last)
-    fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
+    training = observation.only(~last)
+    held = observation.only(last)
+    if evidence.estimate.gains_fixed:
+        fixed = evidence.estimate.gains
+    else:
+        fixed = None
     bare = replace(
         evidence,
         datasets=tuple(evidence.datasets[index] for index in order),
@@ -217,7 +249,9 @@ def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
     rows: IntArray = np.concatenate([np.flatnonzero(bare.run == run) for run in order])
     number = np.zeros(len(bare.runs), dtype=np.int64)
     number[list(order)] = np.arange(len(order))
-    return replace(bare.only(rows), run=number[bare.run[rows]], runs=tuple(bare.runs[run] for run in order))
+    return replace(
+        bare.only(rows), run=number[bare.run[rows]], runs=tuple(bare.runs[run] for run in order)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,9 +303,11 @@ class GainShift:
     before_std: float  #: its σ
     after: float  #: estimate with the effects
     after_std: float  #: its σ
-    choice_std: float  #: the part of it that comes from the choice of the effects (`choice_covariance`)
+    #: the part of it that comes from the choice of the effects (`choice_covariance`)
+    choice_std: float
     change_std: float  #: σ of the change, 0 for a fixed gain
-    significant: bool  #: whether the change is more than noise, at FALSE_ALARM over all axes (Bonferroni)
+    #: whether the change is more than noise, at FALSE_ALARM over all axes (Bonferroni)
+    significant: bool
 
     @property
     def change_percent(self) -> float:
@@ -299,19 +335,23 @@ class BeforeAfter:
 class Account:
     """Change by a whole search for effects."""
 
-    floors: tuple[MotorNoiseFloor | None, ...]  #: noise of each motor's current, None where it is not known
+    #: noise of each motor's current, None where it is not known
+    floors: tuple[MotorNoiseFloor | None, ...]
     left_a: FloatArray  #: `left_on` the rows of the fit after the last turn [A]
-    #: Error that this noise alone would leave on the rows of the fit [%]: an estimate, at most the error of either
-    #: model; NaN where it is not known or refuted.
+    #: Error that this noise alone would leave on the rows of the fit [%]: an estimate, at most the
+    #: error of either model; NaN where it is not known or refuted.
     floor: RelativeError
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
-    #: The same of the lower limit of the noise where it is a bound (`NoiseFloor.least_a`): no model's error is smaller.
+    #: The same of the lower limit of the noise where it is a bound (`NoiseFloor.least_a`): no
+    #: model's error is smaller.
     least_floor: RelativeError
     least_holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
-    turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
+    #: change by each turn of the loop, None where it added nothing
+    turns: tuple[BeforeAfter | None, ...]
     total: BeforeAfter  #: change from the declared model to the last one
     holdout_change: PairedChange | None  #: of the squared error on held-out rows, None without any
-    #: Delay of the currents after the positions, beside the effects of the last model; None where no instruments exist.
+    #: Delay of the currents after the positions, beside the effects of the last model; None where
+    #: no instruments exist.
     skew: CurrentDelay | None = None
 
 
@@ -338,7 +378,11 @@ def account(
     def assessed(evidence: Evidence) -> Assessment:
         count = len(evidence.effects)
         progress(f"errors with {count} {'effect' if count == 1 else 'effects'} in the model")
-        return assess(evidence, weights_nm_a, left_out_runs(evidence, weights_nm_a) if leave_out_runs else None)
+        return assess(
+            evidence,
+            weights_nm_a,
+            left_out_runs(evidence, weights_nm_a) if leave_out_runs else None,
+        )
 
     first = last = assessed(start)
     turns: list[BeforeAfter | None] = []
@@ -346,9 +390,11 @@ def account(
         if step.after.effects == last.effects:
             turns.append(None)
             continue
-        before, last = last, assessed(step.after)
+        before = last
+        last = assessed(step.after)
         turns.append(before_after(before, last))
-    end, floors = steps[-1], noise_floors(start.fit_runs, start.conditioning)
+    end = steps[-1]
+    floors = noise_floors(start.fit_runs, start.conditioning)
     if end.choice_std is not None:
         last = replace(last, gains_std=end.after.estimate.gains_std, choice_std=end.choice_std)
     left_a = left_on(end.after.training, end.after.estimate)
@@ -364,7 +410,9 @@ def account(
             known.append(floor)
             least.append(replace(floor, noise_a=floor.least_a) if floor.is_bound else None)
 
-    def error_of(noises: Sequence[MotorNoiseFloor | None], before: Observation, after: Observation) -> RelativeError:
+    def error_of(
+        noises: Sequence[MotorNoiseFloor | None], before: Observation, after: Observation
+    ) -> RelativeError:
         """Error by noise alone on some rows; a model that leaves less by chance is at the floor."""
         left = np.fmin(left_on(before, start.estimate), left_on(after, end.after.estimate))
         return floor_on(before, start.estimate, capped(noises, left)).relative(weights_nm_a)
@@ -390,7 +438,9 @@ def account(
     )
 
 
-def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: RunErrors | None = None) -> Assessment:
+def assess(
+    evidence: Evidence, weights_nm_a: FloatArray, left_out: RunErrors | None = None
+) -> Assessment:
     """Compute the errors and gains of one model, identified by ``ml``.
 
     Raises:
@@ -406,7 +456,9 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: RunErrors | N
             gains_fixed=estimate.gains_fixed,
         )
     )
-    held, problem, moves = evidence.holdout, folds.linearisation, None
+    held = evidence.holdout
+    problem = folds.linearisation
+    moves = None
     if not estimate.gains_fixed:
         runs = problem.of_clusters(evidence.training.run)
         moves = Moves(folds.cluster_hessian, folds.cluster_score, problem.scale, runs)
@@ -447,24 +499,35 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
                 after_std=float(after.gains_std[motor]),
                 choice_std=float(after.choice_std[motor]),
                 change_std=float(change_std[motor]),
-                significant=bool(abs(after.gains[motor] - before.gains[motor]) > limit * change_std[motor]),
+                significant=bool(
+                    abs(after.gains[motor] - before.gains[motor]) > limit * change_std[motor]
+                ),
             )
             for motor in range(count)
         ),
     )
 
 
-def capped(floors: Sequence[MotorNoiseFloor | None], left_a: FloatArray) -> tuple[MotorNoiseFloor | None, ...]:
-    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square], shape (m,)."""
+def capped(
+    floors: Sequence[MotorNoiseFloor | None], left_a: FloatArray
+) -> tuple[MotorNoiseFloor | None, ...]:
+    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square],
+    shape (m,).
+    """
     return tuple(
         None if floor is None else replace(floor, noise_a=float(np.fmin(floor.noise_a, left)))
         for floor, left in zip(floors, left_a, strict=True)
     )
 
 
-def floor_on(observation: Observation, estimate: Estimate, floors: Sequence[MotorNoiseFloor | None]) -> CurrentError:
-    """Error that noise alone would leave on some rows under an estimate; NaN for a motor whose noise is not known."""
-    use, seen = observation.motor_use, _currents(observation, estimate)
+def floor_on(
+    observation: Observation, estimate: Estimate, floors: Sequence[MotorNoiseFloor | None]
+) -> CurrentError:
+    """Error that noise alone would leave on some rows under an estimate;
+    NaN for a motor whose noise is not known.
+    """
+    use = observation.motor_use
+    seen = _currents(observation, estimate)
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
     size, rows = (np.sum(part, axis=1, where=use) for part in (seen.measured**2, seen.shown))
     return CurrentError(size, rows * noise_a**2)

@@ -1,9 +1,9 @@
 """Rows that are clear of stops, on which friction must show, too.
 
-A joint at rest holds any torque up to its dry friction, and a row counts although standstill fills a small share of its
-filter window (`Conditioning.standstill_share`). On an arm with little noise, what rows beside stops hold of it is more
-than noise, and looks like friction that builds up after a reversal. Friction that is really there acts in rows clear
-of stops as well.
+A joint at rest holds any torque up to its dry friction, and a row counts although standstill fills
+a small share of its filter window (`Conditioning.standstill_share`). On an arm with little noise,
+what rows beside stops hold of it is more than noise, and looks like friction that builds up after a
+reversal. Friction that is really there acts in rows clear of stops as well.
 """
 
 from __future__ import annotations
@@ -22,11 +22,15 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.identify import estimate_with
 
 CLEAR_SHARE = 0.5
-"""Largest share of standstill in the window of a row that is clear of stops, in parts of what the cell allows."""
+"""Largest share of standstill in the window of a row that is clear of stops,
+in parts of what the cell allows.
+"""
 
 
 def turns_with_motion(effect: Effect) -> bool:
-    """Whether an effect could be taken for friction of joints at rest: its torque turns with the sense of motion."""
+    """Whether an effect could be taken for friction of joints at rest:
+    its torque turns with the sense of motion.
+    """
     if is_unnamed(effect):
         return effect.abscissa in {Abscissa.VELOCITY, Abscissa.DISTANCE}
     return effect.declares is Property.ODD_IN_VELOCITY
@@ -49,4 +53,6 @@ def fitted_clear_of_stops(evidence: Evidence) -> Estimate:
     Raises:
         RankDeficient, NotConverged: these rows do not determine it.
     """
-    return estimate_with(evidence.estimate.method, rows_clear_of_stops(evidence).system(), fixed_gains(evidence))
+    return estimate_with(
+        evidence.estimate.method, rows_clear_of_stops(evidence).system(), fixed_gains(evidence)
+    )

@@ -1,18 +1,19 @@
-"""Whether the friction of an axis brakes at every speed: friction takes work out of the arm, it never drives it.
+"""Whether the friction of an axis brakes at every speed:
+friction takes work out of the arm, it never drives it.
 
-A joint fit is of the speeds that its runs have. Terms that depend on the speed alone can stand in for each other there:
-drag by a root of the speed, with a dry friction below zero, is right from a tenth of full speed on, and wrong below it.
-An axis of a real robot moved slowly in a region that was left out: there such a fit was off by 18 % of the torque, and
-the fit without the term by 5 %. So dry and viscous friction are judged together with all effects of the speed on the
-axis,
+A joint fit is of the speeds that its runs have. Terms that depend on the speed alone can stand in
+for each other there: drag by a root of the speed, with a dry friction below zero, is right from a
+tenth of full speed on, and wrong below it. An axis of a real robot moved slowly in a region that
+was left out: there such a fit was off by 18 % of the torque, and the fit without the term by 5 %.
+So dry and viscous friction are judged together with all effects of the speed on the axis,
 
     f(v) = fs + fv |v| + sign(v) Σ c φ(v) ≥ 0,     0 < |v| ≤ the largest speed of the runs, in both directions,
 
-and may be below zero by no more than SIGMAS of its own σ. At rest, f is what the friction of the axis begins with.
-Friction that grows with the load, or depends on position or distance, brakes too and is left out. An axis whose
-friction depends on the temperature is not judged: fs and fv are then those of a temperature that the runs need not
-have.
-"""
+and may be below zero by no more than SIGMAS of its own σ. At rest, f is what the friction of the
+axis begins with. Friction that grows with the load, or depends on position or distance, brakes too
+and is left out. An axis whose friction depends on the temperature is not judged: fs and fv are then
+those of a temperature that the runs need not have.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -41,7 +42,9 @@ def pushing(evidence: Evidence, axis: int) -> str:
         axis: index of the axis.
     """
     of_axis = [placed for placed in evidence.effects if placed.axis == axis]
-    terms = [(placed, placed.effect) for placed in of_axis if isinstance(placed.effect, SpeedFriction)]
+    terms = [
+        (placed, placed.effect) for placed in of_axis if isinstance(placed.effect, SpeedFriction)
+    ]
     by_temperature = any(placed.effect.abscissa is Abscissa.TEMPERATURE for placed in of_axis)
     if not terms or by_temperature:
         return ""
@@ -56,12 +59,17 @@ def pushing(evidence: Evidence, axis: int) -> str:
     rate = "m/s" if worst.unit == "N" else "rad/s"
     is_at_rest = abs(worst.speed) < 2.0 * fastest * SPEEDS[0]
     where = "at rest" if is_at_rest else f"at {worst.speed:.2g} {rate}"
-    return f"the friction of this axis would push the arm {where} ({worst.torque:.3g} ± {worst.std:.2g} {worst.unit})"
+    return (
+        f"the friction of this axis would push the arm {where} ({worst.torque:.3g} ± "
+        f"{worst.std:.2g} {worst.unit})"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class _Declared:
-    """Dry and viscous friction of an axis, as places among the parameters: without load, or the sums with it."""
+    """Dry and viscous friction of an axis, as places among the parameters:
+    without load, or the sums with it.
+    """
 
     dry: tuple[int, ...]
     viscous: tuple[int, ...]
@@ -89,7 +97,10 @@ def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
     Empty where a part of it is regrouped into other parameters.
     """
     model = evidence.model
-    places = {column.name.split(" ", 1)[0]: place for place, column in enumerate(evidence.estimate.unknowns)}
+    places = {
+        column.name.split(" ", 1)[0]: place
+        for place, column in enumerate(evidence.estimate.unknowns)
+    }
     dry = model.columns[model.dry_friction_columns[axis]]
     viscous = model.columns[model.viscous_friction_columns[axis]].name
     if dry.name not in places or viscous not in places:

@@ -1,8 +1,9 @@
 """Propose where a cable along two joints begins to pull, and how much of its way each joint makes.
 
-Both are settings on which the torque depends strongly, and a grid of them on every pair of joints would be most of all
-candidates. So they are tried on the pair alone whose residual a cable of the dictionary explains most of, and the best
-of them are fitted beside the model. They compete together with all that were tried, which represent the search.
+Both are settings on which the torque depends strongly, and a grid of them on every pair of joints
+would be most of all candidates. So they are tried on the pair alone whose residual a cable of the
+dictionary explains most of, and the best of them are fitted beside the model. They compete together
+with all that were tried, which represent the search.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ from ident.effects.effect import Effect, is_placeable
 from ident.effects.position import AlongTwoJoints, SlackCable
 
 DIRECTIONS = 12  #: Of the way of a cable, tried on a pair of joints
-SHARES_OF_WAY = (0.1, 0.3, 0.5, 0.7)  #: Of the rows in which a cable is still slack, where it begins to pull
+#: Of the rows in which a cable is still slack, where it begins to pull
+SHARES_OF_WAY = (0.1, 0.3, 0.5, 0.7)
 STARTS = 3  #: From which direction and start are fitted
-LEAST_SLACK = 0.05  #: Share of the rows in which a slack cable hangs slack: one that never does is a `Cable`
-ONE_JOINT_RAD = 0.15  #: Of a direction from a joint's own, below which a cable is a `Hinge` of that joint
+#: Share of the rows in which a slack cable hangs slack: one that never does is a `Cable`
+LEAST_SLACK = 0.05
+#: Of a direction from a joint's own, below which a cable is a `Hinge` of that joint
+ONE_JOINT_RAD = 0.15
 
 Tried = tuple[Effect, CandidateTrial]
 
@@ -30,7 +34,8 @@ Tried = tuple[Effect, CandidateTrial]
 def propose_cables(
     search_problem: SearchProblem, gates: Gates, families: tuple[tuple[Effect, ...], ...]
 ) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
-    """Return a family of slack cables for the pair of joints that a cable explains most of, by its lower axis.
+    """Return a family of slack cables for the pair of joints that a cable explains most of,
+    by its lower axis.
 
     Args:
         search_problem: around the model.
@@ -59,7 +64,9 @@ def propose_cables(
         fitted = refine_together(search_problem, effect, axis)
         if isinstance(fitted, SlackCable) and _is_slack_cable(search_problem, fitted, axis):
             refined.append(fitted)
-    shared = tuple(effect for effect in grid if is_placeable(effect, axis, search_problem.model.robot))
+    shared = tuple(
+        effect for effect in grid if is_placeable(effect, axis, search_problem.model.robot)
+    )
     return {axis: ((*shared, *(effect for effect, _ in tried), *refined),)}
 
 
@@ -67,12 +74,19 @@ def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tr
     """Slack cables on a pair of joints that the model does not contain, with their trials."""
     effects: list[SlackCable] = []
     step_rad = 2.0 * np.pi / DIRECTIONS
-    for direction_rad in (step_rad * (np.arange(DIRECTIONS) + 0.5) - np.pi).tolist():  # none along one joint alone
+    # None along one joint alone
+    for direction_rad in (step_rad * (np.arange(DIRECTIONS) + 0.5) - np.pi).tolist():
         cable = SlackCable(other_axis, direction_rad)
         starts_rad = np.quantile(_way(search_problem, cable, axis), SHARES_OF_WAY)
-        effects += [SlackCable(other_axis, direction_rad, float(f"{start_rad:.4g}")) for start_rad in starts_rad]
+        effects += [
+            SlackCable(other_axis, direction_rad, float(f"{start_rad:.4g}"))
+            for start_rad in starts_rad
+        ]
     tested = search_problem.test((tuple(effects),), axis, at_rows=True)
-    return [member for family in tested for member in family.members]
+    found: list[tuple[Effect, CandidateTrial]] = []
+    for family in tested:
+        found.extend(family.members)
+    return found
 
 
 def _way(search_problem: SearchProblem, cable: SlackCable, axis: int) -> FloatArray:
@@ -89,7 +103,9 @@ def _is_slack_cable(search_problem: SearchProblem, cable: SlackCable, axis: int)
 
 
 def _best_of(search_problem: SearchProblem, tried: Sequence[Tried]) -> tuple[Effect, ...]:
-    """The best possible cable of each of the best directions: the simplex does not find the way between them."""
+    """The best possible cable of each of the best directions:
+    the simplex does not find the way between them.
+    """
     shares = shares_explained(search_problem, [trial for _, trial in tried])
     possible = [
         (share, effect)

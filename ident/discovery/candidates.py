@@ -1,13 +1,16 @@
-"""Candidates tested on a residual: the search problem, and trials of effects on it, in-sample and on held-out moves.
+"""Candidates tested on a residual: the search problem, and trials of effects on it,
+in-sample and on held-out moves.
 
-Friction differs from run to run, as temperature and mounting do. A search that took moves of all runs as exchangeable
-would find laws in that. So `prepare_search` takes the friction of every run as drawn around the common one: the rows
-are decorrelated (`ident.equations.run_scatter`), and trials, folds and bootstrap see what a law within the runs
-explains. The estimate knows nothing of it: shifts of gains are those of the estimate (`Folds.estimate_factor`).
+Friction differs from run to run, as temperature and mounting do. A search that took moves of all
+runs as exchangeable would find laws in that. So `prepare_search` takes the friction of every run as
+drawn around the common one: the rows are decorrelated (`ident.equations.run_scatter`), and trials,
+folds and bootstrap see what a law within the runs explains. The estimate knows nothing of it:
+shifts of gains are those of the estimate (`Folds.estimate_factor`).
 
-A *candidate* is an effect with one choice of settings on one axis. A *trial* projects its columns off all declared
-directions, gains included, and measures what they explain of the residual: in-sample, and on folds of held-out moves. A
-*family* is one effect with all settings that the dictionary tries.
+A *candidate* is an effect with one choice of settings on one axis. A *trial* projects its columns
+off all declared directions, gains included, and measures what they explain of the residual:
+in-sample, and on folds of held-out moves. A *family* is one effect with all settings that the
+dictionary tries.
 """
 
 from __future__ import annotations
@@ -24,7 +27,14 @@ from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.few_moves import FEW_MOVES, MoveScores, moves_behind, without_most_leverage
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect, PlacedEffect, at_joints, columns_at, effect_columns, is_placeable
+from ident.effects.effect import (
+    Effect,
+    PlacedEffect,
+    at_joints,
+    columns_at,
+    effect_columns,
+    is_placeable,
+)
 from ident.effects.geometry_corrections import GeometryEffect
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
@@ -36,18 +46,27 @@ from ident.model.model import Model
 from ident.model.robot import Motion
 
 ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
-"""Columns of candidates by effect and axis. There are hundreds, and single precision is enough for their trials."""
-Felt = Mapping[int, FloatArray]  #: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
+"""Columns of candidates by effect and axis.
 
-BATCH_COLUMNS = 48  #: Columns tested together: enough for fast products, few enough to keep memory small
+There are hundreds, and single precision is enough for their trials.
+"""
+#: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
+Felt = Mapping[int, FloatArray]
+
+#: Columns tested together: enough for fast products, few enough to keep memory small
+BATCH_COLUMNS = 48
 DECORRELATED_TOGETHER = 16  #: Candidates that are decorrelated at once
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
-REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
+#: Share of a column that must be left when all declared directions are projected out of it
+REDUNDANT_SHARE = 1e-6
 UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
-NO_SERIES = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm"})  #: Fields of `Signals` that do not change in a run
+#: Fields of `Signals` that do not change in a run
+NO_SERIES = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm"})
 FRICTION_OF_A_RUN = 0.03
-"""Standard deviation of fv and fs from run to run, as a share of each: a few degrees of the grease make as much."""
+"""Standard deviation of fv and fs from run to run, as a share of each:
+a few degrees of the grease make as much.
+"""
 FAST = frozenset({Abscissa.MOTOR_ANGLE})  #: Variables that turn within a decimated row
 
 
@@ -61,11 +80,14 @@ class SearchProblem:
     runs: tuple[Signals, ...]  #: predicted signals of each run, at full rate
     rows: tuple[Signals, ...]  #: the same at the observation's rows, without inertia
     folds: Folds  #: the problem around the estimate, in folds of moves
-    #: Estimate of each motor's noise in a row, which no model of motion explains [A]; None where not known.
+    #: Estimate of each motor's noise in a row, which no model of motion explains [A]; None where
+    #: not known.
     floors_a: tuple[float | None, ...]
-    #: From the estimate to the best fit where friction differs by run, in the scale of the unknowns, shape (f,).
+    #: From the estimate to the best fit where friction differs by run, in the scale of the
+    #: unknowns, shape (f,).
     step: FloatArray
-    #: Columns of motion and time alone, which stay the same from turn to turn, before they are placed at joints.
+    #: Columns of motion and time alone, which stay the same from turn to turn, before they are
+    #: placed at joints.
     cache: ColumnCache = field(default_factory=dict)
 
     @property
@@ -95,32 +117,46 @@ class SearchProblem:
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[CandidateTrial | None, ...]:
-        """Test candidates given by their joint torques (m, p, r); None where the model contains them already."""
+        """Test candidates given by their joint torques (m, p, r);
+        None where the model contains them already.
+        """
         return _scored(self.folds, self._felt(torques))
 
     def _felt(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, Felt]]:
-        """Number of columns of each candidate, and its whitened columns; some are decorrelated at once."""
+        """Number of columns of each candidate, and its whitened columns;
+        some are decorrelated at once.
+        """
         problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
-        # One torque after the other is in memory: it is far larger than what single motors feel of it.
-        whitened = ((torque.shape[1], problem.whitened_by_motor(torque, to_motor)) for torque in torques)
+        # One torque after the other is in memory: it is far larger than what single motors feel of
+        # it.
+        whitened = (
+            (torque.shape[1], problem.whitened_by_motor(torque, to_motor)) for torque in torques
+        )
         while together := list(islice(whitened, DECORRELATED_TOGETHER)):
             widths, felt = zip(*together, strict=True)
             yield from zip(widths, problem.decorrelated_by_motor(felt), strict=True)
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
-        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""
+        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m,
+        p, r).
+        """
         if isinstance(effect, GeometryEffect):
-            return self.torque_at_rows(effect, axis)  # the torque of the whole arm, once more, and it is smooth
+            # The torque of the whole arm, once more, and it is smooth
+            return self.torque_at_rows(effect, axis)
         kept = self.cache.get((effect, axis))
         if kept is None:
-            columns = effect_columns(effect, axis, self.runs, self.datasets, self.observation.conditioning)
+            columns = effect_columns(
+                effect, axis, self.runs, self.datasets, self.observation.conditioning
+            )
             kept = columns.astype(np.float32)
             if effect.abscissa.is_independent_of_model:
                 self.cache[effect, axis] = kept
         return at_joints(effect, axis, kept.astype(np.float64), self.model.drive_train)
 
     def torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
-        """Build the same from signals that are decimated already: fast, and good for effects that change slowly."""
+        """Build the same from signals that are decimated already:
+        fast, and good for effects that change slowly.
+        """
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
         columns = np.concatenate([columns_at(effect, run, axis) for run in self.rows], axis=-1)
@@ -135,7 +171,9 @@ class FamilyTrials:
     members: tuple[tuple[Effect, CandidateTrial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, m), with the setting chosen by the other folds alone."""
+        """‖e‖² of each fold and motor, shape (folds, m),
+        with the setting chosen by the other folds alone.
+        """
         chosen = np.argmax(np.stack([trial.training_fall for _, trial in self.members]), axis=0)
         return np.stack([self.members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
 
@@ -146,17 +184,23 @@ class CandidateTrial:
 
     coefficients: FloatArray  #: in-sample, in the unit of the columns, shape (p,)
     fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (m,)
-    training_fall: FloatArray  #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
-    held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, m)
+    #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
+    training_fall: FloatArray
+    #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, m)
+    held_out: FloatArray
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
-    scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    scatter: FloatArray
     gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
-    #: Without the moves of most leverage, of a candidate that rests on few; None of one that rests on many.
+    #: Without the moves of most leverage, of a candidate that rests on few; None of one that rests
+    #: on many.
     rest: MoveScores | None = None
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of the coefficients by the scatter of moves, G⁻¹XᵀXG⁻¹ (Liang & Zeger, 1986), shape (p, p)."""
+        """Covariance of the coefficients by the scatter of moves, G⁻¹XᵀXG⁻¹ (Liang & Zeger, 1986),
+        shape (p, p).
+        """
         spread = self._spread()
         return np.asarray(spread.T @ spread)
 
@@ -170,8 +214,12 @@ class CandidateTrial:
         return np.asarray(self.scatter @ np.linalg.pinv(self.gram.sum(axis=0)))
 
 
-def shares_explained(search_problem: SearchProblem, trials: Sequence[CandidateTrial | None]) -> list[float]:
-    """Share of a motor's squared residual that each trial explains, of the motor that it affects most."""
+def shares_explained(
+    search_problem: SearchProblem, trials: Sequence[CandidateTrial | None]
+) -> list[float]:
+    """Share of a motor's squared residual that each trial explains,
+    of the motor that it affects most.
+    """
     problem = search_problem.folds.linearisation
     left = np.bincount(problem.motor, problem.residual**2)
     return [0.0 if trial is None else float(np.max(trial.fallen / left)) for trial in trials]
@@ -187,8 +235,8 @@ def prepare_search(
 ) -> SearchProblem:
     """Linearise around an estimate by ``ml``, cut into folds, and predict the signals of every run.
 
-    The caller may keep a cache from turn to turn, for these datasets alone. Of the effects in the estimate, the signals
-    know the rotors that they show.
+    The caller may keep a cache from turn to turn, for these datasets alone. Of the effects in the
+    estimate, the signals know the rotors that they show.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
@@ -200,13 +248,23 @@ def prepare_search(
     floors = noise_floors(datasets, observation.conditioning)
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
-        at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name not in NO_SERIES}
-        sampled = {name: array for name, array in at_rate.items() if array is not None and array.shape[-1]}
+        at_rate = {
+            array.name: getattr(run, array.name)
+            for array in fields(run)
+            if array.name not in NO_SERIES
+        }
+        sampled = {
+            name: array for name, array in at_rate.items() if array is not None and array.shape[-1]
+        }
         known = {name: array for name, array in sampled.items() if name != "inertia_kg_m2"}
-        arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in known.items()}
+        arrays = {
+            name: decimate_rows(data, observation.conditioning, array)
+            for name, array in known.items()
+        }
         time_s, none = arrays["time_s"], run.inertia_kg_m2[..., :0]
         rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
-        # The arm of a closed chain moves joints that are not axes: it is followed from the axes again.
+        # The arm of a closed chain moves joints that are not axes: it is followed from the axes
+        # again.
         states = (
             decimate_rows(data, observation.conditioning, state.T).T
             for state in (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
@@ -234,8 +292,11 @@ def prepare_search(
     )
 
 
-def folds_around(model: Model, observation: Observation, estimate: Estimate) -> tuple[Folds, FloatArray]:
-    """The problem around an estimate in folds, with friction that differs by run, and the step to its best fit.
+def folds_around(
+    model: Model, observation: Observation, estimate: Estimate
+) -> tuple[Folds, FloatArray]:
+    """The problem around an estimate in folds, with friction that differs by run,
+    and the step to its best fit.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
@@ -255,9 +316,11 @@ def folds_around(model: Model, observation: Observation, estimate: Estimate) -> 
 def _with_friction_of_runs(
     problem: Linearisation, model: Model, observation: Observation, estimate: Estimate
 ) -> Linearisation:
-    """Let viscous and dry friction differ at random from run to run; the same problem of a single run.
+    """Let viscous and dry friction differ at random from run to run;
+    the same problem of a single run.
 
-    The rows of a redundant drive hold all motors at once, and their derivative to a gain would no longer be exact.
+    The rows of a redundant drive hold all motors at once, and their derivative to a gain would no
+    longer be exact.
     """
     if len(np.unique(observation.run)) < 2 or model.is_redundant:
         return problem
@@ -268,16 +331,19 @@ def _with_friction_of_runs(
 
 
 def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
-    """Piece of a move that each row belongs to, shape (r,), and the move that each piece with rows belongs to.
+    """Piece of a move that each row belongs to, shape (r,),
+    and the move that each piece with rows belongs to.
 
-    The scatter of moves is known well only from many: moves of a short recording are cut into pieces of many
-    correlation times (0.05 s) each. Folds still take whole moves.
+    The scatter of moves is known well only from many: moves of a short recording are cut into
+    pieces of many correlation times (0.05 s) each. Folds still take whole moves.
     """
     time_s, move = observation.time_s, observation.move
     first = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
     length = np.diff(first, append=len(move))
     total_s = float(np.sum(time_s[first + length - 1] - time_s[first]))
-    shortest_s = max(SHORTEST_PIECE_S, total_s / MOVES_WANTED) if len(first) < MOVES_WANTED else np.inf
+    shortest_s = (
+        max(SHORTEST_PIECE_S, total_s / MOVES_WANTED) if len(first) < MOVES_WANTED else np.inf
+    )
     since_s = time_s - np.repeat(time_s[first], length)
     piece = np.floor(since_s / shortest_s).astype(np.int64)
     change = (np.diff(move, prepend=move[0] - 1) != 0) | (np.diff(piece, prepend=-1) != 0)
@@ -301,12 +367,19 @@ def score_candidates(
         one trial a candidate; None where the declared model contains it already.
     """
     parts = [columns.T[chosen] for chosen in candidates]
-    felt = ({own.motor: part[:, own.rows] for own in folds.motors if part[:, own.rows].any()} for part in parts)
+    felt = (
+        {own.motor: part[:, own.rows] for own in folds.motors if part[:, own.rows].any()}
+        for part in parts
+    )
     return _scored(folds, zip(map(len, parts), felt, strict=True))
 
 
-def _scored(folds: Folds, candidates: Iterable[tuple[int, Felt]]) -> tuple[CandidateTrial | None, ...]:
-    """Test candidates, each given by its number of columns and these, in batches of equal numbers."""
+def _scored(
+    folds: Folds, candidates: Iterable[tuple[int, Felt]]
+) -> tuple[CandidateTrial | None, ...]:
+    """Test candidates, each given by its number of columns and these,
+    in batches of equal numbers.
+    """
     trials: dict[int, CandidateTrial | None] = {}
     waiting: dict[int, dict[int, Felt]] = {}
 
@@ -323,13 +396,19 @@ def _scored(folds: Folds, candidates: Iterable[tuple[int, Felt]]) -> tuple[Candi
     return tuple(trials[number] for number in range(len(trials)))
 
 
-def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tuple[CandidateTrial | None, ...]:
+def _scored_together(
+    folds: Folds, width: int, candidates: Sequence[Felt]
+) -> tuple[CandidateTrial | None, ...]:
     """Test c candidates with the same number of columns p.
 
-    Everything is computed from products that are summed block by block, so that no candidate needs a pass over the rows
-    of its own.
+    Everything is computed from products that are summed block by block, so that no candidate needs
+    a pass over the rows of its own.
     """
-    made = [_products(own, candidates) for own in folds.motors if any(own.motor in felt for felt in candidates)]
+    made = [
+        _products(own, candidates)
+        for own in folds.motors
+        if any(own.motor in felt for felt in candidates)
+    ]
     shape, unknowns = (len(candidates), width), folds.linearisation.jacobian.width
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
     parts = (folds.count, len(folds.linearisation.gamma), *shape)
@@ -340,7 +419,9 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
         spread = np.zeros((folds.count, len(one.felt), width, unknowns))
         spread[..., one.own.seen] = one.own.by_fold(one.jacobian, folds.count)
         part_jacobian[place], part_gram[place] = spread, one.own.by_fold(one.gram, folds.count)
-        part_score[place], part_held[place] = (one.own.by_fold(part, folds.count) for part in (one.score, one.held))
+        part_score[place], part_held[place] = (
+            one.own.by_fold(part, folds.count) for part in (one.score, one.held)
+        )
     motor_jacobian, fold_jacobian = part_jacobian.sum(axis=0), part_jacobian.sum(axis=1)
     motor_gram, whole_jacobian = part_gram.sum(axis=0), fold_jacobian.sum(axis=0)
     # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster and of each motor.
@@ -348,7 +429,10 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
     gram = _crossed(_pushed(along, folds.cluster_hessian), along)
     cluster_score = -_scored_along(along, folds.cluster_score)
     for one in made:
-        at, crossed = np.ix_(one.own.cluster, one.felt), _crossed(one.jacobian, along[one.felt][..., one.own.seen])
+        at, crossed = (
+            np.ix_(one.own.cluster, one.felt),
+            _crossed(one.jacobian, along[one.felt][..., one.own.seen]),
+        )
         gram[at] += one.gram - crossed - np.swapaxes(crossed, -1, -2)
         cluster_score[at] += one.score
     squares = np.diagonal(motor_gram.sum(axis=0), axis1=1, axis2=2)
@@ -359,24 +443,35 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
         return tuple(next(trials) if is_new else None for is_new in new)
     fitted = np.linalg.solve(gram.sum(axis=0), cluster_score.sum(axis=0)[..., None])[..., 0]
     motor_score = part_score.sum(axis=0) - _scored_along(along, folds.motor_score)
-    own = _projected_gram(motor_gram, motor_jacobian, along, _pushed(along, folds.part_hessian.sum(axis=0)))
-    fallen = 2.0 * np.einsum("ncp,cp->cn", motor_score, fitted) - np.einsum("cp,ncpq,cq->cn", fitted, own, fitted)
+    own = _projected_gram(
+        motor_gram, motor_jacobian, along, _pushed(along, folds.part_hessian.sum(axis=0))
+    )
+    fallen = 2.0 * np.einsum("ncp,cp->cn", motor_score, fitted) - np.einsum(
+        "cp,ncpq,cq->cn", fitted, own, fitted
+    )
     scatter = cluster_score - (gram @ fitted[..., None])[..., 0]
     # The same with J and Φ of the other folds, for each fold k: Φ − J w_k.
     coupling = whole_jacobian - fold_jacobian
-    steps = np.stack([_solved(factor, part) for factor, part in zip(folds.factors, coupling, strict=True)])
+    steps = np.stack(
+        [_solved(factor, part) for factor, part in zip(folds.factors, coupling, strict=True)]
+    )
     drive = part_score.sum(axis=(0, 1)) - part_score.sum(axis=1)
     drive -= (steps @ folds.scores[:, None, :, None])[..., 0]
     shown = part_held - (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
-    # What the other folds do not show at all is left as it is: in its own unit, the shortest of all solutions.
+    # What the other folds do not show at all is left as it is: in its own unit, the shortest of all
+    # solutions.
     unit = np.sqrt(squares)
     schur = motor_gram.sum(axis=0) - part_gram.sum(axis=1) - _crossed(coupling, steps)
     inverse = np.linalg.pinv(schur / (unit[:, :, None] * unit[:, None, :]), rcond=UNSEEN)
     without = (inverse @ (drive / unit)[..., None])[..., 0] / unit
     # r − (Φ − J w_k) fitted, squared motor by motor.
-    pushed = np.stack([_pushed(step, hessian) for step, hessian in zip(steps, folds.part_hessian, strict=True)])
+    pushed = np.stack(
+        [_pushed(step, hessian) for step, hessian in zip(steps, folds.part_hessian, strict=True)]
+    )
     inside = _projected_gram(part_gram, part_jacobian, steps[:, None], pushed)
-    held_out = folds.square_sum(folds.residual)[:, :, None] - 2.0 * np.einsum("kncp,kcp->knc", shown, without)
+    held_out = folds.square_sum(folds.residual)[:, :, None] - 2.0 * np.einsum(
+        "kncp,kcp->knc", shown, without
+    )
     held_out += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
     training = np.sum(drive * without, axis=-1)
     score = cluster_score.sum(axis=0)
@@ -398,7 +493,9 @@ def _scored_together(folds: Folds, width: int, candidates: Sequence[Felt]) -> tu
 
 @dataclass(frozen=True, slots=True)
 class _Products:
-    """Products of the candidates that one motor feels with its rows, block by block, and of these with J, e and r."""
+    """Products of the candidates that one motor feels with its rows, block by block,
+    and of these with J, e and r.
+    """
 
     own: MotorRows  #: the motor's rows
     felt: IntArray  #: these candidates, among those of the batch
@@ -413,10 +510,14 @@ def _products(own: MotorRows, candidates: Sequence[Felt]) -> _Products:
     inside = np.stack([candidates[number][own.motor] for number in felt])
     flat = own.sums(inside.reshape(-1, inside.shape[-1]), own.equations)
     beside = flat.reshape(len(flat), *inside.shape[:2], -1)
-    return _Products(own, felt, beside[..., :-2], own.sums(inside, inside), beside[..., -2], beside[..., -1])
+    return _Products(
+        own, felt, beside[..., :-2], own.sums(inside, inside), beside[..., -2], beside[..., -1]
+    )
 
 
-def _rest(folds: Folds, made: Sequence[_Products], place: int, projected: FloatArray) -> MoveScores | None:
+def _rest(
+    folds: Folds, made: Sequence[_Products], place: int, projected: FloatArray
+) -> MoveScores | None:
     """One candidate without the moves of most leverage; None where it rests on many."""
     if moves_behind(projected) >= FEW_MOVES:
         return None
@@ -433,7 +534,9 @@ def _rest(folds: Folds, made: Sequence[_Products], place: int, projected: FloatA
 
 
 def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
-    """Mask of candidates that the declared model lacks, from Φ⊥ᵀΦ⊥, (c, p, p), and ‖φ‖² of their columns, (c, p)."""
+    """Mask of candidates that the declared model lacks, from Φ⊥ᵀΦ⊥, (c, p, p),
+    and ‖φ‖² of their columns, (c, p).
+    """
     size = np.diagonal(gram, axis1=1, axis2=2)
     new = np.asarray(np.all(size > REDUNDANT_SHARE * squares, axis=1))
     root = np.sqrt(size[new])
@@ -443,7 +546,9 @@ def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
 
 def _solved(factor: tuple[FloatArray, bool], right: FloatArray) -> FloatArray:
     """H⁻¹JᵀΦ of each candidate, transposed, from ΦᵀJ, both of shape (c, p, f)."""
-    return np.asarray(linalg.cho_solve(factor, right.reshape(-1, right.shape[-1]).T).T.reshape(right.shape))
+    return np.asarray(
+        linalg.cho_solve(factor, right.reshape(-1, right.shape[-1]).T).T.reshape(right.shape)
+    )
 
 
 def _pushed(along: FloatArray, hessian: FloatArray) -> FloatArray:
@@ -461,7 +566,11 @@ def _crossed(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(first @ np.swapaxes(second, -1, -2))
 
 
-def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed: FloatArray) -> FloatArray:
-    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), from ΦᵀΦ, ΦᵀJ, wᵀ and wᵀJᵀJ, the last three (…, p, f)."""
+def _projected_gram(
+    gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed: FloatArray
+) -> FloatArray:
+    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), from ΦᵀΦ, ΦᵀJ, wᵀ and wᵀJᵀJ,
+    the last three (…, p, f).
+    """
     crossed = _crossed(jacobian, along)
     return gram - crossed - np.swapaxes(crossed, -1, -2) + _crossed(pushed, along)

@@ -1,24 +1,28 @@
 """Share of the choice of effects in σ: rivals of those that joined, and those that stayed out.
 
-The covariance of a joint fit takes its effects as given. But the search has chosen them, on the same data. Another
-model r could be the true one. It would put the gains and parameters θ at θ_r, and averaged over the models (Buckland,
-Burnham & Augustin 1997; here around the one that was chosen, whose estimate is kept) the covariance grows by
+The covariance of a joint fit takes its effects as given. But the search has chosen them, on the
+same data. Another model r could be the true one. It would put the gains and parameters θ at θ_r,
+and averaged over the models (Buckland, Burnham & Augustin 1997; here around the one that was
+chosen, whose estimate is kept) the covariance grows by
 
     C_r = w_r (θ_r − θ)(θ_r − θ)ᵀ,      w_r = o_r/(1 + Σ o),      o_r = p_r/(1 − p_r),
 
-with Σ over the rivals of the same effect, or of the same axis, and p_r the probability that r predicts left-out moves
-better than the chosen model, by a paired comparison over folds (Student's t). Models that do equally well have equal
-weights. They are
+with Σ over the rivals of the same effect, or of the same axis, and p_r the probability that r
+predicts left-out moves better than the chosen model, by a paired comparison over folds (Student's
+t). Models that do equally well have equal weights. They are
 
 - for each effect in the fit, those of its ambiguity set in its place;
-- for each axis, one further effect that is no noise (`Gates.false_alarm`, over all candidates) and possible, but too
-  small for the other gates: a saturation that explains 3 % of the residual may move a gain by five σ. A term without a
-  name that did not join because it moves a gain is one of them;
-- each effect that left although nothing refutes it: held-out runs decide nothing, or σ itself hides it. No other model
-  takes a part of its weight, because the gains of a model with it are what they would be if it is true.
+- for each axis, one further effect that is no noise (`Gates.false_alarm`, over all candidates) and
+  possible, but too small for the other gates: a saturation that explains 3 % of the residual may
+  move a gain by five σ. A term without a name that did not join because it moves a gain is one of
+  them;
+- each effect that left although nothing refutes it: held-out runs decide nothing, or σ itself hides
+  it. No other model takes a part of its weight, because the gains of a model with it are what they
+  would be if it is true.
 
-θ_r is taken to first order, from products with columns that the search has made before: no refit. The error of the
-settings that were searched (exponents, time constants) is left out: it was below a tenth of σ wherever it was measured.
+θ_r is taken to first order, from products with columns that the search has made before: no refit.
+The error of the settings that were searched (exponents, time constants) is left out: it was below a
+tenth of σ wherever it was measured.
 """
 
 from __future__ import annotations
@@ -45,7 +49,8 @@ def choice_covariance(
     left: Sequence[Finding],
     open_effects: Sequence[PlacedEffect] = (),
 ) -> FloatArray:
-    """Covariance of (gains, parameters) from the choice of the effects in a joint fit, shape (m + p, m + p).
+    """Covariance of (gains, parameters) from the choice of the effects in a joint fit,
+    shape (m + p, m + p).
 
     Args:
         search_problem: linearised around the joint fit.
@@ -58,13 +63,19 @@ def choice_covariance(
     for finding, others in accepted:
         placed = finding.placed
         found = {(one.effect, one.axis): one for one in others}
-        rivals = [found[key] for one in finding.ambiguity if (key := (one.effect, one.axis)) in found]
+        rivals = [
+            found[key] for one in finding.ambiguity if (key := (one.effect, one.axis)) in found
+        ]
         if rivals:
             reduced = without_effects_of(search_problem, estimate, (placed,))
-            torque, errors = reduced.torque, finding.fold_errors
-            shifts.append(_by_rivals(reduced.search_problem, torque, errors, rivals, len(estimate.covariance)))
+            torque = reduced.torque
+            errors = finding.fold_errors
+            shifts.append(
+                _by_rivals(reduced.search_problem, torque, errors, rivals, len(estimate.covariance))
+            )
     folds = search_problem.folds
-    errors, nothing = folds.square_sum(folds.residual).sum(axis=1), np.zeros(len(folds.residual))
+    errors = folds.square_sum(folds.residual).sum(axis=1)
+    nothing = np.zeros(len(folds.residual))
     for axis in sorted({one.axis for one in left}):
         rivals = [one for one in left if one.axis == axis]
         shifts.append(_by_rivals(search_problem, nothing, errors, rivals, len(estimate.covariance)))
@@ -104,7 +115,9 @@ def scored_beside(search_problem: SearchProblem, finding: Finding) -> Finding | 
 def _by_open_effect(
     search_problem: SearchProblem, fold_errors: FloatArray, placed: PlacedEffect, size: int
 ) -> FloatArray:
-    """√w_r (θ_r − θ) of the model with an effect that left, shape (1, size); no row where the fit contains it."""
+    """√w_r (θ_r − θ) of the model with an effect that left, shape (1, size);
+    no row where the fit contains it.
+    """
     effect = placed.effect
     if isinstance(effect, GeometryEffect):  # the description no longer has its applied part
         effect = effect.with_applied([0.0] * len(effect.coefficients))
@@ -131,9 +144,14 @@ def _weights(chosen: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _by_rivals(
-    search_problem: SearchProblem, torque: FloatArray, fold_errors: FloatArray, rivals: Sequence[Finding], size: int
+    search_problem: SearchProblem,
+    torque: FloatArray,
+    fold_errors: FloatArray,
+    rivals: Sequence[Finding],
+    size: int,
 ) -> FloatArray:
-    """√w_r (θ_r − θ) of models with another effect in the place of the chosen one, shape (rivals, size).
+    """√w_r (θ_r − θ) of models with another effect in the place of the chosen one, shape (rivals,
+    size).
 
     Args:
         search_problem: around the fit, without the chosen effect.

@@ -1,8 +1,9 @@
 """Add the effects that a cell declares: they are fitted, not searched for.
 
-A declared effect must be possible: a balancer does not push where it must pull. Where its coefficients are not, the
-declaration is refused, unless the geometry or the clock is the cause (`ident.discovery.geometry_check`): the torque of
-a balancer and that of gravity are alike, so that a base that leans by a degree makes a true balancer look impossible.
+A declared effect must be possible: a balancer does not push where it must pull. Where its
+coefficients are not, the declaration is refused, unless the geometry or the clock is the cause
+(`ident.discovery.geometry_check`): the torque of a balancer and that of gravity are alike, so that
+a base that leans by a degree makes a true balancer look impossible.
 """
 
 from __future__ import annotations
@@ -32,18 +33,21 @@ def with_declared(
     progress: Callable[[str], None] = lambda _: None,
     axes: Sequence[str] = (),
 ) -> tuple[Step, ...]:
-    """Add effects that the cell declares, and refit everything with each; settings that are refined are fitted, too.
+    """Add effects that the cell declares, and refit everything with each;
+    settings that are refined are fitted, too.
 
     Args:
         start: identified by ``ml``, from `gather`, without effects.
         declared: the effects, with the settings to begin with.
-        rng: of the bootstrap, for what the findings say, and of the geometry's test where an effect is impossible.
+        rng: of the bootstrap, for what the findings say, and of the geometry's test where an effect
+            is impossible.
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
 
     Returns:
-        a step an effect; a search that begins with the last one's evidence keeps them. Where the geometry is to blame,
-        coefficients may be impossible until it is corrected: ask `impossible_declared` after a search.
+        a step an effect; a search that begins with the last one's evidence keeps them. Where the
+        geometry is to blame, coefficients may be impossible until it is corrected: ask
+        `impossible_declared` after a search.
 
     Raises:
         EffectImpossible: the coefficients of an effect are impossible.
@@ -74,7 +78,8 @@ def with_declared(
 
 
 def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
-    """Name the first declared effect with impossible coefficients, and say which; empty where all are possible.
+    """Name the first declared effect with impossible coefficients, and say which;
+    empty where all are possible.
 
     Args:
         evidence: with the declared effects first.
@@ -83,14 +88,20 @@ def impossible_declared(evidence: Evidence, axes: Sequence[str]) -> str:
     estimate = evidence.estimate
     for placed in evidence.effects[: evidence.declared]:
         own = own_unknowns(estimate, (placed,))
-        wrong = impossible(placed.effect.coefficients, values_of(estimate, own), estimate.parameters_std[own])
+        wrong = impossible(
+            placed.effect.coefficients, values_of(estimate, own), estimate.parameters_std[own]
+        )
         if wrong:
             return f"{placed.name_among(axes)}: {wrong}"
     return ""
 
 
-def _is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator, axes: Sequence[str]) -> bool:
-    """Whether the data ask for another geometry or clock, and all declared effects are possible with it."""
+def _is_geometry_to_blame(
+    evidence: Evidence, rng: np.random.Generator, axes: Sequence[str]
+) -> bool:
+    """Whether the data ask for another geometry or clock,
+    and all declared effects are possible with it.
+    """
     try:
         mistakes = check_geometry(evidence, rng).mistakes
     except TooFewMoves:
@@ -106,7 +117,9 @@ def _is_geometry_to_blame(evidence: Evidence, rng: np.random.Generator, axes: Se
 
 
 def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Evidence:
-    """Refit with the first form of a declared effect that the data can fit; the last one must be possible."""
+    """Refit with the first form of a declared effect that the data can fit;
+    the last one must be possible.
+    """
     *richer, plain = forms
     for form in richer:
         try:
@@ -119,12 +132,16 @@ def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Ev
 def _finding_beside_others(
     model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates
 ) -> Finding | None:
-    """What a declared effect explains beside all others in the model; None where they contain it."""
+    """What a declared effect explains beside all others in the model;
+    None where they contain it.
+    """
     reduced = without_effects_of(model.search_problem, model.evidence.estimate, (placed,))
     problem = reduced.search_problem
     columns = reduced.columns
     (trial,) = score_candidates(problem.folds, columns, (slice(0, columns.shape[1]),))
     if trial is None:
         return None
-    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates)
+    (finding,) = rank_families(
+        problem, (FamilyTrials(placed.axis, ((placed.effect, trial),)),), rng, gates
+    )
     return finding

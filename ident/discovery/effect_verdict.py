@@ -26,14 +26,19 @@ class EffectVerdict:
     judgement: Judgement  #: of held-out runs
     reason: str  #: in words
     change: ErrorChange  #: of the squared errors by the effect
-    before: RelativeError  #: error of the held-out torques without the effect, everything else refitted [%]
+    #: error of the held-out torques without the effect, everything else refitted [%]
+    before: RelativeError
     after: RelativeError  #: the same with it [%]
     written: bool = True  #: whether the effect stays in the model
-    is_needed: bool = False  #: nothing can be fitted without it: it is judged together with all others
+    #: nothing can be fitted without it: it is judged together with all others
+    is_needed: bool = False
 
     def error_text(self) -> str:
         """Say how the held-out error in total changes."""
-        return f"{self.before.total:.2f} % of the held-out torques without it, {self.after.total:.2f} % with it"
+        return (
+            f"{self.before.total:.2f} % of the held-out torques without it, "
+            f"{self.after.total:.2f} % with it"
+        )
 
 
 def judge_change(change: ErrorChange, motor: int | None = None) -> tuple[Judgement, str]:
@@ -41,20 +46,27 @@ def judge_change(change: ErrorChange, motor: int | None = None) -> tuple[Judgeme
 
     Args:
         change: by an effect.
-        motor: on which the effect acts; None for one that acts on all of them, or on a joint without a motor.
+        motor: on which the effect acts; None for one that acts on all of them, or on a joint
+            without a motor.
     """
     if harm := change.harm("held-out runs"):
         return Judgement.REFUTED, harm
     blocks = change.total.moves
     if blocks < FEWEST_BLOCKS:
-        few = f"held-out runs have {blocks} independent blocks of moves, and fewer than {FEWEST_BLOCKS} show nothing"
+        few = (
+            f"held-out runs have {blocks} independent blocks of moves, and fewer than "
+            f"{FEWEST_BLOCKS} show nothing"
+        )
         return Judgement.UNDECIDED, few
-    # Of two errors that are asked, each has half the level: a search has gates before this one, a verdict has none.
-    # Either is asked by two tests, so that noise passes one of the four in up to 9 % of all cases, not in 5 %.
+    # Of two errors that are asked, each has half the level: a search has gates before this one, a
+    # verdict has none. Either is asked by two tests, so that noise passes one of the four in up to
+    # 9 % of all cases, not in 5 %.
     each = CONFIDENCE if motor is None else 0.5 * (1.0 + CONFIDENCE)
     if not change.is_fall(motor, each):
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
-        return Judgement.UNDECIDED, f"the squared error on held-out runs changes by {size}, which may be noise"
+        return Judgement.UNDECIDED, (
+            f"the squared error on held-out runs changes by {size}, which may be noise"
+        )
     if doubtful := change.doubtful_motors:
         rise = f"the error of motor {doubtful[0] + 1} on held-out runs rises by much"
         return Judgement.UNDECIDED, f"{rise}, although that may be noise"

@@ -1,28 +1,31 @@
 """Change of the errors of all motors on data that a fit has not seen, beside its noise.
 
-Two models predict the same rows. With d_b the rise of a squared error in block b of B, the errors differ by more than
-noise where
+Two models predict the same rows. With d_b the rise of a squared error in block b of B, the errors
+differ by more than noise where
 
     Σ d_b > t_(p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²).
 
-One block in which an error changes much, either way, makes this σ so large that no change is seen which all other
-blocks share. So a change of the same sign by the trimmed mean counts as well (Yuen 1974: the largest and the smallest
-tenth of the blocks left out, one block each at least): 10 of 11 blocks better prove an effect, although one is worse.
-The reverse is not enough: a fall that two blocks make alone is none.
+One block in which an error changes much, either way, makes this σ so large that no change is seen
+which all other blocks share. So a change of the same sign by the trimmed mean counts as well (Yuen
+1974: the largest and the smallest tenth of the blocks left out, one block each at least): 10 of 11
+blocks better prove an effect, although one is worse. The reverse is not enough: a fall that two
+blocks make alone is none.
 
-Two tests are asked, the mean and the trimmed mean, so noise passes one of them more often than the confidence says:
-where it says 5 %, 5.9 to 8.5 % of changes that are noise alone pass, and 3.0 to 4.6 % where it says 2.5 % (12 000 draws
-of normal and of Student-3 blocks; most with five blocks). The confidences of this module are those of one test.
+Two tests are asked, the mean and the trimmed mean, so noise passes one of them more often than the
+confidence says: where it says 5 %, 5.9 to 8.5 % of changes that are noise alone pass, and 3.0 to
+4.6 % where it says 2.5 % (12 000 draws of normal and of Student-3 blocks; most with five blocks).
+The confidences of this module are those of one test.
 
-Blocks are moves, and neighbouring moves of a run are joined in pairs while their changes correlate: an error that
-differs over a region of the workspace differs in a dozen moves at once, which prove no more than one of them. Fewer
-blocks than FEWEST_BLOCKS show nothing, whatever they say: four fall by chance once in 16 times. One block that
-outweighs all others does not either: t is then near one.
+Blocks are moves, and neighbouring moves of a run are joined in pairs while their changes correlate:
+an error that differs over a region of the workspace differs in a dozen moves at once, which prove
+no more than one of them. Fewer blocks than FEWEST_BLOCKS show nothing, whatever they say: four fall
+by chance once in 16 times. One block that outweighs all others does not either: t is then near one.
 
-A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a rise of any motor at
-MOTOR_CONFIDENCE, one-sided, for all motors together. A fall of the motor on which an effect acts counts as one, too:
-the effect names it before these data are asked. A rise by less than SAME_ERROR of the error is none, however certain it
-is: 5.76 % against 5.76 % refutes nothing.
+A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a
+rise of any motor at MOTOR_CONFIDENCE, one-sided, for all motors together. A fall of the motor on
+which an effect acts counts as one, too: the effect names it before these data are asked. A rise by
+less than SAME_ERROR of the error is none, however certain it is: 5.76 % against 5.76 % refutes
+nothing.
 """
 
 from __future__ import annotations
@@ -37,7 +40,8 @@ from ident.equations.linearisation import CORRELATED
 from ident.estimators.estimate import SAME_ERROR
 
 CONFIDENCE = 0.95  #: One-sided, of a change of the whole squared error by more than noise
-MOTOR_CONFIDENCE = 0.99  #: One-sided, that no motor's error seems to change by more than noise where none does
+#: One-sided, that no motor's error seems to change by more than noise where none does
+MOTOR_CONFIDENCE = 0.99
 FEWEST_BLOCKS = 5  #: 2⁻⁵ < 1 − CONFIDENCE: with fewer, not even equal signs of all blocks are rare
 TRIMMED = 0.1  #: Share of the blocks at either end that a trimmed mean leaves out
 DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although it may be noise
@@ -45,12 +49,15 @@ DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although i
 
 @dataclass(frozen=True, slots=True)
 class PairedChange:
-    """Change of a squared error on the same rows, and its noise by the scatter of moves, or of blocks of moves."""
+    """Change of a squared error on the same rows, and its noise by the scatter of moves,
+    or of blocks of moves.
+    """
 
     rise: float  #: Σ ‖e‖² after − before; negative where the error falls
     std: float  #: its σ
     moves: int  #: number of moves with rows, or of independent blocks of them
-    by_block: tuple[float, ...] = ()  #: the change in each of them, the smallest first; empty where it is not known
+    #: the change in each of them, the smallest first; empty where it is not known
+    by_block: tuple[float, ...] = ()
 
     @property
     def is_rise(self) -> bool:
@@ -111,7 +118,9 @@ class ErrorChange:
         """Motors whose error rises by more than noise, and by more than the tolerance."""
         found: list[int] = []
         for motor, change in enumerate(self.motors):
-            enough = change.moves >= FEWEST_BLOCKS and _is_beyond(change, self.before[motor], SAME_ERROR)
+            enough = change.moves >= FEWEST_BLOCKS and _is_beyond(
+                change, self.before[motor], SAME_ERROR
+            )
             if enough and change.rises(self.each_confidence):
                 found.append(motor)
         return tuple(found)
@@ -137,11 +146,13 @@ class ErrorChange:
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
     def is_fall(self, motor: int | None = None, each: float = CONFIDENCE) -> bool:
-        """Whether the error falls by more than noise, in total, or of the motor that a model claims to know better.
+        """Whether the error falls by more than noise, in total,
+        or of the motor that a model claims to know better.
 
         Args:
             motor: that one; None where the total alone is judged.
-            each: one-sided confidence of either error. Two of them are asked, so noise falls more often than one is.
+            each: one-sided confidence of either error. Two of them are asked, so noise falls more
+                often than one is.
         """
         if not self.is_enough:
             return False
@@ -151,12 +162,17 @@ class ErrorChange:
         return self.total.falls(each) or (own.moves >= FEWEST_BLOCKS and own.falls(each))
 
     def harm(self, data: str) -> str:
-        """Say where the error on some data rises by more than noise; empty where it does nowhere."""
+        """Say where the error on some data rises by more than noise;
+        empty where it does nowhere.
+        """
         if self.is_rise:
             return f"the squared error on {data} rises by {_size(self.total)}"
         if worse := self.worse_motors:
             worst = max(worse, key=lambda motor: self.motors[motor].sigmas)
-            return f"the squared error of motor {worst + 1} on {data} rises by {_size(self.motors[worst])}"
+            return (
+                f"the squared error of motor {worst + 1} on {data} rises by "
+                f"{_size(self.motors[worst])}"
+            )
         return ""
 
 
@@ -170,15 +186,21 @@ def _size(change: PairedChange) -> str:
 
 
 def compare_by_move(change: FloatArray, move: IntArray) -> PairedChange:
-    """Sum the change of each row's squared error, shape (r,), with σ by clusters of moves, shape (r,)."""
-    return _of_blocks(np.asarray(np.bincount(np.unique(move, return_inverse=True)[1], change), dtype=np.float64))
+    """Sum the change of each row's squared error, shape (r,), with σ by clusters of moves,
+    shape (r,).
+    """
+    return _of_blocks(
+        np.asarray(np.bincount(np.unique(move, return_inverse=True)[1], change), dtype=np.float64)
+    )
 
 
 def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> PairedChange:
-    """Sum the change of each row's squared error, with σ by blocks of moves that are independent of each other.
+    """Sum the change of each row's squared error, with σ by blocks of moves that are independent of
+    each other.
 
-    Neighbouring moves of a run are joined in pairs, again and again, while the changes of neighbours correlate by more
-    than CORRELATED standard errors (batch means, as in `ident.equations.linearisation.independent_blocks`).
+    Neighbouring moves of a run are joined in pairs, again and again, while the changes of
+    neighbours correlate by more than CORRELATED standard errors (batch means, as in
+    `ident.equations.linearisation.independent_blocks`).
 
     Args:
         change: of each row, shape (r,).
@@ -193,7 +215,9 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
         products = (centred[1:] * centred[:-1])[runs[1:] == runs[:-1]]
         if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
             break
-        starts = np.sort(np.concatenate([np.flatnonzero(runs == one)[::2] for one in np.unique(runs)]))
+        starts = np.sort(
+            np.concatenate([np.flatnonzero(runs == one)[::2] for one in np.unique(runs)])
+        )
         if len(starts) == len(sums):
             break
         sums = np.add.reduceat(sums, starts)
@@ -202,9 +226,16 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
 
 
 def change_of_errors(
-    *, before: FloatArray, after: FloatArray, motor: IntArray, move: IntArray, run: IntArray, motors: int
+    *,
+    before: FloatArray,
+    after: FloatArray,
+    motor: IntArray,
+    move: IntArray,
+    run: IntArray,
+    motors: int,
 ) -> ErrorChange:
-    """Compare whitened squared errors of two models on the same rows, of all motors below each other.
+    """Compare whitened squared errors of two models on the same rows,
+    of all motors below each other.
 
     Args:
         before, after: squared errors, shape (rows,).
@@ -216,7 +247,10 @@ def change_of_errors(
     parts: list[PairedChange] = []
     for one in range(motors):
         own = motor == one
-        part = compare_by_block(change[own], move[own], run[own]) if own.any() else PairedChange(0.0, 0.0, 0)
+        if own.any():
+            part = compare_by_block(change[own], move[own], run[own])
+        else:
+            part = PairedChange(0.0, 0.0, 0)
         parts.append(part)
     return ErrorChange(
         total=compare_by_block(change, move, run),
@@ -228,4 +262,6 @@ def change_of_errors(
 def _of_blocks(sums: FloatArray) -> PairedChange:
     count = len(sums)
     spread = np.sum((sums - sums.mean()) ** 2) * count / max(count - 1, 1)
-    return PairedChange(float(sums.sum()), float(np.sqrt(spread)), count, tuple(np.sort(sums).tolist()))
+    return PairedChange(
+        float(sums.sum()), float(np.sqrt(spread)), count, tuple(np.sort(sums).tolist())
+    )

@@ -1,6 +1,8 @@
-"""An estimate with the rows that it rests on, and its refits: with effects, without, and by instruments.
+"""An estimate with the rows that it rests on, and its refits:
+with effects, without, and by instruments.
 
-`gather` makes it. The search (`ident.discovery.loop`) and the comparison of errors (`before_after`) work on it.
+`gather` makes it. The search (`ident.discovery.loop`) and the comparison of errors (`before_after`)
+work on it.
 """
 
 from __future__ import annotations
@@ -18,7 +20,12 @@ from ident.data.run import Run
 from ident.data.run_channels import channels_of
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
-from ident.effects.geometry_corrections import GeometryEffect, corrected_dataset, corrected_model, is_correction
+from ident.effects.geometry_corrections import (
+    GeometryEffect,
+    corrected_dataset,
+    corrected_model,
+    is_correction,
+)
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.observation import Observation, observe, on_demanded_motion
@@ -30,7 +37,8 @@ from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
 from ident.model.model import Column, Model
 
-RELINEARISATIONS = 4  #: Corrections of the geometry in one refit; a zero that is wrong by 2° settles in two
+#: Corrections of the geometry in one refit; a zero that is wrong by 2° settles in two
+RELINEARISATIONS = 4
 SETTLED = 0.1  #: Share of σ below which a further correction is not worth its time
 
 
@@ -55,12 +63,17 @@ class Evidence:
     holdout: Observation | None  #: rows of the held-out runs, None without any
     effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
     estimate: Estimate  #: of the training rows
-    declared: int = 0  #: how many of the effects, the first ones, the cell declares: no search takes them out
-    #: Effects whose applied part has corrected model, runs and rows (`ident.effects.geometry_corrections`).
+    #: how many of the effects, the first ones, the cell declares: no search takes them out
+    declared: int = 0
+    #: Effects whose applied part has corrected model, runs and rows
+    #: (`ident.effects.geometry_corrections`).
     corrections: tuple[PlacedEffect, ...] = ()
     uncorrected: Uncorrected | None = None  #: as they were before; None where nothing was corrected
-    demands: Demands = field(default_factory=Demands, repr=False, compare=False)  #: of the runs as they were given
-    _identification: list[Identification] = field(default_factory=list, init=False, repr=False, compare=False)
+    #: of the runs as they were given
+    demands: Demands = field(default_factory=Demands, repr=False, compare=False)
+    _identification: list[Identification] = field(
+        default_factory=list, init=False, repr=False, compare=False
+    )
 
     @property
     def fit_runs(self) -> tuple[Dataset, ...]:
@@ -69,43 +82,67 @@ class Evidence:
 
     @property
     def identification(self) -> Identification:
-        """The estimate with its equations reduced, effects among them; kept, because reducing takes long."""
+        """The estimate with its equations reduced, effects among them;
+        kept, because reducing takes long.
+        """
         if not self._identification:
-            training, holdout = self.training.system(), None if self.holdout is None else self.holdout.system()
+            training = self.training.system()
+            if self.holdout is None:
+                holdout = None
+            else:
+                holdout = self.holdout.system()
             channels = tuple(channels_of(self.model, data) for data in self.fit_runs)
-            found = Identification(self.model, self.conditioning, training, holdout, self.estimate, channels=channels)
+            found = Identification(
+                self.model, self.conditioning, training, holdout, self.estimate, channels=channels
+            )
             self._identification.append(found)
         return self._identification[0]
 
     @property
     def holdout_error(self) -> RelativeError | None:
         """Error on held-out rows [%]."""
-        return None if self.holdout is None else self.estimate.relative_error(self.holdout.system())
+        if self.holdout is None:
+            return None
+        return self.estimate.relative_error(self.holdout.system())
 
 
 @takes(found=Identification, runs=Iterable, holdout=Iterable)
-def gather(found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()) -> Evidence:
-    """Build the rows behind an identification from its runs and held-out runs, unless it has kept them."""
-    model, conditioning = found.model, found.conditioning
+def gather(
+    found: Identification, runs: Iterable[Run] = (), holdout: Iterable[Run] = ()
+) -> Evidence:
+    """Build the rows behind an identification from its runs and held-out runs,
+    unless it has kept them.
+    """
+    model = found.model
+    conditioning = found.conditioning
     if found.gathered is None:
         trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
-        datasets = (*trained, *(differentiate(run, model.drive_train, conditioning) for run in holdout))
-        rows, held_out = observe(model, datasets, conditioning, found.system), len(datasets) - len(trained)
+        datasets = (
+            *trained,
+            *(differentiate(run, model.drive_train, conditioning) for run in holdout),
+        )
+        rows = observe(model, datasets, conditioning, found.system)
+        held_out = len(datasets) - len(trained)
     else:
         datasets, rows = found.gathered
         held_out = len(datasets) - len(found.system.runs)
     training, rest = _split_holdout(rows, held_out)
-    evidence = Evidence(model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate)
+    evidence = Evidence(
+        model, conditioning, datasets, held_out, rows, training, rest, (), found.estimate
+    )
     evidence._identification.append(found)
     return evidence
 
 
-def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:
+def with_effects(
+    before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()
+) -> Evidence:
     """Refit the same data with these effects in the model, gains included.
 
-    Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
-    with the estimate that they led to. Where an effect corrects the geometry, its column is that of a small change:
-    what it finds is applied to the description, and everything is built again, until nothing is left to apply.
+    Load and current are the model's predictions, so columns of them are built twice: with the
+    estimate before, and with the estimate that they led to. Where an effect corrects the geometry,
+    its column is that of a small change: what it finds is applied to the description, and
+    everything is built again, until nothing is left to apply.
 
     Args:
         before: the same data.
@@ -118,7 +155,9 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequ
 def with_first_order_effects(
     before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()
 ) -> Evidence:
-    """As `with_effects`, but what a correction of the geometry finds is not applied to the description."""
+    """As `with_effects`, but what a correction of the geometry finds is not applied to the
+    description.
+    """
     corrections = tuple(placed for placed in effects if is_correction(placed))
     if _is_same_geometry(before.corrections, corrections):
         return _refitted(before, effects, runs)
@@ -126,7 +165,8 @@ def with_first_order_effects(
 
 
 def settled_corrections(found: Evidence) -> Evidence:
-    """Apply what corrections of the geometry have found to the description and refit, until nothing is left to apply.
+    """Apply what corrections of the geometry have found to the description and refit,
+    until nothing is left to apply.
 
     Args:
         found: with effects; without a correction among them it is returned as it is.
@@ -169,7 +209,9 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
 
 
 def coefficients_of(estimate: Estimate, placed: PlacedEffect) -> tuple[FloatArray, FloatArray]:
-    """Coefficients of an effect in an estimate, with what was applied to the description, and σ; shape (p,) each."""
+    """Coefficients of an effect in an estimate, with what was applied to the description, and σ;
+    shape (p,) each.
+    """
     own = own_unknowns(estimate, (placed,))
     return values_of(estimate, own), estimate.parameters_std[own]
 
@@ -189,7 +231,9 @@ def _applied(corrections: Sequence[PlacedEffect]) -> dict[PlacedEffect, tuple[fl
 
 
 def _relinearised(found: Evidence) -> tuple[PlacedEffect, ...] | None:
-    """The effects of a fit with what their corrections have found applied; None where nothing is left to apply."""
+    """The effects of a fit with what their corrections have found applied;
+    None where nothing is left to apply.
+    """
     effects: list[PlacedEffect] = []
     is_moved = False
     for placed in found.effects:
@@ -206,10 +250,14 @@ def _relinearised(found: Evidence) -> tuple[PlacedEffect, ...] | None:
 
 def fixed_gains(evidence: Evidence) -> FloatArray | None:
     """Gains that the fit holds; None where it finds them."""
-    return evidence.estimate.gains if evidence.estimate.gains_fixed else None
+    if evidence.estimate.gains_fixed:
+        return evidence.estimate.gains
+    return None
 
 
-def _refitted(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals]) -> Evidence:
+def _refitted(
+    before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals]
+) -> Evidence:
     """Refit with effects; the description has their corrections already."""
     current = before
     is_independent = all(placed.effect.abscissa.is_independent_of_model for placed in effects)
@@ -221,11 +269,16 @@ def _refitted(before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequenc
     began_s = session_began_s(before.fit_runs)  # held-out runs must not affect the fit
     held_out = before.datasets[len(before.fit_runs) :]
     torque = _torques(effects, around, held_out, began_s)
-    return replace(current, holdout=current.holdout.extended(_columns_of(before.model, effects), torque))
+    return replace(
+        current, holdout=current.holdout.extended(_columns_of(before.model, effects), torque)
+    )
 
 
-def refitted_around(around: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()) -> Evidence:
-    """Refit the same data once; load and current of the effects' columns are predictions of the estimate before.
+def refitted_around(
+    around: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals] = ()
+) -> Evidence:
+    """Refit the same data once; load and current of the effects' columns are predictions of the
+    estimate before.
 
     Args:
         around: the same data and description.
@@ -250,18 +303,23 @@ def _columns_of(model: Model, effects: Sequence[PlacedEffect]) -> tuple[Column, 
 
 
 def by_instruments(evidence: Evidence) -> Estimate | None:
-    """Estimate the same model of the same runs by ``iv``; None where the demanded motion of no run is known.
+    """Estimate the same model of the same runs by ``iv``;
+    None where the demanded motion of no run is known.
 
-    Load and current of the effects' columns are predictions of the estimate by ``ml``, in the instruments too.
+    Load and current of the effects' columns are predictions of the estimate by ``ml``, in the
+    instruments too.
     """
-    system, estimate = _with_instruments(evidence), evidence.estimate
+    system = _with_instruments(evidence)
+    estimate = evidence.estimate
     if system is None:
         return None
     return estimate_with(Method.IV, system, estimate.gains if estimate.gains_fixed else None)
 
 
 def _with_instruments(evidence: Evidence) -> System | None:
-    """System with instruments from the demanded motion; None where none is known or the drive is redundant."""
+    """System with instruments from the demanded motion;
+    None where none is known or the drive is redundant.
+    """
     model = evidence.model
     if model.is_redundant:
         return None
@@ -270,8 +328,11 @@ def _with_instruments(evidence: Evidence) -> System | None:
         return None
     demanded = on_demanded_motion(model, asked, evidence.training)
     if evidence.effects:
-        datasets, began_s = tuple(map(as_demanded, asked)), session_began_s(evidence.fit_runs)
-        demanded = replace(demanded, effects=_torques(evidence.effects, evidence, datasets, began_s))
+        datasets = tuple(map(as_demanded, asked))
+        began_s = session_began_s(evidence.fit_runs)
+        demanded = replace(
+            demanded, effects=_torques(evidence.effects, evidence, datasets, began_s)
+        )
         del datasets
     del asked  # free the copies of the runs before the equations are built
     return evidence.training.system(demanded)
@@ -280,10 +341,16 @@ def _with_instruments(evidence: Evidence) -> System | None:
 def _with_demand(evidence: Evidence, index: int) -> Dataset:
     """A run of the fit with its demanded motion, in the corrected description.
 
-    The demand is rebuilt from the run as it was given: what corrects the recorded positions corrects it, too.
+    The demand is rebuilt from the run as it was given: what corrects the recorded positions
+    corrects it, too.
     """
-    given = evidence.datasets if evidence.uncorrected is None else evidence.uncorrected.datasets
-    asked = with_demand(given[index], evidence.model.drive_train, evidence.conditioning, evidence.demands)
+    if evidence.uncorrected is None:
+        given = evidence.datasets
+    else:
+        given = evidence.uncorrected.datasets
+    asked = with_demand(
+        given[index], evidence.model.drive_train, evidence.conditioning, evidence.demands
+    )
     if asked.demanded is None:
         return evidence.datasets[index]
     corrected = corrected_dataset(as_demanded(asked), evidence.corrections)
@@ -297,17 +364,27 @@ def _torques(
     began_s: float | None,
     runs: Sequence[Signals] = (),
 ) -> FloatArray:
-    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (m, p, r)."""
-    parts, through_links = [], any(placed.effect.needs_inertia for placed in effects)
-    for index, data in enumerate(datasets):  # one by one: signals at full rate are the largest arrays of a search
+    """Columns of effects on the rows of runs, load and current predicted by an estimate, shape (m,
+    p, r).
+    """
+    parts = []
+    through_links = any(placed.effect.needs_inertia for placed in effects)
+    # One by one: signals at full rate are the largest arrays of a search
+    for index, data in enumerate(datasets):
         if runs:
             run = runs[index]
         else:
-            model, rows, estimate = around.model, around.training, around.estimate
+            model = around.model
+            rows = around.training
+            estimate = around.estimate
             run = fitted_signals(model, data, rows, estimate, began_s, inertia=through_links)
         run = beside_rotors(run, effects)
         given = (run,), (data,), around.conditioning, around.model
-        parts.append(np.concatenate([effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1))
+        parts.append(
+            np.concatenate(
+                [effect_torque(placed.effect, placed.axis, *given) for placed in effects], axis=1
+            )
+        )
     return np.concatenate(parts, axis=2)
 
 
@@ -316,17 +393,23 @@ def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
     if evidence.corrections:
         evidence = with_corrections(evidence, ())
     training, rest = _split_holdout(evidence.rows_without_effects, evidence.held_out)
-    return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate, declared=0)
+    return replace(
+        evidence, training=training, holdout=rest, effects=(), estimate=estimate, declared=0
+    )
 
 
 def with_estimate(evidence: Evidence, estimate: Estimate) -> Evidence:
     """Return the same rows with another estimate of the same unknowns, its equations kept."""
     changed = replace(evidence, estimate=estimate)
-    changed._identification.extend(replace(one, estimate=estimate) for one in evidence._identification)
+    changed._identification.extend(
+        replace(one, estimate=estimate) for one in evidence._identification
+    )
     return changed
 
 
-def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation, Observation | None]:
+def _split_holdout(
+    observation: Observation, held_out: int
+) -> tuple[Observation, Observation | None]:
     """Split rows of all runs into those of the fit and those of the last, held-out runs."""
     if not held_out:
         return observation, None

@@ -1,9 +1,11 @@
-"""Candidates that rest on few moves: tested without the moves of most leverage, or left untested with what to record.
+"""Candidates that rest on few moves: tested without the moves of most leverage,
+or left untested with what to record.
 
-The moves' random signs tell noise from an effect by the scatter of moves. A candidate whose columns are large in one or
-two moves, as a saturation that only the largest currents reach, has no scatter to compare with: its statistic is large
-in half of the draws, true or not. So the moves of most leverage are left out, everything is projected and fitted again
-on the others, and these are tested where there are enough of them. What rests on few moves sets no limit for others.
+The moves' random signs tell noise from an effect by the scatter of moves. A candidate whose columns
+are large in one or two moves, as a saturation that only the largest currents reach, has no scatter
+to compare with: its statistic is large in half of the draws, true or not. So the moves of most
+leverage are left out, everything is projected and fitted again on the others, and these are tested
+where there are enough of them. What rests on few moves sets no limit for others.
 """
 
 from __future__ import annotations
@@ -21,11 +23,14 @@ from ident.equations.linearisation import RIDGE, Folds
 
 FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs test nothing
 FEW_MOVES = (
-    8.0  #: The same below which a candidate sets no limit for others, and is tested without those of most leverage
+    #: The same below which a candidate sets no limit for others, and is tested without those of
+    #: most leverage
+    8.0
 )
 SHARE = 0.01
-"""Share of Φ⊥ᵀΦ⊥ that the other moves must hold: with less they know the coefficients ten times worse, and a test by
-them says nothing."""
+"""Share of Φ⊥ᵀΦ⊥ that the other moves must hold: with less they know the coefficients ten times
+worse, and a test by them says nothing.
+"""
 LEVERAGE = 3  #: Moves left out then
 
 RECORD = {
@@ -35,7 +40,8 @@ RECORD = {
     Abscissa.TIME: "and longer runs",
     Abscissa.SESSION: "runs, over a longer session",
     Abscissa.MOTOR_ANGLE: "slow moves over the whole range of this axis",
-    Abscissa.CURRENT: "moves with a large current of this axis (fast starts and stops, or more payload)",
+    Abscissa.CURRENT: "moves with a large current of this axis (fast starts and stops, or "
+    "more payload)",
     Abscissa.TORQUE_RATE: "moves with fast starts and stops of this axis",
     Abscissa.LOAD_CURVATURE: "moves with fast starts and stops of this axis",
     Abscissa.DISTANCE: "moves with reversals of this axis",
@@ -59,15 +65,19 @@ class ByMove(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MoveScores:
-    """Projected products of a candidate, cluster by cluster; zero for clusters that were left out."""
+    """Projected products of a candidate, cluster by cluster;
+    zero for clusters that were left out.
+    """
 
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
-    scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    scatter: FloatArray
     gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
 
 
 def moves_behind(gram: FloatArray) -> float:
-    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m², the least of its coefficients.
+    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m²,
+    the least of its coefficients.
 
     Args:
         gram: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
@@ -78,9 +88,14 @@ def moves_behind(gram: FloatArray) -> float:
 
 
 def without_most_leverage(
-    folds: Folds, crossed: FloatArray, squares: FloatArray, scores: FloatArray, projected: FloatArray
+    folds: Folds,
+    crossed: FloatArray,
+    squares: FloatArray,
+    scores: FloatArray,
+    projected: FloatArray,
 ) -> MoveScores | None:
-    """Fit everything again without the clusters of most leverage; None where the others do not show the candidate.
+    """Fit everything again without the clusters of most leverage;
+    None where the others do not show the candidate.
 
     Args:
         folds: the problem.
@@ -120,7 +135,9 @@ def without_most_leverage(
 
 
 def is_tested_on_others(rest: MoveScores | None) -> bool:
-    """Whether a candidate that rests on few moves rests on enough others, too, to be tested by these."""
+    """Whether a candidate that rests on few moves rests on enough others, too,
+    to be tested by these.
+    """
     return rest is not None and moves_behind(rest.gram) >= FEW_MOVES
 
 
@@ -134,5 +151,8 @@ def what_to_record(effect: Effect, gram: FloatArray, rest: MoveScores | None) ->
     """
     count = max(round(moves_behind(gram)), 1)
     noun = "move" if count == 1 else "moves"
-    why = "and the others do not show it" if is_tested_on_others(rest) else "too few to test it"
+    if is_tested_on_others(rest):
+        why = "and the others do not show it"
+    else:
+        why = "too few to test it"
     return f"it rests on {NUMBERS[count]} {noun}, {why}: record more {RECORD[effect.abscissa]}"

@@ -1,14 +1,16 @@
-"""Limits of the search, and gates that are no matter of one score: physics, parts left out, gains, effects together.
+"""Limits of the search, and gates that are no matter of one score:
+physics, parts left out, gains, effects together.
 
-A column declares which values physics allows its coefficient (`ident.model.model.Column`); `impossible` compares an
-estimate with them. `PartsLeftOut` predicts parts of the data without and with a candidate: whole runs, because moves of
-one run share its temperature, payload and wear; or, where no run can be left out, regions of the workspace, because
-neighbouring moves of one trajectory share their postures. Moves left out alone flatter an effect that holds in this
-recording, or here, only. How the errors of each motor change is judged by `ident.discovery.error_change`.
-`without_effects_of` takes effects out of a joint fit again. No refit is needed: at the
-optimum the residual is orthogonal to all columns, so without Φ with the coefficients c it becomes e + Φ⊥ c, Φ⊥ being
-what the other columns J leave of Φ, and the other unknowns move by (JᵀJ)⁻¹JᵀΦ c. The derivative to a gain is the
-torque of its motor, so it changes with Φ c too.
+A column declares which values physics allows its coefficient (`ident.model.model.Column`);
+`impossible` compares an estimate with them. `PartsLeftOut` predicts parts of the data without and
+with a candidate: whole runs, because moves of one run share its temperature, payload and wear; or,
+where no run can be left out, regions of the workspace, because neighbouring moves of one trajectory
+share their postures. Moves left out alone flatter an effect that holds in this recording, or here,
+only. How the errors of each motor change is judged by `ident.discovery.error_change`.
+`without_effects_of` takes effects out of a joint fit again. No refit is needed: at the optimum the
+residual is orthogonal to all columns, so without Φ with the coefficients c it becomes e + Φ⊥ c, Φ⊥
+being what the other columns J leave of Φ, and the other unknowns move by (JᵀJ)⁻¹JᵀΦ c. The
+derivative to a gain is the torque of its motor, so it changes with Φ c too.
 """
 
 from __future__ import annotations
@@ -35,9 +37,12 @@ REGIONS = 8  #: Of the workspace, that are left out in turn where no run can be
 MOVES_OF_REGION = 2  #: Fewest moves of a region
 CONFIDENCE = 0.95  #: Of a coefficient that is not zero
 CERTAIN_DELAY_SIGMAS = 5.0
-"""σ by which a delay that explains little must differ from zero. A wrong zero that explains little bends gains, and a
-delay of a millisecond does not: it may wait for more data. Without this limit, one of 28 clean cells had a position
-late by 0.7 ms, 4 σ, and an elastic gear one that was early by 0.5 ms (docs/evidence/effects-study.md)."""
+"""σ by which a delay that explains little must differ from zero.
+
+A wrong zero that explains little bends gains, and a delay of a millisecond does not: it may wait
+for more data. Without this limit, one of 28 clean cells had a position late by 0.7 ms, 4 σ, and an
+elastic gear one that was early by 0.5 ms (docs/evidence/effects-study.md).
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +53,8 @@ class Gates:
     folds_better: float = 0.75  #: least share of folds on which the candidate lowers the error
     explained: float = 0.03  #: least share of the motor's squared residual
     error_fall: float = 0.02  #: least relative fall of the motor's error on held-out moves
-    # With few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
+    # With few moves the bootstrap has little power, and a correct prediction is evidence of another
+    # kind.
     strong_folds: float = 0.875  #: as `folds_better`, for a strong candidate
     strong_fall: float = 0.1  #: as `error_fall`, for a strong candidate
     strong_false_alarm: float = 0.05  #: as `false_alarm`, for a strong candidate
@@ -56,12 +62,18 @@ class Gates:
 
     @property
     def smallest_share(self) -> float:
-        """Share of a motor's squared residual below which an effect fails a gate, if held-out moves fall as all do."""
+        """Share of a motor's squared residual below which an effect fails a gate,
+        if held-out moves fall as all do.
+        """
         return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
-def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatArray, tolerance: float = SIGMAS) -> str:
-    """Name the coefficients that are outside their possible values by more than a number of σ; empty without any."""
+def impossible(
+    columns: Sequence[Column], values: FloatArray, deviations: FloatArray, tolerance: float = SIGMAS
+) -> str:
+    """Name the coefficients that are outside their possible values by more than a number of σ;
+    empty without any.
+    """
     found = []
     for column, value, std in zip(columns, values, deviations, strict=True):
         size = f"{column.name} is {value:.3g} ± {std:.2g} {column.unit}; physics allows"
@@ -72,10 +84,14 @@ def impossible(columns: Sequence[Column], values: FloatArray, deviations: FloatA
     return ", ".join(found)
 
 
-def possible_values(columns: Sequence[Column], values: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Move the first values into what physics allows, and the others with them, by their covariance, shape (n,).
+def possible_values(
+    columns: Sequence[Column], values: FloatArray, covariance: FloatArray
+) -> FloatArray:
+    """Move the first values into what physics allows, and the others with them,
+    by their covariance, shape (n,).
 
-    It is what the same fit finds, to first order, if the values that are outside are held at their bounds.
+    It is what the same fit finds, to first order, if the values that are outside are held at their
+    bounds.
 
     Args:
         columns: of the first values, with their bounds.
@@ -104,7 +120,9 @@ def possible_values(columns: Sequence[Column], values: FloatArray, covariance: F
 def in_noise(values: FloatArray, covariance: FloatArray, confidence: float = CONFIDENCE) -> str:
     """Why coefficients, shape (p,), may all be zero by Wald's test; empty where they may not."""
     probability = probability_of_zero(values, covariance)
-    return "" if probability <= 1.0 - confidence else f"its coefficients may all be zero (p = {probability:.2f})"
+    if probability <= 1.0 - confidence:
+        return ""
+    return f"its coefficients may all be zero (p = {probability:.2f})"
 
 
 def certain_delays(seconds: FloatArray, deviations: FloatArray) -> BoolArray:
@@ -113,25 +131,33 @@ def certain_delays(seconds: FloatArray, deviations: FloatArray) -> BoolArray:
 
 
 def probability_of_zero(values: FloatArray, covariance: FloatArray) -> float:
-    """Probability that coefficients which are all zero are estimated this far from it, by Wald's test, shape (p,)."""
+    """Probability that coefficients which are all zero are estimated this far from it,
+    by Wald's test, shape (p,).
+    """
     wald = float(values @ np.linalg.pinv(covariance, hermitian=True) @ values)
     return float(scipy.special.chdtrc(len(values), wald))
 
 
 def runs_to_leave_out(observation: Observation) -> tuple[int, ...]:
-    """Runs that can be left out: of at least MIN_RUNS, those whose payload, or lack of one, is in another run too."""
+    """Runs that can be left out: of at least MIN_RUNS, those whose payload, or lack of one,
+    is in another run too.
+    """
     runs = np.unique(observation.run)
     mounted = np.array([observation.mounting[observation.run == run][0] for run in runs])
     if len(runs) < MIN_RUNS:
         return ()
-    return tuple(int(run) for run, own in zip(runs, mounted, strict=True) if np.sum(mounted == own) > 1)
+    return tuple(
+        int(run) for run, own in zip(runs, mounted, strict=True) if np.sum(mounted == own) > 1
+    )
 
 
 def regions_to_leave_out(observation: Observation, position: FloatArray) -> IntArray:
-    """Region of the workspace that each row is in, shape (r,); empty where there are too few moves to leave some out.
+    """Region of the workspace that each row is in, shape (r,);
+    empty where there are too few moves to leave some out.
 
-    Moves are parted by their mean posture, each joint in units of its scatter: the region with the most moves is cut at
-    the median along the direction in which its moves differ most, until there are REGIONS.
+    Moves are parted by their mean posture, each joint in units of its scatter: the region with the
+    most moves is cut at the median along the direction in which its moves differ most, until there
+    are REGIONS.
 
     Args:
         observation: the rows.
@@ -174,17 +200,23 @@ class _Others:
 
 @dataclass(frozen=True, slots=True)
 class PartsLeftOut:
-    """A linearised problem cut into parts, runs or regions of the workspace: the others predict each."""
+    """A linearised problem cut into parts, runs or regions of the workspace:
+    the others predict each.
+    """
 
     search_problem: SearchProblem  #: the problem
     name: str  #: of the parts, in words
     part_of: IntArray  #: part of each of its clusters, shape (clusters,)
-    others: tuple[_Others | None, ...]  #: of each part, None for one that stays; empty where none can be left out
+    #: of each part, None for one that stays; empty where none can be left out
+    others: tuple[_Others | None, ...]
 
     @classmethod
     def of(cls, search_problem: SearchProblem) -> PartsLeftOut:
-        """Cut a search problem into its runs; into regions of the workspace where no run can be left out."""
-        folds, observation = search_problem.folds, search_problem.observation
+        """Cut a search problem into its runs;
+        into regions of the workspace where no run can be left out.
+        """
+        folds = search_problem.folds
+        observation = search_problem.observation
         left_out = runs_to_leave_out(observation)
         part_of_row = observation.run
         name = "runs"
@@ -210,23 +242,33 @@ class PartsLeftOut:
         return cls(search_problem, name, part_of, tuple(others) if left_out else ())
 
     def change(self, columns: FloatArray) -> ErrorChange:
-        """Change of the errors on parts left out when whitened columns, shape (rows, p), join the model."""
+        """Change of the errors on parts left out when whitened columns, shape (rows, p),
+        join the model.
+        """
         folds = self.search_problem.folds
-        problem, observation, phi = folds.linearisation, self.search_problem.observation, columns.T
-        count, width, unknowns = len(self.others), len(phi), problem.jacobian.width
+        problem = folds.linearisation
+        observation = self.search_problem.observation
+        phi = columns.T
+        count = len(self.others)
+        width = len(phi)
+        unknowns = problem.jacobian.width
         # ΦᵀΦ, Φᵀe and ΦᵀJ of each part.
-        grams, scores = np.zeros((count, width, width)), np.zeros((count, width))
+        grams = np.zeros((count, width, width))
+        scores = np.zeros((count, width))
         crossed = np.zeros((count, width, unknowns))
         for motor in folds.motors:
-            part_of, own = self.part_of[motor.cluster], phi[:, motor.rows]
+            part_of = self.part_of[motor.cluster]
+            own = phi[:, motor.rows]
             np.add.at(grams, part_of, motor.sums(own, own))
             beside = motor.sums(own, motor.equations)
             np.add.at(scores, part_of, beside[..., -2])
             for part in np.unique(part_of):
                 crossed[part][:, motor.seen] += beside[part_of == part][..., :-2].sum(axis=0)
         unit = np.sqrt(np.maximum(np.diag(grams.sum(axis=0)), np.finfo(np.float64).tiny))
-        # What the fit of the others predicts of each part, without the columns, and what these change of it.
-        steps, coefficients = np.zeros((count, 2, unknowns)), np.zeros((count, width))
+        # What the fit of the others predicts of each part, without the columns, and what these
+        # change of it.
+        steps = np.zeros((count, 2, unknowns))
+        coefficients = np.zeros((count, width))
         for part, fit in enumerate(self.others):
             if fit is None:
                 continue
@@ -234,10 +276,13 @@ class PartsLeftOut:
             along = linalg.cho_solve(fit.factor, rest.T).T
             left = grams.sum(axis=0) - grams[part] - rest @ along.T
             drive = scores.sum(axis=0) - scores[part] - along @ fit.score
-            coefficients[part] = np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
+            coefficients[part] = (
+                np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
+            )
             steps[part] = linalg.cho_solve(fit.factor, fit.score), coefficients[part] @ along
         without, turned = np.concatenate(
-            [motor.predicted(list(steps[self.part_of[motor.cluster]])) for motor in folds.motors], axis=1
+            [motor.predicted(list(steps[self.part_of[motor.cluster]])) for motor in folds.motors],
+            axis=1,
         )
         part_of_row = self.part_of[problem.cluster]
         before = problem.residual - without
@@ -254,7 +299,9 @@ class PartsLeftOut:
         )
 
     def refusal(self, columns: FloatArray) -> str:
-        """Why whitened columns may not join; empty where they may, or where nothing can be left out."""
+        """Why whitened columns may not join;
+        empty where they may, or where nothing can be left out.
+        """
         if not self.others:
             return ""
         change = self.change(columns)
@@ -262,7 +309,9 @@ class PartsLeftOut:
         if harm := change.harm(data):
             return harm
         # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
-        of_motor = np.bincount(self.search_problem.folds.linearisation.motor, np.sum(columns**2, axis=1))
+        of_motor = np.bincount(
+            self.search_problem.folds.linearisation.motor, np.sum(columns**2, axis=1)
+        )
         if not change.is_enough or change.is_fall(int(np.argmax(of_motor))):
             return ""
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
@@ -272,7 +321,9 @@ class PartsLeftOut:
 def whitened_columns(search_problem: SearchProblem, effect: Effect, axis: int) -> FloatArray:
     """Columns of an effect beside the Jacobian of a search problem, shape (rows, p)."""
     torque = search_problem.torque(effect, axis)
-    return search_problem.folds.linearisation.whitened(torque, search_problem.model.drive_train.to_motor)
+    return search_problem.folds.linearisation.whitened(
+        torque, search_problem.model.drive_train.to_motor
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,12 +348,16 @@ def own_unknowns(estimate: Estimate, effects: Sequence[PlacedEffect]) -> IntArra
 
 
 def values_of(estimate: Estimate, own: IntArray) -> FloatArray:
-    """Values of some parameters, what was applied to the description of the robot included, shape (p,)."""
+    """Values of some parameters, what was applied to the description of the robot included,
+    shape (p,).
+    """
     applied = np.array([estimate.unknowns[index].about for index in own])
     return np.asarray(estimate.parameters[own] + applied)
 
 
-def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effects: Sequence[PlacedEffect]) -> Reduced:
+def without_effects_of(
+    search_problem: SearchProblem, estimate: Estimate, effects: Sequence[PlacedEffect]
+) -> Reduced:
     """Take effects out of a joint fit, to first order, without a refit.
 
     Args:
@@ -317,8 +372,10 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
     torque = columns @ values_of(estimate, own)
     rest = problem.jacobian.only(np.flatnonzero(~taken))
     for place, motor in enumerate(problem.free[problem.free < len(estimate.gains)]):
-        # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects; with preload ∂e/∂g_i = (T_D)_i (v_i − σ_i e_i), in all rows.
-        lost, scale = torque[problem.rows_of(motor)], problem.scale[place]
+        # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects; with preload ∂e/∂g_i = (T_D)_i (v_i − σ_i
+        # e_i), in all rows.
+        lost = torque[problem.rows_of(motor)]
+        scale = problem.scale[place]
         if problem.transform is None:
             rest.parts[motor][rest.seen[motor] == place] += lost * problem.gamma[motor] * scale
             continue
@@ -342,24 +399,30 @@ def without_effects_of(search_problem: SearchProblem, estimate: Estimate, effect
 
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
-    """Shift of each gain when a whitened torque, shape (rows,), joins the model [Nm at the joint per A], shape (m,)."""
+    """Shift of each gain when a whitened torque, shape (rows,),
+    joins the model [Nm at the joint per A], shape (m,).
+    """
     count = len(folds.linearisation.gamma)
     return shifts_by(folds, torque, max(count, int(folds.linearisation.free[-1]) + 1))[:count]
 
 
 def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
-    """Shift of (gains, parameters), size of them, when a whitened torque, shape (rows,), joins the model.
+    """Shift of (gains, parameters), size of them, when a whitened torque, shape (rows,),
+    joins the model.
 
     It is zero for what is fixed and for what the problem does not hold.
     """
-    problem, shifts = folds.linearisation, np.zeros(size)
+    problem = folds.linearisation
+    shifts = np.zeros(size)
     score = problem.jacobian.on_columns(problem.correlated(torque))
     shifts[problem.free] = -linalg.cho_solve(folds.estimate_factor, score) * problem.scale
     return shifts
 
 
 def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, float], ...]:
-    """Index of each gain that moves by more than its σ, and by how many; fixed gains do not move."""
+    """Index of each gain that moves by more than its σ, and by how many;
+    fixed gains do not move.
+    """
     times = np.divide(np.abs(shifts), gains_std, where=gains_std > 0.0, out=np.zeros_like(shifts))
     return tuple((motor, float(size)) for motor, size in enumerate(times) if size > 1.0)
 
@@ -368,7 +431,8 @@ def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> tuple[FloatArray, b
     """Cholesky factor of JᵀJ; directions that the rows do not show stay where they are.
 
     Args:
-        hessian: of some rows, shape (f, f). An effect that acts at one end of the workspace may have none among them.
+        hessian: of some rows, shape (f, f). An effect that acts at one end of the workspace may
+            have none among them.
         seen_by_all: diagonal of JᵀJ of all rows, positive, shape (f,).
     """
     regular = hessian + RIDGE * np.diag(seen_by_all)

@@ -1,15 +1,16 @@
 """The side that drives each gear, and the part of its loss that the data show.
 
-A gear of efficiency η takes τ/η from a motor that drives the load, and ητ where the load drives the motor. With
-c = (1 − η²)/(1 + η²) and the torque τ through the gear,
+A gear of efficiency η takes τ/η from a motor that drives the load, and ητ where the load drives the
+motor. With c = (1 − η²)/(1 + η²) and the torque τ through the gear,
 
     τ_motor = (τ + c |τ| sign(q̇)) / √(1 − c²).
 
-`load-friction` and `efficiency` estimate c, the contrast of the two sides. Where one side gives nearly all torque,
+`load-friction` and `efficiency` estimate c, the contrast of the two sides. Where one side gives
+nearly all torque,
 |τ| sign(q̇) is ±τ: the gain takes up the loss, and the residual stays silent. The factor 1/√(1 − c²) scales
-everything, and the gain always carries it: g is the motor's gain times √(1 − c²) if both directions lose the same
-share of the power. No residual can show whether they do.
-"""
+everything, and the gain always carries it: g is the motor's gain times √(1 − c²) if both directions
+lose the same share of the power. No residual can show whether they do.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -33,13 +34,16 @@ class GearLoss:
     """One axis: which side drives, and the loss with its σ."""
 
     motoring_rows: float  #: share of the moving rows in which the motor drives the load
-    motoring_torque: float  #: the same share of the squared load torque; NaN for a joint without load
+    #: the same share of the squared load torque; NaN for a joint without load
+    motoring_torque: float
     loss: float | None  #: c, the contrast of the two sides; None where the search could not test it
     loss_std: float | None  #: its σ
 
     @property
     def lean(self) -> float:
-        """Part of the loss that an estimate without it puts into the gain: 1 where the motor drives throughout."""
+        """Part of the loss that an estimate without it puts into the gain:
+        1 where the motor drives throughout.
+        """
         return 2.0 * self.motoring_torque - 1.0
 
     @property
@@ -56,28 +60,38 @@ class GearLoss:
 
     @property
     def efficiency(self) -> float | None:
-        """η of a gear that loses the same share of the power in both directions; None for a loss outside 0 to 1."""
+        """η of a gear that loses the same share of the power in both directions;
+        None for a loss outside 0 to 1.
+        """
         if self.loss is None or not 0.0 <= self.loss < 1.0:
             return None
         return float(np.sqrt((1.0 - self.loss) / (1.0 + self.loss)))
 
     @property
     def gain_factor(self) -> float | None:
-        """Gain of the motor of such a gear over the gain found with the loss in the model; None as above."""
-        return None if self.efficiency is None or self.loss is None else float(1.0 / np.sqrt(1.0 - self.loss**2))
+        """Gain of the motor of such a gear over the gain found with the loss in the model;
+        None as above.
+        """
+        if self.efficiency is None or self.loss is None:
+            return None
+        return float(1.0 / np.sqrt(1.0 - self.loss**2))
 
 
 def gear_losses(step: Step) -> tuple[GearLoss, ...]:
-    """Judge every axis by the last turn of a search, which has tested the loss beside all that is in the model."""
+    """Judge every axis by the last turn of a search, which has tested the loss beside all that is
+    in the model.
+    """
     after = step.after
     shares = driving_shares(after.training, after.estimate)
     return tuple(GearLoss(*share, *_loss(step, axis)) for axis, share in enumerate(shares))
 
 
 def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[float, float], ...]:
-    """Share of each joint's moving rows, and of their squared load torque, in which the motor drives the load.
+    """Share of each joint's moving rows, and of their squared load torque,
+    in which the motor drives the load.
 
-    The load torque is the model's, for links and payload; the direction of motion is that of the dry friction.
+    The load torque is the model's, for links and payload; the direction of motion is that of the
+    dry friction.
     """
     standard = np.array(observation.base.independent)
     # Payload columns follow those of the effects, which follow the base parameters.
@@ -86,7 +100,9 @@ def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[
     is_load[: len(standard)] = np.isin(standard, observation.model.link_columns)
     known = observation.known()
     shares: list[tuple[float, float]] = []
-    for joint, (used, friction) in enumerate(zip(observation.use, observation.model.dry_friction_columns, strict=True)):
+    for joint, (used, friction) in enumerate(
+        zip(observation.use, observation.model.dry_friction_columns, strict=True)
+    ):
         dry = np.flatnonzero(standard == friction)
         if not len(dry) or not used.any():
             shares.append((float("nan"), float("nan")))
@@ -95,21 +111,37 @@ def driving_shares(observation: Observation, estimate: Estimate) -> tuple[tuple[
         torque = estimate.parameters[is_load] @ linear[is_load] + known[joint, used]
         drives = torque * linear[dry[0]] > 0.0
         size = float(np.sum(torque**2))
-        shares.append((float(np.mean(drives)), float(np.sum(torque[drives] ** 2)) / size if size else float("nan")))
+        shares.append(
+            (
+                float(np.mean(drives)),
+                float(np.sum(torque[drives] ** 2)) / size if size else float("nan"),
+            )
+        )
     return tuple(shares)
 
 
 def _loss(step: Step, axis: int) -> tuple[float | None, float | None]:
     """Loss and σ: fitted where it is in the model, else as the search tested it."""
-    evidence, first = step.after, len(step.after.rows_without_effects.columns)
+    evidence = step.after
+    first = len(step.after.rows_without_effects.columns)
     for placed in evidence.effects:
         if placed.axis == axis and is_gear_loss(placed.effect):
-            return float(evidence.estimate.parameters[first]), float(evidence.estimate.parameters_std[first])
+            return float(evidence.estimate.parameters[first]), float(
+                evidence.estimate.parameters_std[first]
+            )
         first += len(placed.effect.coefficients)
-    tested = [found for found in step.findings if found.axis == axis and isinstance(found.effect, Efficiency)]
-    return (float(tested[0].coefficients[0]), float(tested[0].deviations[0])) if tested else (None, None)
+    tested = [
+        found
+        for found in step.findings
+        if found.axis == axis and isinstance(found.effect, Efficiency)
+    ]
+    if tested:
+        return (float(tested[0].coefficients[0]), float(tested[0].deviations[0]))
+    return (None, None)
 
 
 def is_gear_loss(effect: Effect) -> bool:
     """Whether an effect is the contrast of the two sides, c."""
-    return isinstance(effect, Efficiency) or (isinstance(effect, LoadFriction) and effect.speed_exponent == 0)
+    return isinstance(effect, Efficiency) or (
+        isinstance(effect, LoadFriction) and effect.speed_exponent == 0
+    )

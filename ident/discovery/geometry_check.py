@@ -1,15 +1,17 @@
-"""Whether the description of a robot, or the clock of its recordings, is wrong: without a search, correcting nothing.
+"""Whether the description of a robot, or the clock of its recordings, is wrong:
+without a search, correcting nothing.
 
-Zeros of joints, the direction of gravity, late positions and late currents are tested on the rows of a fit
-(`ident.effects.geometry_corrections`, `ident.discovery.late_currents`). Where one of them passes, it must also explain
-more of what is left out than each named effect of one axis does, or most of it beside the best of these: a spring that
-the model lacks explains a part of what a wrong zero does, and friction that it lacks on another axis does not. What is
-left is fitted together with everything else, and must pass by the σ of that fit, which is the one that is reported.
+Zeros of joints, the direction of gravity, late positions and late currents are tested on the rows
+of a fit (`ident.effects.geometry_corrections`, `ident.discovery.late_currents`). Where one of them
+passes, it must also explain more of what is left out than each named effect of one axis does, or
+most of it beside the best of these: a spring that the model lacks explains a part of what a wrong
+zero does, and friction that it lacks on another axis does not. What is left is fitted together with
+everything else, and must pass by the σ of that fit, which is the one that is reported.
 
-Two zeros that are wrong at once bend each other's numbers: alone, one of them takes over a part of the other. So the
-test is repeated beside what it has found until it finds nothing more, and all numbers are those of one fit together.
-Two that are wrong by opposite amounts turn only the link between them, and neither passes alone
-(`ident.discovery.pairs_of_zeros`).
+Two zeros that are wrong at once bend each other's numbers: alone, one of them takes over a part of
+the other. So the test is repeated beside what it has found until it finds nothing more, and all
+numbers are those of one fit together. Two that are wrong by opposite amounts turn only the link
+between them, and neither passes alone (`ident.discovery.pairs_of_zeros`).
 """
 
 from __future__ import annotations
@@ -56,19 +58,34 @@ from ident.estimators.method import Method
 from ident.model.robot import JointKind, Robot
 
 AT_ROWS = frozenset(
-    {Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME, Abscissa.SESSION, Abscissa.CURRENT}
+    {
+        Abscissa.VELOCITY,
+        Abscissa.POSITION,
+        Abscissa.LOAD,
+        Abscissa.TIME,
+        Abscissa.SESSION,
+        Abscissa.CURRENT,
+    }
 )
-"""Variables of the effects that a correction competes with: they change slowly enough to be built at the rows."""
+"""Variables of the effects that a correction competes with:
+they change slowly enough to be built at the rows.
+"""
 CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one moment
-SEEN_ZERO_RAD = 0.007  #: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
+#: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
+SEEN_ZERO_RAD = 0.007
 SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
 LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
 LEAST_EARLY_SHARE = Gates().smallest_share
-"""Share of its motor's squared residual that a current which is early by itself explains; as any effect of a search."""
+"""Share of its motor's squared residual that a current which is early by itself explains;
+as any effect of a search.
+"""
 MOST_ROUNDS = 4  #: Tests one after the other, each beside the mistakes that were found before
 LEAST_SETTLED_STD = 0.1
-"""Least σ of a correction in the joint fit, in that of its column. Where gravity leans and a joint hardly moves, a base
-parameter of the corrected robot is the same column as the turn itself, and leaves it a σ of rounding errors."""
+"""Least σ of a correction in the joint fit, in that of its column.
+
+Where gravity leans and a joint hardly moves, a base parameter of the corrected robot is the same
+column as the turn itself, and leaves it a σ of rounding errors.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +96,18 @@ class Gravity:
     found_m_s2: FloatArray  #: of the same length, shape (3,)
     turn_rad: float  #: angle between both
     turn_std_rad: float  #: its σ
-    covariance_rad2: FloatArray  #: of the turn about both axes of `ident.effects.geometry_corrections.across`, (2, 2)
+    #: of the turn about both axes of `ident.effects.geometry_corrections.across`, (2, 2)
+    covariance_rad2: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class AlikeCorrections:
     """Corrections of which the data show that one is needed, and not which."""
 
-    findings: tuple[Finding, ...]  #: the mistake that was found, then those that explain the same; at least two
-    axes_to_move: tuple[int, ...]  #: axes that must turn further, so that other data tell these apart
+    #: the mistake that was found, then those that explain the same; at least two
+    findings: tuple[Finding, ...]
+    #: axes that must turn further, so that other data tell these apart
+    axes_to_move: tuple[int, ...]
 
     def contain(self, placed: PlacedEffect) -> bool:
         """Whether a correction is one of them."""
@@ -99,11 +119,14 @@ class GeometryCheck:
     """What a fit says of the description of its robot, and of the clock of its recordings."""
 
     gravity: Gravity | None  #: None where the data do not show it, as in a plane that is level
-    #: Corrections of the description and of the clock that the data ask for, by one fit of all of them.
+    #: Corrections of the description and of the clock that the data ask for, by one fit of all of
+    #: them.
     mistakes: tuple[Finding, ...]
-    hidden_zeros: tuple[int, ...]  #: axes whose zero the data cannot show: another one makes nearly the same torques
+    #: axes whose zero the data cannot show: another one makes nearly the same torques
+    hidden_zeros: tuple[int, ...]
     alike: tuple[AlikeCorrections, ...] = ()  #: of each mistake that does not stand alone
-    hidden_pairs: tuple[tuple[int, int], ...] = ()  #: axes whose zeros are seen one by one, and not both at once
+    #: axes whose zeros are seen one by one, and not both at once
+    hidden_pairs: tuple[tuple[int, int], ...] = ()
 
     @property
     def certain_mistakes(self) -> tuple[Finding, ...]:
@@ -147,7 +170,9 @@ class _Suspect:
     @classmethod
     def of_pair(cls, problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
         """Two zeros."""
-        return cls(pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum()))
+        return cls(
+            pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum())
+        )
 
     @property
     def is_pair(self) -> bool:
@@ -192,7 +217,12 @@ class _Rivals:
             return False
         for found in self.findings:
             is_fast = found.placed in self.at_full_rate
-            if is_fast and found.passed and _is_of_axis(found, delay) and found.held_out_fall > delay.held_out_fall:
+            if (
+                is_fast
+                and found.passed
+                and _is_of_axis(found, delay)
+                and found.held_out_fall > delay.held_out_fall
+            ):
                 return True
         return False
 
@@ -214,8 +244,10 @@ def check_geometry(
     Args:
         evidence: identified by ``ml``, from `gather`.
         rng: of the bootstrap.
-        gates: limits for a mistake, those of a search; its share of one motor's residual is not among them.
-        own_effects: that a mistake competes with, beside those of the dictionary and of installed packages.
+        gates: limits for a mistake, those of a search; its share of one motor's residual is not
+            among them.
+        own_effects: that a mistake competes with, beside those of the dictionary and of installed
+            packages.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
@@ -277,7 +309,9 @@ def _tested_once(
 
 
 def _not_late_yet(tested: Sequence[FamilyTrials], evidence: Evidence) -> tuple[FamilyTrials, ...]:
-    """Trials without delays of what the model has a delay of: a second one would only mend the form of the first."""
+    """Trials without delays of what the model has a delay of:
+    a second one would only mend the form of the first.
+    """
     left: list[FamilyTrials] = []
     for family in tested:
         effect, _ = family.members[0]
@@ -297,7 +331,9 @@ def _is_second_delay(placed: PlacedEffect, evidence: Evidence) -> bool:
 
 
 def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
-    """The mistakes of all rounds with values and σ of the fit that has all of them; those that it shows."""
+    """The mistakes of all rounds with values and σ of the fit that has all of them;
+    those that it shows.
+    """
     settled = [one.settled for one in rounds if one.settled is not None]
     if not settled:
         return ()
@@ -314,9 +350,15 @@ def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
 
 
 def _all_alike(
-    evidence: Evidence, rounds: Sequence[_Round], mistakes: Sequence[Finding], rng: np.random.Generator, gates: Gates
+    evidence: Evidence,
+    rounds: Sequence[_Round],
+    mistakes: Sequence[Finding],
+    rng: np.random.Generator,
+    gates: Gates,
 ) -> tuple[AlikeCorrections, ...]:
-    """For each correction of the description, those that the data do not tell apart from it beside all others."""
+    """For each correction of the description, those that the data do not tell apart from it beside
+    all others.
+    """
     found: list[AlikeCorrections] = []
     for mistake in mistakes:
         if not isinstance(mistake.effect, GeometryEffect):
@@ -326,16 +368,21 @@ def _all_alike(
         if beside is None:
             try:
                 beside = _ranked_beside(evidence, others, rng, gates)
-            except (*UNFITTED, TooFewMoves):  # of the corrected description, other moves may be valid
+            # Of the corrected description, other moves may be valid.
+            except (*UNFITTED, TooFewMoves):
                 continue
         alike = _alike(beside, mistake)
         if alike:
-            axes = axes_to_move([one.placed for one in alike], evidence.model.robot, evidence.fit_runs)
+            axes = axes_to_move(
+                [one.placed for one in alike], evidence.model.robot, evidence.fit_runs
+            )
             found.append(AlikeCorrections(alike, axes))
     return tuple(found)
 
 
-def _round_beside(rounds: Sequence[_Round], evidence: Evidence, others: Sequence[PlacedEffect]) -> _Round | None:
+def _round_beside(
+    rounds: Sequence[_Round], evidence: Evidence, others: Sequence[PlacedEffect]
+) -> _Round | None:
     """The round that was made beside some mistakes and nothing else; None where there was none."""
     effects = {*evidence.effects, *others}
     return next((one for one in rounds if set(one.evidence.effects) == effects), None)
@@ -357,9 +404,12 @@ def _ranked_beside(
 
 
 def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
-    """A mistake and the corrections that the data do not tell apart from it; empty where it stands alone."""
+    """A mistake and the corrections that the data do not tell apart from it;
+    empty where it stands alone.
+    """
     corrections = [found for found in beside.findings if isinstance(found.effect, GeometryEffect)]
-    # As it was ranked among the corrections: its ambiguity names those that folds do not distinguish from it.
+    # As it was ranked among the corrections: its ambiguity names those that folds do not
+    # distinguish from it.
     as_found = next((one for one in corrections if one.placed == mistake.placed), None)
     if as_found is None:
         return ()
@@ -383,8 +433,8 @@ def _suspects(
 ) -> tuple[_Suspect, ...]:
     """The mistakes that pass, the best on held-out moves first.
 
-    Late currents are one suspect, whichever of them pass. They are one as well where a late position does alone: the
-    delays of several currents, of which none passes alone, look like it.
+    Late currents are one suspect, whichever of them pass. They are one as well where a late
+    position does alone: the delays of several currents, of which none passes alone, look like it.
     """
     suspects: list[_Suspect] = []
     passed = [found for found in findings if found.passed]
@@ -394,7 +444,9 @@ def _suspects(
             continue
         if not isinstance(found.effect, Delay):
             torque_nm = problem.torque_at_rows(found.effect, found.axis)
-            suspects.append(_Suspect((found.placed,), torque_nm, found.coefficients, found.held_out_fall))
+            suspects.append(
+                _Suspect((found.placed,), torque_nm, found.coefficients, found.held_out_fall)
+            )
     if any(isinstance(found.effect, CLOCK) for found in passed):
         late = find_late_currents(problem, of_currents, rates_nm_s)
         if late is not None:
@@ -415,14 +467,21 @@ def _rivals(
 ) -> _Rivals:
     """Test everything that the suspects compete with, and they themselves, each beside all others.
 
-    A late current or position also competes with what is fast on its axis: presliding, a gear with a gap or a spring in
-    it.
+    A late current or position also competes with what is fast on its axis: presliding, a gear with
+    a gap or a spring in it.
     """
     slow = (*tested, *_tested(problem, _slow(families)))
     late: set[int] = set()
     for suspect in suspects:
-        late |= {one.axis for one in suspect.effects if isinstance(one.effect, CLOCK) and one.effect.has_axis}
-    at_full_rate = _columns_at_full_rate(evidence, families, sorted(late)) if late else {}
+        late |= {
+            one.axis
+            for one in suspect.effects
+            if isinstance(one.effect, CLOCK) and one.effect.has_axis
+        }
+    if late:
+        at_full_rate = _columns_at_full_rate(evidence, families, sorted(late))
+    else:
+        at_full_rate = {}
     of_fast = problem.trials(at_full_rate.values())
     fast: list[FamilyTrials] = []
     for placed, trial in zip(at_full_rate, of_fast, strict=True):
@@ -434,7 +493,9 @@ def _rivals(
 def _first_that_stands(
     evidence: Evidence, problem: SearchProblem, suspects: Sequence[_Suspect], rivals: _Rivals
 ) -> _Settled | None:
-    """The best suspect that stands beside all rivals, and in the joint fit; None where none does."""
+    """The best suspect that stands beside all rivals, and in the joint fit;
+    None where none does.
+    """
     for suspect in suspects:
         own = rivals.findings_of(suspect.effects)
         if not suspect.is_pair and not any(found.passed for found in own):
@@ -450,12 +511,15 @@ def _first_that_stands(
     return None
 
 
-def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Finding], rivals: _Rivals) -> bool:
+def _stands_beside(
+    problem: SearchProblem, suspect: _Suspect, own: Sequence[Finding], rivals: _Rivals
+) -> bool:
     """Whether a suspect explains more than every rival, or most of it beside the best.
 
-    A late current must do so beside the effects of its own axis, too. Delays of currents do not compete with each
-    other: they were fitted together. A spring or a gap in a gear explains a part of what a delay does, and more: where
-    one passes and explains more than a delay of its axis, the delay is not named before that effect is in the model.
+    A late current must do so beside the effects of its own axis, too. Delays of currents do not
+    compete with each other: they were fitted together. A spring or a gap in a gear explains a part
+    of what a delay does, and more: where one passes and explains more than a delay of its axis, the
+    delay is not named before that effect is in the model.
 
     Args:
         problem: around the fit.
@@ -475,24 +539,29 @@ def _stands_beside(problem: SearchProblem, suspect: _Suspect, own: Sequence[Find
     for index, found in enumerate(own):
         of_axis = [other for other in others if _is_of_axis(other, found)]
         if of_axis and of_axis[0].held_out_fall > found.held_out_fall:
-            alone = replace(suspect, torque_nm=suspect.torque_nm[:, [index]], held_out_fall=found.held_out_fall)
+            alone = replace(
+                suspect, torque_nm=suspect.torque_nm[:, [index]], held_out_fall=found.held_out_fall
+            )
             if not alone.explains_beside(problem, rivals.torque_nm(problem, of_axis[0])):
                 return False
     return True
 
 
 def _is_of_axis(other: Finding, found: Finding) -> bool:
-    """Whether a finding is an effect of the axis of another one, and corrects nothing of the whole arm."""
+    """Whether a finding is an effect of the axis of another one,
+    and corrects nothing of the whole arm.
+    """
     is_same = found.effect.has_axis and other.axis == found.axis
     return is_same and not isinstance(other.effect, GeometryEffect)
 
 
 def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _Settled | None:
-    """A suspect with values and σ of a fit with it, corrected until nothing is left to correct; None where it falls.
+    """A suspect with values and σ of a fit with it, corrected until nothing is left to correct;
+    None where it falls.
 
-    Its column is for small mistakes. The fit must show it by its own σ, within what is possible; and instruments from
-    the demanded motion must not show that a disturbance in the position loop looks like it. A mistake without such a
-    fit has no size that could be reported.
+    Its column is for small mistakes. The fit must show it by its own σ, within what is possible;
+    and instruments from the demanded motion must not show that a disturbance in the position loop
+    looks like it. A mistake without such a fit has no size that could be reported.
 
     Args:
         evidence: without it.
@@ -513,7 +582,8 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
         covariance = _covariance_of(estimate, placed)
         settled = replace(found, effect=placed.effect, coefficients=values, deviations=deviations)
         if np.any(deviations < LEAST_SETTLED_STD * found.deviations):
-            # The fit has lost the correction in a parameter of the corrected robot: the linear values stay.
+            # The fit has lost the correction in a parameter of the corrected robot: the linear
+            # values stay.
             settled = found
             covariance = np.diag(found.deviations**2)
         if impossible(settled.effect.coefficients, settled.coefficients, settled.deviations):
@@ -531,10 +601,11 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
 
 
 def _is_unlikely_delay(found: Finding) -> bool:
-    """Whether the delay of currents is too short to be named, or is one that no drive has and that explains little.
+    """Whether the delay of currents is too short to be named,
+    or is one that no drive has and that explains little.
 
-    A filter of a drive makes its current late. One that is early is a mistake of stamps, which is large; less is what
-    another effect leaves, or a loop that answers to the noise of its encoder.
+    A filter of a drive makes its current late. One that is early is a mistake of stamps, which is
+    large; less is what another effect leaves, or a loop that answers to the noise of its encoder.
     """
     delay_s = float(found.coefficients[0])
     if abs(delay_s) < LEAST_DELAY_S:
@@ -550,7 +621,9 @@ def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
 
 
 def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
-    """The direction of gravity by a fit of it together with everything else; None where that fit shows none."""
+    """The direction of gravity by a fit of it together with everything else;
+    None where that fit shows none.
+    """
     placed = PlacedEffect(GravityDirection(), 0)
     torque_nm = problem.torque_at_rows(placed.effect, placed.axis)
     (trial,) = problem.trials([torque_nm])
@@ -578,13 +651,21 @@ def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
 
 def _hidden_zeros(findings: Sequence[Finding], robot: Robot) -> tuple[int, ...]:
     """Axes whose zero could be wrong by 2°, or 6 mm, without being named."""
-    std_of = {found.axis: float(found.deviations[0]) for found in findings if isinstance(found.effect, ZeroOffset)}
-    placeable = [axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)]
+    std_of = {
+        found.axis: float(found.deviations[0])
+        for found in findings
+        if isinstance(found.effect, ZeroOffset)
+    }
+    placeable = [
+        axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)
+    ]
     return tuple(axis for axis in placeable if std_of.get(axis, np.inf) > _seen_std(robot, axis))
 
 
 def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int, int], ...]:
-    """Axes whose zeros could be wrong by opposite amounts without being named, although each alone would be."""
+    """Axes whose zeros could be wrong by opposite amounts without being named,
+    although each alone would be.
+    """
     hidden: list[tuple[int, int]] = []
     for pair in pairs:
         largest = np.array([_seen_std(robot, axis) for axis in pair.axes])
@@ -595,10 +676,14 @@ def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int
 
 def _seen_std(robot: Robot, axis: int) -> float:
     """Largest σ of a zero that is seen [rad or m]."""
-    return SEEN_ZERO_M if robot.axes[axis].kind is JointKind.PRISMATIC else SEEN_ZERO_RAD
+    if robot.axes[axis].kind is JointKind.PRISMATIC:
+        return SEEN_ZERO_M
+    return SEEN_ZERO_RAD
 
 
-def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tuple[FamilyTrials, ...]:
+def _tested(
+    problem: SearchProblem, families: Sequence[Sequence[Effect]]
+) -> tuple[FamilyTrials, ...]:
     """Trials of families on all axes, built at the rows."""
     tested: list[FamilyTrials] = []
     for axis in range(len(problem.model.robot.places)):
@@ -612,7 +697,11 @@ def _tested(problem: SearchProblem, families: Sequence[Sequence[Effect]]) -> tup
 
 def _slow(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
     """Families whose columns can be built at the rows."""
-    return tuple(family for family in families if family[0].abscissa in AT_ROWS and not family[0].needs_inertia)
+    return tuple(
+        family
+        for family in families
+        if family[0].abscissa in AT_ROWS and not family[0].needs_inertia
+    )
 
 
 def _fast(families: Sequence[Sequence[Effect]]) -> tuple[Sequence[Effect], ...]:
@@ -636,23 +725,30 @@ def _columns_at_full_rate(
     placed: list[PlacedEffect] = []
     for family in _fast(families):
         for axis in axes:
-            placed += [PlacedEffect(one, axis) for one in family if is_placeable(one, axis, model.robot)]
+            placed += [
+                PlacedEffect(one, axis) for one in family if is_placeable(one, axis, model.robot)
+            ]
     parts: dict[PlacedEffect, list[FloatArray]] = {one: [] for one in placed}
     for data in evidence.fit_runs:  # one after the other: signals at full rate are large
         signals = fitted_signals(model, data, evidence.training, evidence.estimate, began_s)
         for one in placed:
-            parts[one].append(effect_torque(one.effect, one.axis, (signals,), (data,), conditioning, model))
+            parts[one].append(
+                effect_torque(one.effect, one.axis, (signals,), (data,), conditioning, model)
+            )
     return {one: np.concatenate(own, axis=-1) for one, own in parts.items()}
 
 
 def _problem_at_rows(evidence: Evidence) -> SearchProblem:
     """The residual of a fit with signals of the decimated motion: a twentieth of the samples."""
-    observation, estimate = evidence.training, evidence.estimate
+    observation = evidence.training
+    estimate = evidence.estimate
     began_s = session_began_s(evidence.fit_runs)
     rows: list[Signals] = []
     for data in evidence.fit_runs:
         slow = at_rows(data, evidence.conditioning)
-        rows.append(fitted_signals(evidence.model, slow, observation, estimate, began_s, inertia=False))
+        rows.append(
+            fitted_signals(evidence.model, slow, observation, estimate, began_s, inertia=False)
+        )
     folds, step = folds_around(evidence.model, observation, estimate)
     return SearchProblem(
         model=evidence.model,

@@ -1,8 +1,10 @@
-"""An identification with the geometry that the encoders of a redundant drive show, and what its σ does to the gains.
+"""An identification with the geometry that the encoders of a redundant drive show,
+and what its σ does to the gains.
 
-The corrections come from positions alone (`ident.estimators.geometry_estimate`), before any torque is looked at, so
-that they cannot take up what belongs to gains or effects. The gains depend on them through all columns: for each
-direction of their covariance, the rows are built and estimated once more with the geometry one step beside.
+The corrections come from positions alone (`ident.estimators.geometry_estimate`), before any torque
+is looked at, so that they cannot take up what belongs to gains or effects. The gains depend on them
+through all columns: for each direction of their covariance, the rows are built and estimated once
+more with the geometry one step beside.
 """
 
 from __future__ import annotations
@@ -24,15 +26,19 @@ from ident.model.geometry_derivatives import model_with_geometry
 from ident.model.model import Column, Model
 
 LEAST_STEP = 1e-4
-"""Step [rad or m] of a refit whose difference is taken: far above the tolerance of the gains' iteration, and a tenth of
-what bends gains by one percent."""
+"""Step [rad or m] of a refit whose difference is taken:
+far above the tolerance of the gains' iteration, and a tenth of what bends gains by one percent.
+"""
 
 
-def geometry_covariance(found: Identification, described: Model, finding: GeometryFinding) -> FloatArray:
+def geometry_covariance(
+    found: Identification, described: Model, finding: GeometryFinding
+) -> FloatArray:
     """Covariance that the corrected geometry adds to (gains, parameters), shape (m + p, m + p).
 
-    Other explanations of the same misfit are as likely: the one that moves the gains by most of their σ counts as σ of
-    one more direction. Where the gains are fixed, it is the one that moves the parameters by most.
+    Other explanations of the same misfit are as likely: the one that moves the gains by most of
+    their σ counts as σ of one more direction. Where the gains are fixed, it is the one that moves
+    the parameters by most.
 
     Args:
         found: with the corrected geometry and without effects; it has kept its rows.
@@ -43,7 +49,9 @@ def geometry_covariance(found: Identification, described: Model, finding: Geomet
         IdentificationError: the estimate with a geometry beside the corrected one failed.
     """
     if found.gathered is None:
-        raise IdentificationError("the identification has not kept its rows; expected identify(..., keep_rows=True)")
+        raise IdentificationError(
+            "the identification has not kept its rows; expected identify(..., keep_rows=True)"
+        )
     center = _vector(found.estimate)
     parameters = [one.parameter for one in finding.corrections]
     values = np.array([one.change for one in finding.corrections])
@@ -55,7 +63,10 @@ def geometry_covariance(found: Identification, described: Model, finding: Geomet
         changes = [GeometryChange(*pair) for pair in zip(parameters, beside.tolist(), strict=True)]
         moved = _vector(_estimated(found, model_with_geometry(described, changes))) - center
         shifts.append(moved * (size / step))
-    others = [_alternative(found, described, finding, number) - center for number in range(len(finding.alternatives))]
+    others = [
+        _alternative(found, described, finding, number) - center
+        for number in range(len(finding.alternatives))
+    ]
     if others:
         shifts.append(max(others, key=lambda shift: shift_in_sigmas(shift, found.estimate)))
     columns = np.stack(shifts, axis=1)
@@ -63,17 +74,22 @@ def geometry_covariance(found: Identification, described: Model, finding: Geomet
 
 
 def shift_in_sigmas(shift: FloatArray, estimate: Estimate) -> float:
-    """Size of a shift of (gains, parameters), shape (m + p,), in σ of the gains, or of parameters beside fixed gains.
+    """Size of a shift of (gains, parameters), shape (m + p,), in σ of the gains,
+    or of parameters beside fixed gains.
 
     A gain of 100 Nm/A that moves by 1 moves less than one of 1 Nm/A that moves by 0.1.
     """
     gains = len(estimate.gains)
     part = slice(gains, None) if estimate.gains_fixed else slice(gains)
     std = np.sqrt(np.diag(estimate.covariance))[part]
-    return float(np.linalg.norm(np.divide(shift[part], std, out=np.zeros_like(std), where=std > 0.0)))
+    return float(
+        np.linalg.norm(np.divide(shift[part], std, out=np.zeros_like(std), where=std > 0.0))
+    )
 
 
-def _alternative(found: Identification, described: Model, finding: GeometryFinding, number: int) -> FloatArray:
+def _alternative(
+    found: Identification, described: Model, finding: GeometryFinding, number: int
+) -> FloatArray:
     """Gains and parameters with another explanation of the misfit."""
     changes = [GeometryChange(one.parameter, one.change) for one in finding.alternatives[number]]
     return _vector(_estimated(found, model_with_geometry(described, changes)))
@@ -89,7 +105,10 @@ def _estimated(found: Identification, model: Model) -> Estimate:
     datasets, _ = found.gathered
     of_fit = datasets[: len(found.system.runs)]
     system = observe(model, of_fit, found.conditioning, found.system).system()
-    fixed = found.estimate.gains if found.estimate.gains_fixed else None
+    if found.estimate.gains_fixed:
+        fixed = found.estimate.gains
+    else:
+        fixed = None
     return estimate_with(found.estimate.method, system, fixed)
 
 
@@ -99,11 +118,14 @@ def with_geometry_covariance(found: Identification, covariance: FloatArray) -> I
     return replace(found, estimate=replace(estimate, covariance=estimate.covariance + covariance))
 
 
-def evidence_with_geometry(evidence: Evidence, covariance: FloatArray, unknowns: Sequence[Column]) -> Evidence:
-    """Add the uncertainty of the geometry to an estimate with effects, whose own parameters it leaves alone.
+def evidence_with_geometry(
+    evidence: Evidence, covariance: FloatArray, unknowns: Sequence[Column]
+) -> Evidence:
+    """Add the uncertainty of the geometry to an estimate with effects,
+    whose own parameters it leaves alone.
 
-    Rows are found by the names of the parameters: where gravity was turned, there are other base parameters. Those that
-    are new have no part in it.
+    Rows are found by the names of the parameters: where gravity was turned, there are other base
+    parameters. Those that are new have no part in it.
 
     Args:
         evidence: with effects.

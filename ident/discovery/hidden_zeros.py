@@ -11,15 +11,18 @@ from ident.discovery.alike_corrections import axes_before
 from ident.model.robot import JointKind, Robot
 
 UPRIGHT = 0.1
-"""Largest sine of the angle between an axis and gravity, 6°, at which the axis counts as vertical: a zero that is
-off by 2° turns gravity by a tenth of that at most."""
+"""Largest sine of the angle between an axis and gravity, 6°, at which the axis counts as vertical:
+a zero that is off by 2° turns gravity by a tenth of that at most.
+"""
 
 
 class ZeroHiddenBy(Enum):
     """What hides the zero of a joint."""
 
-    SYMMETRY = "symmetry"  #: another zero turns the whole arm about a vertical axis, or shifts it: all torques stay
-    LAST_LINK = "last link"  #: no joint is behind it, so another zero is another body of unknown mass and centre
+    #: another zero turns the whole arm about a vertical axis, or shifts it: all torques stay
+    SYMMETRY = "symmetry"
+    #: no joint is behind it, so another zero is another body of unknown mass and centre
+    LAST_LINK = "last link"
     MOVES = "moves"  #: nothing but these moves
 
 

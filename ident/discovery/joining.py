@@ -1,9 +1,11 @@
-"""Whether a finding may join the model: refit everything with it, and judge every effect beside all the others.
+"""Whether a finding may join the model: refit everything with it,
+and judge every effect beside all the others.
 
-`join` is the entry. It refits gains, parameters and effects together, asks instruments from the demanded motion whether
-the effect is a disturbance in the position loop, linearises the problem around the joint fit, and lets each effect pass
-all gates again beside the others; what fails leaves. A finding that may not join is returned as `SetAside`, with why.
-`refuted_by_structure` asks before the refit whether a name is only similar to what would bend a gain.
+`join` is the entry. It refits gains, parameters and effects together, asks instruments from the
+demanded motion whether the effect is a disturbance in the position loop, linearises the problem
+around the joint fit, and lets each effect pass all gates again beside the others; what fails
+leaves. A finding that may not join is returned as `SetAside`, with why. `refuted_by_structure` asks
+before the refit whether a name is only similar to what would bend a gain.
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.discovery.beside_stops import fitted_clear_of_stops, turns_with_motion
 from ident.discovery.braking import pushing
-from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem, prepare_search, score_candidates
+from ident.discovery.candidates import (
+    ColumnCache,
+    FamilyTrials,
+    SearchProblem,
+    prepare_search,
+    score_candidates,
+)
 from ident.discovery.evidence import (
     Evidence,
     by_instruments,
@@ -54,7 +62,8 @@ from ident.estimators.estimate import Estimate
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
-REFINEMENTS = 4  #: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
+#: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
+REFINEMENTS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +77,16 @@ class SetAside:
 
     def reason(self, axes: Sequence[str]) -> str:
         """Why it did not join, in words, with the names of the axes."""
-        words = self.words if self.rival is None else self.words.replace("{rival}", self.rival.name_among(axes))
+        if self.rival is None:
+            words = self.words
+        else:
+            words = self.words.replace("{rival}", self.rival.name_among(axes))
         if not self.moved:
             return words
         gains = self.moved_text(axes)
-        return f"it would move {gains}, and {words}" if words else f"it has no name, and would move {gains}"
+        if words:
+            return f"it would move {gains}, and {words}"
+        return f"it has no name, and would move {gains}"
 
     def moved_text(self, axes: Sequence[str]) -> str:
         """Which gains it would move, and by how many σ, with the names of the axes."""
@@ -89,14 +103,21 @@ class JointFit:
 
 def linearised(evidence: Evidence, cache: ColumnCache) -> JointFit:
     """Linearise the problem around a joint fit."""
-    model, estimate = evidence.model, evidence.estimate
-    problem = prepare_search(model, evidence.fit_runs, evidence.training, estimate, cache, evidence.effects)
+    model = evidence.model
+    estimate = evidence.estimate
+    problem = prepare_search(
+        model, evidence.fit_runs, evidence.training, estimate, cache, evidence.effects
+    )
     return JointFit(evidence, problem)
 
 
 def linearised_after(evidence: Evidence, before: JointFit) -> JointFit:
-    """Linearise around a refit; columns of motion are kept unless a correction has changed the motion."""
-    is_same = all(one is other for one, other in zip(evidence.datasets, before.evidence.datasets, strict=True))
+    """Linearise around a refit; columns of motion are kept unless a correction has changed the
+    motion.
+    """
+    is_same = all(
+        one is other for one, other in zip(evidence.datasets, before.evidence.datasets, strict=True)
+    )
     return linearised(evidence, before.search_problem.cache if is_same else ColumnCache())
 
 
@@ -106,9 +127,15 @@ def keys_of(evidence: Evidence) -> frozenset[EffectKey]:
 
 
 def join(
-    model: JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates, seen: set[frozenset[EffectKey]]
+    model: JointFit,
+    accepted: Finding,
+    rng: np.random.Generator,
+    gates: Gates,
+    seen: set[frozenset[EffectKey]],
 ) -> JointFit | SetAside:
-    """Refit with a finding in the model and drop what no longer passes; or say why it may not join."""
+    """Refit with a finding in the model and drop what no longer passes;
+    or say why it may not join.
+    """
     joined = _refit(model, accepted)
     if isinstance(joined, JointFit):
         accepted = as_joined(accepted, joined.evidence)
@@ -118,7 +145,10 @@ def join(
     if keys_of(pruned.evidence) in seen:
         return SetAside(accepted, "it would only exchange places with an effect that it replaces")
     last = accepted.placed
-    why = "" if pruned is joined else refuted_by_instruments(pruned.evidence, last)
+    if pruned is joined:
+        why = ""
+    else:
+        why = refuted_by_instruments(pruned.evidence, last)
     why = why or refuted_clear_of_stops(pruned.evidence, last)
     return SetAside(accepted, why) if why else pruned
 
@@ -126,8 +156,8 @@ def join(
 def refuted_clear_of_stops(evidence: Evidence, placed: PlacedEffect) -> str:
     """Why an effect of a joint fit may be friction of joints at rest alone; empty where it may not.
 
-    In rows that are clear of stops it is then nearer to zero than to the fit. Rows that would not show an effect of
-    that size refute nothing.
+    In rows that are clear of stops it is then nearer to zero than to the fit. Rows that would not
+    show an effect of that size refute nothing.
     """
     if not turns_with_motion(placed.effect):
         return ""
@@ -139,17 +169,21 @@ def refuted_clear_of_stops(evidence: Evidence, placed: PlacedEffect) -> str:
     return f"in rows that are clear of stops, {why}" if why else ""
 
 
-def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAside]) -> SetAside | None:
-    """Why a name may not join: structure on its axis explains clearly more, was set aside as it bends a gain, and the
-    name bends one, too.
+def refuted_by_structure(
+    model: JointFit, found: Finding, aside: Sequence[SetAside]
+) -> SetAside | None:
+    """Why a name may not join: structure on its axis explains clearly more,
+    was set aside as it bends a gain, and the name bends one, too.
 
-    The name is then only similar to the truth. It does no harm where it bends no gain, and is no mistake where it still
-    lowers the error beside the structure: then it explains something else. A term against the time, or the session,
-    refutes nothing where no run can be left out: it can separate the loaded runs from the others.
+    The name is then only similar to the truth. It does no harm where it bends no gain, and is no
+    mistake where it still lowers the error beside the structure: then it explains something else. A
+    term against the time, or the session, refutes nothing where no run can be left out: it can
+    separate the loaded runs from the others.
     """
     if is_unnamed(found.effect):
         return None
-    problem, folds = model.search_problem, model.search_problem.folds
+    problem = model.search_problem
+    folds = model.search_problem.folds
     unsure = () if runs_to_leave_out(problem.observation) else (Abscissa.TIME, Abscissa.SESSION)
     before = float(folds.square_sum(folds.residual).sum())
     for term in (one.finding for one in aside if one.moved and is_unnamed(one.finding.effect)):
@@ -160,9 +194,13 @@ def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAsi
         by_name, by_term, by_both = score_candidates(folds, np.hstack((own, free)), parts)
         if by_name is None or by_term is None or by_both is None:
             continue
-        left, beside = by_name.held_out.sum(axis=1), by_both.held_out.sum(axis=1)
+        left = by_name.held_out.sum(axis=1)
+        beside = by_both.held_out.sum(axis=1)
         again = replace(
-            found, coefficients=by_name.coefficients, fold_errors=left, held_out_fall=before - float(left.sum())
+            found,
+            coefficients=by_name.coefficients,
+            fold_errors=left,
+            held_out_fall=before - float(left.sum()),
         )
         adds_to_term = is_better(beside, by_term.held_out.sum(axis=1))
         if not adds_to_term and is_inadequate(again, term) and (moved := _moved_by(model, again)):
@@ -171,8 +209,11 @@ def refuted_by_structure(model: JointFit, found: Finding, aside: Sequence[SetAsi
 
 
 def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
-    """Refit with a finding in the model; or say why it may not join, whatever else is in the model."""
-    evidence, problem = model.evidence, model.search_problem
+    """Refit with a finding in the model;
+    or say why it may not join, whatever else is in the model.
+    """
+    evidence = model.evidence
+    problem = model.search_problem
     last = accepted.placed
     # Asked before the refit, which takes longer.
     if is_unnamed(last.effect) and (moved := _moved_by(model, accepted)):
@@ -186,7 +227,10 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
         if refitted is not first_order and (why := refuted_by_instruments(refitted, last)):
             return SetAside(accepted, why)
         joined = linearised_after(refitted, model)
-        joined = _all_resettled(joined) if is_correction(last) else resettled(joined)
+        if is_correction(last):
+            joined = _all_resettled(joined)
+        else:
+            joined = resettled(joined)
     except UNFITTED as error:
         # The linearised problem distinguished the effect from the model, the whole one does not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
@@ -199,7 +243,9 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
 
 
 def _moved_by(model: JointFit, found: Finding) -> tuple[tuple[int, float], ...]:
-    """Index of each gain that a finding would move by more than its σ, to first order, and by how many σ."""
+    """Index of each gain that a finding would move by more than its σ, to first order,
+    and by how many σ.
+    """
     problem = model.search_problem
     torque = whitened_columns(problem, found.effect, found.axis) @ found.coefficients
     return moved_gains(gain_shifts(problem.folds, torque), model.evidence.estimate.gains_std)
@@ -236,7 +282,9 @@ def _all_resettled(model: JointFit) -> JointFit:
 
 def _refined_in(model: JointFit, placed: PlacedEffect) -> Effect:
     """Return an effect of a joint fit with the settings that are fitted refined around it."""
-    effect, axis, estimate = placed.effect, placed.axis, model.evidence.estimate
+    effect = placed.effect
+    axis = placed.axis
+    estimate = model.evidence.estimate
     if effect.fits_rotor:
         own = own_unknowns(estimate, (placed,))
         fitted = estimate.parameters[own], estimate.parameters_std[own]
@@ -250,17 +298,23 @@ def _refined_in(model: JointFit, placed: PlacedEffect) -> Effect:
 def as_joined(accepted: Finding, evidence: Evidence) -> Finding:
     """A finding with the settings that its effect has in a joint fit."""
     key = effect_key(accepted.effect, accepted.axis)
-    found = (placed.effect for placed in evidence.effects if effect_key(placed.effect, placed.axis) == key)
+    found = (
+        placed.effect
+        for placed in evidence.effects
+        if effect_key(placed.effect, placed.axis) == key
+    )
     return replace(accepted, effect=next(found, accepted.effect))
 
 
 def refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
-    """Why an effect of a joint fit may be a disturbance in the position loop alone; empty where it may not.
+    """Why an effect of a joint fit may be a disturbance in the position loop alone;
+    empty where it may not.
 
-    A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded motion then explain
-    a part of it, which those of the demanded motion do not. What the columns explain is then nearer to zero by
-    instruments than to the fit: it may be zero, or it is another number than that of the fit. Instruments that would
-    not show an effect of that size refute no named one; nor do those by which nothing can be fitted.
+    A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded
+    motion then explain a part of it, which those of the demanded motion do not. What the columns
+    explain is then nearer to zero by instruments than to the fit: it may be zero, or it is another
+    number than that of the fit. Instruments that would not show an effect of that size refute no
+    named one; nor do those by which nothing can be fitted.
     """
     try:
         estimate = by_instruments(evidence)
@@ -269,11 +323,15 @@ def refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     if estimate is None:
         return ""
     why = _contradicted_by(estimate, evidence, placed)
-    return f"with instruments from the demanded motion, {why}" if why else ""
+    if why:
+        return f"with instruments from the demanded motion, {why}"
+    return ""
 
 
 def _contradicted_by(other: Estimate, evidence: Evidence, placed: PlacedEffect) -> str:
-    """Why another estimate of the same unknowns contradicts an effect of a joint fit; empty where it does not."""
+    """Why another estimate of the same unknowns contradicts an effect of a joint fit;
+    empty where it does not.
+    """
     own = own_unknowns(other, (placed,))
     place = len(other.gains) + own
     values = values_of(other, own)
@@ -281,7 +339,9 @@ def _contradicted_by(other: Estimate, evidence: Evidence, placed: PlacedEffect) 
     return _contradiction(placed, values, fitted, other.covariance[np.ix_(place, place)])
 
 
-def _contradiction(placed: PlacedEffect, values: FloatArray, fitted: FloatArray, covariance: FloatArray) -> str:
+def _contradiction(
+    placed: PlacedEffect, values: FloatArray, fitted: FloatArray, covariance: FloatArray
+) -> str:
     """Why coefficients of another estimate contradict those of a fit; empty where they do not.
 
     Args:
@@ -294,7 +354,8 @@ def _contradiction(placed: PlacedEffect, values: FloatArray, fitted: FloatArray,
     if may_be_zero and is_unnamed(placed.effect):
         return may_be_zero
     precision = np.linalg.pinv(covariance, hermitian=True)
-    is_nearer_to_zero = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0  # |values − fitted|² > |values|²
+    # |values − fitted|² > |values|²
+    is_nearer_to_zero = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0
     if not is_nearer_to_zero:
         return ""
     if may_be_zero:
@@ -312,14 +373,19 @@ def _sizes_text(placed: PlacedEffect, values: FloatArray, fitted: FloatArray) ->
     return ", ".join(parts)
 
 
-def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates) -> JointFit | SetAside:
-    """Drop effects that no longer pass beside the last one; or say why the last one may not stay."""
+def _pruned(
+    model: JointFit, accepted: Finding, rng: np.random.Generator, gates: Gates
+) -> JointFit | SetAside:
+    """Drop effects that no longer pass beside the last one;
+    or say why the last one may not stay.
+    """
     last = model.evidence.effects[-1]
     needed: set[PlacedEffect] = set()
     while True:
         evidence = model.evidence
         judged = [
-            (placed, *beside_others(model, placed, rng, gates)) for placed in evidence.effects[evidence.declared :]
+            (placed, *beside_others(model, placed, rng, gates))
+            for placed in evidence.effects[evidence.declared :]
         ]
         failing = [one for one in judged if one[2] and one[0] not in needed]
         if not failing:
@@ -338,19 +404,29 @@ def _pruned(model: JointFit, accepted: Finding, rng: np.random.Generator, gates:
             needed.add(worst)  # the data cannot be fitted without it
 
 
-def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates) -> tuple[float, str]:
-    """Judge an effect of a joint fit beside all others: fall of ‖e‖² on held-out moves, and why it does not pass."""
+def beside_others(
+    model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates
+) -> tuple[float, str]:
+    """Judge an effect of a joint fit beside all others:
+    fall of ‖e‖² on held-out moves, and why it does not pass.
+    """
     is_delay = isinstance(placed.effect, Delay | LatePosition)
     limits = gates
     if is_delay:
-        # A delay is judged by its length: beside dry friction it is a small part of a motor's residual.
+        # A delay is judged by its length: beside dry friction it is a small part of a motor's
+        # residual.
         limits = replace(gates, explained=0.0, error_fall=0.0)
     estimate = model.evidence.estimate
     reduced = without_effects_of(model.search_problem, estimate, (placed,))
-    problem, columns = reduced.search_problem, reduced.columns
+    problem = reduced.search_problem
+    columns = reduced.columns
     forms = placed.effect.forms
-    trials = score_candidates(problem.folds, columns, [slice(len(form.coefficients)) for form in forms])
-    members = tuple((form, trial) for form, trial in zip(forms, trials, strict=True) if trial is not None)
+    trials = score_candidates(
+        problem.folds, columns, [slice(len(form.coefficients)) for form in forms]
+    )
+    members = tuple(
+        (form, trial) for form, trial in zip(forms, trials, strict=True) if trial is not None
+    )
     if not members:
         return 0.0, "the model contains it already"
     (finding,) = rank_families(problem, (FamilyTrials(placed.axis, members),), rng, limits)
@@ -364,13 +440,27 @@ def beside_others(model: JointFit, placed: PlacedEffect, rng: np.random.Generato
         uncertain = _uncertain_delay(finding, values, deviations, gates)
     physics = impossible(placed.effect.coefficients, values, deviations)
     is_of_speed = isinstance(placed.effect, SpeedFriction)
-    drives = pushing(model.evidence, placed.axis) if is_of_speed else ""
-    reasons = (*finding.refusals, joint, uncertain, physics, drives, PartsLeftOut.of(problem).refusal(columns))
+    if is_of_speed:
+        drives = pushing(model.evidence, placed.axis)
+    else:
+        drives = ""
+    reasons = (
+        *finding.refusals,
+        joint,
+        uncertain,
+        physics,
+        drives,
+        PartsLeftOut.of(problem).refusal(columns),
+    )
     return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
 
 
-def _uncertain_delay(finding: Finding, seconds: FloatArray, deviations: FloatArray, gates: Gates) -> str:
-    """Why a delay of a joint fit may not stay; empty where it explains much, or is far from zero."""
+def _uncertain_delay(
+    finding: Finding, seconds: FloatArray, deviations: FloatArray, gates: Gates
+) -> str:
+    """Why a delay of a joint fit may not stay;
+    empty where it explains much, or is far from zero.
+    """
     is_small = finding.explained < gates.explained or finding.error_fall < gates.error_fall
     if not is_small or certain_delays(seconds, deviations).all():
         return ""

@@ -1,12 +1,13 @@
-"""Mistakes of the description and of the clock that a check has named, and that join the model of a search.
+"""Mistakes of the description and of the clock that a check has named,
+and that join the model of a search.
 
-`ident.discovery.geometry_check` compares each of them with everything else that could explain it, and sees what a
-search does not look for: two zeros that hide each other, and a late current that is a small part of its motor's
-residual. All join at once, because each of two may explain nothing alone. What does not pass the gates of a joint fit
-leaves again.
+`ident.discovery.geometry_check` compares each of them with everything else that could explain it,
+and sees what a search does not look for: two zeros that hide each other, and a late current that is
+a small part of its motor's residual. All join at once, because each of two may explain nothing
+alone. What does not pass the gates of a joint fit leaves again.
 
-Wrong zeros and gravity join before the search. A delay joins behind it: what makes a torque that is fast, a coupling or
-a spring in a gear, looks like a delay until it is in the model.
+Wrong zeros and gravity join before the search. A delay joins behind it: what makes a torque that is
+fast, a coupling or a spring in a gear, looks like a delay until it is in the model.
 """
 
 from __future__ import annotations
@@ -18,7 +19,14 @@ import numpy as np
 
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
-from ident.discovery.joining import UNFITTED, JointFit, SetAside, as_joined, beside_others, linearised_after
+from ident.discovery.joining import (
+    UNFITTED,
+    JointFit,
+    SetAside,
+    as_joined,
+    beside_others,
+    linearised_after,
+)
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 
@@ -36,9 +44,11 @@ class JoinedMistakes:
 def join_mistakes(
     model: JointFit, mistakes: Sequence[Finding], rng: np.random.Generator, gates: Gates
 ) -> JoinedMistakes:
-    """Fit all mistakes together, and take out those that do not pass the gates of a joint fit, the worst first.
+    """Fit all mistakes together, and take out those that do not pass the gates of a joint fit,
+    the worst first.
 
-    An effect of the model that no longer passes beside them leaves, too: it was a part of a mistake.
+    An effect of the model that no longer passes beside them leaves, too: it was a part of a
+    mistake.
 
     Args:
         model: before or behind a search.
@@ -82,9 +92,11 @@ def join_mistakes(
 def _growing_models(
     model: JointFit, kept: tuple[PlacedEffect, ...], mistakes: Sequence[Finding], last: Evidence
 ) -> tuple[Evidence, ...]:
-    """Models with the first of some mistakes, the first two, and so on to the last one, which is given.
+    """Models with the first of some mistakes, the first two, and so on to the last one,
+    which is given.
 
-    Of two zeros that hide each other, one alone may not be fitted: then the model with both stands for it, too.
+    Of two zeros that hide each other, one alone may not be fitted: then the model with both stands
+    for it, too.
     """
     models = [last]
     for number in reversed(range(1, len(mistakes))):
@@ -98,7 +110,9 @@ def _growing_models(
 def _worst_of_model(
     joined: JointFit, kept: Sequence[PlacedEffect], rng: np.random.Generator, gates: Gates
 ) -> PlacedEffect | None:
-    """The effect of a model that passes least beside mistakes; None where all that are not declared pass."""
+    """The effect of a model that passes least beside mistakes;
+    None where all that are not declared pass.
+    """
     failing: list[tuple[float, PlacedEffect]] = []
     for placed in kept[joined.evidence.declared :]:
         fall, why = beside_others(joined, placed, rng, gates)
@@ -110,7 +124,9 @@ def _worst_of_model(
     return worst
 
 
-def _with_mistakes(model: JointFit, kept: tuple[PlacedEffect, ...], mistakes: Sequence[Finding]) -> Evidence:
+def _with_mistakes(
+    model: JointFit, kept: tuple[PlacedEffect, ...], mistakes: Sequence[Finding]
+) -> Evidence:
     """Refit with mistakes beside effects of a model.
 
     Raises:

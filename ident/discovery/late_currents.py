@@ -1,9 +1,9 @@
 """Currents that are late, beside a fit: of one motor, of several, or of all alike.
 
-A late current leaves the rate of its motor's torque in the residual, and that of all currents the rate of every motor's
-torque. An encoder that is late leaves nearly the same on some joints. So the delays of all motors are fitted at once:
-where they are alike, the stamps of a recording are wrong, or a filter delays every current; where they differ, each
-motor has a delay of its own.
+A late current leaves the rate of its motor's torque in the residual, and that of all currents the
+rate of every motor's torque. An encoder that is late leaves nearly the same on some joints. So the
+delays of all motors are fitted at once: where they are alike, the stamps of a recording are wrong,
+or a filter delays every current; where they differ, each motor has a delay of its own.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from ident.equations.rows import decimate_rows
 Delay = Lag | TimeSkew
 
 ALIKE_SIGMAS = 2.5  #: Within which a delay is the common one
-ALIKE_SHARE = 1.0 / 3.0  #: Of the common delay, within which a delay is the common one, too: filters differ a little
+#: Of the common delay, within which a delay is the common one, too: filters differ a little
+ALIKE_SHARE = 1.0 / 3.0
 REFITS = 4  #: Refits with the filter of the delays found; see `ident.discovery.time_skew`
 SETTLED = 0.1  #: Share of σ below which another refit is not worth its time
 
@@ -41,9 +42,11 @@ class LateCurrents:
 
 
 def rough_torque_rates(evidence: Evidence) -> FloatArray:
-    """Rate of each motor's predicted torque by differences of the rows of a fit [Nm/s], shape (m, r).
+    """Rate of each motor's predicted torque by differences of the rows of a fit [Nm/s], shape (m,
+    r).
 
-    It takes no time, and misses a third of what `torque_rates` has: enough to see whether a current may be late.
+    It takes no time, and misses a third of what `torque_rates` has: enough to see whether a current
+    may be late.
     """
     rows = evidence.training
     torque_nm = evidence.model.drive_train.to_motor @ evidence.estimate.predicted_torque(rows)
@@ -57,19 +60,23 @@ def rough_torque_rates(evidence: Evidence) -> FloatArray:
 def torque_rates(evidence: Evidence) -> FloatArray:
     """Rate of each motor's predicted torque on the rows of a fit [Nm/s], shape (m, r).
 
-    It is built at full rate, because torque jumps where a joint turns back, and one run after the other, because the
-    signals of a run are large.
+    It is built at full rate, because torque jumps where a joint turns back, and one run after the
+    other, because the signals of a run are large.
     """
     began_s = session_began_s(evidence.fit_runs)
     parts: list[FloatArray] = []
     for data in evidence.fit_runs:
-        signals = fitted_signals(evidence.model, data, evidence.training, evidence.estimate, began_s, inertia=False)
+        signals = fitted_signals(
+            evidence.model, data, evidence.training, evidence.estimate, began_s, inertia=False
+        )
         rate = -TimeSkew().columns(signals, 0)[:, 0]
         parts.append(decimate_rows(data, evidence.conditioning, rate))
     return np.concatenate(parts, axis=-1)
 
 
-def delay_columns(problem: SearchProblem, placed: PlacedEffect, rates_nm_s: FloatArray) -> FloatArray:
+def delay_columns(
+    problem: SearchProblem, placed: PlacedEffect, rates_nm_s: FloatArray
+) -> FloatArray:
     """Torque at the joints per second of a delay [Nm/s], shape (m, 1, r).
 
     Args:
@@ -77,7 +84,10 @@ def delay_columns(problem: SearchProblem, placed: PlacedEffect, rates_nm_s: Floa
         placed: a lag or a time skew, without a filter.
         rates_nm_s: from `torque_rates`.
     """
-    columns = -rates_nm_s[:, None] if isinstance(placed.effect, TimeSkew) else -rates_nm_s[placed.axis][None]
+    if isinstance(placed.effect, TimeSkew):
+        columns = -rates_nm_s[:, None]
+    else:
+        columns = -rates_nm_s[placed.axis][None]
     return at_joints(placed.effect, placed.axis, columns, problem.model.drive_train)
 
 
@@ -140,7 +150,8 @@ def find_late_currents(
 
 
 def _are_alike(seconds: FloatArray, covariance: FloatArray) -> bool:
-    """Whether delays are one common delay: none differs from it by more than its σ explains and filters may.
+    """Whether delays are one common delay:
+    none differs from it by more than its σ explains and filters may.
 
     Args:
         seconds: of each motor, shape (m,).
@@ -157,8 +168,11 @@ def _are_alike(seconds: FloatArray, covariance: FloatArray) -> bool:
     return bool(np.all(differences <= allowed))
 
 
-def with_delays(evidence: Evidence, effects: Sequence[PlacedEffect], seconds: FloatArray) -> Evidence:
-    """Refit with delays in the model, each with the filter that makes it a delay to second order (see `Lag`).
+def with_delays(
+    evidence: Evidence, effects: Sequence[PlacedEffect], seconds: FloatArray
+) -> Evidence:
+    """Refit with delays in the model, each with the filter that makes it a delay to second order
+    (see `Lag`).
 
     Args:
         evidence: the fit without them.
@@ -171,7 +185,9 @@ def with_delays(evidence: Evidence, effects: Sequence[PlacedEffect], seconds: Fl
     found = evidence
     values = seconds
     for _ in range(REFITS):
-        placed = [_with_filter(one, float(value)) for one, value in zip(effects, values, strict=True)]
+        placed = [
+            _with_filter(one, float(value)) for one, value in zip(effects, values, strict=True)
+        ]
         found = with_effects(evidence, (*evidence.effects, *placed))
         before = values
         fitted = [coefficients_of(found.estimate, one) for one in placed]

@@ -1,6 +1,8 @@
-"""Find missing effects: add what the residual calls for, refit everything, and examine the new residual.
+"""Find missing effects: add what the residual calls for, refit everything,
+and examine the new residual.
 
-`find_effects` is the entry; `ident.discovery.evidence.gather` prepares the rows behind an identification for it.
+`find_effects` is the entry; `ident.discovery.evidence.gather` prepares the rows behind an
+identification for it.
 """
 
 from __future__ import annotations
@@ -54,7 +56,12 @@ from ident.discovery.search import (
     rank_families,
     refine_setting,
 )
-from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE, detection_limits_nm, find_structure, is_inadequate
+from ident.discovery.structure import (
+    MIN_MOVES_FOR_STRUCTURE,
+    detection_limits_nm,
+    find_structure,
+    is_inadequate,
+)
 from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.own import families_of, search_families
@@ -64,7 +71,8 @@ from ident.effects.unnamed import is_unnamed
 from ident.errors import TooFewMoves
 
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
-PIECES_PER_EFFECT = 3  #: Fewer pieces of moves than this for each effect cannot show that all of them are there
+#: Fewer pieces of moves than this for each effect cannot show that all of them are there
+PIECES_PER_EFFECT = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,31 +80,41 @@ class Step:
     """One turn of the loop: the findings, and the model after it."""
 
     findings: tuple[Finding, ...]  #: named effects on all axes, the best on held-out moves first
-    #: Smooth and periodic terms: on the axis of the best named effect, which must not be much worse than they are, or
-    #: on all axes where no named effect passed.
+    #: Smooth and periodic terms: on the axis of the best named effect, which must not be much worse
+    #: than they are, or on all axes where no named effect passed.
     structures: tuple[Finding, ...]
-    limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (m,)
-    accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
+    #: torque (root mean square) that a detectable effect has at each motor, shape (m,)
+    limits_nm: FloatArray
+    #: the finding, or the structure without a name, that joined the model; None ends the loop
+    accepted: Finding | None
     after: Evidence  #: the model with it
-    set_aside: tuple[SetAside, ...] = ()  #: what would have joined the model, but for parts left out or the joint fit
-    ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
-    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape (m,); last turn only.
+    #: what would have joined the model, but for parts left out or the joint fit
+    set_aside: tuple[SetAside, ...] = ()
+    #: reason why the search ended here although the residual may call for more; else empty
+    ended: str = ""
+    #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape
+    #: (m,); last turn only.
     choice_std: FloatArray | None = None
     declared: bool = False  #: the cell declares the effect that joined: it was not searched for
-    verdicts: tuple[EffectVerdict, ...] = ()  #: of held-out runs on each effect that was found; last turn only
-    #: Effects that left although nothing refutes them, and so may be true: σ contains what they would move. Last turn
-    #: only.
+    #: of held-out runs on each effect that was found; last turn only
+    verdicts: tuple[EffectVerdict, ...] = ()
+    #: Effects that left although nothing refutes them, and so may be true: σ contains what they
+    #: would move. Last turn only.
     left_open: tuple[PlacedEffect, ...] = ()
 
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""
         best, added = self.findings[:count], self.accepted
-        if added is None or effect_key(added.effect, added.axis) in {effect_key(one.effect, one.axis) for one in best}:
+        if added is None or effect_key(added.effect, added.axis) in {
+            effect_key(one.effect, one.axis) for one in best
+        }:
             return best
         return (*best, added)
 
 
-@takes(start=Evidence, rng=np.random.Generator, gates=Gates | None, axes=Sequence, own_effects=Sequence)
+@takes(
+    start=Evidence, rng=np.random.Generator, gates=Gates | None, axes=Sequence, own_effects=Sequence
+)
 def find_effects(
     start: Evidence,
     rng: np.random.Generator,
@@ -110,52 +128,63 @@ def find_effects(
 ) -> tuple[Step, ...]:
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
-    Mistakes of the description that a check names join first, and delays that it names behind the search
-    (`check_geometry`, `join_mistakes`); what of them does not join is set aside in the last turn. Each turn of the
-    loop:
+    Mistakes of the description that a check names join first, and delays that it names behind the
+    search (`check_geometry`, `join_mistakes`); what of them does not join is set aside in the last
+    turn. Each turn of the loop:
 
-    1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every axis: its columns,
-       made from the motion and the predicted load and current, are projected off all declared directions, and the fall
-       of the squared residual is measured in-sample and on held-out moves (`rank_effects`);
-    2. passes a candidate only through all gates: larger than noise makes anywhere in the search, better on most folds,
-       large enough to matter, and physically possible (`Gates`, `impossible`);
-    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it lowers the error on
-       runs or regions of the workspace left out, and raises it there on no motor (`PartsLeftOut`);
-    4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if no named effect
-       passed; one that explains much more replaces the named effect (`find_structure`, `is_inadequate`). A term that
-       moves a gain by more than its σ does not join; the name that it refutes then joins only if it moves none either
+    1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every
+       axis: its columns, made from the motion and the predicted load and current, are projected off
+       all declared directions, and the fall of the squared residual is measured in-sample and on
+       held-out moves (`rank_effects`);
+    2. passes a candidate only through all gates: larger than noise makes anywhere in the search,
+       better on most folds, large enough to matter, and physically possible (`Gates`,
+       `impossible`);
+    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it lowers
+       the error on runs or regions of the workspace left out, and raises it there on no motor
+       (`PartsLeftOut`);
+    4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if
+       no named effect passed; one that explains much more replaces the named effect
+       (`find_structure`, `is_inadequate`). A term that moves a gain by more than its σ does not
+       join; the name that it refutes then joins only if it moves none either
        (`refuted_by_structure`);
-    5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects together;
-    6. asks instruments from the demanded motion whether the effect is a disturbance in the position loop;
-    7. linearises the problem around the joint fit and deals whole moves to folds (`prepare_search`); every effect in
-       the model must still pass, beside all the others, or it leaves (`without_effects_of`). A term without a name may
-       not make a named effect leave: then it does not join;
-    8. asks whether what turns with the motion passes in rows that are clear of stops, too (`refuted_clear_of_stops`).
+    5. refines its setting (`refine_setting`), adds it, and refits gains, parameters and effects
+       together;
+    6. asks instruments from the demanded motion whether the effect is a disturbance in the position
+       loop;
+    7. linearises the problem around the joint fit and deals whole moves to folds
+       (`prepare_search`); every effect in the model must still pass, beside all the others, or it
+       leaves (`without_effects_of`). A term without a name may not make a named effect leave: then
+       it does not join;
+    8. asks whether what turns with the motion passes in rows that are clear of stops, too
+       (`refuted_clear_of_stops`).
 
-    What parts left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best is tried. The
-    ambiguity of an accepted effect holds what could not be distinguished from it, passed before, and does not pass
-    beside it.
+    What parts left out or a gate of the joint fit refuse is in `Step.set_aside`, and the next best
+    is tried. The ambiguity of an accepted effect holds what could not be distinguished from it,
+    passed before, and does not pass beside it.
 
-    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS turns. The covariance
-    of the last estimate includes the choice of its effects (`choice_covariance`); an effect that this σ no longer shows
-    leaves (`end_search`). Held-out runs take no part in it: `ident.discovery.acceptance` judges by them.
+    It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS
+    turns. The covariance of the last estimate includes the choice of its effects
+    (`choice_covariance`); an effect that this σ no longer shows leaves (`end_search`). Held-out
+    runs take no part in it: `ident.discovery.acceptance` judges by them.
 
     Args:
         start: identified by ``ml``, from `gather`.
         rng: of the bootstrap.
         gates: limits for a candidate.
-        families: that are tried, the members of each with the settings to begin with; when None, the dictionary and
-            those of installed packages.
+        families: that are tried, the members of each with the settings to begin with; when None,
+            the dictionary and those of installed packages.
         progress: called with a description of each step.
         axes: their names in it; those of the robot's joints when empty.
-        geometry: the part of the dictionary that corrects the description of the robot; when None, all of it.
-        mistakes: that the check has named beside this start; when None, and there is a geometry, it is made here.
-        own_effects: effects that no installed package has, tried beside the families; several of one name are one
-            family. They take the place of installed ones of the same name.
+        geometry: the part of the dictionary that corrects the description of the robot; when None,
+            all of it.
+        mistakes: that the check has named beside this start; when None, and there is a geometry, it
+            is made here.
+        own_effects: effects that no installed package has, tried beside the families; several of
+            one name are one family. They take the place of installed ones of the same name.
 
     Returns:
-        the turns taken, one of each mistake that has joined among them; the last one has accepted nothing, unless
-        MAX_EFFECTS was reached.
+        the turns taken, one of each mistake that has joined among them; the last one has accepted
+        nothing, unless MAX_EFFECTS was reached.
 
     Raises:
         EffectRefused: an effect of another package cannot be used.
@@ -189,7 +218,9 @@ def find_effects(
     found, model = search(corrected, MAX_EFFECTS)
     if delays and found[-1].accepted is None:
         progress("testing the clock beside what was found")
-        late = join_mistakes(model, _named_mistakes(model.evidence, rng, gates, own_effects), rng, gates)
+        late = join_mistakes(
+            model, _named_mistakes(model.evidence, rng, gates, own_effects), rng, gates
+        )
         aside += late.set_aside
         if late.joined:
             *found, last = found  # a turn that has found nothing is the last one of all
@@ -204,9 +235,14 @@ def find_effects(
 
 
 def _corrected(
-    start: Evidence, mistakes: Sequence[Finding], corrections: Sequence[Finding], rng: np.random.Generator, gates: Gates
+    start: Evidence,
+    mistakes: Sequence[Finding],
+    corrections: Sequence[Finding],
+    rng: np.random.Generator,
+    gates: Gates,
 ) -> tuple[list[Step], Evidence, tuple[SetAside, ...]]:
-    """Join corrections of the description: a turn for each that joins, the model with them, and what does not join.
+    """Join corrections of the description: a turn for each that joins, the model with them,
+    and what does not join.
 
     The linearised problem ends here: it is large, and the search makes its own.
     """
@@ -226,13 +262,17 @@ def _searched(
     progress: Callable[[str], None],
     names: Sequence[str],
 ) -> tuple[list[Step], JointFit]:
-    """Take turns until one finds nothing, at most so many and at least one: the turns, and the model behind them."""
+    """Take turns until one finds nothing, at most so many and at least one:
+    the turns, and the model behind them.
+    """
     model = linearised(start, ColumnCache())
     steps: list[Step] = []
     for _ in range(max(most, 1)):
         step, joined = _turn(model, rng, gates, families, seen, progress, names)
         if steps:
-            steps[-1] = _settled(steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates)
+            steps[-1] = _settled(
+                steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates
+            )
         steps.append(step)
         if joined is None:
             break
@@ -250,7 +290,9 @@ def _ignore(_line: str) -> None:
 def _named_mistakes(
     start: Evidence, rng: np.random.Generator, gates: Gates, own_effects: Sequence[Effect]
 ) -> tuple[Finding, ...]:
-    """What the check of the description and of the clock names for certain; nothing with too few moves."""
+    """What the check of the description and of the clock names for certain;
+    nothing with too few moves.
+    """
     (own,) = rng.spawn(1)  # the draws of the search stay what they are
     try:
         return check_geometry(start, own, gates, own_effects).certain_mistakes
@@ -258,8 +300,13 @@ def _named_mistakes(
         return ()
 
 
-def _steps_of(corrected: JoinedMistakes, mistakes: Sequence[Finding], limits_nm: FloatArray) -> list[Step]:
-    """A turn for each mistake that has joined. It has no rivals: the check has compared it with all of them."""
+def _steps_of(
+    corrected: JoinedMistakes, mistakes: Sequence[Finding], limits_nm: FloatArray
+) -> list[Step]:
+    """A turn for each mistake that has joined.
+
+    It has no rivals: the check has compared it with all of them.
+    """
     steps: list[Step] = []
     for found, after in zip(corrected.joined, corrected.models, strict=True):
         steps.append(Step(tuple(mistakes), (), limits_nm, replace(found, ambiguity=()), after))
@@ -274,16 +321,19 @@ def end_search(
     rng: np.random.Generator,
     left_open: Sequence[PlacedEffect] = (),
 ) -> Step:
-    """Return the last step with the σ that is reported, and with those effects alone that pass in this model.
+    """Return the last step with the σ that is reported,
+    and with those effects alone that pass in this model.
 
-    σ from the choice of the effects comes last, so that an effect can have passed every gate by a smaller one: it
-    leaves where its coefficients may all be zero by the covariance that is reported, or one of them is impossible. An
-    effect that has passed beside another one must pass without it, too: after each that leaves, the rest is fitted
-    again, and passes the gates of a joint fit again; instruments alone are not asked again, because they take as long
-    as a fit. The worst leaves first. An effect that leaves here is not refuted by it, so that σ contains what it would
-    move.
+    σ from the choice of the effects comes last, so that an effect can have passed every gate by a
+    smaller one: it leaves where its coefficients may all be zero by the covariance that is
+    reported, or one of them is impossible. An effect that has passed beside another one must pass
+    without it, too: after each that leaves, the rest is fitted again, and passes the gates of a
+    joint fit again; instruments alone are not asked again, because they take as long as a fit. The
+    worst leaves first. An effect that leaves here is not refuted by it, so that σ contains what it
+    would move.
 
-    Of what stays, a coefficient that is a little outside its possible values is held at the nearest one.
+    Of what stays, a coefficient that is a little outside its possible values is held at the nearest
+    one.
 
     Args:
         steps: of the search; the last one is returned.
@@ -326,7 +376,8 @@ def end_search(
 
 
 def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
-    """Effects that the covariance of an estimate does not show, why, and the probability of their being zero.
+    """Effects that the covariance of an estimate does not show, why,
+    and the probability of their being zero.
 
     What the cell declares stays. An impossible coefficient counts like one that is certainly zero.
     """
@@ -343,7 +394,9 @@ def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
         shown = possible_values(placed.effect.coefficients, values, covariance)
         noise = in_noise(shown, covariance)
         if not noise and not is_unnamed(placed.effect) and np.all(np.abs(shown) < std):
-            noise = "each of its coefficients is less than its σ: what they are together is not known"
+            noise = (
+                "each of its coefficients is less than its σ: what they are together is not known"
+            )
         if wrong:
             failing.append((placed, wrong, 1.0))
         elif noise:
@@ -351,8 +404,12 @@ def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
     return failing
 
 
-def _failing_again(model: JointFit, rng: np.random.Generator, gates: Gates) -> list[tuple[PlacedEffect, str, float]]:
-    """Effects that do not pass the gates of a joint fit, why, and how much worse left-out moves are with each."""
+def _failing_again(
+    model: JointFit, rng: np.random.Generator, gates: Gates
+) -> list[tuple[PlacedEffect, str, float]]:
+    """Effects that do not pass the gates of a joint fit, why,
+    and how much worse left-out moves are with each.
+    """
     evidence = model.evidence
     failing: list[tuple[PlacedEffect, str, float]] = []
     for placed in evidence.effects[evidence.declared :]:
@@ -365,14 +422,17 @@ def _failing_again(model: JointFit, rng: np.random.Generator, gates: Gates) -> l
 def with_possible_values(evidence: Evidence) -> Evidence:
     """Hold coefficients of the effects that are not declared at the nearest possible value.
 
-    They were outside by less than their noise. Everything else moves with them, to first order; σ stays what it is.
+    They were outside by less than their noise. Everything else moves with them, to first order; σ
+    stays what it is.
     """
     estimate = evidence.estimate
     own = own_unknowns(estimate, evidence.effects[evidence.declared :])
     if not len(own):
         return evidence
     count = len(estimate.gains)
-    order = np.concatenate((count + own, np.setdiff1d(np.arange(len(estimate.covariance)), count + own)))
+    order = np.concatenate(
+        (count + own, np.setdiff1d(np.arange(len(estimate.covariance)), count + own))
+    )
     values = np.concatenate((estimate.gains, estimate.parameters))
     about = np.array([column.about for column in estimate.unknowns])
     values[count:] += about
@@ -394,17 +454,27 @@ def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
     return None
 
 
-def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates, left_open: Sequence[PlacedEffect]) -> Step:
-    """Return the last step, what the choice of its effects adds to the covariance of its estimate included."""
-    estimate, accepted = model.evidence.estimate, dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]]()
+def _with_choice(
+    steps: Sequence[Step], model: JointFit, gates: Gates, left_open: Sequence[PlacedEffect]
+) -> Step:
+    """Return the last step, what the choice of its effects adds to the covariance of its estimate
+    included.
+    """
+    estimate, accepted = (
+        model.evidence.estimate,
+        dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]](),
+    )
     for step in steps:  # an effect that left and joined again counts by its last turn
         found = step.accepted
         if found is not None and (placed := found.placed) in model.evidence.effects:
             accepted[placed] = found, (*step.findings, *step.structures)
     last = steps[-1]
     left = _small_findings(last, model, gates)
-    choice = choice_covariance(model.search_problem, estimate, tuple(accepted.values()), left, left_open)
-    # The coefficient of an effect is that of a model with the effect: another model has none, not another one.
+    choice = choice_covariance(
+        model.search_problem, estimate, tuple(accepted.values()), left, left_open
+    )
+    # The coefficient of an effect is that of a model with the effect: another model has none, not
+    # another one.
     own = len(estimate.gains) + own_unknowns(estimate, model.evidence.effects)
     choice[own, :] = 0.0
     choice[:, own] = 0.0
@@ -419,7 +489,8 @@ def _with_choice(steps: Sequence[Step], model: JointFit, gates: Gates, left_open
 def _small_findings(last: Step, model: JointFit, gates: Gates) -> tuple[Finding, ...]:
     """Findings of the last turn that did not join, and may be true, scored beside a model.
 
-    A model without some of the effects of the last turn is not the one that its findings were scored beside.
+    A model without some of the effects of the last turn is not the one that its findings were
+    scored beside.
     """
     if last.accepted is not None:  # its findings are of the model before it
         return ()
@@ -448,23 +519,31 @@ def _turn(
     progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
     present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
-    findings, structures = rank_effects(problem, rng, gates, families, proposed, present), tuple[Finding, ...]()
+    findings, structures = (
+        rank_effects(problem, rng, gates, families, proposed, present),
+        tuple[Finding, ...](),
+    )
     limits_nm, runs = detection_limits_nm(problem, gates), PartsLeftOut.of(problem)
     taken, searched, aside, ended = set(keys_of(evidence)), range(0), list[SetAside](), ""
     while True:
         named = choose_effect(findings, taken)
-        if named is not None and (why := runs.refusal(whitened_columns(problem, named.effect, named.axis))):
+        if named is not None and (
+            why := runs.refusal(whitened_columns(problem, named.effect, named.axis))
+        ):
             findings = _refused(findings, named, why)
             aside += _first_of_axis(aside, SetAside(named, why))
             continue
         axes = range(problem.axes) if named is None else range(named.axis, named.axis + 1)
-        axes = axes if axes.stop <= problem.axes else range(0)  # terms without a name are of driven joints
+        # Terms without a name are of driven joints
+        axes = axes if axes.stop <= problem.axes else range(0)
         if axes != searched:
             if named is None:
                 progress("searching for structure that no named effect explains")
             structures, searched = find_structure(problem, axes, rng, gates), axes
         accepted = term = choose_effect(structures, taken)
-        if term is not None and (why := runs.refusal(whitened_columns(problem, term.effect, term.axis))):
+        if term is not None and (
+            why := runs.refusal(whitened_columns(problem, term.effect, term.axis))
+        ):
             structures = _refused(structures, term, why)
             aside += _first_of_axis(aside, SetAside(term, why))
             continue
@@ -482,22 +561,39 @@ def _turn(
             accepted = as_joined(accepted, joined.evidence)
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
-                aside.append(SetAside(named, "{rival} explains clearly more of the same residual", rival))
-            return Step(findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)), joined
-        progress(f"{effect.name} on {names[accepted.axis]} does not join the model: {joined.reason(names)}")
+                aside.append(
+                    SetAside(named, "{rival} explains clearly more of the same residual", rival)
+                )
+            return Step(
+                findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)
+            ), joined
+        progress(
+            f"{effect.name} on {names[accepted.axis]} does not join the model: "
+            f"{joined.reason(names)}"
+        )
         aside.append(joined)
-        # The variables of an axis go together: if its best term may not join, no other term replaces it.
+        # The variables of an axis go together: if its best term may not join, no other term
+        # replaces it.
         others = structures if is_unnamed(effect) else ()
-        taken |= {effect_key(one.effect, one.axis) for one in (chosen, *others) if one.axis == chosen.axis}
+        taken |= {
+            effect_key(one.effect, one.axis) for one in (chosen, *others) if one.axis == chosen.axis
+        }
     if accepted is not None:
-        ended = f"{problem.folds.linearisation.cluster_count} pieces of {moves} moves allow no more than {most} effects"
+        ended = (
+            f"{problem.folds.linearisation.cluster_count} pieces of {moves} moves allow no "
+            f"more than {most} effects"
+        )
     elif moves < MIN_MOVES_FOR_STRUCTURE:
         ended = f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}"
     return Step(findings, structures, limits_nm, None, evidence, tuple(aside), ended), None
 
 
-def _refined(search_problem: SearchProblem, accepted: Finding, near: Sequence[Sequence[Effect]]) -> Effect:
-    """Return the effect that was chosen with its setting refined; a gear that is not rigid also gets its form."""
+def _refined(
+    search_problem: SearchProblem, accepted: Finding, near: Sequence[Sequence[Effect]]
+) -> Effect:
+    """Return the effect that was chosen with its setting refined;
+    a gear that is not rigid also gets its form.
+    """
     effect = refine_setting(search_problem, accepted.effect, accepted.axis, near)
     gear = refined_gear(search_problem, effect, accepted.axis)
     if gear == effect:
@@ -512,7 +608,9 @@ def _proposals(
     gates: Gates,
     families: tuple[tuple[Effect, ...], ...],
 ) -> dict[int, tuple[tuple[Effect, ...], ...]]:
-    """Families with settings that only the data suggest, by axis, of those that the dictionary holds."""
+    """Families with settings that only the data suggest, by axis,
+    of those that the dictionary holds.
+    """
     kinds = {type(family[0]) for family in families}
     ripples = propose_orders(search_problem, effects, rng, gates) if Ripple in kinds else {}
     resonances = propose_resonances(search_problem, gates, kinds)
@@ -520,14 +618,23 @@ def _proposals(
     balancers = propose_balancers(search_problem, gates, families, balanced)
     cables = propose_cables(search_problem, gates, families)
     found = (ripples, resonances, balancers, cables)
-    own = {axis: tuple(f for one in found for f in one.get(axis, ())) for axis in {a for one in found for a in one}}
+    own = {
+        axis: tuple(f for one in found for f in one.get(axis, ()))
+        for axis in {a for one in found for a in one}
+    }
     return propose_rotors(search_problem, gates, families, own)
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
-    """Finding that parts left out refuse, unless a better finding of its kind on this axis was set aside before."""
+    """Finding that parts left out refuse, unless a better finding of its kind on this axis was set
+    aside before.
+    """
     kind = new.finding.axis, is_unnamed(new.finding.effect)
-    return () if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside} else (new,)
+    return (
+        ()
+        if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside}
+        else (new,)
+    )
 
 
 def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[Finding, ...]:
@@ -536,9 +643,14 @@ def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[F
 
 
 def _settled(
-    step: Step, problem: SearchProblem, tested: Sequence[Finding], rng: np.random.Generator, gates: Gates
+    step: Step,
+    problem: SearchProblem,
+    tested: Sequence[Finding],
+    rng: np.random.Generator,
+    gates: Gates,
 ) -> Step:
-    """Limit the ambiguity of an accepted effect to rivals that passed before it joined and no longer do.
+    """Limit the ambiguity of an accepted effect to rivals that passed before it joined and no
+    longer do.
 
     Args:
         step: with what was accepted.
@@ -552,11 +664,16 @@ def _settled(
     own = effect_key(step.accepted.effect, step.accepted.axis)
     passed = {(one.effect, one.axis) for one in (*step.findings, *step.structures) if one.passed}
     rivals = {
-        effect_key(one.effect, one.axis): one for one in step.accepted.ambiguity if (one.effect, one.axis) in passed
+        effect_key(one.effect, one.axis): one
+        for one in step.accepted.ambiguity
+        if (one.effect, one.axis) in passed
     }
     now = {effect_key(one.effect, one.axis): one.passed for one in tested}
     missing = [one for key, one in rivals.items() if key not in now]
     again = [trial for one in missing for trial in problem.test(((one.effect,),), one.axis)]
-    now |= {effect_key(one.effect, one.axis): one.passed for one in rank_families(problem, again, rng, gates)}
+    now |= {
+        effect_key(one.effect, one.axis): one.passed
+        for one in rank_families(problem, again, rng, gates)
+    }
     left = tuple(one for key, one in rivals.items() if key != own and not now.get(key, False))
     return replace(step, accepted=replace(step.accepted, ambiguity=left))

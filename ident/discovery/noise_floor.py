@@ -1,51 +1,60 @@
-"""Noise of each motor's current at rest and between repeated moves; the latter bounds a model's error from below.
+"""Noise of each motor's current at rest and between repeated moves;
+the latter bounds a model's error from below.
 
 Two estimates of σ² are made of parts in which no model has anything to explain:
 
-- a dwell: while a joint stands still, friction holds it within ±Fs, the amplifier's integrator creeps, and faster
-  changes of the current are noise of measurement and control;
-- a pair of repeated moves: two stretches in which the motor moves and all axes follow the same path. In the difference
-  of their currents, divided by √2, torques that depend on the path cancel, and so do the errors of any model of them.
-  Disturbances, quantisation, noise of encoder and control, and ripple whose phase is random remain.
+- a dwell: while a joint stands still, friction holds it within ±Fs, the amplifier's integrator
+  creeps, and faster changes of the current are noise of measurement and control;
+- a pair of repeated moves: two stretches in which the motor moves and all axes follow the same
+  path. In the difference of their currents, divided by √2, torques that depend on the path cancel,
+  and so do the errors of any model of them. Disturbances, quantisation, noise of encoder and
+  control, and ripple whose phase is random remain.
 
-A disturbance also moves the arm a little, and a model that is given the measured motion explains the inertia's share of
-the current. So the differences of acceleration of all axes are fitted to that of a pair and subtracted: without this,
-pairs exceed the error of the fit where a disturbance acts inside the position loop. Differences of position and
-velocity stay in: the controller makes its current of them, and they would take the disturbance away.
+A disturbance also moves the arm a little, and a model that is given the measured motion explains
+the inertia's share of the current. So the differences of acceleration of all axes are fitted to
+that of a pair and subtracted: without this, pairs exceed the error of the fit where a disturbance
+acts inside the position loop. Differences of position and velocity stay in: the controller makes
+its current of them, and they would take the disturbance away.
 
-Parts longer than LONGEST_MOVE_S are cut, as moves are. Each is filtered and decimated like every row (windows wholly
-inside), a parabola in time is subtracted, and the rest gives an estimate of σ² from each part d,
+Parts longer than LONGEST_MOVE_S are cut, as moves are. Each is filtered and decimated like every
+row (windows wholly inside), a parabola in time is subtracted, and the rest gives an estimate of σ²
+from each part d,
 
     s_d² = ‖M_d v_d‖²/tr(M_d P_d),        M_d = I − H_d,
 
-with H_d the projection on (1, t, t²) and the differences of acceleration, and P_d the correlation that the filter
-itself gives to rows of white noise, so that a short part counts only by what the projection leaves of it. s_d² is
-nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP) (Satterthwaite 1946); divided by the median of χ²_ν/ν every part is as likely
-above σ² as below, and σ² is their median, weighted by ν. A median, because an axis slips or rings in some of its dwells
-and is disturbed in some moves.
+with H_d the projection on (1, t, t²) and the differences of acceleration, and P_d the correlation
+that the filter itself gives to rows of white noise, so that a short part counts only by what the
+projection leaves of it. s_d² is nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP) (Satterthwaite 1946);
+divided by the median of χ²_ν/ν every part is as likely above σ² as below, and σ² is their median,
+weighted by ν. A median, because an axis slips or rings in some of its dwells and is disturbed in
+some moves.
 
-Pairs are neighbours in time, so that warm-up changes little between them; the parabola subtracts a change of Coulomb
-friction. Of m repetitions they are m − 1 pairs, each of which shares a move with the next: together they have
-2(m − 1)²/(3m − 4) times the freedom of one (von Neumann, Kent, Bellinson & Hart 1941), not m − 1 times.
+Pairs are neighbours in time, so that warm-up changes little between them; the parabola subtracts a
+change of Coulomb friction. Of m repetitions they are m − 1 pairs, each of which shares a move with
+the next: together they have 2(m − 1)²/(3m − 4) times the freedom of one (von Neumann, Kent,
+Bellinson & Hart 1941), not m − 1 times.
 
-The smaller estimate is taken: either can be too high, standstill where an axis hunts about its target or a brake takes
-the load over in most dwells, repeated moves where the robot warms up or the paths differ a little.
+The smaller estimate is taken: either can be too high, standstill where an axis hunts about its
+target or a brake takes the load over in most dwells, repeated moves where the robot warms up or the
+paths differ a little.
 
-What it is. Repeated moves show a part of the noise in motion: ripple that repeats, commutation error, and noise slower
-than a part are not in it. Where all noise is in the current, they show all of it, and half of the estimates are too
-high, by their own σ. So no estimate is a bound, but its lower 95 % limit is one, `NoiseFloor.least_a`: of 96 limits on
-axes of clean simulated cells, 2 are above the error of a fit of the right model. It is not tight: where a torque
-disturbs the arm, it is 0.8 to 0.9 of that error, and less where standstill shows less.
+What it is. Repeated moves show a part of the noise in motion: ripple that repeats, commutation
+error, and noise slower than a part are not in it. Where all noise is in the current, they show all
+of it, and half of the estimates are too high, by their own σ. So no estimate is a bound, but its
+lower 95 % limit is one, `NoiseFloor.least_a`: of 96 limits on axes of clean simulated cells, 2 are
+above the error of a fit of the right model. It is not tight: where a torque disturbs the arm, it is
+0.8 to 0.9 of that error, and less where standstill shows less.
 
-Standstill alone bounds nothing. The load of an axis that stands still changes while others move, and its integrator
-follows: in recordings of 40 s, 12 of 47 limits from standstill are above the error of the right model, by up to 58 %.
-Elsewhere it is a fraction of that error, 0.1 to 0.7 with a disturbance (`tests/studies/floor_study.py`). Such an
-estimate is shown as one, and is no noise floor (`NoiseFloor.is_bound`).
+Standstill alone bounds nothing. The load of an axis that stands still changes while others move,
+and its integrator follows: in recordings of 40 s, 12 of 47 limits from standstill are above the
+error of the right model, by up to 58 %. Elsewhere it is a fraction of that error, 0.1 to 0.7 with a
+disturbance (`tests/studies/floor_study.py`). Such an estimate is shown as one, and is no noise
+floor (`NoiseFloor.is_bound`).
 
-A source may still be no part of the noise in motion, as a brake that takes over the load at rest. An estimate far above
-the error of a model on rows in motion is refuted (`NoiseFloor.is_refuted`); a limit that chance has put above that
-error is shown as the error. Parts with one constant number (power stage off, brake on, one run given twice) are no
-measurement and are left out.
+A source may still be no part of the noise in motion, as a brake that takes over the load at rest.
+An estimate far above the error of a model on rows in motion is refuted (`NoiseFloor.is_refuted`); a
+limit that chance has put above that error is shown as the error. Parts with one constant number
+(power stage off, brake on, one run given twice) are no measurement and are left out.
 """
 
 from __future__ import annotations
@@ -64,16 +73,21 @@ from ident.data.dataset import LONGEST_MOVE_S, Dataset
 from ident.equations.rows import row_filter
 
 MIN_DWELLS = 8
-MIN_PAIRS = 4  #: Fewer than dwells: a stretch of motion is longer, and no brake or settling controller is in it
+#: Fewer than dwells: a stretch of motion is longer, and no brake or settling controller is in it
+MIN_PAIRS = 4
 MIN_FREEDOM = 20.0  #: σ is then known to 20 %
 PATH_TOLERANCE = 2e-3
-"""Largest distance between the paths of two repetitions, as a share of each axis's travel: the torques of both then
-differ by about as small a share, and a difference that is left makes the estimate too high, never too low."""
+"""Largest distance between the paths of two repetitions, as a share of each axis's travel: the
+torques of both then differ by about as small a share, and a difference that is left makes the
+estimate too high, never too low.
+"""
 DURATION_TOLERANCE = 0.1  #: Largest difference in duration: an axis creeps into its target
 CONFIDENCE = 0.95  #: That the noise is no less than the lower limit, one-sided
 REFUTED_SIGMAS = 3.0  #: Under a perfect model, one floor in 700 is refuted by chance
-_TREND = 3  #: Coefficients of the parabola: a straight line would leave the bend of a settling controller
-_MEDIAN_EFFICIENCY = 2.0 / np.pi  #: Efficiency of a median of many against their mean (van der Vaart 1998, §21.2)
+#: Coefficients of the parabola: a straight line would leave the bend of a settling controller
+_TREND = 3
+#: Efficiency of a median of many against their mean (van der Vaart 1998, §21.2)
+_MEDIAN_EFFICIENCY = 2.0 / np.pi
 
 
 class FloorSource(Enum):
@@ -89,9 +103,11 @@ class MotorNoiseFloor:
 
     noise_a: float  #: estimate of σ of the current in the observation's rows [A]
     source: FloorSource
-    parts: int  #: number of standstills, or of pairs of repeated moves, used; long ones count as several
+    #: number of standstills, or of pairs of repeated moves, used; long ones count as several
+    parts: int
     freedom: float  #: their degrees of freedom; pairs that share a move count less
-    is_bound: bool = False  #: whether repeated moves show no less: `least_a` then bounds the error of any model
+    #: whether repeated moves show no less: `least_a` then bounds the error of any model
+    is_bound: bool = False
 
     @property
     def std_percent(self) -> float:
@@ -102,10 +118,14 @@ class MotorNoiseFloor:
     def least_a(self) -> float:
         """Lower limit of this noise at CONFIDENCE [A]."""
         freedom = _MEDIAN_EFFICIENCY * self.freedom
-        return float(self.noise_a * np.sqrt(freedom / scipy.special.chdtri(freedom, 1.0 - CONFIDENCE)))
+        return float(
+            self.noise_a * np.sqrt(freedom / scipy.special.chdtri(freedom, 1.0 - CONFIDENCE))
+        )
 
     def is_refuted(self, left_a: float) -> bool:
-        """Whether a model leaves so little on rows in motion [A, root mean square] that the floor is too high."""
+        """Whether a model leaves so little on rows in motion [A,
+        root mean square] that the floor is too high.
+        """
         return bool(self.noise_a > (1.0 + REFUTED_SIGMAS * self.std_percent / 100.0) * left_a)
 
 
@@ -141,7 +161,10 @@ def noise_floors(
     parts_of = {FloorSource.STANDSTILL: _dwells, FloorSource.REPEATED_MOVES: _pairs}
     floors: list[MotorNoiseFloor | None] = []
     for motor in range(datasets[0].current_a.shape[1]):
-        made = [_floor(tuple(parts_of[source](datasets, conditioning, motor)), source) for source in sources]
+        made = [
+            _floor(tuple(parts_of[source](datasets, conditioning, motor)), source)
+            for source in sources
+        ]
         known = [floor for floor in made if floor is not None]
         smallest = min(known, key=lambda floor: floor.noise_a, default=None)
         if smallest is not None:
@@ -153,11 +176,16 @@ def noise_floors(
 
 def _floor(parts: Sequence[_Part], source: FloorSource) -> MotorNoiseFloor | None:
     """Weighted median of the parts, None if they are too few or too short."""
-    fewest = MIN_DWELLS if source is FloorSource.STANDSTILL else MIN_PAIRS
+    if source is FloorSource.STANDSTILL:
+        fewest = MIN_DWELLS
+    else:
+        fewest = MIN_PAIRS
     total = sum(part.weight for part in parts)
     if len(parts) < fewest or total < MIN_FREEDOM:
         return None
-    variance, freedom, weight = np.array([(part.variance_a2, part.freedom, part.weight) for part in parts]).T
+    variance, freedom, weight = np.array(
+        [(part.variance_a2, part.freedom, part.weight) for part in parts]
+    ).T
     likely = variance * freedom / scipy.special.chdtri(freedom, 0.5)
     order = np.argsort(likely)
     share = np.cumsum(weight[order]) / total
@@ -175,14 +203,23 @@ def _pairs(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
     for differences, rate_hz in _repetitions(datasets, motor):
         pairs = len(differences)
         for difference in differences:
-            yield from _parts(difference / np.sqrt(2.0), rate_hz, conditioning, share=2.0 * pairs / (3.0 * pairs - 1.0))
+            yield from _parts(
+                difference / np.sqrt(2.0),
+                rate_hz,
+                conditioning,
+                share=2.0 * pairs / (3.0 * pairs - 1.0),
+            )
 
 
-def _parts(signals: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0) -> Iterator[_Part]:
-    """Variance and freedom by the rows of each piece of a part; nothing where it is too short or constant.
+def _parts(
+    signals: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0
+) -> Iterator[_Part]:
+    """Variance and freedom by the rows of each piece of a part;
+    nothing where it is too short or constant.
 
     Args:
-        signals: the current [A], and after it what is subtracted from it by least squares, shape (s, k).
+        signals: the current [A], and after it what is subtracted from it by least squares, shape
+            (s, k).
         rate_hz: sampling rate.
         conditioning: the filter of the rows.
         share: of its freedom that a part adds to that of the others.
@@ -200,7 +237,11 @@ def _parts(signals: FloatArray, rate_hz: float, conditioning: Conditioning, shar
             taken, expected, freedom = _projection(np.column_stack((powers, *others)), correlation)
         else:
             taken, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, rows)
-        yield _Part(float(np.sum((current - taken @ (taken.T @ current)) ** 2)) / expected, freedom, share * freedom)
+        yield _Part(
+            float(np.sum((current - taken @ (taken.T @ current)) ** 2)) / expected,
+            freedom,
+            share * freedom,
+        )
 
 
 def _projection(columns: FloatArray, correlation: FloatArray) -> tuple[FloatArray, float, float]:
@@ -221,7 +262,9 @@ def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray
 def _stretches(flags: BoolArray) -> list[slice]:
     """Samples that follow each other and are all set, shape (k,)."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])).astype(np.int8)))
-    return [slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+    return [
+        slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,14 +276,18 @@ class _MoveChain:
     differences: tuple[FloatArray, ...]  #: of each and the one before, as of `_difference`
 
 
-def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tuple[FloatArray, ...], float]]:
+def _repetitions(
+    datasets: Sequence[Dataset], motor: int
+) -> Iterator[tuple[tuple[FloatArray, ...], float]]:
     """Differences between repetitions of each move of a motor, and their sampling rate [Hz].
 
-    A move of the motor is a stretch between two standstills or reversals of it, so that continuous motion has moves.
+    A move of the motor is a stretch between two standstills or reversals of it, so that continuous
+    motion has moves.
     """
     moved = np.any([data.moving.any(axis=0) for data in datasets], axis=0)
     travel = np.max([np.ptp(data.position_rad, axis=0) for data in datasets], axis=0)
-    scale = np.where(moved, 1.0 / np.where(moved, travel, 1.0), 0.0)  # an axis that rests throughout has no path
+    # An axis that rests throughout has no path
+    scale = np.where(moved, 1.0 / np.where(moved, travel, 1.0), 0.0)
     chains: list[_MoveChain] = []
     ends = np.empty((0, 2, len(scale)))  # of the last move of each chain
     for data in sorted(datasets, key=lambda data: data.started_s or 0.0):
@@ -262,15 +309,20 @@ def _repetitions(datasets: Sequence[Dataset], motor: int) -> Iterator[tuple[tupl
             yield chain.differences, chain.data.rate_hz
 
 
-def _difference(chain: _MoveChain, data: Dataset, part: slice, motor: int, scale: FloatArray) -> FloatArray | None:
-    """A move minus the last one of a chain: current [A] and accelerations of all axes, shape (1 + m, k).
+def _difference(
+    chain: _MoveChain, data: Dataset, part: slice, motor: int, scale: FloatArray
+) -> FloatArray | None:
+    """A move minus the last one of a chain:
+    current [A] and accelerations of all axes, shape (1 + m, k).
 
     None if it is no repetition.
 
-    The two are aligned by their paths, because neither log nor controller starts a move at a sample. With q' = q + λ q̇
-    where the later one is ahead by λ, λ is found by least squares over all axes, scaled by their travel.
+    The two are aligned by their paths, because neither log nor controller starts a move at a
+    sample. With q' = q + λ q̇ where the later one is ahead by λ, λ is found by least squares over
+    all axes, scaled by their travel.
     """
-    before, rate = chain.data, data.rate_hz
+    before = chain.data
+    rate = data.rate_hz
     lengths = (chain.part.stop - chain.part.start, part.stop - part.start)
     length = min(lengths)
     if (
@@ -281,7 +333,8 @@ def _difference(chain: _MoveChain, data: Dataset, part: slice, motor: int, scale
         return None
     first = slice(chain.part.start, chain.part.start + length)
     speed = before.velocity_rad_s[first] * scale
-    start, ahead = part.start, 0.0
+    start = part.start
+    ahead = 0.0
     for _ in range(2):
         start -= round(ahead)
         if start < 1 or start + length >= len(data.time_s):
@@ -303,7 +356,10 @@ def _signals(data: Dataset, part: slice, motor: int) -> FloatArray:
 def _of_length(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, FloatArray]:
     """Powers of time of so many rows, shape (rows, 3), and P, shape (rows, rows)."""
     filter_ = decimator(rate_hz, cutoff_hz)
-    lags, taps = filter_.factor * np.arange(rows), filter_.taps
-    of_lag = np.array([float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags])
+    lags = filter_.factor * np.arange(rows)
+    taps = filter_.taps
+    of_lag = np.array(
+        [float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags]
+    )
     correlation = of_lag[np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))] / of_lag[0]
     return np.vander(np.linspace(-1.0, 1.0, rows), _TREND), correlation

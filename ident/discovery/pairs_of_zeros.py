@@ -1,8 +1,8 @@
 """Zeros of two joints that are wrong at once, beside a fit.
 
-Where J2 is off by +5° and J3 by −5°, only the link between them is turned: what gravity does to it is that of another
-centre of mass, and the arm behind it hangs as it should. Neither zero explains anything alone. Both together are a
-candidate with two columns, and pass by the same tests as one.
+Where J2 is off by +5° and J3 by −5°, only the link between them is turned: what gravity does to it
+is that of another centre of mass, and the arm behind it hangs as it should. Neither zero explains
+anything alone. Both together are a candidate with two columns, and pass by the same tests as one.
 """
 
 from __future__ import annotations
@@ -59,9 +59,13 @@ def try_pairs(problem: SearchProblem, tested: Sequence[FamilyTrials]) -> tuple[P
             zeros[family.axis] = PlacedEffect(effect, family.axis)
             columns[family.axis] = problem.torque_at_rows(effect, family.axis)
     paired = list(combinations(zeros, 2))
-    torques = [np.concatenate((columns[first], columns[second]), axis=1) for first, second in paired]
+    torques = [
+        np.concatenate((columns[first], columns[second]), axis=1) for first, second in paired
+    ]
     pairs: list[PairOfZeros] = []
-    for (first, second), torque_nm, trial in zip(paired, torques, problem.trials(torques), strict=True):
+    for (first, second), torque_nm, trial in zip(
+        paired, torques, problem.trials(torques), strict=True
+    ):
         if trial is not None:
             pairs.append(PairOfZeros((zeros[first], zeros[second]), torque_nm, trial))
     return tuple(pairs)
@@ -79,13 +83,18 @@ def pairs_that_pass(
         gates: limits; the probability is that of the strongest of all pairs under noise.
     """
     trials = tuple(pair.trial for pair in pairs)
-    if all(probability_of_zero(trial.coefficients, trial.covariance) > SCREENED_CHANCE for trial in trials):
+    if all(
+        probability_of_zero(trial.coefficients, trial.covariance) > SCREENED_CHANCE
+        for trial in trials
+    ):
         return ()
     passed: list[PairOfZeros] = []
     for pair, chance in zip(pairs, chances(trials, rng, gates.draws), strict=True):
         fall = pair.fall(problem)
         share_of_folds = float(np.mean(fall > 0.0))
-        is_certain = np.all(np.abs(pair.trial.coefficients) > CERTAIN_SIGMAS * pair.trial.deviations)
+        is_certain = np.all(
+            np.abs(pair.trial.coefficients) > CERTAIN_SIGMAS * pair.trial.deviations
+        )
         is_better = fall.sum() > 0.0 and share_of_folds >= gates.folds_better
         if is_certain and is_better and chance <= gates.false_alarm:
             passed.append(pair)

@@ -1,7 +1,8 @@
 """Fit the settings of an effect that are refined together, beside everything else in the model.
 
-The fall of the squared residual is a smooth function of them, and each value costs products of columns, no refit. It is
-maximised by the simplex of Nelder and Mead (1965), which needs no derivatives and no scale.
+The fall of the squared residual is a smooth function of them, and each value costs products of
+columns, no refit. It is maximised by the simplex of Nelder and Mead (1965), which needs no
+derivatives and no scale.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import scipy  # loads scipy.optimize when it is first used
 
 from ident.arrays import FloatArray
 from ident.discovery.candidates import CandidateTrial, SearchProblem
-from ident.effects.effect import Effect, is_shipped, setting_range
+from ident.effects.effect import Effect, Range, is_shipped, setting_range
 
 MOST_TRIALS = 80  #: Of settings, in one refinement
 FIRST_STEP = 0.15  #: Of the simplex, in the unit of each setting
@@ -30,7 +31,8 @@ def is_strictly_possible(effect: Effect, trial: CandidateTrial) -> bool:
 
 
 def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
-    """Refine the settings in `Effect.refined_once_chosen`, or return the effect unchanged where none is better.
+    """Refine the settings in `Effect.refined_once_chosen`,
+    or return the effect unchanged where none is better.
 
     Args:
         search_problem: around the model without the effect.
@@ -41,20 +43,23 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
     ranges = [setting_range(effect, name) for name in names]
 
     def changed(values: Sequence[float] | FloatArray) -> Effect:
-        return effect.with_settings({n: float(f"{v:.{DIGITS}g}") for n, v in zip(names, values, strict=True)})
+        return effect.with_settings(
+            {n: float(f"{v:.{DIGITS}g}") for n, v in zip(names, values, strict=True)}
+        )
 
     def cost(values: FloatArray) -> float:
-        if not all(one.least <= value <= one.largest for one, value in zip(ranges, values, strict=True)):
+        if not all(
+            one.least <= value <= one.largest for one, value in zip(ranges, values, strict=True)
+        ):
             return 0.0  # it explains nothing
         (trial,) = search_problem.trials([search_problem.torque_at_rows(changed(values), axis)])
-        return -float(trial.fallen.sum()) if trial is not None and is_strictly_possible(effect, trial) else 0.0
+        if trial is not None and is_strictly_possible(effect, trial):
+            return -float(trial.fallen.sum())
+        return 0.0
 
     start = np.array([effect.settings[name] for name in names])
     unit = _units(effect, start)
-    steps = np.vstack((np.zeros(len(names)), FIRST_STEP * np.diag(unit)))
-    least = [one.least for one in ranges]
-    largest = [one.largest for one in ranges]
-    simplex = np.clip(start + steps, least, largest)
+    simplex = _first_simplex(start, unit, ranges)
 
     def cost_in_units(values: FloatArray) -> float:
         return cost(values * unit)
@@ -63,15 +68,39 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
         cost_in_units,
         start / unit,
         method="Nelder-Mead",
-        options={"initial_simplex": simplex / unit, "maxfev": MOST_TRIALS, "xatol": CLOSE_ENOUGH, "fatol": 0.1},
+        options={
+            "initial_simplex": simplex / unit,
+            "maxfev": MOST_TRIALS,
+            "xatol": CLOSE_ENOUGH,
+            "fatol": 0.1,
+        },
     )
     if found.fun >= cost(start):
         return effect
     return changed(found.x * unit)
 
 
+def _first_simplex(start: FloatArray, unit: FloatArray, ranges: Sequence[Range]) -> FloatArray:
+    """Corners of the simplex, shape (p + 1, p): the start, and a step of each setting from it.
+
+    A step beyond the range goes the other way: cut off at its end, the simplex would be flat, and
+    never leave the end.
+    """
+    corners = [start]
+    for place, allowed in enumerate(ranges):
+        step = min(FIRST_STEP * unit[place], 0.5 * (allowed.largest - allowed.least))
+        if start[place] + step > allowed.largest:
+            step = -step
+        corner = start.copy()
+        corner[place] += step
+        corners.append(corner)
+    return np.array(corners)
+
+
 def _units(effect: Effect, start: FloatArray) -> FloatArray:
-    """Unit in which each setting is changed: 1 rad or a ratio of 1 in the dictionary, else the size of its value."""
+    """Unit in which each setting is changed:
+    1 rad or a ratio of 1 in the dictionary, else the size of its value.
+    """
     if is_shipped(effect):
         return np.ones(len(start))
     return np.where(start == 0.0, 1.0, np.abs(start))

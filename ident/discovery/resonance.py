@@ -1,15 +1,18 @@
-"""Propose compliances and gaps of a flexible gear: where its resonance would lie in the band that the rows can see.
+"""Propose compliances and gaps of a flexible gear:
+where its resonance would lie in the band that the rows can see.
 
-A compliance means nothing by itself: 1e-4 rad/Nm puts the resonance of a heavy link at 10 Hz and that of a wrist at
-100 Hz. The dictionary therefore holds elasticity and backlash to first order, which is right far below the resonance,
-and this chapter gives each axis the compliances that put the resonance of its mean inertia at some frequencies. As
-these are many, they are tried on the joint itself first, and proposed only where one of them explains half of what the
-gates require. For backlash, pairs of gap and compliance are tried where the residual gathers at turns of the torque,
+A compliance means nothing by itself: 1e-4 rad/Nm puts the resonance of a heavy link at 10 Hz and
+that of a wrist at 100 Hz. The dictionary therefore holds elasticity and backlash to first order,
+which is right far below the resonance, and this chapter gives each axis the compliances that put
+the resonance of its mean inertia at some frequencies. As these are many, they are tried on the
+joint itself first, and proposed only where one of them explains half of what the gates require. For
+backlash, pairs of gap and compliance are tried where the residual gathers at turns of the torque,
 and the neighbours of the best pair are proposed.
 
-What was chosen gets its form and its finer settings in `refined_gear`: the link's friction acts as the motor moves, or
-holds the link by itself until the gear pushes it (`ident.effects.twist`). Where the mass matrix of an axis contains the
-rotor, which does not move behind the gear, some shares of it are tried as the rotor's inertia.
+What was chosen gets its form and its finer settings in `refined_gear`: the link's friction acts as
+the motor moves, or holds the link by itself until the gear pushes it (`ident.effects.twist`). Where
+the mass matrix of an axis contains the rotor, which does not move behind the gear, some shares of
+it are tried as the rotor's inertia.
 """
 
 from __future__ import annotations
@@ -34,7 +37,9 @@ from ident.equations.rows import decimate_rows
 Families = tuple[tuple[Effect, ...], ...]
 
 FREQUENCIES_HZ = (6.0, 8.0, 11.0, 15.0, 20.0, 27.0, 36.0)
-"""From below the band of the moves to far above that of the rows, 20 Hz, where the first order is right."""
+"""From below the band of the moves to far above that of the rows, 20 Hz,
+where the first order is right.
+"""
 DAMPING_RATIOS = (0.1, 0.25)
 HALF_GAPS_RAD = (2e-4, 3.2e-4, 5e-4, 8e-4, 1.3e-3, 2e-3, 3.2e-3, 5e-3, 8e-3)
 FLANKS_HZ = (15.0, 25.0, 40.0)
@@ -47,9 +52,12 @@ SCREENED = 0.5  #: Share of the gates' least share below which nothing is propos
 
 
 def propose_resonances(
-    search_problem: SearchProblem, gates: Gates, kinds: Collection[type[Effect]] = (Elasticity, Backlash)
+    search_problem: SearchProblem,
+    gates: Gates,
+    kinds: Collection[type[Effect]] = (Elasticity, Backlash),
 ) -> Mapping[int, Families]:
-    """Return a family of elasticity for each axis whose residual could hold one, and one of backlash.
+    """Return a family of elasticity for each axis whose residual could hold one,
+    and one of backlash.
 
     Only effects of these kinds are proposed.
     """
@@ -59,18 +67,27 @@ def propose_resonances(
     for axis in range(search_problem.axes):
         inertia = float(np.mean([np.mean(run.inertia(axis, axis)) for run in search_problem.runs]))
         if inertia > 0.0:
-            found = (make(search_problem, axis, inertia, least) for kind, make in makers.items() if kind in kinds)
+            found = (
+                make(search_problem, axis, inertia, least)
+                for kind, make in makers.items()
+                if kind in kinds
+            )
             proposed[axis] = tuple(family for family in found if family)
     return {axis: families for axis, families in proposed.items() if families}
 
 
-def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: float) -> tuple[Effect, ...]:
+def _elastic(
+    search_problem: SearchProblem, axis: int, inertia: float, least: float
+) -> tuple[Effect, ...]:
     compliances = _compliances(inertia, FREQUENCIES_HZ)
 
     def bent(run: Signals) -> FloatArray:
         own = run.inertia(axis, axis)
         torque = run.link_torque(axis)
-        passed = [spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1]) for one in compliances[::2]]
+        passed = [
+            spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1])
+            for one in compliances[::2]
+        ]
         return -own * np.stack([curvature(one, run.rate_hz) for one in passed])
 
     if max(shares_explained(search_problem, _tried(search_problem, axis, bent))) < least:
@@ -79,7 +96,9 @@ def _elastic(search_problem: SearchProblem, axis: int, inertia: float, least: fl
     return (Elasticity(), *plain)
 
 
-def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: float) -> tuple[Effect, ...]:
+def _with_gap(
+    search_problem: SearchProblem, axis: int, inertia: float, least: float
+) -> tuple[Effect, ...]:
     if _gathered_at_turns(search_problem, axis) < least:
         return ()
     pairs = [(gap, one) for one in _compliances(inertia, FLANKS_HZ) for gap in HALF_GAPS_RAD]
@@ -89,7 +108,9 @@ def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: f
     if shares[best] < least:
         return ()
     flank, place = divmod(best, len(HALF_GAPS_RAD))
-    near = [(flank, place + step) for step in (-1, 0, 1)] + [(flank + step, place) for step in (-1, 1)]
+    near = [(flank, place + step) for step in (-1, 0, 1)] + [
+        (flank + step, place) for step in (-1, 1)
+    ]
     return tuple(
         gears[len(HALF_GAPS_RAD) * row + column]
         for row, column in near
@@ -98,9 +119,11 @@ def _with_gap(search_problem: SearchProblem, axis: int, inertia: float, least: f
 
 
 def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
-    """Return a gear that is not rigid in the form, and with the settings, that explain most; any other effect as it is.
+    """Return a gear that is not rigid in the form, and with the settings, that explain most;
+    any other effect as it is.
 
-    Both forms are tried: a link whose friction acts as its motor moves, and one that its own friction holds.
+    Both forms are tried: a link whose friction acts as its motor moves, and one that its own
+    friction holds.
 
     Args:
         search_problem: around the model without the effect.
@@ -115,21 +138,27 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
         shares: list[float] = []
         for rotor in _rotors(search_problem, axis) if held else (0.0,):
             for ratio in HELD_DAMPING if held else (effect.damping_ratio,):
-                form = replace(effect, held=held, sags=1, rotor_inertia_kg_m2=rotor, damping_ratio=ratio)
+                form = replace(
+                    effect, held=held, sags=1, rotor_inertia_kg_m2=rotor, damping_ratio=ratio
+                )
                 gears = gears_around(form)
                 tried += gears
                 shares += _explained(search_problem, axis, gears)
         forms.append(tried[int(np.argmax(shares))])
     trials = search_problem.trials(search_problem.torque(form, axis) for form in forms)
     falls = [
-        float(trial.fallen.sum()) if trial is not None and is_strictly_possible(form, trial) else 0.0
+        float(trial.fallen.sum())
+        if trial is not None and is_strictly_possible(form, trial)
+        else 0.0
         for form, trial in zip(forms, trials, strict=True)
     ]
     return forms[int(np.argmax(falls))]
 
 
 def gears_around(gear: Effect) -> list[Effect]:
-    """Return gears that are stiffer and softer than one, and have larger and smaller gaps where it has one."""
+    """Return gears that are stiffer and softer than one,
+    and have larger and smaller gaps where it has one.
+    """
     around: list[Effect] = []
     if not isinstance(gear, Elasticity | Backlash):
         return around
@@ -145,7 +174,9 @@ def gears_around(gear: Effect) -> list[Effect]:
 
 
 def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
-    """Inertias to be tried for the rotor of an axis [kg m²]: none where it is no part of the mass matrix."""
+    """Inertias to be tried for the rotor of an axis [kg m²]:
+    none where it is no part of the mass matrix.
+    """
     is_known = search_problem.runs[0].rotor_inertia(axis) > 0.0
     if is_known or axis not in axes_with_rotor_in_load(search_problem.observation):
         return (0.0,)
@@ -154,7 +185,9 @@ def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
 
 
 def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Effect]) -> list[float]:
-    """Share of the squared residual that gears explain on the joint itself; all have one damping, form and rotor."""
+    """Share of the squared residual that gears explain on the joint itself;
+    all have one damping, form and rotor.
+    """
     common = gears[0].settings
     gaps = np.array([gear.settings.get("half_gap_rad", 0.0) for gear in gears])
     compliances = np.array([gear.settings["resonant_rad_nm"] for gear in gears])
@@ -165,25 +198,36 @@ def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Effect]
         found = twists(link_of(signals, axis, held=bool(common["held"])), several)
         return found.passed_nm - signals.gear_torque(axis)
 
-    return [float(share) for share in shares_explained(search_problem, _tried(search_problem, axis, behind))]
+    return [
+        float(share)
+        for share in shares_explained(search_problem, _tried(search_problem, axis, behind))
+    ]
 
 
 def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
-    """Share of a motor's squared residual by which rows after a turn of the joint's torque exceed the others.
+    """Share of a motor's squared residual by which rows after a turn of the joint's torque exceed
+    the others.
 
-    Whatever a gap does, it does there; its first order follows the torque so badly that it cannot screen.
+    Whatever a gap does, it does there; its first order follows the torque so badly that it cannot
+    screen.
     """
     near: list[BoolArray] = []
     for run in search_problem.rows:
         turned = np.diff(np.sign(run.gear_torque(axis)), prepend=0.0) != 0.0
-        near.append(np.convolve(turned, np.ones(round(SETTLED_S * run.rate_hz)))[: len(turned)] > 0.0)
-    is_near, problem = np.concatenate(near), search_problem.folds.linearisation
+        near.append(
+            np.convolve(turned, np.ones(round(SETTLED_S * run.rate_hz)))[: len(turned)] > 0.0
+        )
+    is_near = np.concatenate(near)
+    problem = search_problem.folds.linearisation
     shares = [0.0]
     for motor in np.flatnonzero(search_problem.model.drive_train.to_motor[:, axis]):
         rows = problem.motor == motor
-        square, here = problem.residual[rows] ** 2, is_near[problem.source[rows]]
+        square = problem.residual[rows] ** 2
+        here = is_near[problem.source[rows]]
         if here.any() and not here.all():
-            shares.append(float(here.sum() * (square[here].mean() - square[~here].mean()) / square.sum()))
+            shares.append(
+                float(here.sum() * (square[here].mean() - square[~here].mean()) / square.sum())
+            )
     return max(shares)
 
 
@@ -198,10 +242,14 @@ def _rounded(setting: float) -> float:
 def _tried(
     search_problem: SearchProblem, axis: int, added: Callable[[Signals], FloatArray]
 ) -> tuple[CandidateTrial | None, ...]:
-    """Test gears by their torque on the joint itself: a sixth of the work of all joints on a six-axis arm."""
-    conditioning, runs = search_problem.observation.conditioning, search_problem.runs
+    """Test gears by their torque on the joint itself:
+    a sixth of the work of all joints on a six-axis arm.
+    """
+    conditioning = search_problem.observation.conditioning
+    runs = search_problem.runs
     rows = [
-        decimate_rows(data, conditioning, added(run)) for run, data in zip(runs, search_problem.datasets, strict=True)
+        decimate_rows(data, conditioning, added(run))
+        for run, data in zip(runs, search_problem.datasets, strict=True)
     ]
     columns = np.concatenate(rows, axis=-1)
     torque = np.zeros((search_problem.axes, *columns.shape))

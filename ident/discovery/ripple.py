@@ -1,22 +1,25 @@
-"""Propose orders of torque ripple that are no whole numbers: a periodogram of the residual against an axis' angle.
+"""Propose orders of torque ripple that are no whole numbers:
+a periodogram of the residual against an axis' angle.
 
-A belt, a strain-wave gear or a cam gives ripple at an order k that no list holds. With a candidate a cos kθ + b sin kθ
-at full rate, filtered into rows by D and whitened by w, its score is
+A belt, a strain-wave gear or a cam gives ripple at an order k that no list holds. With a candidate
+a cos kθ + b sin kθ at full rate, filtered into rows by D and whitened by w, its score is
 
     S(k) = Σ_t (Dᵀ w e)_t exp(−i k θ_t).
 
-So the residual e of the rows is spread over the samples by the adjoint of the decimation, summed in bins of θ, and a
-Fourier transform of the bins gives all orders at once, move by move. With S_m of the moves as vectors of two numbers,
+So the residual e of the rows is spread over the samples by the adjoint of the decimation, summed in
+bins of θ, and a Fourier transform of the bins gives all orders at once, move by move. With S_m of
+the moves as vectors of two numbers,
 
     T(k) = SᵀV⁻¹S,        S = Σ S_m,        V = Σ S_m S_mᵀ,
 
-needs no model of the noise: it is that of moves as a whole. Orders are searched, so an order is proposed only if its T
-exceeds the largest of all orders, angles and axes in 99 % of draws that give every move a random sign
-(`Gates.false_alarm`; V does not change with the signs). A proposed order then has to pass all gates of the search,
-beside all other candidates.
+needs no model of the noise: it is that of moves as a whole. Orders are searched, so an order is
+proposed only if its T exceeds the largest of all orders, angles and axes in 99 % of draws that give
+every move a random sign (`Gates.false_alarm`; V does not change with the signs). A proposed order
+then has to pass all gates of the search, beside all other candidates.
 
-Lines closer than one period over the range of the angle cannot be separated. Orders of less than four periods over it
-are left to gravity, springs, compensators and smooth functions of the position.
+Lines closer than one period over the range of the angle cannot be separated. Orders of less than
+four periods over it are left to gravity, springs, compensators and smooth functions of the
+position.
 """
 
 from __future__ import annotations
@@ -40,10 +43,13 @@ FEWEST_PERIODS = 4.0  #: Over the range of the angle
 BINS_A_PERIOD = 8  #: Of the highest order: rounding an angle to its bin takes 3 % of that line
 STEPS_A_LINE = 2  #: Orders of the periodogram within the width of a line, one period over the range
 FAMILY = (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""Members of a proposed family around its order, in sixths of a line's width: the refinement needs neighbours."""
+"""Members of a proposed family around its order, in sixths of a line's width:
+the refinement needs neighbours.
+"""
 LINES_AN_AXIS = 2  #: Most orders proposed at once
 DRAWS = 199  #: Of random signs; the smallest probability is 1/200
-HOPELESS = 0.3  #: Probability that independent orders reach the largest T, above which no draw is made
+#: Probability that independent orders reach the largest T, above which no draw is made
+HOPELESS = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,19 +65,26 @@ class Periodogram:
     def statistic(self, signs: FloatArray) -> FloatArray:
         """T of every order with these signs of the moves, shape (draws, moves) → (draws, k)."""
         cosine, sine = self.scores
-        a, b, c = np.sum(cosine**2, axis=0), np.sum(cosine * sine, axis=0), np.sum(sine**2, axis=0)
+        a = np.sum(cosine**2, axis=0)
+        b = np.sum(cosine * sine, axis=0)
+        c = np.sum(sine**2, axis=0)
         determinant = a * c - b**2
         usable = determinant > 1e-9 * (a * c + np.finfo(np.float32).tiny)
         signs = signs.astype(cosine.dtype)  # halves the work of the two products
-        x, y = signs @ cosine, signs @ sine
+        x = signs @ cosine
+        y = signs @ sine
         square = (c * x**2 - 2.0 * b * x * y + a * y**2) / np.where(usable, determinant, 1.0)
         return np.asarray(np.where(usable, square, 0.0))
 
 
 def propose_orders(
-    search_problem: SearchProblem, effects: Iterable[PlacedEffect], rng: np.random.Generator, gates: Gates
+    search_problem: SearchProblem,
+    effects: Iterable[PlacedEffect],
+    rng: np.random.Generator,
+    gates: Gates,
 ) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
-    """Find lines in the residual that noise does not make, as families of ripple for the search, by axis.
+    """Find lines in the residual that noise does not make, as families of ripple for the search,
+    by axis.
 
     Args:
         search_problem: the residual.
@@ -94,10 +107,16 @@ def propose_orders(
     signs = rng.choice((-1.0, 1.0), size=(DRAWS, clusters))
     largest = np.max([one.statistic(signs).max(axis=1) for one in made], axis=0)
     limit = float(np.quantile(largest, 1.0 - gates.false_alarm, method="higher"))
-    known = {(placed.axis, *_line(placed.effect)) for placed in effects if isinstance(placed.effect, Ripple | Cogging)}
+    known = {
+        (placed.axis, *_line(placed.effect))
+        for placed in effects
+        if isinstance(placed.effect, Ripple | Cogging)
+    }
     proposed: dict[int, tuple[tuple[Effect, ...], ...]] = {}
     for one, statistic in zip(made, observed, strict=True):
-        taken = [order for axis, of_joint, order in known if (axis, of_joint) == (one.axis, one.of_joint)]
+        taken = [
+            order for axis, of_joint, order in known if (axis, of_joint) == (one.axis, one.of_joint)
+        ]
         families = tuple(_family(one, order) for order in _peaks(one, statistic, limit, taken))
         if families:
             proposed[one.axis] = (*proposed.get(one.axis, ()), *families)
@@ -105,8 +124,13 @@ def propose_orders(
 
 
 def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Periodogram | None:
-    """Score all orders of ripple on one angle of an axis; None where it turns too little for a line."""
-    angles = [(run.position_rad if of_joint else run.motor_position_rad)[axis] for run in search_problem.runs]
+    """Score all orders of ripple on one angle of an axis;
+    None where it turns too little for a line.
+    """
+    angles = [
+        (run.position_rad if of_joint else run.motor_position_rad)[axis]
+        for run in search_problem.runs
+    ]
     lowest = min(float(angle.min()) for angle in angles)
     range_rev = (max(float(angle.max()) for angle in angles) - lowest) / (2.0 * np.pi)
     largest = LARGEST_ORDER[of_joint]
@@ -114,11 +138,17 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
         return None
     width_rev = 1.0 / (BINS_A_PERIOD * largest)
     bins = _fast_length(STEPS_A_LINE * range_rev / width_rev)
-    first, last = int(np.ceil(STEPS_A_LINE * FEWEST_PERIODS)), bins // BINS_A_PERIOD
+    first = int(np.ceil(STEPS_A_LINE * FEWEST_PERIODS))
+    last = bins // BINS_A_PERIOD
     places = [((angle - lowest) / (2.0 * np.pi * width_rev)).astype(np.int64) for angle in angles]
-    problem, observation = search_problem.folds.linearisation, search_problem.observation
-    torque = search_problem.model.drive_train.to_motor[:, axis] if of_joint else np.eye(search_problem.axes)[axis]
-    # A whitened line is T_D times its torque at the axes. T_D = P D⁻¹ and P e = e: T_Dᵀe = D⁻¹e, also with preload.
+    problem = search_problem.folds.linearisation
+    observation = search_problem.observation
+    if of_joint:
+        torque = search_problem.model.drive_train.to_motor[:, axis]
+    else:
+        torque = np.eye(search_problem.axes)[axis]
+    # A whitened line is T_D times its torque at the axes. T_D = P D⁻¹ and P e = e: T_Dᵀe = D⁻¹e,
+    # also with preload.
     weights = torque * problem.gamma / problem.noise
     filters = [row_filter(data, observation.conditioning) for data in search_problem.datasets]
     # A line is decorrelated as the residual was: (V^(−1/2)Φ)ᵀe = Φᵀ(V^(−1/2)e).
@@ -130,7 +160,8 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
             continue
         source = problem.source[rows]
         run = int(observation.run[source[0]])
-        begin, end = int(source.min()), int(source.max())
+        begin = int(source.min())
+        end = int(source.max())
         filter_ = filters[run]
         stuffed = np.zeros((end - begin) * filter_.factor + 1)
         stuffed[(source - begin) * filter_.factor] = weights[motor] * residual[rows]
@@ -144,7 +175,8 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
 
 
 def _fast_length(least: float) -> int:
-    """Smallest length from there on whose Fourier transform is fast; one of a prime length takes twenty times as long.
+    """Smallest length from there on whose Fourier transform is fast;
+    one of a prime length takes twenty times as long.
 
     The bins beyond the range stay empty.
     """
@@ -153,19 +185,25 @@ def _fast_length(least: float) -> int:
 
 
 def _angles(search_problem: SearchProblem, axis: int) -> tuple[int, ...]:
-    """Angles that show different lines: where the motor turns with its joint alone, the joint's adds nothing."""
+    """Angles that show different lines: where the motor turns with its joint alone,
+    the joint's adds nothing.
+    """
     alone = np.count_nonzero(search_problem.model.drive_train.ratio[axis]) == 1
     return (0,) if alone else (0, 1)
 
 
 def _independent_probability(observed: Sequence[FloatArray], clusters: int) -> float:
-    """Probability that one of so many independent orders reaches the largest T: T/m has a beta distribution."""
+    """Probability that one of so many independent orders reaches the largest T:
+    T/m has a beta distribution.
+    """
     count = sum(len(statistic) for statistic in observed) / STEPS_A_LINE
     largest = min(max(float(statistic.max(initial=0.0)) for statistic in observed) / clusters, 1.0)
     return float(count * (1.0 - largest) ** (0.5 * (clusters - 2)))
 
 
-def _peaks(one: Periodogram, statistic: FloatArray, limit: float, taken: Sequence[float]) -> list[float]:
+def _peaks(
+    one: Periodogram, statistic: FloatArray, limit: float, taken: Sequence[float]
+) -> list[float]:
     """Orders of the highest lines above the limit, none within a line's width of another one."""
     chosen: list[float] = []
     for index in np.argsort(-statistic):
@@ -179,7 +217,9 @@ def _peaks(one: Periodogram, statistic: FloatArray, limit: float, taken: Sequenc
 
 def _family(one: Periodogram, order: float) -> tuple[Effect, ...]:
     width = 1.0 / one.range_rev
-    return tuple(Ripple(float(f"{order + step * width / 6.0:.6g}"), one.of_joint) for step in FAMILY)
+    return tuple(
+        Ripple(float(f"{order + step * width / 6.0:.6g}"), one.of_joint) for step in FAMILY
+    )
 
 
 def _line(effect: Effect) -> tuple[int, float]:

@@ -1,9 +1,11 @@
-"""Propose what the rotor takes of the load, for losses at the gear of an axis whose load contains the rotor.
+"""Propose what the rotor takes of the load, for losses at the gear of an axis whose load contains
+the rotor.
 
-Which axes these are follows from the base parameters: the column of the rotor's inertia depends on columns of links.
-There `load-friction` and `efficiency` are proposed in a second form, with the rotor's inertia as a setting and the
-rest of it as a coefficient (`ident.effects.rotor`). It is tried only where the plain form explains what the gates
-require, so a search without such a loss costs a few trials.
+Which axes these are follows from the base parameters: the column of the rotor's inertia depends on
+columns of links. There `load-friction` and `efficiency` are proposed in a second form, with the
+rotor's inertia as a setting and the rest of it as a coefficient (`ident.effects.rotor`). It is
+tried only where the plain form explains what the gates require, so a search without such a loss
+costs a few trials.
 """
 
 from __future__ import annotations
@@ -23,15 +25,19 @@ from ident.errors import EffectRefused
 
 Families = tuple[tuple[Effect, ...], ...]
 
-SMALLEST_EIGENVALUE = 1e-6  #: Of the mass matrix of a redundant drive, in parts of the largest, that is not zero
+#: Of the mass matrix of a redundant drive, in parts of the largest, that is not zero
+SMALLEST_EIGENVALUE = 1e-6
 MOST_STEPS = 6  #: Of a rotor's inertia; each is a fraction of the one before
 SETTLED_SHARE = 0.01  #: Of the largest inertia, a step after which the joint fit does the rest
 CLOSE_ENOUGH = 0.1  #: Standard deviations of the inertia below which a step no longer matters
 
 
 def axes_with_rotor_in_load(observation: Observation) -> tuple[int, ...]:
-    """Indices of the axes whose predicted load contains the rotor's torque, because links move the same way."""
-    model, base = observation.model, observation.base
+    """Indices of the axes whose predicted load contains the rotor's torque,
+    because links move the same way.
+    """
+    model = observation.model
+    base = observation.base
     links = set(model.link_columns.ravel().tolist())
     of_links = np.array([column in links for column in base.independent])
     found = []
@@ -43,9 +49,13 @@ def axes_with_rotor_in_load(observation: Observation) -> tuple[int, ...]:
 
 
 def propose_rotors(
-    search_problem: SearchProblem, gates: Gates, families: Families, proposed: Mapping[int, Families]
+    search_problem: SearchProblem,
+    gates: Gates,
+    families: Families,
+    proposed: Mapping[int, Families],
 ) -> dict[int, Families]:
-    """Return each family of losses with the form that leaves the rotor out, for each axis that needs it.
+    """Return each family of losses with the form that leaves the rotor out,
+    for each axis that needs it.
 
     Args:
         search_problem: around the model.
@@ -63,18 +73,23 @@ def propose_rotors(
             shares = shares_explained(search_problem, [trial for _, trial in tested.members])
             if max(shares) < gates.smallest_share:
                 continue
-            forms = [without_rotor(search_problem, effect, trial, axis) for effect, trial in tested.members]
+            forms = [
+                without_rotor(search_problem, effect, trial, axis)
+                for effect, trial in tested.members
+            ]
             better = tuple(effect for effect in forms if effect is not None)
             if better:
                 found[axis] = (*found.get(axis, ()), (*family, *better))
     return found
 
 
-def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequence[str]) -> tuple[PlacedEffect, ...]:
+def declared_forms(
+    placed: PlacedEffect, observation: Observation, axes: Sequence[str]
+) -> tuple[PlacedEffect, ...]:
     """Return the forms in which a declared effect may be fitted, the best first.
 
-    A loss leaves the rotor out where the load contains it and no inertia is declared; a declared one, as from a data
-    sheet, is kept.
+    A loss leaves the rotor out where the load contains it and no inertia is declared; a declared
+    one, as from a data sheet, is kept.
 
     Args:
         placed: the declared effect.
@@ -91,8 +106,9 @@ def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequenc
     contains_rotor = placed.axis in axes_with_rotor_in_load(observation)
     if given and not contains_rotor:
         raise EffectRefused(
-            f"the declared {placed.name_among(axes)} is given a rotor; the load of that axis does not contain its "
-            "rotor's inertia, which is a parameter of its own: leave rotor_inertia_kg_m2 and with_rotor out"
+            f"the declared {placed.name_among(axes)} is given a rotor; the load of that axis does "
+            "not contain its rotor's inertia, which is a parameter of its own: leave "
+            "rotor_inertia_kg_m2 and with_rotor out"
         )
     if given or not contains_rotor:
         return (placed,)
@@ -100,10 +116,14 @@ def declared_forms(placed: PlacedEffect, observation: Observation, axes: Sequenc
     return (replace(placed, effect=fitted), placed)
 
 
-def without_rotor(search_problem: SearchProblem, effect: Effect, plain: CandidateTrial, axis: int) -> Effect | None:
-    """Return the form of a loss that leaves the rotor out, with the inertia that fits best; None where none is better.
+def without_rotor(
+    search_problem: SearchProblem, effect: Effect, plain: CandidateTrial, axis: int
+) -> Effect | None:
+    """Return the form of a loss that leaves the rotor out, with the inertia that fits best;
+    None where none is better.
 
-    Its second coefficient costs certainty: where the moves do not show the rotor, they are predicted worse with it.
+    Its second coefficient costs certainty: where the moves do not show the rotor, they are
+    predicted worse with it.
 
     Args:
         search_problem: around the model.
@@ -130,12 +150,17 @@ def without_rotor(search_problem: SearchProblem, effect: Effect, plain: Candidat
 
 
 def refined_rotor(
-    search_problem: SearchProblem, effect: Effect, axis: int, coefficients: FloatArray, deviations: FloatArray
+    search_problem: SearchProblem,
+    effect: Effect,
+    axis: int,
+    coefficients: FloatArray,
+    deviations: FloatArray,
 ) -> Effect:
-    """Return a loss with the rotor's inertia that its fit calls for, or the same effect where that is close enough.
+    """Return a loss with the rotor's inertia that its fit calls for,
+    or the same effect where that is close enough.
 
-    Where the fit calls for a rotor whose inertia is certainly negative, the data show none: the loss then multiplies
-    the load with the rotor in it.
+    Where the fit calls for a rotor whose inertia is certainly negative, the data show none: the
+    loss then multiplies the load with the rotor in it.
 
     Args:
         search_problem: around the fit.
@@ -155,18 +180,21 @@ def refined_rotor(
 
 
 def largest_inertia(search_problem: SearchProblem, axis: int) -> float:
-    """Return the largest inertia that the rotor of an axis can have [kg m²]: links have no negative one.
+    """Return the largest inertia that the rotor of an axis can have [kg m²]:
+    links have no negative one.
 
-    With M the mass matrix that contains it, M − J e eᵀ has no negative eigenvalue for J ≤ 1/(eᵀ M⁺ e). M_jj, which is
-    larger, is used where M is invertible: it needs no other estimate than its own. The least of all postures counts;
-    zero where the model has none.
+    With M the mass matrix that contains it, M − J e eᵀ has no negative eigenvalue for J ≤ 1/(eᵀ M⁺
+    e). M_jj, which is larger, is used where M is invertible: it needs no other estimate than its
+    own. The least of all postures counts; zero where the model has none.
     """
     least = np.inf
     for run in search_problem.runs:
         inertia_kg_m2 = run.inertia_kg_m2[axis, axis]
         if search_problem.model.is_redundant:
             by_posture = np.moveaxis(run.inertia_kg_m2, -1, 0)
-            mobility = np.linalg.pinv(by_posture, rcond=SMALLEST_EIGENVALUE, hermitian=True)[:, axis, axis]
+            mobility = np.linalg.pinv(by_posture, rcond=SMALLEST_EIGENVALUE, hermitian=True)[
+                :, axis, axis
+            ]
             inertia_kg_m2 = 1.0 / mobility
         least = min(least, float(np.min(inertia_kg_m2)))
     return max(0.0, least)

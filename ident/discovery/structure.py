@@ -1,7 +1,8 @@
-"""Find structure that no named effect explains, and the size of an effect that would have been found.
+"""Find structure that no named effect explains,
+and the size of an effect that would have been found.
 
-Candidates are smooth functions of one variable and periodic ones of the motor's angle (`ident.effects.unnamed`). They
-pass the same gates as named effects (`ident.discovery.search`).
+Candidates are smooth functions of one variable and periodic ones of the motor's angle
+(`ident.effects.unnamed`). They pass the same gates as named effects (`ident.discovery.search`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import SearchProblem
+from ident.discovery.candidates import FamilyTrials, SearchProblem
 from ident.discovery.gates import Gates
 from ident.discovery.search import Finding, is_better, rank_families
 from ident.effects.effect import Effect
@@ -30,22 +31,29 @@ VARIABLES = (
     (Abscissa.TORQUE_RATE, (0,)),
     (Abscissa.LOAD_CURVATURE, (0,)),
 )
-"""Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
-MUCH_MORE = 0.15  #: Share by which a term must explain more than a named effect to call the name wrong
+"""Each variable, and whether its function is tried as it is (0)
+or turning with the direction of motion (1).
+"""
+#: Share by which a term must explain more than a named effect to call the name wrong
+MUCH_MORE = 0.15
 MIN_MOVES_FOR_STRUCTURE = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
 TAIL = 0.005
-"""Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
+"""Share of the samples cut off at either end of a variable's range,
+where a spline would rest on a handful of them.
+"""
 
 
 def find_structure(
     search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
-    """Find variables that the residual of some axes depends on, the best on held-out moves first."""
+    """Find variables that the residual of some axes depends on,
+    the best on held-out moves first.
+    """
     if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
         return ()  # a term of many coefficients would fit the few moves
-    tested = [
-        found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
-    ]
+    tested: list[FamilyTrials] = []
+    for axis in axes:
+        tested.extend(search_problem.test(_families(search_problem, axis), axis, at_rows=True))
     return rank_families(search_problem, tested, rng, gates)
 
 
@@ -59,11 +67,12 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
 
 
 def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
-    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (m,).
+    """Compute the torque of a detectable effect at each motor,
+    root mean square over the moving rows, shape (m,).
 
-    It is torque that the declared model cannot mimic: most of an effect that resembles gravity or viscous friction is
-    absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short
-    recording noise raises it.
+    It is torque that the declared model cannot mimic: most of an effect that resembles gravity or
+    viscous friction is absorbed by those. The limit holds for effects whose shape the dictionary or
+    a spline can follow; on a short recording noise raises it.
     """
     problem = search_problem.folds.linearisation
     square = np.bincount(problem.motor, problem.residual**2) / np.bincount(problem.motor)
@@ -83,7 +92,9 @@ def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, .
     families.append((Periodic(0), Periodic(1)))
     for other in range(search_problem.axes):
         if other != axis:
-            term = _ranged(search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
+            term = _ranged(
+                search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis
+            )
             families.append((replace(term, signed=1), replace(term, signed=0)))
     return tuple(families)
 

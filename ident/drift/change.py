@@ -1,30 +1,33 @@
-"""Significance of changed gains: one change against its noise, all changes of a recalibration, and the pattern of many.
+"""Significance of changed gains: one change against its noise, all changes of a recalibration,
+and the pattern of many.
 
-Recordings of different days are independent, so σ of a difference is the root of the sum of squares. But σ of a single
-fit covers one session: repeated sessions scatter more (friction warms up, magnets too). Every function here therefore
-takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions` estimates it from a
-history.
+Recordings of different days are independent, so σ of a difference is the root of the sum of
+squares. But σ of a single fit covers one session: repeated sessions scatter more (friction warms
+up, magnets too). Every function here therefore takes a *dispersion*, the ratio of the scatter of
+repeated calibrations to their σ; `dispersions` estimates it from a history.
 
-Control chart of one gain over many calibrations: CUSUM, single points, and the line through all of them.
+Control chart of one gain over many calibrations: CUSUM, single points, and the line through all of
+them.
 
-With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery, Introduction to Statistical
-Quality Control, ch. 9)::
+With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery,
+Introduction to Statistical Quality Control, ch. 9)::
 
     C⁺ᵢ = max(0, C⁺ᵢ₋₁ + zᵢ − k),   C⁻ᵢ = max(0, C⁻ᵢ₋₁ − zᵢ − k),   alarm where either exceeds h
 
-The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while there are fewer, of
-all that came before (Hawkins 1987), so that the zᵢ are independent and the chart watches from the second one on. The
-baseline's own uncertainty is part of the σ of zᵢ.
+The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while
+there are fewer, of all that came before (Hawkins 1987), so that the zᵢ are independent and the
+chart watches from the second one on. The baseline's own uncertainty is part of the σ of zᵢ.
 
-A drift during the first calibrations becomes part of the baseline. The slope of the straight line through all
-calibrations needs no baseline: with gᵢ the gain of calibration i = 1 … n and wᵢ = 1/σᵢ² (weighted least squares; Draper
-& Smith, Applied Regression Analysis, ch. 9)::
+A drift during the first calibrations becomes part of the baseline. The slope of the straight line
+through all calibrations needs no baseline: with gᵢ the gain of calibration i = 1 … n and wᵢ = 1/σᵢ²
+(weighted least squares; Draper & Smith, Applied Regression Analysis, ch. 9)::
 
     t = Σ wᵢ (i − ī) gᵢ / √(Σ wᵢ (i − ī)²),    ī = Σ wᵢ i / Σ wᵢ
 
-is standard normal without drift for every n. Of all tests that do not know the level, |t| is the most powerful against
-a drift from the first calibration to the last. It is worse than the CUSUM at a late change, because all the
-calibrations before it pull at the line too; so neither replaces the other.
+is standard normal without drift for every n. Of all tests that do not know the level, |t| is the
+most powerful against a drift from the first calibration to the last. It is worse than the CUSUM at
+a late change, because all the calibrations before it pull at the line too; so neither replaces the
+other.
 """
 
 from __future__ import annotations
@@ -40,16 +43,23 @@ from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray
 
-LEAST_PROBABILITY = 1e-6  #: That is written with its digits: further out no distribution of errors is known
+#: That is written with its digits: further out no distribution of errors is known
+LEAST_PROBABILITY = 1e-6
 
-DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
+#: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
+DISPERSION = 1.05
 FALSE_ALARM = 0.01
-"""Share of comparisons without any change in which a gain is said to change by more than noise, over all axes."""
+"""Share of comparisons without any change in which a gain is said to change by more than noise,
+over all axes.
+"""
 
-_POOLED_WEIGHT = 10.0  #: Weight of the prior in the pooled estimate, in numbers of successive differences
+#: Weight of the prior in the pooled estimate, in numbers of successive differences
+_POOLED_WEIGHT = 10.0
 _AXIS_WEIGHT = 30.0  #: Weight of the pooled estimate in that of an axis, likewise
 _MIN_DIFFERENCES = 4
-_CUT = 1.5  #: Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size
+#: Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of
+#: any size
+_CUT = 1.5
 _FARTHEST = 1e100  #: Limit of a difference over its σ, so that its square is still a number
 _MEAN_OF_CUT = (
     1.0
@@ -59,8 +69,11 @@ _MEAN_OF_CUT = (
 """E min(Z², c²) of a standard normal Z."""
 _MEDIAN_OF_NORMAL = 0.6744897501960817  #: Median of |Z|, the upper quartile of a standard normal Z
 _STEPS = 20
-"""Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
-_UNLIKE = 0.01  #: Changes are not one common factor if noise makes them so different in fewer cases than this
+"""Each brings the scale nearer to its end by a factor of two and more,
+unless more than a tenth are outliers.
+"""
+#: Changes are not one common factor if noise makes them so different in fewer cases than this
+_UNLIKE = 0.01
 _COMMON_SIGMAS = 4.0
 
 
@@ -68,7 +81,8 @@ _COMMON_SIGMAS = 4.0
 class Change:
     """Change of one gain."""
 
-    percent: float  #: of the compared gain's magnitude [%], inf from zero; negative where the gain has decreased
+    #: of the compared gain's magnitude [%], inf from zero; negative where the gain has decreased
+    percent: float
     sigmas: float  #: the change over its σ, signed as `percent`
     probability: float  #: of so large a change by noise alone, two-sided
 
@@ -80,7 +94,8 @@ class ChangeDecision:
     differs: bool  #: at least one gain has changed by more than noise
     axes: tuple[str, ...]  #: names, as they were given
     changes: tuple[Change, ...]  #: one an axis
-    #: Probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
+    #: Probability of each axis' change among all of them (Holm 1979, valid however their errors
+    #: depend).
     adjusted: tuple[float, ...]
     significant: tuple[bool, ...]  #: whether each axis' change is more than noise
     words: str  #: the same in one sentence
@@ -112,8 +127,8 @@ def change_significance(
     has_negative = np.min([old_std, new_std, dispersion]) < 0
     if has_negative or not are_finite:
         raise ValueError(
-            f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± {new_std} "
-            f"and dispersion {dispersion}"
+            f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± "
+            f"{new_std} and dispersion {dispersion}"
         )
     sign = 1.0
     if old < 0.0:
@@ -141,12 +156,14 @@ def decide(
 
     Of recalibrations without change, one is found in a share of FALSE_ALARM at most.
 
-    Each axis is tested by itself against its own σ, and the probabilities are corrected for the number of axes, however
-    their errors depend on each other. There is no fixed threshold in per cent.
+    Each axis is tested by itself against its own σ, and the probabilities are corrected for the
+    number of axes, however their errors depend on each other. There is no fixed threshold in per
+    cent.
 
     Args:
         axes: n names.
-        old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one unit an axis.
+        old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one
+            unit an axis.
         dispersion: scatter of repeated calibrations over their σ, a number or shape (n,).
 
     Raises:
@@ -160,7 +177,9 @@ def decide(
     factors = _one_an_axis(dispersion, count)
     changes: list[Change] = []
     for axis in range(count):
-        change = change_significance(olds[axis], old_stds[axis], news[axis], new_stds[axis], dispersion=factors[axis])
+        change = change_significance(
+            olds[axis], old_stds[axis], news[axis], new_stds[axis], dispersion=factors[axis]
+        )
         changes.append(change)
     adjusted = _adjusted([change.probability for change in changes])
     significant = tuple(probability <= FALSE_ALARM for probability in adjusted)
@@ -181,7 +200,9 @@ def _one_an_axis(values: ArrayLike, count: int) -> list[float]:
 
 
 def _adjusted(probabilities: Sequence[float]) -> tuple[float, ...]:
-    """Holm: the smallest probability counts times their number, the next times one less, never falling."""
+    """Holm: the smallest probability counts times their number, the next times one less,
+    never falling.
+    """
     given = np.array(probabilities)
     count = len(given)
     order = np.argsort(given)
@@ -193,7 +214,10 @@ def _adjusted(probabilities: Sequence[float]) -> tuple[float, ...]:
 
 
 def _decision_words(
-    axes: Sequence[str], changes: Sequence[Change], adjusted: Sequence[float], significant: Sequence[bool]
+    axes: Sequence[str],
+    changes: Sequence[Change],
+    adjusted: Sequence[float],
+    significant: Sequence[bool],
 ) -> str:
     """Describe a decision in one sentence."""
     if not axes:
@@ -202,7 +226,10 @@ def _decision_words(
     parts: list[str] = []
     for axis, change, probability in zip(axes, changes, adjusted, strict=True):
         sigmas = _short(abs(change.sigmas))
-        parts.append(f"{axis} {change.percent:+.2g} % ({sigmas} σ, {_probability(probability)} among {count})")
+        parts.append(
+            f"{axis} {change.percent:+.2g} % ({sigmas} σ, {_probability(probability)} "
+            f"among {count})"
+        )
     if any(significant):
         changed = ", ".join(compress(parts, significant))
         return f"changed by more than noise: {changed}"
@@ -212,11 +239,13 @@ def _decision_words(
 
 
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
-    """Estimate how much more repeated calibrations scatter than their σ, for each axis; never less than 1.
+    """Estimate how much more repeated calibrations scatter than their σ, for each axis;
+    never less than 1.
 
-    From differences of successive calibrations, so that a slow drift adds little; each counts up to 1.5 of their σ
-    (Huber 1964, proposal 2), so that a sudden change adds little too. The estimate of an axis is drawn towards that of
-    all axes, and that towards DISPERSION, by weights in numbers of differences (as a scaled inverse-χ² prior).
+    From differences of successive calibrations, so that a slow drift adds little; each counts up to
+    1.5 of their σ (Huber 1964, proposal 2), so that a sudden change adds little too. The estimate
+    of an axis is drawn towards that of all axes, and that towards DISPERSION, by weights in numbers
+    of differences (as a scaled inverse-χ² prior).
 
     Args:
         values, stds: shape (..., axes, n), oldest first; leading dimensions are separate histories.
@@ -243,7 +272,9 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(variance, 1.0)))
 
 
-def _weighted_mean(prior: FloatArray | float, prior_weight: float, found: FloatArray, weight: int) -> FloatArray:
+def _weighted_mean(
+    prior: FloatArray | float, prior_weight: float, found: FloatArray, weight: int
+) -> FloatArray:
     """Mean of a prior and of what was found."""
     return np.asarray((prior_weight * prior + weight * found) / (prior_weight + weight))
 
@@ -251,8 +282,9 @@ def _weighted_mean(prior: FloatArray | float, prior_weight: float, found: FloatA
 def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
     """Classify the changes of all gains together.
 
-    They have one common factor where at least two raise an alarm, the weighted mean c̄ of all changes is significant,
-    and Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom makes plausible.
+    They have one common factor where at least two raise an alarm, the weighted mean c̄ of all
+    changes is significant, and Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom
+    makes plausible.
 
     Args:
         change_percent, std_percent: of each axis since its baseline, with σ > 0 [%], shape (n,).
@@ -279,7 +311,9 @@ def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLik
 
 
 def _robust_variance(squares: FloatArray) -> FloatArray:
-    """Solve mean(min(x², c² s)) = s E min(Z², c²) for s along the last axis, starting from the median."""
+    """Solve mean(min(x², c² s)) = s E min(Z², c²) for s along the last axis,
+    starting from the median.
+    """
     variance = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
     for _ in range(_STEPS):
         largest = _CUT**2 * variance[..., None]
@@ -310,15 +344,21 @@ def _short(sigmas: float) -> str:
     return f"{sigmas:.1e}"
 
 
-FEWEST = 4  #: Calibrations of the first line that is tested; through fewer it is hardly more than one difference
-_RECENT = 3  #: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be recent
+#: Calibrations of the first line that is tested; through fewer it is hardly more than one
+#: difference
+FEWEST = 4
+#: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be
+#: recent
+_RECENT = 3
 _FINEST = 2.0**-52  #: Smallest σ of the largest gain over itself: no number is written finer
 _LARGEST_FACTOR = 1e3  #: Between a σ and the median one: beyond, a weight is all or nothing anyway
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Limits of the chart; the defaults come from `make drift-study`, docs/evidence/drift.md has its table."""
+    """Limits of the chart; the defaults come from `make drift-study`,
+    docs/evidence/drift.md has its table.
+    """
 
     reference: float = 1.25  #: k [σ]: half the shift that is to be found soonest
     threshold: float = 4.6  #: h [σ]: sum that raises an alarm
@@ -351,23 +391,26 @@ class Alarm:
 class Drift:
     """Change of one gain since its baseline began."""
 
-    #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to the onset while there
-    #: is an alarm; while that is a trend, the beginning of the line.
+    #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to
+    #: the onset while there is an alarm; while that is a trend, the beginning of the line.
     baseline: float
     baseline_std: float  #: its σ
     #: Z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
     deviations: FloatArray
     upper: FloatArray  #: C⁺, shape (n,)
     lower: FloatArray  #: C⁻, shape (n,)
-    #: T of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
+    #: T of the line through each calibration and all before it, shape (n,), positive where the
+    #: magnitude rises.
     trend: FloatArray
-    #: In the order of the calibrations, also those that have passed; nothing else here depends on these.
+    #: In the order of the calibrations, also those that have passed; nothing else here depends on
+    #: these.
     alarms: tuple[Alarm, ...]
-    #: Index of the last calibration before the change that `alarm` reports, the first calibration for a trend; None
-    #: where the newest calibration raises no alarm.
+    #: Index of the last calibration before the change that `alarm` reports, the first calibration
+    #: for a trend; None where the newest calibration raises no alarm.
     onset: int | None
-    #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without alarm those behind
-    #: the baseline, if fewer); while there is a trend, along the line [% of the baseline's magnitude].
+    #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without
+    #: alarm those behind the baseline, if fewer); while there is a trend, along the line [% of the
+    #: baseline's magnitude].
     change_percent: float
     change_sigmas: float  #: the same over its σ
 
@@ -391,17 +434,22 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION)
     """Watch one gain.
 
     Args:
-        values, stds: of its calibrations since the last acknowledged change, oldest first, shape (n,), n ≥ 1, in one
-            unit; σ > 0.
-        dispersion: scatter of repeated calibrations over their σ, as `ident.drift.change.dispersions` finds it.
+        values, stds: of its calibrations since the last acknowledged change, oldest first, shape
+            (n,), n ≥ 1, in one unit; σ > 0.
+        dispersion: scatter of repeated calibrations over their σ, as
+            `ident.drift.change.dispersions` finds it.
 
     Raises:
-        ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline is zero.
+        ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline
+            is zero.
     """
     values = np.asarray(values, float)
     stds = np.asarray(stds, float)
     if values.ndim != 1 or values.shape != stds.shape or not len(values):
-        raise ValueError(f"expected as many values as σ, at least one, found shapes {values.shape} and {stds.shape}")
+        raise ValueError(
+            f"expected as many values as σ, at least one, found shapes {values.shape} "
+            f"and {stds.shape}"
+        )
     are_finite = np.isfinite(values).all() and np.isfinite(stds).all()
     if not (are_finite and (stds > 0).all()):
         raise ValueError("expected finite gains with σ > 0")
@@ -429,7 +477,8 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION)
         path = lower
         if present.rose:
             path = upper
-        # Where the sum that has the alarm was zero for the last time (Page's estimate of the change point).
+        # Where the sum that has the alarm was zero for the last time (Page's estimate of the change
+        # point).
         zeros = np.flatnonzero(path[: present.index + 1] == 0.0)
         onset = int(zeros[-1])
         since = _change_since_baseline(values, stds, onset)
@@ -449,10 +498,14 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION)
     )
 
 
-def _alarms(deviations: FloatArray, upper: FloatArray, lower: FloatArray, slopes: FloatArray) -> tuple[Alarm, ...]:
+def _alarms(
+    deviations: FloatArray, upper: FloatArray, lower: FloatArray, slopes: FloatArray
+) -> tuple[Alarm, ...]:
     """Alarms of all calibrations, in their order; each by the first rule that applies."""
     alarms: list[Alarm] = []
-    for index, (z, above, below, slope) in enumerate(zip(deviations, upper, lower, slopes, strict=True)):
+    for index, (z, above, below, slope) in enumerate(
+        zip(deviations, upper, lower, slopes, strict=True)
+    ):
         if max(above, below) > CHART.threshold:
             alarms.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
         elif abs(z) > CHART.single:
@@ -484,8 +537,12 @@ def _change_along_line(values: FloatArray, stds: FloatArray) -> _ChangeSinceBase
     )
 
 
-def _change_since_baseline(values: FloatArray, stds: FloatArray, onset: int | None) -> _ChangeSinceBaseline:
-    """Change of the newest calibrations; the baseline ends at the onset, and the newest begin behind both."""
+def _change_since_baseline(
+    values: FloatArray, stds: FloatArray, onset: int | None
+) -> _ChangeSinceBaseline:
+    """Change of the newest calibrations; the baseline ends at the onset,
+    and the newest begin behind both.
+    """
     count = len(values)
     most = count - 1
     if onset is not None:
@@ -500,7 +557,9 @@ def _change_since_baseline(values: FloatArray, stds: FloatArray, onset: int | No
     change = 0.0
     if count > 1:
         change = recent - baseline
-    return _ChangeSinceBaseline(baseline, baseline_std, change, math.hypot(recent_std, baseline_std))
+    return _ChangeSinceBaseline(
+        baseline, baseline_std, change, math.hypot(recent_std, baseline_std)
+    )
 
 
 def cusum_paths(
@@ -529,8 +588,11 @@ def cusum_paths(
     return deviations, upper, lower
 
 
-def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray | float) -> FloatArray:
-    """Compute t of the line through the first n calibrations, for every n and any number of gains at once.
+def trend_statistic(
+    values: FloatArray, stds: FloatArray, dispersion: FloatArray | float
+) -> FloatArray:
+    """Compute t of the line through the first n calibrations,
+    for every n and any number of gains at once.
 
     Args:
         values, stds: magnitudes, shape (..., n), oldest first, σ > 0.
@@ -546,7 +608,8 @@ def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray
     mean = zeros  # ḡ
     index_square = zeros  # Σ w (i − ī)²
     product = zeros  # Σ w (i − ī) (g − ḡ)
-    # About running means (West 1979): differences of large sums lose their digits where one σ is far below the others.
+    # About running means (West 1979): differences of large sums lose their digits where one σ is
+    # far below the others.
     for i in range(values.shape[-1]):
         value = values[..., i]
         weight = 1.0 / stds[..., i] ** 2
@@ -592,7 +655,9 @@ def fit_line(values: FloatArray, stds: FloatArray) -> GainTrend:
 
 
 def _bounded(stds: FloatArray, scale: float) -> FloatArray:
-    """σ over the scale of the gains, such that no weight 1/σ² overflows, vanishes, or leaves nothing of the others."""
+    """σ over the scale of the gains, such that no weight 1/σ² overflows, vanishes,
+    or leaves nothing of the others.
+    """
     with np.errstate(over="ignore"):
         relative = np.clip(stds / scale, _FINEST, 1.0 / _FINEST)
     middle = float(np.median(relative))

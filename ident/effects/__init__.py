@@ -1,1 +1,3 @@
-"""Effects beyond the declared model: a dictionary grouped by physics, and the signals that they depend on."""
+"""Effects beyond the declared model: a dictionary grouped by physics,
+and the signals that they depend on.
+"""

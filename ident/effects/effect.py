@@ -1,7 +1,8 @@
 """The form of an effect: columns of joint torque that the declared model lacks.
 
-An effect adds Σ c_k φ_k to the torque that the motors must supply beside the declared model, in joint units. A positive
-coefficient c with a positive column φ therefore needs more current in the positive direction of the joint.
+An effect adds Σ c_k φ_k to the torque that the motors must supply beside the declared model, in
+joint units. A positive coefficient c with a positive column φ therefore needs more current in the
+positive direction of the joint.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from ident.model.robot import JointKind, Robot
 class GearSide(Enum):
     """Where the torque acts.
 
-    JOINT: on the joint. MOTOR: on the motor of that number, and through R on all joints that it turns. TWO_JOINTS: on
-    the joint and on a second one, whose number is the setting `other_axis`. ALL_JOINTS: on every joint, through the
-    links. ALL_MOTORS: on every motor alike; such an effect has no axis of its own and is placed on the first.
+    JOINT: on the joint. MOTOR: on the motor of that number, and through R on all joints that it
+    turns. TWO_JOINTS: on the joint and on a second one, whose number is the setting `other_axis`.
+    ALL_JOINTS: on every joint, through the links. ALL_MOTORS: on every motor alike; such an effect
+    has no axis of its own and is placed on the first.
     """
 
     JOINT = "joint"
@@ -42,7 +44,9 @@ class GearSide(Enum):
 
 
 class Property(Enum):
-    """Property that an effect declares of its columns; one test tries to refute it for every entry of EFFECTS."""
+    """Property that an effect declares of its columns;
+    one test tries to refute it for every entry of EFFECTS.
+    """
 
     ODD_IN_VELOCITY = "turns its sign when the motion is reversed in place"
     EVEN_IN_VELOCITY = "keeps its value when the motion is reversed in place"
@@ -68,7 +72,9 @@ class Reported(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Values that a searched parameter can have: far beyond what a search tries, short of an overflow."""
+    """Values that a searched parameter can have:
+    far beyond what a search tries, short of an overflow.
+    """
 
     least: float
     largest: float
@@ -76,22 +82,25 @@ class Range:
 
 Switch = Annotated[int, Range(0, 1)]
 Sense = Annotated[int, Range(-1, 1)]  #: 1 or −1 (`sense_fault`)
-AxisNumber = Annotated[int, Range(0, math.inf)]  #: Number of another axis, from 1; 0 where an effect has none
+#: Number of another axis, from 1; 0 where an effect has none
+AxisNumber = Annotated[int, Range(0, math.inf)]
 
 
 @dataclass(frozen=True, slots=True)
 class Effect(ABC):
-    """A torque Σ c_k φ_k [Nm; N] that the declared model lacks; derive from it to add an effect of your own.
+    """A torque Σ c_k φ_k [Nm; N] that the declared model lacks;
+    derive from it to add an effect of your own.
 
-    A subclass is a frozen dataclass. It sets `name`, `declares`, `abscissa` and `coefficients`, and defines `columns`,
-    the φ_k. The torque is what the motors must supply, at the joint: a positive coefficient with a positive column
-    needs more current in the positive direction. Its fields, each with a `Range`, are its searched parameters, with
-    units in their names. Its docstring states equation, sign, source and signature: how the residual shows it.
+    A subclass is a frozen dataclass. It sets `name`, `declares`, `abscissa` and `coefficients`, and
+    defines `columns`, the φ_k. The torque is what the motors must supply, at the joint: a positive
+    coefficient with a positive column needs more current in the positive direction. Its fields,
+    each with a `Range`, are its searched parameters, with units in their names. Its docstring
+    states equation, sign, source and signature: how the residual shows it.
 
-    The other properties say where and when it is tried, and what its settings mean; their defaults are those of a
-    torque on one driven joint. No name of a setting or a coefficient has a meaning by itself. A search tries it where a
-    package registers it by the entry point group `drivegain.effects`, or where it is in `own_effects` of
-    `find_effects`.
+    The other properties say where and when it is tried, and what its settings mean; their defaults
+    are those of a torque on one driven joint. No name of a setting or a coefficient has a meaning
+    by itself. A search tries it where a package registers it by the entry point group
+    `drivegain.effects`, or where it is in `own_effects` of `find_effects`.
 
     Example::
 
@@ -129,7 +138,9 @@ class Effect(ABC):
 
     @property
     def phrase(self) -> str:
-        """Words for reports, to follow "J3 has": `friction that grows with the load`; its name where empty."""
+        """Words for reports, to follow "J3 has": `friction that grows with the load`;
+        its name where empty.
+        """
         return ""
 
     @property
@@ -139,7 +150,9 @@ class Effect(ABC):
 
     @property
     def has_axis(self) -> bool:
-        """Whether it is on an axis; what acts on all alike is placed on the first one for order only."""
+        """Whether it is on an axis; what acts on all alike is placed on the first one for order
+        only.
+        """
         return self.side is not GearSide.ALL_MOTORS
 
     @property
@@ -169,7 +182,8 @@ class Effect(ABC):
 
     @property
     def axis_setting(self) -> str:
-        """Name of the setting that is the number of another axis, from 1; empty where there is none.
+        """Name of the setting that is the number of another axis, from 1;
+        empty where there is none.
 
         Of a torque on two joints it is `other_axis`, unless it says otherwise.
         """
@@ -178,16 +192,21 @@ class Effect(ABC):
     @property
     def second_axis(self) -> int | None:
         """Number of the other axis, from 1; None where it has none."""
-        return int(self.settings[self.axis_setting]) or None if self.axis_setting else None
+        if self.axis_setting:
+            return int(self.settings[self.axis_setting]) or None
+        return None
 
     @property
     def form_settings(self) -> tuple[str, ...]:
-        """Settings that choose a form of one effect: a search counts an effect in two forms as one."""
+        """Settings that choose a form of one effect:
+        a search counts an effect in two forms as one.
+        """
         return ()
 
     @property
     def key_settings(self) -> tuple[str, ...]:
-        """Settings in which two effects of one name on one axis must differ for a model to have both.
+        """Settings in which two effects of one name on one axis must differ for a model to have
+        both.
 
         All whole numbers that choose no form: cogging of two orders is two effects.
         """
@@ -204,7 +223,8 @@ class Effect(ABC):
 
     @property
     def nearly_declared(self) -> Mapping[str, Range]:
-        """Values of a setting, by its name, with which the effect is nearly a term that the model has.
+        """Values of a setting, by its name, with which the effect is nearly a term that the model
+        has.
 
         A refinement stays outside of them, on the side where it begins.
         """
@@ -212,51 +232,68 @@ class Effect(ABC):
 
     @property
     def settings_fault(self) -> str:
-        """What is wrong with its settings together, to follow "effect 'x' is given"; empty where nothing is."""
+        """What is wrong with its settings together, to follow "effect 'x' is given";
+        empty where nothing is.
+        """
         return ""
 
     @property
     def has_rotor_form(self) -> bool:
-        """Whether it is a loss at a gear that can leave the rotor out of the load (`ident.effects.rotor`).
+        """Whether it is a loss at a gear that can leave the rotor out of the load
+        (`ident.effects.rotor`).
 
-        Its settings `rotor_inertia_kg_m2` and `with_rotor` are then J, and 1 where the rest of it is fitted.
+        Its settings `rotor_inertia_kg_m2` and `with_rotor` are then J, and 1 where the rest of it
+        is fitted.
         """
         return False
 
     @property
     def fits_rotor(self) -> bool:
-        """Whether its last coefficient is the rest of the rotor's inertia, the loss times Ia − J."""
+        """Whether its last coefficient is the rest of the rotor's inertia,
+        the loss times Ia − J.
+        """
         return self.has_rotor_form and bool(self.settings["with_rotor"])
 
     @property
     def known_rotor_kg_m2(self) -> float:
         """Inertia of the axis' rotor that it takes off the load [kg m²]; 0 where it knows none."""
-        return self.settings["rotor_inertia_kg_m2"] if self.has_rotor_form else 0.0
+        if self.has_rotor_form:
+            return self.settings["rotor_inertia_kg_m2"]
+        return 0.0
 
     @property
     def refined(self) -> tuple[str, ...]:
-        """Settings that are fitted together with the whole model; the values that a family has are where to begin.
+        """Settings that are fitted together with the whole model;
+        the values that a family has are where to begin.
 
-        All real settings where it has two or more: kept at a value that somebody gave, they would leave a rest that
-        other effects explain, and σ would not know it. Without names here, the first positive one that has smaller and
-        larger values in the family is refined between them, once it was chosen.
+        All real settings where it has two or more: kept at a value that somebody gave, they would
+        leave a rest that other effects explain, and σ would not know it. Without names here, the
+        first positive one that has smaller and larger values in the family is refined between them,
+        once it was chosen.
         """
         real = tuple(name for name, value in self.settings.items() if isinstance(value, float))
         return real if len(real) > 1 else ()
 
     @property
     def refined_once_chosen(self) -> tuple[str, ...]:
-        """Settings that are fitted together with the whole model only once the effect was chosen from its family."""
+        """Settings that are fitted together with the whole model only once the effect was chosen
+        from its family.
+        """
         return self.refined
 
     @property
     def is_rate(self) -> bool:
         """Whether the torque is a derivative in time, which a filter makes much smaller."""
-        return self.side is GearSide.ALL_JOINTS or self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}
+        return self.side is GearSide.ALL_JOINTS or self.declares in {
+            Property.RATE_OF_TORQUE,
+            Property.RATE_OF_LOAD,
+        }
 
     @property
     def reach(self) -> int | None:
-        """How many joints further along the robot the other joint of a pair may be; None for any."""
+        """How many joints further along the robot the other joint of a pair may be;
+        None for any.
+        """
         return None
 
     @property
@@ -266,15 +303,21 @@ class Effect(ABC):
 
     @property
     def forms(self) -> tuple[Self, ...]:
-        """Simpler forms of the effect, then the effect itself; each form's columns are the first ones of the next."""
+        """Simpler forms of the effect, then the effect itself;
+        each form's columns are the first ones of the next.
+        """
         return (self,)
 
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (m, p, k) of all joints or motors."""
+        """Torque per unit coefficient [Nm], (p, k);
+        (2, p, k) of two joints, (m, p, k) of all joints or motors.
+        """
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
-        """Whether the data can show it on an axis: no time constant is longer than them, and its variable is there."""
+        """Whether the data can show it on an axis:
+        no time constant is longer than them, and its variable is there.
+        """
         del runs, axis
         return True
 
@@ -299,7 +342,9 @@ def setting_range(effect: Effect, setting: str) -> Range:
 
 
 def setting_kind(effect: Effect, setting: str) -> type:
-    """Return the type of a setting, as it is annotated: int, or float for one that can be refined."""
+    """Return the type of a setting, as it is annotated:
+    int, or float for one that can be refined.
+    """
     hint = get_type_hints(type(effect), include_extras=True)[setting]
     kind: type = get_args(hint)[0]
     return kind
@@ -308,11 +353,17 @@ def setting_kind(effect: Effect, setting: str) -> type:
 @cache
 def _ranges(kind: type[Effect]) -> dict[str, Range]:
     hints = get_type_hints(kind, include_extras=True)
-    return {name: part for name, hint in hints.items() for part in get_args(hint)[1:] if isinstance(part, Range)}
+    return {
+        name: part
+        for name, hint in hints.items()
+        for part in get_args(hint)[1:]
+        if isinstance(part, Range)
+    }
 
 
 def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axes: int) -> None:
-    """Refuse settings that an effect cannot have on this axis: a calibration written by hand may hold anything.
+    """Refuse settings that an effect cannot have on this axis:
+    a calibration written by hand may hold anything.
 
     Args:
         effect: any member of the family.
@@ -321,24 +372,27 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         axes: number of axes of the robot.
 
     Raises:
-        EffectRefused: a setting is not finite, outside its range, or names an axis that is no other one.
+        EffectRefused: a setting is not finite, outside its range, or names an axis that is no other
+            one.
     """
     name = effect.name
     for setting, value in settings.items():
         if not math.isfinite(value):
-            raise EffectRefused(f"effect {name!r} is given {setting} = {value}; it must be a finite number")
+            raise EffectRefused(
+                f"effect {name!r} is given {setting} = {value}; it must be a finite number"
+            )
     for setting, allowed in _ranges(type(effect)).items():
         value = settings[setting]
         if setting == effect.axis_setting:
             if value not in range(1, axes + 1) or value == axis + 1:
                 raise EffectRefused(
-                    f"effect {name!r} on axis {axis + 1} is given {setting} = {value:g}; it is the number of another "
-                    f"of the {axes} axes"
+                    f"effect {name!r} on axis {axis + 1} is given {setting} = {value:g}; it is the "
+                    f"number of another of the {axes} axes"
                 )
         elif not allowed.least <= settings[setting] <= allowed.largest:
             raise EffectRefused(
-                f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between {allowed.least:g} and "
-                f"{allowed.largest:g}"
+                f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between "
+                f"{allowed.least:g} and {allowed.largest:g}"
             )
     if fault := effect.with_settings(settings).settings_fault:
         raise EffectRefused(f"effect {name!r} is given {fault}")
@@ -349,31 +403,43 @@ ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 
 @dataclass(frozen=True, slots=True)
 class PlacedEffect:
-    """An effect on an axis (index from 0), or on a joint without a motor: those follow the axes (`Robot.places`)."""
+    """An effect on an axis (index from 0), or on a joint without a motor:
+    those follow the axes (`Robot.places`).
+    """
 
     effect: Effect
     axis: int
 
     def axis_name(self, axes: Sequence[str]) -> str:
-        """Name of its axis; what acts on every axis alike is placed on the first one for order only: ALL_AXES."""
+        """Name of its axis; what acts on every axis alike is placed on the first one for order
+        only: ALL_AXES.
+        """
         return axes[self.axis] if self.effect.has_axis else ALL_AXES
 
     def name_among(self, axes: Sequence[str]) -> str:
         """Name of effect and place: `load-friction on J3`, `coupling on J4 with J5`."""
         other = self.effect.second_axis
-        return f"{self.effect.name} on {self.axis_name(axes)}" + (f" with {axes[other - 1]}" if other else "")
+        return (f"{self.effect.name} on {self.axis_name(axes)}") + (
+            f" with {axes[other - 1]}" if other else ""
+        )
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Linear parameters named after effect, axis and settings, because an axis may have cogging of two orders."""
-        name, number = self.effect.name, self.axis + 1
+        """Linear parameters named after effect, axis and settings,
+        because an axis may have cogging of two orders.
+        """
+        name = self.effect.name
+        number = self.axis + 1
         given = {
-            key: value for key, value in self.effect.settings.items() if value or key not in self.effect.added_settings
+            key: value
+            for key, value in self.effect.settings.items()
+            if value or key not in self.effect.added_settings
         }
         settings = ", ".join(f"{key} {value:.6g}" for key, value in given.items())
         suffix = f" ({settings})" if settings else ""
         return tuple(
-            replace(column, name=f"{name} {column.name} {number}{suffix}") for column in self.effect.coefficients
+            replace(column, name=f"{name} {column.name} {number}{suffix}")
+            for column in self.effect.coefficients
         )
 
 
@@ -385,14 +451,24 @@ def effect_torque(
     conditioning: Conditioning,
     model: Model,
 ) -> FloatArray:
-    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p, r)."""
-    return at_joints(effect, axis, effect_columns(effect, axis, runs, datasets, conditioning), model.drive_train)
+    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p,
+    r).
+    """
+    return at_joints(
+        effect, axis, effect_columns(effect, axis, runs, datasets, conditioning), model.drive_train
+    )
 
 
 def effect_columns(
-    effect: Effect, axis: int, runs: Sequence[Signals], datasets: Sequence[Dataset], conditioning: Conditioning
+    effect: Effect,
+    axis: int,
+    runs: Sequence[Signals],
+    datasets: Sequence[Dataset],
+    conditioning: Conditioning,
 ) -> FloatArray:
-    """An effect's columns where it is placed, on the observation's rows, shape (p, r) or (joints, p, r)."""
+    """An effect's columns where it is placed, on the observation's rows, shape (p, r) or (joints,
+    p, r).
+    """
     parts = [
         decimate_rows(data, conditioning, columns_at(effect, run, axis))
         for run, data in zip(runs, datasets, strict=True)
@@ -406,13 +482,18 @@ def is_shipped(effect: Effect) -> bool:
 
 
 def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
-    """Columns of an effect where it is placed; on a joint without a motor, as torques of all axes, (m, p, k).
+    """Columns of an effect where it is placed;
+    on a joint without a motor, as torques of all axes, (m, p, k).
 
     Raises:
-        EffectRefused: an effect of one's own fails, or returns columns of another shape or a number that is not finite.
+        EffectRefused: an effect of one's own fails, or returns columns of another shape or a number
+            that is not finite.
     """
     count = len(signals.current_a)
-    columns = effect.columns(signals, axis) if is_shipped(effect) else _own_columns(effect, signals, axis, count)
+    if is_shipped(effect):
+        columns = effect.columns(signals, axis)
+    else:
+        columns = _own_columns(effect, signals, axis, count)
     if axis < count:
         return columns
     return np.asarray(signals.leverage[axis - count][:, None] * columns)
@@ -430,8 +511,8 @@ def fits_data(effect: Effect, runs: Sequence[Signals], axis: int) -> bool:
         return bool(effect.fits_in(runs, axis))
     except (Exception, SystemExit) as error:  # code of others
         raise EffectRefused(
-            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method `fits_in`; expected True or "
-            "False; correct it"
+            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method "
+            "`fits_in`; expected True or False; correct it"
         ) from error
 
 
@@ -440,31 +521,40 @@ _SHAPES = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}
 
 
 def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> FloatArray:
-    """Columns of an effect of one's own; refused where it fails, their shape is wrong or a number is not finite."""
+    """Columns of an effect of one's own; refused where it fails,
+    their shape is wrong or a number is not finite.
+    """
     try:
         found = np.asarray(effect.columns(signals, axis), dtype=np.float64)
-    except (Exception, SystemExit) as error:  # code of others: it may fail in any way, and even end the program
+    # Code of others: it may fail in any way, and even end the program.
+    except (Exception, SystemExit) as error:
         raise EffectRefused(
-            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method `columns`; expected a "
-            "torque for every sample; correct it, and copy what it changes: the arrays of `signals` are read-only"
+            f"effect {effect.name!r}: found {type(error).__name__} ({error}) in its method "
+            "`columns`; expected a torque for every sample; correct it, and copy what it changes: "
+            "the arrays of `signals` are read-only"
         ) from error
     ahead = _SHAPES.get(effect.side, (count,))
     expected = (*ahead, len(effect.coefficients), len(signals.time_s))
     if found.shape != expected:
         raise EffectRefused(
-            f"effect {effect.name!r}: found columns of shape {found.shape}; expected {expected}, the last two for "
-            "coefficients and samples; correct its method `columns`"
+            f"effect {effect.name!r}: found columns of shape {found.shape}; expected {expected}, "
+            "the last two for coefficients and samples; correct its method `columns`"
         )
     if not np.isfinite(found).all():
         raise EffectRefused(
-            f"effect {effect.name!r}: found columns with numbers that are not finite; expected a torque for every "
-            "sample; correct its method `columns`, or return False from `fits_in` where it lacks a signal"
+            f"effect {effect.name!r}: found columns with numbers that are not finite; expected a "
+            "torque for every sample; correct its method `columns`, or return False from `fits_in` "
+            "where it lacks a signal"
         )
     return found
 
 
-def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
-    """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all axes, shape (m, p, k)."""
+def at_joints(
+    effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain
+) -> FloatArray:
+    """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all axes,
+    shape (m, p, k).
+    """
     if axis >= len(drive_train.ratio):
         return columns
     if effect.side is GearSide.MOTOR:
@@ -482,12 +572,14 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
 
 
 def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
-    """Whether an effect can act on an axis; an effect of two joints is placed on the one with the lower number."""
+    """Whether an effect can act on an axis;
+    an effect of two joints is placed on the one with the lower number.
+    """
     if effect.with_motor != (axis < robot.axis_count):
         return False
     if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:
         return False
-    if effect.needs_tree and robot.closures:
+    if effect.needs_tree and robot.is_constrained:
         return False
     if not effect.has_axis:
         return axis == 0

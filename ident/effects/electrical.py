@@ -1,4 +1,6 @@
-"""The motor and its current: less torque at large current, torque ripple, offsets that drift, and late currents."""
+"""The motor and its current: less torque at large current, torque ripple, offsets that drift,
+and late currents.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,21 @@ from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
 EARLIEST_S = 0.01
-"""By how much a current may be early on one axis: its reference precedes the torque by the current loop, and a position
-is read a few cycles late; both are milliseconds. More is no cause of what was recorded before it."""
+"""By how much a current may be early on one axis: its reference precedes the torque by the current
+loop, and a position is read a few cycles late; both are milliseconds. More is no cause of what was
+recorded before it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Effect):
     """τ = c · g v³ + d · g v⁵: at large torque the motor needs more current v than its gain g says.
 
-    v is the current that the model predicts. Where half the torque constant is left at a current h, i/(1 + (i/h)²) = v,
-    c is about 1/h² and d about 2/h⁴ (the series converges below v = h/2). With the first term alone the gain takes up
-    what is left of the others. Source: saturation of the stator iron, the first even terms of the current per torque;
-    Hendershot & Miller, Design of Brushless Permanent-Magnet Motors. Signature: large current, odd in it.
+    v is the current that the model predicts. Where half the torque constant is left at a current h,
+    i/(1 + (i/h)²) = v, c is about 1/h² and d about 2/h⁴ (the series converges below v = h/2). With
+    the first term alone the gain takes up what is left of the others. Source: saturation of the
+    stator iron, the first even terms of the current per torque; Hendershot & Miller, Design of
+    Brushless Permanent-Magnet Motors. Signature: large current, odd in it.
     """
 
     name = "saturation"
@@ -42,7 +47,10 @@ class Saturation(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """One linear parameter a term."""
-        terms = Column("coefficient", "1/A²", least=0.0), Column("second coefficient", "1/A⁴", least=0.0)
+        terms = (
+            Column("coefficient", "1/A²", least=0.0),
+            Column("second coefficient", "1/A⁴", least=0.0),
+        )
         return terms[: 1 + self.two_terms]
 
     @property
@@ -53,15 +61,19 @@ class Saturation(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1 or 2, k)."""
         square = signals.current_a[axis] ** 2
-        return np.asarray(signals.motor_torque_nm[axis] * np.stack((square, square**2)[: 1 + self.two_terms]))
+        return np.asarray(
+            signals.motor_torque_nm[axis] * np.stack((square, square**2)[: 1 + self.two_terms])
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Cogging(Effect):
-    """τ = a cos(k q_m) + b sin(k q_m), at the motor;  a > 0: the motor pushes in the positive direction at q_m = 0.
+    """τ = a cos(k q_m) + b sin(k q_m), at the motor;  a > 0:
+    the motor pushes in the positive direction at q_m = 0.
 
-    Source: magnetic cogging (k poles and slots), current-offset ripple (k = pole pairs) and the wave generator of a
-    strain-wave gear (k = 2); Gandhi et al., IEEE/ASME ToM 7 (2002). Signature: a line at motor order k.
+    Source: magnetic cogging (k poles and slots), current-offset ripple (k = pole pairs) and the
+    wave generator of a strain-wave gear (k = 2); Gandhi et al., IEEE/ASME ToM 7 (2002). Signature:
+    a line at motor order k.
     """
 
     name = "cogging"
@@ -80,10 +92,11 @@ class Cogging(Effect):
 
 @dataclass(frozen=True, slots=True)
 class OffsetDrift(Effect):
-    """τ = c · e^(−t/η), at the motor;  c > 0: the reference is too high by c/g at first, beside the declared offset.
+    """τ = c · e^(−t/η), at the motor;  c > 0:
+    the reference is too high by c/g at first, beside the declared offset.
 
-    Source: the offset of a current sensor drifts with its temperature, which settles with one time constant after
-    power-on. Signature: time, at any speed.
+    Source: the offset of a current sensor drifts with its temperature, which settles with one time
+    constant after power-on. Signature: time, at any speed.
     """
 
     name = "offset-drift"
@@ -93,29 +106,37 @@ class OffsetDrift(Effect):
     coefficients = (Column("offset", "Nm"),)
 
     time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η
-    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as after a power-on.
+    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run,
+    #: as after a power-on.
     whole_session: Switch
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
-        """Whether the offset settles while it is watched: over the session, or over the longest run."""
+        """Whether the offset settles while it is watched:
+        over the session, or over the longest run.
+        """
         del axis
         return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
         del axis
-        time_s = signals.session_s if self.whole_session else signals.time_s
+        if self.whole_session:
+            time_s = signals.session_s
+        else:
+            time_s = signals.time_s
         return np.asarray(np.exp(-time_s / self.time_constant_s))[None]
 
 
 @dataclass(frozen=True, slots=True)
 class Lag(Effect):
-    """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0: it is early, by EARLIEST_S at most.
+    """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0:
+    it is early, by EARLIEST_S at most.
 
-    v is the current that the model predicts, other effects left out. A first-order lag of time constant c is this with
-    T = c; a delay is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to second order. For an early current the filter
-    runs backwards in time. With T = 0 it is the first order alone, which is wrong where the torque jumps, and bends the
-    gain. Source: Taylor and Padé expansions of a delay. Signature: rate of torque.
+    v is the current that the model predicts, other effects left out. A first-order lag of time
+    constant c is this with T = c; a delay is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to
+    second order. For an early current the filter runs backwards in time. With T = 0 it is the first
+    order alone, which is wrong where the torque jumps, and bends the gain. Source: Taylor and Padé
+    expansions of a delay. Signature: rate of torque.
     """
 
     name = "lag"
@@ -133,7 +154,10 @@ class Lag(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
         rate = filtered_rate(
-            signals.motor_torque_nm[axis], signals.rate_hz, self.filter_s, backwards=bool(self.backwards)
+            signals.motor_torque_nm[axis],
+            signals.rate_hz,
+            self.filter_s,
+            backwards=bool(self.backwards),
         )
         return -rate[None]
 
@@ -142,8 +166,9 @@ class Lag(Effect):
 class TimeSkew(Effect):
     """τ_i = −c · ẏ_i,  T ẏ_i + y_i = g_i v_i, of every motor i;  c > 0: all currents are late by c.
 
-    On one axis a delay is a `Lag` (see there for T); the same delay on all axes is a fault of the recording. Source:
-    Padé expansion of a delay. Signature: rate of torque, the same time everywhere.
+    On one axis a delay is a `Lag` (see there for T); the same delay on all axes is a fault of the
+    recording. Source: Padé expansion of a delay. Signature: rate of torque, the same time
+    everywhere.
     """
 
     name = "time-skew"
@@ -160,14 +185,20 @@ class TimeSkew(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k); the axis does not matter."""
-        rate = filtered_rate(signals.motor_torque_nm, signals.rate_hz, self.filter_s, backwards=bool(self.backwards))
+        rate = filtered_rate(
+            signals.motor_torque_nm, signals.rate_hz, self.filter_s, backwards=bool(self.backwards)
+        )
         return -rate[:, None]
 
 
-def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float, *, backwards: bool) -> FloatArray:
-    """ẏ of T ẏ + y = τ [Nm/s], exact for torques that are linear between samples; of the shape of ``torque_nm``.
+def filtered_rate(
+    torque_nm: FloatArray, rate_hz: float, filter_s: float, *, backwards: bool
+) -> FloatArray:
+    """ẏ of T ẏ + y = τ [Nm/s], exact for torques that are linear between samples;
+    of the shape of ``torque_nm``.
 
-    It starts as if the first torque had been there for ever. With T = 0, ẏ is the central difference of τ.
+    It starts as if the first torque had been there for ever. With T = 0, ẏ is the central
+    difference of τ.
 
     Args:
         torque_nm: τ, shape (k,) or (n, k).
@@ -181,11 +212,14 @@ def filtered_rate(torque_nm: FloatArray, rate_hz: float, filter_s: float, *, bac
         return np.asarray(np.gradient(torque_nm, axis=-1) * rate_hz)
     steps = filter_s * rate_hz
     kept = np.exp(-1.0 / steps)
-    new, old = 1.0 - (1.0 - kept) * steps, (1.0 - kept) * steps - kept
+    new = 1.0 - (1.0 - kept) * steps
+    old = (1.0 - kept) * steps - kept
     # y_k − kept · y_k−1 = new · τ_k + old · τ_k−1 is a triangular system with two bands.
     band = np.full((2, torque_nm.shape[-1]), -kept, order="F")
     driven = new * torque_nm
     driven[..., 1:] += old * torque_nm[..., :-1]
     driven[..., 0] = torque_nm[..., 0]
-    passed = lapack.dtbtrs(band, np.atleast_2d(driven).T, uplo="L", diag="U")[0].T.reshape(torque_nm.shape)
+    passed = lapack.dtbtrs(band, np.atleast_2d(driven).T, uplo="L", diag="U")[0].T.reshape(
+        torque_nm.shape
+    )
     return np.asarray((torque_nm - passed) / filter_s)

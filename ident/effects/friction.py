@@ -10,7 +10,17 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Reported, Sense, Switch, sense_fault
+from ident.effects.effect import (
+    AxisNumber,
+    Effect,
+    GearSide,
+    Property,
+    Range,
+    Reported,
+    Sense,
+    Switch,
+    sense_fault,
+)
 from ident.effects.rotor import least_rotor_rest, loss_columns
 from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal, watched_s
 from ident.model.model import Column
@@ -36,15 +46,17 @@ class SpeedFriction(Effect):
 class Stribeck(SpeedFriction):
     """τ = c · sign(q̇) · exp(−|q̇|/η);  c > 0: more friction at low speed.
 
-    Source: Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994), the exponential form of the Stribeck
-    curve; boundary lubrication gives way to a film as the speed grows past η. Signature: low speed, odd in q̇.
+    Source: Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994), the exponential form
+    of the Stribeck curve; boundary lubrication gives way to a film as the speed grows past η.
+    Signature: low speed, odd in q̇.
     """
 
     name = "stribeck"
     declares = Property.ODD_IN_VELOCITY
     coefficients = (Column("amplitude", "Nm", least=0.0),)
 
-    speed_rad_s: Annotated[float, Range(1e-4, 1e2)]  #: η, between standstill and a tenth of full speed
+    #: η, between standstill and a tenth of full speed
+    speed_rad_s: Annotated[float, Range(1e-4, 1e2)]
 
     def at_speed(self, velocity_rad_s: FloatArray) -> FloatArray:
         """Torque per unit of the amplitude, shape (1, k)."""
@@ -56,14 +68,16 @@ class Stribeck(SpeedFriction):
 class NonlinearViscous(SpeedFriction):
     """τ = c · sign(q̇) · |q̇|^η;  c > 0: drag against the motion.
 
-    Source: shear-thinning grease (η < 1) and churning losses (η = 2, 3); Harris & Kotzalas, Rolling Bearing Analysis,
-    where load-free bearing drag grows with speed to the power 2/3. Signature: all speeds, odd in q̇.
+    Source: shear-thinning grease (η < 1) and churning losses (η = 2, 3); Harris & Kotzalas, Rolling
+    Bearing Analysis, where load-free bearing drag grows with speed to the power 2/3. Signature: all
+    speeds, odd in q̇.
     """
 
     name = "nonlinear-viscous"
     declares = Property.ODD_IN_VELOCITY
 
-    exponent: Annotated[float, Range(0.05, 10.0)]  #: η; one would be the declared viscous friction itself
+    #: η; one would be the declared viscous friction itself
+    exponent: Annotated[float, Range(0.05, 10.0)]
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
@@ -83,10 +97,11 @@ class NonlinearViscous(SpeedFriction):
 
 @dataclass(frozen=True, slots=True)
 class AsymmetricViscous(SpeedFriction):
-    """τ = c · |q̇|;  c > 0: more viscous friction in the positive direction than in the negative one.
+    """τ = c · |q̇|;  c > 0: more viscous friction in the positive direction than in the negative
+    one.
 
-    Source: the even part of Fv⁺q̇ for q̇ > 0, Fv⁻q̇ for q̇ < 0 (Swevers et al., IEEE TRA 13 (1997)); the odd part is the
-    declared viscous friction. Signature: even in q̇.
+    Source: the even part of Fv⁺q̇ for q̇ > 0, Fv⁻q̇ for q̇ < 0 (Swevers et al., IEEE TRA 13
+    (1997)); the odd part is the declared viscous friction. Signature: even in q̇.
     """
 
     name = "asymmetric-viscous"
@@ -100,13 +115,15 @@ class AsymmetricViscous(SpeedFriction):
 
 @dataclass(frozen=True, slots=True)
 class LoadFriction(Effect):
-    """τ = c · |τ_L| · sign(q̇) · |q̇|^η, τ_L the torque for links and payload;  c > 0: friction grows with the load.
+    """τ = c · |τ_L| · sign(q̇) · |q̇|^η, τ_L the torque for links and payload;  c > 0:
+    friction grows with the load.
 
-    Where the model's τ_L contains the rotor, J q̈ is taken off, and d · ∂τ/∂J / c is a second column (`with_rotor`): see
-    `ident.effects.rotor`.
+    Where the model's τ_L contains the rotor, J q̈ is taken off, and d · ∂τ/∂J / c is a second
+    column (`with_rotor`): see `ident.effects.rotor`.
 
-    Source: Amontons' law at the gear mesh; Hamon, Gautier & Garrec, IROS 2010, "Dynamic identification of robots with
-    a dry friction model depending on load and velocity". Signature: sign × load; loaded and unloaded runs differ in it.
+    Source: Amontons' law at the gear mesh; Hamon, Gautier & Garrec, IROS 2010, "Dynamic
+    identification of robots with a dry friction model depending on load and velocity". Signature:
+    sign × load; loaded and unloaded runs differ in it.
     """
 
     name = "load-friction"
@@ -117,8 +134,10 @@ class LoadFriction(Effect):
     added_settings = ("rotor_inertia_kg_m2", "with_rotor")
 
     speed_exponent: Switch  #: η, 0 for dry and 1 for viscous friction
-    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
-    with_rotor: Switch = 0  #: 1 where the rest of the rotor's inertia is fitted, d = c (Ia − J), else 0
+    #: J, of the rotor in the model's load torque
+    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0
+    #: 1 where the rest of the rotor's inertia is fitted, d = c (Ia − J), else 0
+    with_rotor: Switch = 0
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
@@ -135,7 +154,9 @@ class LoadFriction(Effect):
     @property
     def reported(self) -> Reported:
         """A share of the load of dry friction; of viscous friction its coefficient."""
-        return Reported.COEFFICIENTS if self.speed_exponent else Reported.SHARE_OF_LOAD
+        if self.speed_exponent:
+            return Reported.COEFFICIENTS
+        return Reported.SHARE_OF_LOAD
 
     @property
     def forms(self) -> tuple[LoadFriction, ...]:
@@ -148,15 +169,18 @@ class LoadFriction(Effect):
         rubbing = np.sign(v) * np.abs(v) ** self.speed_exponent
         load_nm = signals.load_torque_nm[axis]
         with_rotor = bool(self.with_rotor)
-        return loss_columns(signals, axis, load_nm, rubbing, self.rotor_inertia_kg_m2, with_rotor=with_rotor)
+        return loss_columns(
+            signals, axis, load_nm, rubbing, self.rotor_inertia_kg_m2, with_rotor=with_rotor
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class PositionFriction(Effect):
     """τ = sign(q̇) · (a cos q + b sin q);  a > 0: more dry friction at q = 0.
 
-    Source: first harmonic of a run-out of gear, seal or bearing over one joint revolution; Armstrong-Hélouvry (1991),
-    "Control of Machines with Friction", ch. 4. Signature: sign × position.
+    Source: first harmonic of a run-out of gear, seal or bearing over one joint revolution;
+    Armstrong-Hélouvry (1991), "Control of Machines with Friction", ch. 4. Signature: sign ×
+    position.
     """
 
     name = "position-friction"
@@ -168,16 +192,18 @@ class PositionFriction(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
-        q, s = signals.position_rad[axis], np.sign(signals.velocity_rad_s[axis])
+        q = signals.position_rad[axis]
+        s = np.sign(signals.velocity_rad_s[axis])
         return np.asarray(np.stack(cos_sin(q)) * s)
 
 
 @dataclass(frozen=True, slots=True)
 class Presliding(Effect):
-    """τ = c · (z − sign(q̇)),  dz/dq = (1 − z · sign(q̇))/η;  c > 0: friction builds up after a reversal.
+    """τ = c · (z − sign(q̇)),  dz/dq = (1 − z · sign(q̇))/η;  c > 0:
+    friction builds up after a reversal.
 
-    Instead of the declared sign(q̇), a part c of the dry friction follows z. Source: Dahl (1968), "A solid friction
-    model". Signature: distance since the last reversal.
+    Instead of the declared sign(q̇), a part c of the dry friction follows z. Source: Dahl (1968),
+    "A solid friction model". Signature: distance since the last reversal.
     """
 
     name = "presliding"
@@ -190,7 +216,8 @@ class Presliding(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
         direction, distance = distance_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)
-        # z − direction: after a reversal it starts where the last one ended, and dies out over the distance.
+        # z − direction: after a reversal it starts where the last one ended, and dies out over the
+        # distance.
         faded = np.exp(-distance / self.distance_rad)
         starts = np.flatnonzero(np.diff(direction, prepend=np.nan) != 0)
         lag = np.empty_like(direction)
@@ -203,11 +230,12 @@ class Presliding(Effect):
 
 @dataclass(frozen=True, slots=True)
 class PassiveFriction(Effect):
-    """τ = a sign(q̇) + b q̇ on a joint without a motor;  a, b > 0: bearings of a closed chain brake.
+    """τ = a sign(q̇) + b q̇ on a joint without a motor;  a, b > 0:
+    bearings of a closed chain brake.
 
-    Source: Coulomb's law and a film of oil; in the equations of the motors it appears through the leverage of the joint
-    (Briot & Gautier, Multibody System Dynamics 2015, friction of passive joints). Signature: odd in the speed of the
-    passive joint, on all motors of its loop.
+    Source: Coulomb's law and a film of oil; in the equations of the motors it appears through the
+    leverage of the joint (Briot & Gautier, Multibody System Dynamics 2015, friction of passive
+    joints). Signature: odd in the speed of the passive joint, on all motors of its loop.
     """
 
     name = "passive-friction"
@@ -226,9 +254,10 @@ class PassiveFriction(Effect):
 class WarmUp(Effect):
     """τ = e^(−t/η) · (c_s · sign(q̇) + c_v · q̇);  c_s, c_v > 0: more friction while cold.
 
-    Source: grease is stiff when cold, and the heat of the losses fills the joint's capacity with one time constant;
-    Bittencourt & Axelsson, "Modeling and experiment design for identification of wear in a robot joint under load and
-    temperature uncertainties based on friction data", IEEE/ASME Trans. Mechatronics 19 (2014). Signature: time.
+    Source: grease is stiff when cold, and the heat of the losses fills the joint's capacity with
+    one time constant; Bittencourt & Axelsson, "Modeling and experiment design for identification of
+    wear in a robot joint under load and temperature uncertainties based on friction data",
+    IEEE/ASME Trans. Mechatronics 19 (2014). Signature: time.
     """
 
     name = "warm-up"
@@ -237,18 +266,25 @@ class WarmUp(Effect):
     coefficients = (Column("dry", "Nm", least=0.0), Column("viscous", "Nm/(rad/s)", least=0.0))
 
     time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η, from half a run to many
-    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as after a power-on.
+    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run,
+    #: as after a power-on.
     whole_session: Switch
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
-        """Whether the friction fades while it is watched: over the session, or over the longest run."""
+        """Whether the friction fades while it is watched:
+        over the session, or over the longest run.
+        """
         del axis
         return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
-        time_s = signals.session_s if self.whole_session else signals.time_s
-        cold, v = np.exp(-time_s / self.time_constant_s), signals.velocity_rad_s[axis]
+        if self.whole_session:
+            time_s = signals.session_s
+        else:
+            time_s = signals.time_s
+        cold = np.exp(-time_s / self.time_constant_s)
+        v = signals.velocity_rad_s[axis]
         return np.stack((cold * np.sign(v), cold * v))
 
 
@@ -257,12 +293,14 @@ SMALLEST_WARMING_K = 1.0  #: Range of a temperature that some sensors of drives 
 
 @dataclass(frozen=True, slots=True)
 class TemperatureFriction(Effect):
-    """τ = (T − T₀) · (c_s · sign(q̇) + c_v · q̇), T the recorded temperature, T₀ = 40 °C;  c_v < 0: less while warm.
+    """τ = (T − T₀) · (c_s · sign(q̇) + c_v · q̇), T the recorded temperature, T₀ = 40 °C;  c_v < 0:
+    less while warm.
 
-    The declared friction is then that at T₀, for which see `ident.effects.signals.REFERENCE_C`. A lubricant's viscosity
-    falls with temperature, so c_v is not positive; dry friction may go either way, by preload and by film. Source:
-    Bittencourt & Gunnarsson, "Static friction in a robot joint: modeling and identification of load and temperature
-    effects", ASME J. Dynamic Systems, Measurement, and Control 134 (2012), to first order. Signature: temperature.
+    The declared friction is then that at T₀, for which see `ident.effects.signals.REFERENCE_C`. A
+    lubricant's viscosity falls with temperature, so c_v is not positive; dry friction may go either
+    way, by preload and by film. Source: Bittencourt & Gunnarsson, "Static friction in a robot
+    joint: modeling and identification of load and temperature effects", ASME J. Dynamic Systems,
+    Measurement, and Control 134 (2012), to first order. Signature: temperature.
     """
 
     name = "temperature-friction"
@@ -272,22 +310,27 @@ class TemperatureFriction(Effect):
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
         """Whether every run has the temperature of the axis, and it changes over them."""
-        if any(run.temperature_c is None or np.isnan(run.temperature_c[axis]).any() for run in runs):
+        if any(
+            run.temperature_c is None or np.isnan(run.temperature_c[axis]).any() for run in runs
+        ):
             return False
         values = [run.temperature(axis) for run in runs]
         return bool(max(map(np.max, values)) - min(map(np.min, values)) >= SMALLEST_WARMING_K)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k); zero where the temperature was not recorded."""
-        above_k, v = signals.temperature(axis) - REFERENCE_C, signals.velocity_rad_s[axis]
+        above_k = signals.temperature(axis) - REFERENCE_C
+        v = signals.velocity_rad_s[axis]
         return np.stack((above_k * np.sign(v), above_k * v))
 
 
 @dataclass(frozen=True, slots=True)
 class Coupling(Effect):
-    """τ_i = c_s · sign(q̇_i ± q̇_j) + c_v · (q̇_i ± q̇_j), and ± the same on joint j;  c > 0: against the relative motion.
+    """τ_i = c_s · sign(q̇_i ± q̇_j) + c_v · (q̇_i ± q̇_j), and ± the same on joint j;  c > 0:
+    against the relative motion.
 
-    Source: a shaft, belt or hose of one joint that runs through another (paper eq. 25). Signature: another axis' speed.
+    Source: a shaft, belt or hose of one joint that runs through another (paper eq. 25). Signature:
+    another axis' speed.
     """
 
     name = "coupling"
@@ -306,6 +349,8 @@ class Coupling(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, 2, k)."""
-        shared = signals.velocity_rad_s[axis] + self.sense * signals.velocity_rad_s[self.other_axis - 1]
+        shared = (
+            signals.velocity_rad_s[axis] + self.sense * signals.velocity_rad_s[self.other_axis - 1]
+        )
         friction = np.stack((np.sign(shared), shared))
         return np.stack((friction, self.sense * friction))

@@ -1,10 +1,12 @@
-"""What the description of a robot has wrong: zeros of joints, the mounting, and positions that come late.
+"""What the description of a robot has wrong:
+zeros of joints, the mounting, and positions that come late.
 
-Such a mistake changes the torques of the whole arm. Its column is the derivative of all joint torques with respect to
-it, at the parameters of an estimate; friction of one axis, which may look like it there, explains nothing on the
-others. One column is right for small mistakes alone. So a search corrects the description by what it has found
-(`corrected_robot`, `corrected_dataset`), builds everything anew around it, and fits what is left: the value of a
-coefficient is the whole correction, what was applied and what is left, and its σ is that of the fit.
+Such a mistake changes the torques of the whole arm. Its column is the derivative of all joint
+torques with respect to it, at the parameters of an estimate; friction of one axis, which may look
+like it there, explains nothing on the others. One column is right for small mistakes alone. So a
+search corrects the description by what it has found (`corrected_robot`, `corrected_dataset`),
+builds everything anew around it, and fits what is left: the value of a coefficient is the whole
+correction, what was applied and what is left, and its σ is that of the fit.
 """
 
 from __future__ import annotations
@@ -23,9 +25,11 @@ from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter
 from ident.model.model import Column, Model
 from ident.model.robot import Motion, Robot, skew
 
-POSITION_STEP = 1e-5  #: Of a difference quotient, rad or m: torques change by 1e-5 of themselves, far above rounding
+#: Of a difference quotient, rad or m: torques change by 1e-5 of themselves, far above rounding
+POSITION_STEP = 1e-5
 TIME_STEP_S = 1e-5  #: The same of a delay
-LARGEST_ZERO = 0.8  #: Largest zero offset, rad or m: 46°; a larger one is looked for by `turned_geometry`
+#: Largest zero offset, rad or m: 46°; a larger one is looked for by `turned_geometry`
+LARGEST_ZERO = 0.8
 LARGEST_TILT_RAD = 0.35  #: Largest turn of gravity that two columns can find
 LONGEST_DELAY_S = 0.02  #: Longest delay of one encoder
 
@@ -34,7 +38,8 @@ LONGEST_DELAY_S = 0.02  #: Longest delay of one encoder
 class GeometryEffect(Effect):
     """An effect that corrects the description of the robot, or of its recordings.
 
-    The applied part does not take part in comparisons: an effect is the same one after each correction.
+    The applied part does not take part in comparisons: an effect is the same one after each
+    correction.
     """
 
     side = GearSide.ALL_JOINTS
@@ -43,7 +48,9 @@ class GeometryEffect(Effect):
     @property
     @abstractmethod
     def applied(self) -> tuple[float, ...]:
-        """Value of each coefficient that the description has been corrected by already, shape (p,)."""
+        """Value of each coefficient that the description has been corrected by already,
+        shape (p,).
+        """
 
     @abstractmethod
     def with_applied(self, values: Sequence[float]) -> GeometryEffect:
@@ -64,9 +71,10 @@ class GeometryEffect(Effect):
 class ZeroOffset(GeometryEffect):
     """τ = c ∂τ/∂q_j, on all joints;  c > 0: joint j stands further than its position says, by c.
 
-    Source: calibration of joint offsets; Hollerbach, Khalil & Gautier, "Model identification", Springer Handbook of
-    Robotics (2016), by torques in the place of poses. Signature: gravity and inertia of the arm behind the joint act in
-    directions that are turned, on the joint and on all those before it.
+    Source: calibration of joint offsets; Hollerbach, Khalil & Gautier, "Model identification",
+    Springer Handbook of Robotics (2016), by torques in the place of poses. Signature: gravity and
+    inertia of the arm behind the joint act in directions that are turned, on the joint and on all
+    those before it.
     """
 
     name = "zero-offset"
@@ -75,12 +83,17 @@ class ZeroOffset(GeometryEffect):
     declares = Property.TURNS_THE_ARM
     abscissa = Abscissa.LOAD
 
-    applied_rad: float = field(default=0.0, compare=False)  #: correction of the joint's zero in the description
+    #: correction of the joint's zero in the description
+    applied_rad: float = field(default=0.0, compare=False)
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """The offset."""
-        return (Column("offset", "rad", least=-LARGEST_ZERO, largest=LARGEST_ZERO, about=self.applied_rad),)
+        return (
+            Column(
+                "offset", "rad", least=-LARGEST_ZERO, largest=LARGEST_ZERO, about=self.applied_rad
+            ),
+        )
 
     @property
     def applied(self) -> tuple[float, ...]:
@@ -93,7 +106,9 @@ class ZeroOffset(GeometryEffect):
         return ZeroOffset(applied_rad=float(offset))
 
     def correct_robot(self, robot: Robot, axis: int) -> Robot:
-        """Turn or shift the frame of the joint, so that its recorded position means what it should."""
+        """Turn or shift the frame of the joint, so that its recorded position means what it
+        should.
+        """
         zero = GeometryParameter(GeometryKind.ZERO, robot.axes[axis].name)
         return with_geometry(robot, (GeometryChange(zero, self.applied_rad),))
 
@@ -109,10 +124,12 @@ class ZeroOffset(GeometryEffect):
 
 @dataclass(frozen=True, slots=True)
 class GravityDirection(GeometryEffect):
-    """τ = a ∂τ/∂α + b ∂τ/∂β on all joints: gravity is turned about two axes across the declared one.
+    """τ = a ∂τ/∂α + b ∂τ/∂β on all joints:
+    gravity is turned about two axes across the declared one.
 
-    Source: torque is linear in the vector of gravity. Its length is known; two angles are its direction, so a mounting
-    that is tilted shows in two columns. Signature: torque at rest on many joints at once, also about a vertical axis.
+    Source: torque is linear in the vector of gravity. Its length is known; two angles are its
+    direction, so a mounting that is tilted shows in two columns. Signature: torque at rest on many
+    joints at once, also about a vertical axis.
     """
 
     name = "gravity-direction"
@@ -121,14 +138,21 @@ class GravityDirection(GeometryEffect):
     abscissa = Abscissa.LOAD
     has_axis = False
 
-    applied_1_rad: float = field(default=0.0, compare=False)  #: applied turn about the first axis (`across`)
+    #: applied turn about the first axis (`across`)
+    applied_1_rad: float = field(default=0.0, compare=False)
     applied_2_rad: float = field(default=0.0, compare=False)  #: applied turn about the second axis
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """The components of the turn."""
         return tuple(
-            Column(f"turn {number}", "rad", least=-LARGEST_TILT_RAD, largest=LARGEST_TILT_RAD, about=applied)
+            Column(
+                f"turn {number}",
+                "rad",
+                least=-LARGEST_TILT_RAD,
+                largest=LARGEST_TILT_RAD,
+                about=applied,
+            )
             for number, applied in enumerate(self.applied, start=1)
         )
 
@@ -146,7 +170,11 @@ class GravityDirection(GeometryEffect):
         """Turn gravity."""
         del axis
         declared = robot.gravity_m_s2
-        return replace(robot, gravity_m_s2=turned_gravity(declared, self.applied), declared_gravity_m_s2=declared)
+        return replace(
+            robot,
+            gravity_m_s2=turned_gravity(declared, self.applied),
+            declared_gravity_m_s2=declared,
+        )
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 2, k); the axis does not matter."""
@@ -154,7 +182,10 @@ class GravityDirection(GeometryEffect):
         arm = require_arm(signals)
         robot = arm.model.robot
         found = robot.gravity_m_s2
-        declared = found if robot.declared_gravity_m_s2 is None else robot.declared_gravity_m_s2
+        if robot.declared_gravity_m_s2 is None:
+            declared = found
+        else:
+            declared = robot.declared_gravity_m_s2
         columns: list[FloatArray] = []
         for number in range(2):
             turn = list(self.applied)
@@ -166,10 +197,12 @@ class GravityDirection(GeometryEffect):
 
 @dataclass(frozen=True, slots=True)
 class LatePosition(GeometryEffect):
-    """τ = c (∂τ/∂q_j q̇_j + ∂τ/∂q̇_j q̈_j + ∂τ/∂q̈_j d³q_j/dt³), on all joints;  c > 0: the position of j is late by c.
+    """τ = c (∂τ/∂q_j q̇_j + ∂τ/∂q̇_j q̈_j + ∂τ/∂q̈_j d³q_j/dt³), on all joints;  c > 0:
+    the position of j is late by c.
 
-    Source: Taylor expansion of the torque of the whole arm with one joint later than the others. Signature: in motion
-    alone, on the joint itself and on all joints that its acceleration acts on; a late current shows on its own alone.
+    Source: Taylor expansion of the torque of the whole arm with one joint later than the others.
+    Signature: in motion alone, on the joint itself and on all joints that its acceleration acts on;
+    a late current shows on its own alone.
     """
 
     name = "late-position"
@@ -178,12 +211,17 @@ class LatePosition(GeometryEffect):
     declares = Property.TURNS_THE_ARM
     abscissa = Abscissa.TORQUE_RATE
 
-    applied_s: float = field(default=0.0, compare=False)  #: by which the recorded position was advanced
+    #: by which the recorded position was advanced
+    applied_s: float = field(default=0.0, compare=False)
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """The delay."""
-        return (Column("time", "s", least=-LONGEST_DELAY_S, largest=LONGEST_DELAY_S, about=self.applied_s),)
+        return (
+            Column(
+                "time", "s", least=-LONGEST_DELAY_S, largest=LONGEST_DELAY_S, about=self.applied_s
+            ),
+        )
 
     @property
     def applied(self) -> tuple[float, ...]:
@@ -196,7 +234,9 @@ class LatePosition(GeometryEffect):
         return LatePosition(applied_s=float(delay_s))
 
     def correct_dataset(self, data: Dataset, axis: int) -> Dataset:
-        """Advance one joint's position and its derivatives; what the filter has smoothed is interpolated."""
+        """Advance one joint's position and its derivatives;
+        what the filter has smoothed is interpolated.
+        """
         steps = self.applied_s * data.rate_hz
 
         def advanced(values: FloatArray) -> FloatArray:
@@ -225,12 +265,14 @@ class LatePosition(GeometryEffect):
         motion = arm.motion
         jerk = np.gradient(motion.acceleration_rad_s2[:, axis]) * signals.rate_hz
         position, velocity, acceleration = (
-            state.copy() for state in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
+            state.copy()
+            for state in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
         )
         position[:, axis] += TIME_STEP_S * motion.velocity_rad_s[:, axis]
         velocity[:, axis] += TIME_STEP_S * motion.acceleration_rad_s2[:, axis]
         acceleration[:, axis] += TIME_STEP_S * jerk
-        # Dry friction jumps where the joint turns back; there the joint rests, and rows at rest do not count.
+        # Dry friction jumps where the joint turns back; there the joint rests, and rows at rest do
+        # not count.
         change = arm.smooth_torque_change(Motion(position, velocity, acceleration))
         return change[:, None] / TIME_STEP_S
 
@@ -246,11 +288,15 @@ def corrected_model(model: Model, effects: Iterable[PlacedEffect]) -> Model:
     for placed in effects:
         if isinstance(placed.effect, GeometryEffect):
             robot = placed.effect.correct_robot(robot, placed.axis)
-    return model if robot is model.robot else replace(model, robot=robot)
+    if robot is model.robot:
+        return model
+    return replace(model, robot=robot)
 
 
 def corrected_dataset(data: Dataset, effects: Iterable[PlacedEffect]) -> Dataset:
-    """A run with the applied part of all corrections among these effects; one that was planned has nothing wrong."""
+    """A run with the applied part of all corrections among these effects;
+    one that was planned has nothing wrong.
+    """
     if data.is_planned:
         return data
     for placed in effects:
@@ -266,14 +312,17 @@ def require_arm(signals: Signals) -> Arm:
         ValueError: they were made without one.
     """
     if signals.arm is None:
-        raise ValueError("signals without an arm; expected those that fitted_signals or declared_signals returns")
+        raise ValueError(
+            "signals without an arm; expected those that fitted_signals or declared_signals returns"
+        )
     return signals.arm
 
 
 def across(gravity_m_s2: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors across gravity and each other, shape (3,) each.
 
-    Of gravity along −z they are x and y of the base, of gravity along +z, as of an arm that hangs, x and −y.
+    Of gravity along −z they are x and y of the base, of gravity along +z, as of an arm that hangs,
+    x and −y.
     """
     along = gravity_m_s2 / np.linalg.norm(gravity_m_s2)
     other = np.eye(3)[int(np.argmin(np.abs(along)))]
@@ -283,7 +332,9 @@ def across(gravity_m_s2: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> FloatArray:
-    """Gravity turned by the two components of a turn about the axes of `across` [m/s²], shape (3,)."""
+    """Gravity turned by the two components of a turn about the axes of `across` [m/s²],
+    shape (3,).
+    """
     first, second = across(declared_m_s2)
     return rotation_by(turn_rad[0] * first + turn_rad[1] * second) @ declared_m_s2
 
@@ -291,10 +342,11 @@ def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> Floa
 def turned_gravity_std(
     declared_m_s2: FloatArray, turned_m_s2: FloatArray, deviations_rad: Sequence[float]
 ) -> FloatArray:
-    """σ of each component of gravity, from those of the two components of its turn [m/s²], shape (3,).
+    """σ of each component of gravity, from those of the two components of its turn [m/s²],
+    shape (3,).
 
-    To first order a small further turn t about an axis moves gravity by t × g; the two σ may differ, because the moves
-    may show one of the turns alone.
+    To first order a small further turn t about an axis moves gravity by t × g; the two σ may
+    differ, because the moves may show one of the turns alone.
     """
     changes = [
         deviation * np.cross(axis, turned_m_s2)
@@ -304,7 +356,9 @@ def turned_gravity_std(
 
 
 def turn_between(declared_m_s2: FloatArray, found_m_s2: FloatArray) -> FloatArray:
-    """The two components of the turn from one direction of gravity to another, as of `turned_gravity`, shape (2,)."""
+    """The two components of the turn from one direction of gravity to another,
+    as of `turned_gravity`, shape (2,).
+    """
     axis = np.cross(declared_m_s2, found_m_s2)
     sine = float(np.linalg.norm(axis))
     if sine == 0.0:
@@ -324,7 +378,9 @@ def rotation_by(vector_rad: FloatArray) -> FloatArray:
 
 
 def shifted(values: FloatArray, steps: float) -> FloatArray:
-    """Values so many samples later, by Lagrange's cubic between four neighbours, shape (k,); the ends stay constant."""
+    """Values so many samples later, by Lagrange's cubic between four neighbours, shape (k,);
+    the ends stay constant.
+    """
     whole = int(np.floor(steps))
     part = steps - whole
     weights = (

@@ -1,12 +1,13 @@
-"""Effects of one's own: subclasses of `Effect` in other packages, found by an entry point or given as an argument.
+"""Effects of one's own: subclasses of `Effect` in other packages,
+found by an entry point or given as an argument.
 
 A package registers its effects in its `pyproject.toml`::
 
     [project.entry-points."drivegain.effects"]
     eccentric-friction = "my_effects:EFFECTS"
 
-where ``EFFECTS`` is an effect, or a sequence of effects: those of one name are one family, with the values of its
-searched parameters that a search tries.
+where ``EFFECTS`` is an effect, or a sequence of effects: those of one name are one family, with the
+values of its searched parameters that a search tries.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, packages_distributions, version
+from importlib.metadata import (
+    EntryPoint,
+    PackageNotFoundError,
+    entry_points,
+    packages_distributions,
+    version,
+)
 from itertools import chain
 
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
@@ -29,7 +36,10 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 Family = tuple[Effect, ...]
 """Effects of one name, with the values of its searched parameters that a search tries."""
 
-SHIPPED = {effect.name: effect for effect in chain((family[0] for family in (*EFFECTS, *GEOMETRY)), UNNAMED)}
+SHIPPED = {
+    effect.name: effect
+    for effect in chain((family[0] for family in (*EFFECTS, *GEOMETRY)), UNNAMED)
+}
 """One member of each family of the dictionary, by its name."""
 
 
@@ -42,13 +52,15 @@ class InstalledFamily:
 
 
 def search_families(own_effects: Sequence[Effect] = ()) -> tuple[Family, ...]:
-    """Return the families that a search tries: the dictionary, those of installed packages, and one's own.
+    """Return the families that a search tries:
+    the dictionary, those of installed packages, and one's own.
 
     Args:
         own_effects: given as an argument; they take the place of installed ones of the same name.
 
     Raises:
-        EffectRefused: an effect of another package cannot be used (`installed_families`, `families_of`).
+        EffectRefused: an effect of another package cannot be used (`installed_families`,
+            `families_of`).
     """
     given = families_of(own_effects, "`own_effects`")
     names = {family[0].name for family in given}
@@ -85,18 +97,21 @@ def installed_families() -> dict[str, InstalledFamily]:
     """Return the families that installed packages register by an entry point, by their names.
 
     Raises:
-        EffectRefused: an entry point cannot be loaded, is no effect, or two packages have effects of one name.
+        EffectRefused: an entry point cannot be loaded, is no effect, or two packages have effects
+            of one name.
     """
     found: dict[str, InstalledFamily] = {}
-    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda one: (one.name, one.value)):
+    for point in sorted(
+        entry_points(group=ENTRY_POINT_GROUP), key=lambda one: (one.name, one.value)
+    ):
         package = _package_of_entry(point)
         where = f"entry point {point.name!r} of package {package!r}"
         for family in families_of(_loaded(point, where), where):
             name = family[0].name
             if name in found:
                 raise EffectRefused(
-                    f"{where}: found effect {name!r}, which package {found[name].package!r} has, too; expected one "
-                    "package for each effect; remove one of the packages"
+                    f"{where}: found effect {name!r}, which package {found[name].package!r} has, "
+                    "too; expected one package for each effect; remove one of the packages"
                 )
             found[name] = InstalledFamily(family, package)
     return found
@@ -110,20 +125,29 @@ def families_of(effects: Iterable[object], where: str) -> tuple[Family, ...]:
         where: source of the effects, for the error.
 
     Raises:
-        EffectRefused: one is not an effect, has a name that cannot be used, or a field that no calibration would keep.
+        EffectRefused: one is not an effect, has a name that cannot be used, or a field that no
+            calibration would keep.
     """
     if isinstance(effects, Effect) or not isinstance(effects, Iterable):
-        raise EffectRefused(f"{where}: found {effects!r:.80}; expected a list of effects; put brackets around it")
+        raise EffectRefused(
+            f"{where}: found {effects!r:.80}; expected a list of effects; put brackets around it"
+        )
     families: dict[str, list[Effect]] = {}
     for effect in effects:
         if not isinstance(effect, Effect):
-            given = f"the class {effect.__name__}" if isinstance(effect, type) else f"{effect!r:.80}"
-            raise EffectRefused(f"{where}: found {given}; expected objects of subclasses of `ident.Effect`")
+            if isinstance(effect, type):
+                given = f"the class {effect.__name__}"
+            else:
+                given = f"{effect!r:.80}"
+            raise EffectRefused(
+                f"{where}: found {given}; expected objects of subclasses of `ident.Effect`"
+            )
         _check(effect, where)
         family = families.setdefault(effect.name, [])
         if family and type(family[0]) is not type(effect):
             raise EffectRefused(
-                f"{where}: found two classes of effects with the name {effect.name!r}; expected one name for each class"
+                f"{where}: found two classes of effects with the name {effect.name!r}; expected "
+                "one name for each class"
             )
         family.append(effect)
     return tuple(map(tuple, families.values()))
@@ -146,6 +170,36 @@ def package_of(effect: Effect) -> str | None:
     return f"module {module}"
 
 
+def is_of_package(effect: Effect, package: str) -> bool:
+    """Whether an effect is of the package that a calibration names, in whichever version.
+
+    Args:
+        effect: of one's own.
+        package: as from `package_of`, when the calibration was made: an effect of a module may
+            have moved into a package since, and a package may be imported without its entry point.
+    """
+    module = f"module {type(effect).__module__}"
+    own = package_of(effect) or ""
+    return package == module or _name_of(own) == _name_of(package)
+
+
+def installed_version(package: str) -> str:
+    """Return the installed version of the package that a calibration names; empty without one."""
+    if package.startswith("module "):
+        return ""
+    try:
+        return version(_name_of(package))
+    except PackageNotFoundError:
+        return ""
+
+
+def _name_of(package: str) -> str:
+    """Name of a package without its version; a module with its word."""
+    if package.startswith("module "):
+        return package
+    return package.partition(" ")[0]
+
+
 def _package_of_entry(point: EntryPoint) -> str:
     if point.dist is None:
         return point.module
@@ -156,9 +210,12 @@ def _loaded(point: EntryPoint, where: str) -> Iterable[object]:
     """What an entry point names: one effect, or several."""
     try:
         loaded = point.load()
-    except (Exception, SystemExit) as error:  # code of others: it may fail in any way, and even end the program
+    # Code of others: it may fail in any way, and even end the program.
+    except (Exception, SystemExit) as error:
         found = f"{point.value!r} that cannot be loaded ({type(error).__name__}: {error})"
-        raise EffectRefused(f"{where}: found {found}; expected an effect; repair or remove the package") from error
+        raise EffectRefused(
+            f"{where}: found {found}; expected an effect; repair or remove the package"
+        ) from error
     return loaded if isinstance(loaded, list | tuple) else (loaded,)
 
 
@@ -167,49 +224,57 @@ def _check(effect: Effect, where: str) -> None:
     name = effect.name
     if not _NAME.fullmatch(name):  # names of parameters begin with it
         raise EffectRefused(
-            f"{where}: found an effect with the name {name!r}; expected lowercase words joined by hyphens, such as "
-            "'eccentric-friction'"
+            f"{where}: found an effect with the name {name!r}; expected lowercase words joined by "
+            "hyphens, such as 'eccentric-friction'"
         )
     if name in SHIPPED and not is_shipped(effect):
-        raise EffectRefused(f"{where}: found an effect with the name {name!r}, which drivegain has; give it another")
+        raise EffectRefused(
+            f"{where}: found an effect with the name {name!r}, which drivegain has; give it another"
+        )
     if name in SHIPPED:
         raise EffectRefused(
-            f"{where}: found drivegain's own effect {name!r}; expected others: it is tried without this"
+            f"{where}: found drivegain's own effect {name!r}; expected others: it is tried "
+            "without this"
         )
     kept = set(effect.settings)
     lost = [field.name for field in fields(effect) if field.name not in kept]
     if lost:
         raise EffectRefused(
-            f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; expected each as "
-            "`Annotated[float, ident.Range(least, largest)]`: a calibration keeps these alone"
+            f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; "
+            "expected each as `Annotated[float, ident.Range(least, largest)]`: a calibration keeps "
+            "these alone"
         )
     if effect.side is GearSide.TWO_JOINTS and effect.axis_setting not in kept:
         raise EffectRefused(
-            f"{where}: found effect {name!r} on two joints without a setting `{effect.axis_setting}`; expected the "
-            f"number of the second one: `{effect.axis_setting}: Annotated[int, ident.Range(0, 12)] = 0`"
+            f"{where}: found effect {name!r} on two joints without a setting "
+            f"`{effect.axis_setting}`; expected the number of the second one: "
+            f"`{effect.axis_setting}: Annotated[int, ident.Range(0, 12)] = 0`"
         )
     _check_properties(effect, where)
     for setting, value in effect.settings.items():
         kind = setting_kind(effect, setting)
         if type(value) is not kind:
             raise EffectRefused(
-                f"{where}: found {setting} = {value!r} in effect {name!r}; expected a value of type {kind.__name__}, "
-                f"as it is annotated; write {kind.__name__}({value!r})"
+                f"{where}: found {setting} = {value!r} in effect {name!r}; expected a value of "
+                f"type {kind.__name__}, as it is annotated; write {kind.__name__}({value!r})"
             )
         allowed = setting_range(effect, setting)
         if not allowed.least <= value <= allowed.largest:
             raise EffectRefused(
-                f"{where}: found {setting} = {value:g} in effect {name!r}; expected a value from {allowed.least:g} to "
-                f"{allowed.largest:g}, as its range says; correct one of both"
+                f"{where}: found {setting} = {value:g} in effect {name!r}; expected a value from "
+                f"{allowed.least:g} to {allowed.largest:g}, as its range says; correct one of both"
             )
     coefficients = [column.name for column in effect.coefficients]
     if len(set(coefficients)) < len(coefficients):
-        raise EffectRefused(f"{where}: found coefficients {coefficients} of effect {name!r}; expected a name for each")
+        raise EffectRefused(
+            f"{where}: found coefficients {coefficients} of effect {name!r}; expected a name for "
+            "each"
+        )
     unfit = [column.name for column in effect.coefficients if ":" in column.name or not column.name]
     if unfit or not effect.coefficients:
         raise EffectRefused(
-            f"{where}: found coefficients {[column.name for column in effect.coefficients]} of effect {name!r}; "
-            "expected at least one, with a name without a colon"
+            f"{where}: found coefficients {[column.name for column in effect.coefficients]} of "
+            f"effect {name!r}; expected at least one, with a name without a colon"
         )
 
 
@@ -229,11 +294,12 @@ def _check_properties(effect: Effect, where: str) -> None:
         unknown = sorted(set(names) - set(settings))
         if unknown:
             raise EffectRefused(
-                f"{where}: found {', '.join(unknown)} in `{given}` of effect {effect.name!r}; expected names among its "
-                f"settings: {', '.join(settings) or 'it has none'}"
+                f"{where}: found {', '.join(unknown)} in `{given}` of effect {effect.name!r}; "
+                f"expected names among its settings: {', '.join(settings) or 'it has none'}"
             )
     if effect.reported is Reported.AMPLITUDE and len(effect.coefficients) != 2:
         raise EffectRefused(
-            f"{where}: found {len(effect.coefficients)} coefficients of effect {effect.name!r}, which reports give as "
-            "one amplitude; expected two, of a cosine and a sine; leave `reported` out"
+            f"{where}: found {len(effect.coefficients)} coefficients of effect {effect.name!r}, "
+            "which reports give as one amplitude; expected two, of a cosine and a sine; leave "
+            "`reported` out"
         )

@@ -1,4 +1,6 @@
-"""Torques that depend on the joint's position alone: springs, gravity compensators, cables and hoses."""
+"""Torques that depend on the joint's position alone:
+springs, gravity compensators, cables and hoses.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +10,39 @@ from typing import Annotated
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.effects.effect import AxisNumber, Effect, GearSide, Property, Range, Reported, Sense, Switch, sense_fault
+from ident.effects.effect import (
+    AxisNumber,
+    Effect,
+    GearSide,
+    Property,
+    Range,
+    Reported,
+    Sense,
+    Switch,
+    sense_fault,
+)
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
 CABLE_REACH = 2
-"""A cable or hose is led along neighbouring joints; between joints far apart, others would stretch it as well."""
+"""A cable or hose is led along neighbouring joints;
+between joints far apart, others would stretch it as well.
+"""
 
 CABLE_MOVES = 35
-"""As many as a term without a name needs: a cable's settings are chosen from as many shapes. In ten moves of a real
-arm, one joined that raised the error where the arm had not been."""
+"""As many as a term without a name needs: a cable's settings are chosen from as many shapes.
+
+In ten moves of a real arm, one joined that raised the error where the arm had not been.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Spring(Effect):
     """τ = c · q, with c · q₀ in the declared offset;  c > 0: pulls towards q₀.
 
-    Source: Hooke's law. Signature: position, at any speed; a gravity term differs from it over a large range only.
+    Source: Hooke's law. Signature: position, at any speed; a gravity term differs from it over a
+    large range only.
     """
 
     name = "spring"
@@ -42,8 +59,8 @@ class Spring(Effect):
 class PassiveSpring(Effect):
     """τ = c q + a on a joint without a motor;  c > 0: pulls towards −a/c.
 
-    Source: Hooke's law. Signature: position of the passive joint, on all motors of its loop. The torque a at position
-    zero is no declared offset there, so it is a parameter of its own.
+    Source: Hooke's law. Signature: position of the passive joint, on all motors of its loop. The
+    torque a at position zero is no declared offset there, so it is a parameter of its own.
     """
 
     name = "passive-spring"
@@ -62,8 +79,9 @@ class PassiveSpring(Effect):
 class Compensator(Effect):
     """τ = a cos kq + b sin kq;  a > 0: the motor pushes in the positive direction at q = 0.
 
-    Source: a compensating spring between two points of the arm, to its first harmonics; Ulrich & Kumar (1991),
-    "Passive mechanical gravity compensation for robot manipulators". Signature: position, at any speed.
+    Source: a compensating spring between two points of the arm, to its first harmonics; Ulrich &
+    Kumar (1991), "Passive mechanical gravity compensation for robot manipulators". Signature:
+    position, at any speed.
     """
 
     name = "gravity-compensator"
@@ -82,17 +100,19 @@ class Compensator(Effect):
 
 @dataclass(frozen=True, slots=True)
 class Counterbalance(Effect):
-    """τ = c₀ sin x / w + c₁ sin x (1 − (1 − ρ)/w),  w = √(1 + ρ² − 2ρ cos x),  x = q − α;  c₀, c₁ > 0: it pulls.
+    """τ = c₀ sin x / w + c₁ sin x (1 − (1 − ρ)/w),  w = √(1 + ρ² − 2ρ cos x),  x = q − α;  c₀,
+    c₁ > 0: it pulls.
 
-    A balancer pulls a lever of length L on the moving link towards its foot, at a from the axis on the link before;
-    ρ = l/b with l = min(a, L) and b = max(a, L), and α is the position where the lever points at the foot. Its length
-    is s = b w, shortest at s₁ = b (1 − ρ), and its force F = F₁ + k (s − s₁) gives the torque F ds/dq: c₀ = F₁ l is the
-    preload's share and c₁ = k a L the spring's. The motor must push away from q = α. Source: Klimchik, Wu, Caro, Dumas,
-    Furet & Pashkevich (2013), "Modelling of the gravity compensators in robotic manufacturing cells".
+    A balancer pulls a lever of length L on the moving link towards its foot, at a from the axis on
+    the link before; ρ = l/b with l = min(a, L) and b = max(a, L), and α is the position where the
+    lever points at the foot. Its length is s = b w, shortest at s₁ = b (1 − ρ), and its force F =
+    F₁ + k (s − s₁) gives the torque F ds/dq: c₀ = F₁ l is the preload's share and c₁ = k a L the
+    spring's. The motor must push away from q = α. Source: Klimchik, Wu, Caro, Dumas, Furet &
+    Pashkevich (2013), "Modelling of the gravity compensators in robotic manufacturing cells".
 
-    sin x is gravity's torque, too. Where nothing else shows the first moments of the links, it belongs to them, and
-    only c sin x / w is new, with c = (F₁ − k s₁) l of either sign: `with_spring` = 0. Signature: position, at any
-    speed, with harmonics.
+    sin x is gravity's torque, too. Where nothing else shows the first moments of the links, it
+    belongs to them, and only c sin x / w is new, with c = (F₁ − k s₁) l of either sign:
+    `with_spring` = 0. Signature: position, at any speed, with harmonics.
     """
 
     name = "counterbalance"
@@ -101,7 +121,8 @@ class Counterbalance(Effect):
     needs_revolute = True
     refined = ("ratio", "phase_rad")
 
-    #: ρ; with a shorter lever the torque is that of gravity and its second harmonic, and ρ and α do not show.
+    #: ρ; with a shorter lever the torque is that of gravity and its second harmonic, and ρ and α do
+    #: not show.
     ratio: Annotated[float, Range(0.05, 0.95)]
     phase_rad: Annotated[float, Range(-10.0, 10.0)]  #: α
     with_spring: Switch = 1  #: 1 where sin x is identified beside gravity, else 0
@@ -117,15 +138,18 @@ class Counterbalance(Effect):
         """Columns, shape (2, k) or (1, k)."""
         cosine, sine = cos_sin(signals.position_rad[axis] - self.phase_rad)
         bent = sine / np.sqrt(1.0 + self.ratio**2 - 2.0 * self.ratio * cosine)
-        return np.stack((bent, sine - (1.0 - self.ratio) * bent)) if self.with_spring else np.asarray(bent)[None]
+        if self.with_spring:
+            return np.stack((bent, sine - (1.0 - self.ratio) * bent))
+        return np.asarray(bent)[None]
 
 
 @dataclass(frozen=True, slots=True)
 class Hinge(Effect):
     """τ = c · max(0, σ (q − q₀));  c > 0: the motor pushes in the positive direction beyond q₀.
 
-    A cable or hose only pulls: what it stores beyond q₀ grows, ½ σ c (q − q₀)², and so σ c ≥ 0. One that lets go beyond
-    q₀ is the hinge of the other σ. Source: Hooke's law of a slack cable or hose. Signature: position, on one side.
+    A cable or hose only pulls: what it stores beyond q₀ grows, ½ σ c (q − q₀)², and so σ c ≥ 0. One
+    that lets go beyond q₀ is the hinge of the other σ. Source: Hooke's law of a slack cable or
+    hose. Signature: position, on one side.
     """
 
     name = "hinge"
@@ -150,7 +174,9 @@ class Hinge(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        return np.asarray(np.maximum(0.0, self.sense * (signals.position_rad[axis] - self.start_rad)))[None]
+        return np.asarray(
+            np.maximum(0.0, self.sense * (signals.position_rad[axis] - self.start_rad))
+        )[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,11 +194,13 @@ class AlongTwoJoints(Effect):
 
 @dataclass(frozen=True, slots=True)
 class Cable(AlongTwoJoints):
-    """τ_i = a q_i + b q_j and τ_j = b q_i + c q_j, with the torques at zero in the declared offsets;  a, c > 0.
+    """τ_i = a q_i + b q_j and τ_j = b q_i + c q_j, with the torques at zero in the declared
+    offsets;  a, c > 0.
 
-    Source: Hooke's law of a cable or hose that both joints stretch. One potential gives both torques,
-    V = ½ a q_i² + b q_i q_j + ½ c q_j², so b is the same in both. Led around the joints at radii r_i and r_j, it has
-    a = k r_i², b = k r_i r_j and c = k r_j². Signature: positions of two joints, at any speed.
+    Source: Hooke's law of a cable or hose that both joints stretch. One potential gives both
+    torques, V = ½ a q_i² + b q_i q_j + ½ c q_j², so b is the same in both. Led around the joints at
+    radii r_i and r_j, it has a = k r_i², b = k r_i r_j and c = k r_j². Signature: positions of two
+    joints, at any speed.
     """
 
     name = "cable"
@@ -194,11 +222,12 @@ class Cable(AlongTwoJoints):
 
 @dataclass(frozen=True, slots=True)
 class SlackCable(AlongTwoJoints):
-    """τ_i = c h cos φ and τ_j = c h sin φ,  h = max(0, q_i cos φ + q_j sin φ − s₀);  c > 0: it pulls beyond s₀.
+    """τ_i = c h cos φ and τ_j = c h sin φ,  h = max(0, q_i cos φ + q_j sin φ − s₀);  c > 0:
+    it pulls beyond s₀.
 
-    A cable along two joints that hangs slack before s₀: its potential is ½ c h². φ says how much of its way each joint
-    makes, tan φ = r_j/r_i with the radii at which it is led around them. Source: Hooke's law of a slack cable or hose.
-    Signature: positions of two joints, on one side.
+    A cable along two joints that hangs slack before s₀: its potential is ½ c h². φ says how much of
+    its way each joint makes, tan φ = r_j/r_i with the radii at which it is led around them. Source:
+    Hooke's law of a slack cable or hose. Signature: positions of two joints, on one side.
     """
 
     name = "slack-cable"

@@ -1,19 +1,22 @@
-"""The rotor in the load: a loss at the gear grows with the torque behind it, and the rotor is before it.
+"""The rotor in the load: a loss at the gear grows with the torque behind it,
+and the rotor is before it.
 
-A base parameter is named after its leading standard one. On an axis whose rotor moves as its link does, as on the first
-two axes of a serial arm and on the cranks of a closed chain, the rotor's inertia Ia is part of a base parameter of the
-links. The predicted torque for links and payload τ_L then contains Ia q̈, and a loss that multiplies it is wrong:
+A base parameter is named after its leading standard one. On an axis whose rotor moves as its link
+does, as on the first two axes of a serial arm and on the cranks of a closed chain, the rotor's
+inertia Ia is part of a base parameter of the links. The predicted torque for links and payload τ_L
+then contains Ia q̈, and a loss that multiplies it is wrong:
 
     c |τ_L − Ia q̈| sign(q̇)   is in the current,   c |τ_L| sign(q̇)   would be fitted.
 
-The motion alone does not show how a base parameter divides into link and rotor; the loss does. Around a first guess J,
-with d = c (Ia − J),
+The motion alone does not show how a base parameter divides into link and rotor; the loss does.
+Around a first guess J, with d = c (Ia − J),
 
     c |τ_L − Ia q̈|  ≈  c |τ_L − J q̈| − d q̈ sign(τ_L − J q̈).
 
-Both columns are linear, so c and d are fitted together with everything else, and the σ of c, and that of the gains,
-contains what the data leave open about the rotor. J + d/c is the next guess; at the last one d is zero within its σ
-(Gauss-Newton). Effects that speak of the load or the inertia behind the gear, as `elasticity`, then leave J out, too.
+Both columns are linear, so c and d are fitted together with everything else, and the σ of c, and
+that of the gains, contains what the data leave open about the rotor. J + d/c is the next guess; at
+the last one d is zero within its σ (Gauss-Newton). Effects that speak of the load or the inertia
+behind the gear, as `elasticity`, then leave J out, too.
 """
 
 from __future__ import annotations
@@ -32,7 +35,13 @@ DIGITS = 4  #: Of a rotor's inertia, as a calibration shows it
 
 
 def loss_columns(
-    signals: Signals, axis: int, torque_nm: FloatArray, rubbing: FloatArray, inertia_kg_m2: float, *, with_rotor: bool
+    signals: Signals,
+    axis: int,
+    torque_nm: FloatArray,
+    rubbing: FloatArray,
+    inertia_kg_m2: float,
+    *,
+    with_rotor: bool,
 ) -> FloatArray:
     """Columns of a loss that grows with the torque behind a gear, shape (1 or 2, k).
 
@@ -56,14 +65,15 @@ def loss_columns(
 def least_rotor_rest(inertia_kg_m2: float) -> float:
     """Return the least d that is possible beside a guess J of a rotor's inertia [kg m²].
 
-    A rotor's inertia J + d/c is not negative. Beside J = 0 that is d ≥ 0; beside any other J, d is zero within its σ,
-    because J follows it.
+    A rotor's inertia J + d/c is not negative. Beside J = 0 that is d ≥ 0; beside any other J, d is
+    zero within its σ, because J follows it.
     """
     return 0.0 if inertia_kg_m2 == 0.0 else -math.inf
 
 
 def next_inertia(inertia_kg_m2: float, coefficients: FloatArray, largest_kg_m2: float) -> float:
-    """Return the next guess J + d/c of a rotor's inertia [kg m²], between zero and the largest; J where c is not > 0.
+    """Return the next guess J + d/c of a rotor's inertia [kg m²], between zero and the largest;
+    J where c is not > 0.
 
     Args:
         inertia_kg_m2: J.
@@ -78,7 +88,8 @@ def next_inertia(inertia_kg_m2: float, coefficients: FloatArray, largest_kg_m2: 
 
 
 def known_rotors(effects: Iterable[PlacedEffect], axes: int) -> tuple[float, ...]:
-    """Return the inertia of each axis' rotor that losses of a model show [kg m²], 0 where none does; empty without any.
+    """Return the inertia of each axis' rotor that losses of a model show [kg m²],
+    0 where none does; empty without any.
 
     Args:
         effects: of the model; the first loss on an axis counts.
@@ -97,11 +108,15 @@ def known_rotors(effects: Iterable[PlacedEffect], axes: int) -> tuple[float, ...
 def beside_rotors(signals: Signals, effects: Iterable[PlacedEffect]) -> Signals:
     """Return signals of a run that know the rotors which losses of the model show."""
     known = known_rotors(effects, len(signals.current_a))
-    return replace(signals, rotor_inertia_kg_m2=known) if known else signals
+    if known:
+        return replace(signals, rotor_inertia_kg_m2=known)
+    return signals
 
 
 def beside_rotor(signals: Signals, axis: int, inertia_kg_m2: float) -> Signals:
-    """Return signals of a run that know the rotor of one axis; the same signals for an inertia of 0."""
+    """Return signals of a run that know the rotor of one axis;
+    the same signals for an inertia of 0.
+    """
     if not inertia_kg_m2:
         return signals
     known = [signals.rotor_inertia(index) for index in range(len(signals.current_a))]

@@ -1,4 +1,6 @@
-"""Signals that an effect may depend on: motion, predicted load and predicted current, at full rate."""
+"""Signals that an effect may depend on:
+motion, predicted load and predicted current, at full rate.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,10 @@ from ident.model.robot import Motion
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
 REFERENCE_C = 40.0
-"""Temperature at which the declared friction holds beside a friction that depends on it; motors are rated at this
-ambient temperature (IEC 60034-1). The fit is the same for any; a fixed one keeps calibrations comparable."""
+"""Temperature at which the declared friction holds beside a friction that depends on it; motors are
+rated at this ambient temperature (IEC 60034-1). The fit is the same for any; a fixed one keeps
+calibrations comparable.
+"""
 TWIST_RAD = 1e-4  #: Step of the derivative to the position of a joint
 TWIST_RAD_S = 1e-3  #: Step of the derivative to its velocity
 POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
@@ -46,7 +50,12 @@ class Abscissa(Enum):
     @property
     def is_independent_of_model(self) -> bool:
         """Whether the variable does not depend on the model's predictions."""
-        return self not in {Abscissa.LOAD, Abscissa.CURRENT, Abscissa.TORQUE_RATE, Abscissa.LOAD_CURVATURE}
+        return self not in {
+            Abscissa.LOAD,
+            Abscissa.CURRENT,
+            Abscissa.TORQUE_RATE,
+            Abscissa.LOAD_CURVATURE,
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,19 +63,23 @@ class Arm:
     """The arm behind a run's signals, for the torques of a changed geometry."""
 
     model: Model  #: the model, with the corrections that were applied to it
-    standard: FloatArray  #: standard parameters, those of the mounted payload on the flange, shape (c,)
+    #: standard parameters, those of the mounted payload on the flange, shape (c,)
+    standard: FloatArray
     motion: Motion  #: of the axes over k samples
     #: Torques of `motion` itself, from which the derivative to every zero, or every delay, begins.
     _kept: dict[str, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
     def load_change(self, motion: Motion) -> FloatArray:
-        """Torque for links and payload of another motion, less that of this one [Nm or N], shape (m, k)."""
+        """Torque for links and payload of another motion, less that of this one [Nm or N],
+        shape (m, k).
+        """
         if "load" not in self._kept:
             self._kept["load"] = self._load(self.motion)
         return self._load(motion) - self._kept["load"]
 
     def load_derivatives(self, axis: int, samples: IntArray) -> tuple[FloatArray, FloatArray]:
-        """∂τ/∂q_j and ∂τ/∂q̇_j of the torque for links and payload at some samples, shape (m, s) each.
+        """∂τ/∂q_j and ∂τ/∂q̇_j of the torque for links and payload at some samples, shape (m, s)
+        each.
 
         Args:
             axis: joint j.
@@ -84,12 +97,18 @@ class Arm:
             position[:, axis] += TWIST_RAD
             velocity = motion.velocity_rad_s.copy()
             velocity[:, axis] += TWIST_RAD_S
-            self._kept[names[0]] = (self._load(replace(motion, position_rad=position)) - load) / TWIST_RAD
-            self._kept[names[1]] = (self._load(replace(motion, velocity_rad_s=velocity)) - load) / TWIST_RAD_S
+            self._kept[names[0]] = (
+                self._load(replace(motion, position_rad=position)) - load
+            ) / TWIST_RAD
+            self._kept[names[1]] = (
+                self._load(replace(motion, velocity_rad_s=velocity)) - load
+            ) / TWIST_RAD_S
         return self._kept[names[0]], self._kept[names[1]]
 
     def smooth_torque_change(self, motion: Motion) -> FloatArray:
-        """Whole torque of another motion without dry friction, less that of this one [Nm or N], shape (m, k)."""
+        """Whole torque of another motion without dry friction, less that of this one [Nm or N],
+        shape (m, k).
+        """
         if "smooth" not in self._kept:
             self._kept["smooth"] = self._smooth_torque(self.motion)
         return self._smooth_torque(motion) - self._kept["smooth"]
@@ -104,7 +123,9 @@ class Arm:
         return self.model.torques(motion, smooth)[2]
 
     def weight(self, gravity_m_s2: FloatArray) -> FloatArray:
-        """Torque that carries links and payload in some gravity, at rest [Nm or N], shape (m, k)."""
+        """Torque that carries links and payload in some gravity, at rest [Nm or N], shape (m,
+        k).
+        """
         robot = replace(self.model.robot, gravity_m_s2=gravity_m_s2)
         still = np.zeros_like(self.motion.position_rad)
         at_rest = Motion(self.motion.position_rad, still, still)
@@ -115,38 +136,44 @@ class Arm:
 class Signals:
     """One run as an effect sees it; arrays are axis-first, shape (n, k), and cannot be changed.
 
-    Torques and currents are the model's predictions, never measurements: a measured current in a regressor would put
-    its noise on both sides of the equation.
+    Torques and currents are the model's predictions, never measurements: a measured current in a
+    regressor would put its noise on both sides of the equation.
     """
 
     rate_hz: float  #: sampling rate
     time_s: FloatArray  #: since the start of the run, shape (k,)
     #: Since the first run of the session began, shape (k,); equal to time_s without a common clock.
     session_s: FloatArray
-    position_rad: FloatArray  #: position of the joints; in a closed chain those without a motor follow the driven ones
+    #: position of the joints; in a closed chain those without a motor follow the driven ones
+    position_rad: FloatArray
     velocity_rad_s: FloatArray  #: velocity of the same joints
     acceleration_rad_s2: FloatArray  #: acceleration of the same joints
     motor_position_rad: FloatArray  #: of the motors, R q
-    #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
-    #: where it is regrouped with theirs, in postures spread evenly over the run, shape (n, n, postures); none where it
-    #: was not asked for. See `inertia`.
+    #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with
+    #: a rotor's inertia where it is regrouped with theirs, in postures spread evenly over the run,
+    #: shape (n, n, postures); none where it was not asked for. See `inertia`.
     inertia_kg_m2: FloatArray
-    load_torque_nm: FloatArray  #: torque at each joint for links and payload, without friction and drive chain
+    #: torque at each joint for links and payload, without friction and drive chain
+    load_torque_nm: FloatArray
     geared_torque_nm: FloatArray  #: torque through the gear of each joint: load and friction
-    motor_torque_nm: FloatArray  #: torque of each motor in joint units (g v), friction included, effects left out
+    #: torque of each motor in joint units (g v), friction included, effects left out
+    motor_torque_nm: FloatArray
     current_a: FloatArray  #: the same in the unit of the current reference
     #: Of each motor or its drive [°C], NaN for one without; None where none was recorded.
     temperature_c: FloatArray | None = None
-    #: Torque at each axis per unit of torque on each joint without a motor, then on each pivot that a loop is cut at,
-    #: shape (u, m, k); empty without any.
+    #: Torque at each axis per unit of torque on each joint without a motor, then on each pivot that
+    #: a loop is cut at, shape (u, m, k); empty without any.
     leverage: FloatArray = field(default_factory=lambda: np.empty((0, 0, 0)))
-    #: What made the torques; None where they were not made of a model. Effects that change the geometry need it.
+    #: What made the torques; None where they were not made of a model. Effects that change the
+    #: geometry need it.
     arm: Arm | None = None
-    #: Inertia of each axis' rotor that load and mass matrix contain, as far as it is known; empty without any.
+    #: Inertia of each axis' rotor that load and mass matrix contain, as far as it is known; empty
+    #: without any.
     rotor_inertia_kg_m2: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        # Every effect of a search reads the same arrays: one that changed them would change the columns of all others.
+        # Every effect of a search reads the same arrays: one that changed them would change the
+        # columns of all others.
         for one in fields(self):
             value = getattr(self, one.name)
             if isinstance(value, np.ndarray):
@@ -163,14 +190,18 @@ class Signals:
 
     def rotor_inertia(self, axis: int) -> float:
         """Inertia of an axis' rotor that its load contains [kg m²]; 0 where none is known."""
-        return self.rotor_inertia_kg_m2[axis] if axis < len(self.rotor_inertia_kg_m2) else 0.0
+        if axis < len(self.rotor_inertia_kg_m2):
+            return self.rotor_inertia_kg_m2[axis]
+        return 0.0
 
     def link_torque(self, axis: int) -> FloatArray:
         """Torque of an axis for links and payload, less that of a known rotor [Nm], shape (k,)."""
         return self._without_rotor(self.load_torque_nm, axis)
 
     def gear_torque(self, axis: int) -> FloatArray:
-        """Torque through the gear of an axis, load and friction, less that of a known rotor [Nm], shape (k,)."""
+        """Torque through the gear of an axis, load and friction, less that of a known rotor [Nm],
+        shape (k,).
+        """
         return self._without_rotor(self.geared_torque_nm, axis)
 
     def _without_rotor(self, torque_nm: FloatArray, axis: int) -> FloatArray:
@@ -180,7 +211,8 @@ class Signals:
         return np.asarray(torque_nm[axis] - inertia_kg_m2 * self.acceleration_rad_s2[axis])
 
     def inertia(self, joints: int | slice, axis: int) -> FloatArray:
-        """Torque at joints per unit of acceleration of the joint `axis` along the run, shape (…, k).
+        """Torque at joints per unit of acceleration of the joint `axis` along the run, shape (…,
+        k).
 
         It is interpolated between postures, because it changes slowly. A known rotor is left out.
         """
@@ -189,14 +221,17 @@ class Signals:
         coarse = of_axis[joints]
         at = _postures(len(self.time_s), coarse.shape[-1])
         step = np.diff(at)
-        following = step + (np.arange(len(step)) == len(step) - 1)  # the last sample is a posture, too
+        # The last sample is a posture, too
+        following = step + (np.arange(len(step)) == len(step) - 1)
         out = np.repeat(np.diff(coarse, axis=-1) / step, following, axis=-1)
         out *= np.arange(len(self.time_s)) - np.repeat(at[:-1], following)
         out += np.repeat(coarse[..., :-1], following, axis=-1)
         return np.asarray(out)
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
-        """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""
+        """Return a variable of an axis along the run, shape (k,);
+        `other` is the second axis of OTHER_VELOCITY.
+        """
         choices: dict[Abscissa, Callable[[], FloatArray]] = {
             Abscissa.VELOCITY: lambda: self.velocity_rad_s[axis],
             Abscissa.POSITION: lambda: self.position_rad[axis],
@@ -207,7 +242,9 @@ class Signals:
             Abscissa.CURRENT: lambda: self.current_a[axis],
             Abscissa.TORQUE_RATE: lambda: np.gradient(self.motor_torque_nm[axis]) * self.rate_hz,
             Abscissa.LOAD_CURVATURE: lambda: curvature(self.link_torque(axis), self.rate_hz),
-            Abscissa.DISTANCE: lambda: distance_since_reversal(self.velocity_rad_s[axis], self.rate_hz)[1],
+            Abscissa.DISTANCE: lambda: distance_since_reversal(
+                self.velocity_rad_s[axis], self.rate_hz
+            )[1],
             Abscissa.TEMPERATURE: lambda: self.temperature(axis),
             Abscissa.OTHER_VELOCITY: lambda: self.velocity_rad_s[axis if other is None else other],
         }
@@ -223,9 +260,11 @@ def fitted_signals(
     *,
     inertia: bool = True,
 ) -> Signals:
-    """Predict a run's torques with the declared part of an estimate; coefficients of effects are left out.
+    """Predict a run's torques with the declared part of an estimate;
+    coefficients of effects are left out.
 
-    The observation, rows of the fit, names the base parameters; for the last two see `declared_signals`.
+    The observation, rows of the fit, names the base parameters; for the last two see
+    `declared_signals`.
     """
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
@@ -235,9 +274,15 @@ def fitted_signals(
     for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
         if data.payload is not None and other.mounting == data.payload.mounting:
             values = estimate.parameters[first : first + len(indices)]
-            identified = {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
+            identified = {
+                LINK_PARAMETERS[index]: float(value)
+                for index, value in zip(indices, values, strict=True)
+            }
         first += len(indices)
-    body = None if data.payload is None else payload_parameters(data.payload, identified)
+    if data.payload is None:
+        body = None
+    else:
+        body = payload_parameters(data.payload, identified)
     standard = model.with_payload(standard, body)
     return declared_signals(model, data, standard, estimate.gains, session_began_s, inertia=inertia)
 
@@ -256,18 +301,22 @@ def declared_signals(
     Args:
         model: the declared model.
         data: the run.
-        standard: χ_st with the payload on the flange; base parameters at their leading columns, zero elsewhere,
-            are as good as the true standard ones (paper §2.1). Shape (c,).
+        standard: χ_st with the payload on the flange; base parameters at their leading columns,
+            zero elsewhere, are as good as the true standard ones (paper §2.1). Shape (c,).
         gains: g of each motor [Nm at the joint per A], shape (n,).
-        session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
+        session_began_s: start of the first run by the clock of `Dataset.started_s`; None if
+            unknown.
         inertia: whether the mass matrix is needed, by effects through the links.
     """
-    # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load
-    # until a loss shows how much it is (`ident.effects.rotor`).
-    motion, leverage = data.motion(), np.empty((0, 0, 0))
+    # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus
+    # counts as load until a loss shows how much it is (`ident.effects.rotor`).
+    motion = data.motion()
+    leverage = np.empty((0, 0, 0))
     load, geared, total = model.torques(motion, standard)
-    position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-    if model.robot.closures:
+    position = motion.position_rad
+    velocity = motion.velocity_rad_s
+    acceleration = motion.acceleration_rad_s2
+    if model.robot.undriven_names:
         followed = model.follow(motion)
         placed = model.at_places(followed)
         position = placed.position_rad
@@ -275,7 +324,10 @@ def declared_signals(
         acceleration = placed.acceleration_rad_s2
         leverage = model.leverage(followed)
     motor = model.drive_train.to_motor @ total
-    began = None if data.started_s is None or session_began_s is None else data.started_s - session_began_s
+    if data.started_s is None or session_began_s is None:
+        began = None
+    else:
+        began = data.started_s - session_began_s
     return Signals(
         rate_hz=data.rate_hz,
         time_s=data.time_s - data.time_s[0],
@@ -284,7 +336,9 @@ def declared_signals(
         velocity_rad_s=velocity.T,
         acceleration_rad_s2=acceleration.T,
         motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
-        inertia_kg_m2=_inertia_of_joints(model, data, standard) if inertia else np.empty((len(load), len(load), 0)),
+        inertia_kg_m2=_inertia_of_joints(model, data, standard)
+        if inertia
+        else np.empty((len(load), len(load), 0)),
         load_torque_nm=load,
         geared_torque_nm=geared,
         motor_torque_nm=motor,
@@ -296,25 +350,33 @@ def declared_signals(
 
 
 def session_began_s(datasets: Sequence[Dataset]) -> float | None:
-    """Return the start of the earliest run, None if one of them has no clock, or if they have no common one.
+    """Return the start of the earliest run, None if one of them has no clock,
+    or if they have no common one.
 
-    Clocks that start with a run, or with a controller, show it: by them two runs of the robot overlap, or one is since
-    1970 and another is not.
+    Clocks that start with a run, or with a controller, show it: by them two runs of the robot
+    overlap, or one is since 1970 and another is not.
     """
     spans_s = sorted(
-        (data.started_s, data.time_s[-1] - data.time_s[0]) for data in datasets if data.started_s is not None
+        (data.started_s, data.time_s[-1] - data.time_s[0])
+        for data in datasets
+        if data.started_s is not None
     )
     if not spans_s or len(spans_s) < len(datasets):
         return None
-    first_s, last_s = spans_s[0][0], spans_s[-1][0]
-    overlap = any(start_s + length_s > next_s for (start_s, length_s), (next_s, _) in pairwise(spans_s))
+    first_s = spans_s[0][0]
+    last_s = spans_s[-1][0]
+    overlap = any(
+        start_s + length_s > next_s for (start_s, length_s), (next_s, _) in pairwise(spans_s)
+    )
     # By the time of day, runs of a simulated cell may overlap: it moves faster than time.
     common = not overlap if last_s < UNIX_S else first_s >= UNIX_S
     return first_s if common else None
 
 
 def watched_s(runs: Sequence[Signals], *, whole_session: bool) -> float:
-    """How long an effect that fades in time was watched [s]: over the session, or over the longest run."""
+    """How long an effect that fades in time was watched [s]:
+    over the session, or over the longest run.
+    """
     if not whole_session:
         return float(max(run.time_s[-1] for run in runs))
     began_s = min(run.session_s[0] for run in runs)
@@ -335,7 +397,8 @@ def _postures(samples: int, count: int) -> IntArray:
 
 
 def payload_parameters(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
-    """Return χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,); zeros without payload.
+    """Return χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,);
+    zeros without payload.
 
     Unknown parameters that are not identifiable in the data are missing in `identified`, and zero.
     """
@@ -348,8 +411,12 @@ def curvature(value: FloatArray, rate_hz: float) -> FloatArray:
     return np.asarray(np.gradient(np.gradient(value)) * rate_hz**2)
 
 
-def distance_since_reversal(velocity_rad_s: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Direction of the last motion (−1, 0 before any, 1) and the distance moved in it [rad], both of shape (k,)."""
+def distance_since_reversal(
+    velocity_rad_s: FloatArray, rate_hz: float
+) -> tuple[FloatArray, FloatArray]:
+    """Direction of the last motion (−1, 0 before any, 1) and the distance moved in it [rad],
+    both of shape (k,).
+    """
     moving = np.abs(velocity_rad_s) > STICKING_RAD_S
     way = np.cumsum(np.abs(velocity_rad_s) * moving) / rate_hz
     last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))

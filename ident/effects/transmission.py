@@ -1,4 +1,5 @@
-"""Gears that lose power, gears and shafts that are not rigid behind the motors' encoders, and inertia shared by two.
+"""Gears that lose power, gears and shafts that are not rigid behind the motors' encoders,
+and inertia shared by two.
 
 What a twist between motor and joint does is computed in `ident.effects.twist`.
 """
@@ -21,14 +22,17 @@ from ident.model.regressor import cos_sin
 
 @dataclass(frozen=True, slots=True)
 class Backlash(Effect):
-    """τ_i = c (D_i(δ) − M_ij δ̈)/b,  M_jj δ̈ = τ_j − y,  y = (δ ± b)/c₀ + 2ζ√(M_jj/c₀) δ̇ on a flank, 0 in the gap.
+    """τ_i = c (D_i(δ) − M_ij δ̈)/b,  M_jj δ̈ = τ_j − y,  y = (δ ± b)/c₀ + 2ζ√(M_jj/c₀)
+    δ̇ on a flank, 0 in the gap.
 
-    c > 0 is half the gap. The joint lags its motor by δ: half the gap on the side to which it is pushed and the bend of
-    the flank; where the torque turns, it crosses. τ_j is the torque that a rigid gear would pass, with friction, and M
-    the mass matrix. With b = 0 the crossing follows the torque at once, δ = c tanh(τ_j/w): for light links and stiff
-    flanks only. Where its own friction holds the link, its motor crosses the gap, and τ_j = c (y − τ_j)/b on the joint
-    itself. Source: Nordin & Gutman (2002), "Controlling mechanical systems with backlash", Automatica 38, the dead-zone
-    model. Signature: sign changes of the load, each with a blow at its end; starts without a load.
+    c > 0 is half the gap. The joint lags its motor by δ: half the gap on the side to which it is
+    pushed and the bend of the flank; where the torque turns, it crosses. τ_j is the torque that a
+    rigid gear would pass, with friction, and M the mass matrix. With b = 0 the crossing follows the
+    torque at once, δ = c tanh(τ_j/w): for light links and stiff flanks only. Where its own friction
+    holds the link, its motor crosses the gap, and τ_j = c (y − τ_j)/b on the joint itself. Source:
+    Nordin & Gutman (2002), "Controlling mechanical systems with backlash", Automatica 38, the
+    dead-zone model. Signature: sign changes of the load, each with a blow at its end; starts
+    without a load.
     """
 
     name = "backlash"
@@ -40,14 +44,16 @@ class Backlash(Effect):
     added_settings = ("half_gap_rad", "resonant_rad_nm", "damping_ratio", *form_settings)
     refined = ()  # by `ident.discovery.resonance`
 
-    #: W, over which the side changes, in parts of the load's root mean square; 0 where the crossing is computed.
+    #: W, over which the side changes, in parts of the load's root mean square; 0 where the crossing
+    #: is computed.
     share: Annotated[float, Range(0.0, 1.0)]
     half_gap_rad: Annotated[float, Range(0.0, 1.0)] = 0.0  #: b, with which the crossing is computed
     resonant_rad_nm: Annotated[float, Range(0.0, 10.0)] = 0.0  #: c₀, compliance of the flanks
     damping_ratio: Annotated[float, Range(0.0, 10.0)] = 0.0  #: ζ
     held: Switch = 0  #: 1 where the link's own friction holds it, else 0
     sags: Switch = 0  #: 1 where D_i is in the column: the arm stands elsewhere, by the twist
-    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
+    #: J, of the rotor in the model's load torque
+    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0
 
     @property
     def known_rotor_kg_m2(self) -> float:
@@ -57,9 +63,14 @@ class Backlash(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k)."""
         if self.half_gap_rad > 0.0 and self.resonant_rad_nm > 0.0:
-            gear = Gears(np.array([self.half_gap_rad]), np.array([self.resonant_rad_nm]), self.damping_ratio)
+            gear = Gears(
+                np.array([self.half_gap_rad]), np.array([self.resonant_rad_nm]), self.damping_ratio
+            )
             known = beside_rotor(signals, axis, self.rotor_inertia_kg_m2)
-            return _behind(gear, known, axis, held=bool(self.held), sags=bool(self.sags)) / self.half_gap_rad
+            return (
+                _behind(gear, known, axis, held=bool(self.held), sags=bool(self.sags))
+                / self.half_gap_rad
+            )
         torque = signals.gear_torque(axis)
         width = self.share * float(np.sqrt(np.mean(torque**2))) or 1.0
         twist = np.tanh(torque / width)
@@ -71,17 +82,20 @@ class Backlash(Effect):
 
 @dataclass(frozen=True, slots=True)
 class Elasticity(Effect):
-    """τ_i = c (D_i(y) − M_ij ÿ),  c₀ M_jj (ÿ + 2ζω ẏ) + y = τ_j,  ω² = 1/(c₀ M_jj);  c > 0: compliance 1/k.
+    """τ_i = c (D_i(y) − M_ij ÿ),  c₀ M_jj (ÿ + 2ζω ẏ) + y = τ_j,  ω² = 1/(c₀ M_jj);  c > 0:
+    compliance 1/k.
 
-    Joint j lags its motor by y/k, so its acceleration is less than the motor's by ÿ/k, and every joint i takes M_ij
-    times as much torque less, beside D_i, what the posture changes; M is the mass matrix in that posture, τ_j the
-    torque that a rigid gear would pass, without its friction, and y what the spring passes: τ_j through the resonance
-    of spring and link. With c₀ = 0, y is τ_j, the first order in c: good well below the resonance. D_i is left out
-    until an elasticity is chosen: a sag alone is no sign of one, because gravity that is described wrongly looks alike.
-    Where its own friction holds the link, the motor winds up the spring first (`ident.effects.twist`), and
-    τ_j = c (y − τ_j)/c₀ on the joint itself: the spring passes neither weight nor friction of a link at rest. Source:
-    Spong (1987), "Modeling and control of elastic joint robots", with the encoder on the motor. Signature: second
-    derivative of the load, larger near the resonance.
+    Joint j lags its motor by y/k, so its acceleration is less than the motor's by ÿ/k, and every
+    joint i takes M_ij times as much torque less, beside D_i, what the posture changes; M is the
+    mass matrix in that posture, τ_j the torque that a rigid gear would pass, without its friction,
+    and y what the spring passes: τ_j through the resonance of spring and link. With c₀ = 0, y is
+    τ_j, the first order in c: good well below the resonance. D_i is left out until an elasticity is
+    chosen: a sag alone is no sign of one, because gravity that is described wrongly looks alike.
+    Where its own friction holds the link, the motor winds up the spring first
+    (`ident.effects.twist`), and τ_j = c (y − τ_j)/c₀ on the joint itself: the spring passes neither
+    weight nor friction of a link at rest. Source: Spong (1987), "Modeling and control of elastic
+    joint robots", with the encoder on the motor. Signature: second derivative of the load, larger
+    near the resonance.
     """
 
     name = "elasticity"
@@ -93,11 +107,13 @@ class Elasticity(Effect):
     added_settings = ("resonant_rad_nm", "damping_ratio", *form_settings)
     refined = ()  # by `ident.discovery.resonance`
 
-    resonant_rad_nm: Annotated[float, Range(0.0, 10.0)] = 0.0  #: c₀, the compliance that sets the resonance
+    #: c₀, the compliance that sets the resonance
+    resonant_rad_nm: Annotated[float, Range(0.0, 10.0)] = 0.0
     damping_ratio: Annotated[float, Range(0.0, 10.0)] = 0.0  #: ζ
     held: Switch = 0  #: 1 where the link's own friction holds it, else 0
     sags: Switch = 0  #: 1 where D_i is in the column: the arm stands elsewhere, by the twist
-    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
+    #: J, of the rotor in the model's load torque
+    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0
 
     @property
     def known_rotor_kg_m2(self) -> float:
@@ -109,10 +125,14 @@ class Elasticity(Effect):
         if self.held and self.resonant_rad_nm > 0.0:
             gear = Gears(np.zeros(1), np.array([self.resonant_rad_nm]), self.damping_ratio)
             known = beside_rotor(signals, axis, self.rotor_inertia_kg_m2)
-            return _behind(gear, known, axis, held=True, sags=bool(self.sags)) / self.resonant_rad_nm
+            return (
+                _behind(gear, known, axis, held=True, sags=bool(self.sags)) / self.resonant_rad_nm
+            )
         inertia = signals.inertia(slice(None), axis)
         torque = signals.link_torque(axis)
-        passed = spring_torque(torque, inertia[axis], signals.rate_hz, self.resonant_rad_nm, self.damping_ratio)
+        passed = spring_torque(
+            torque, inertia[axis], signals.rate_hz, self.resonant_rad_nm, self.damping_ratio
+        )
         added = -inertia * curvature(passed, signals.rate_hz)
         if self.sags:
             added += torque_of_twist(signals, axis, passed)
@@ -126,7 +146,8 @@ def _behind(gear: Gears, signals: Signals, axis: int, *, held: bool, sags: bool)
         gear: one.
         signals: of the run.
         axis: joint behind it.
-        held: the link's own friction holds it; the gear then passes neither its weight nor its friction.
+        held: the link's own friction holds it; the gear then passes neither its weight nor its
+            friction.
         sags: with what the twist changes in the posture of the arm.
     """
     found = twists(link_of(signals, axis, held=held), gear)
@@ -140,16 +161,18 @@ def _behind(gear: Gears, signals: Signals, axis: int, *, held: bool, sags: bool)
 
 @dataclass(frozen=True, slots=True)
 class Efficiency(Effect):
-    """τ = c · |τ_g| · sign(q̇),  τ_g = τ_L + σ (Fs sign(q̇) + Fv q̇);  c = (1 − η²)/(1 + η²) > 0, η the efficiency.
+    """τ = c · |τ_g| · sign(q̇),  τ_g = τ_L + σ (Fs sign(q̇) + Fv q̇);  c = (1 − η²)/(1 + η²) > 0,
+    η the efficiency.
 
-    The motor gives τ_g/η where it drives the load and η τ_g where the load drives it. The mean of the two is c |τ_g|
-    from the plain torque; their difference is τ_g itself and belongs to the gain: `ident.discovery.gear_loss`. A loss
-    on τ_L alone is `load-friction`; here the share σ of the joint's own friction passes the mesh too. Source: Hamon,
-    Gautier, Garrec & Janot, AIM 2010, "Dynamic identification of robot with a load-dependent joint friction model".
-    Signature: sign × torque through the gear, with a step where the load turns.
+    The motor gives τ_g/η where it drives the load and η τ_g where the load drives it. The mean of
+    the two is c |τ_g| from the plain torque; their difference is τ_g itself and belongs to the
+    gain: `ident.discovery.gear_loss`. A loss on τ_L alone is `load-friction`; here the share σ of
+    the joint's own friction passes the mesh too. Source: Hamon, Gautier, Garrec & Janot, AIM 2010,
+    "Dynamic identification of robot with a load-dependent joint friction model". Signature: sign ×
+    torque through the gear, with a step where the load turns.
 
-    Where the model's τ_L contains the rotor, J q̈ is taken off, and d · ∂τ/∂J / c is a second column (`with_rotor`): see
-    `ident.effects.rotor`.
+    Where the model's τ_L contains the rotor, J q̈ is taken off, and d · ∂τ/∂J / c is a second
+    column (`with_rotor`): see `ident.effects.rotor`.
     """
 
     name = "efficiency"
@@ -161,9 +184,12 @@ class Efficiency(Effect):
     added_settings = ("rotor_inertia_kg_m2", "with_rotor")
     refined = ()
 
-    friction_share: Annotated[float, Range(1e-3, 1.0)]  #: σ, of the joint's friction that lies behind the gear
-    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0  #: J, of the rotor in the model's load torque
-    with_rotor: Switch = 0  #: 1 where the rest of the rotor's inertia is fitted, d = c (Ia − J), else 0
+    #: σ, of the joint's friction that lies behind the gear
+    friction_share: Annotated[float, Range(1e-3, 1.0)]
+    #: J, of the rotor in the model's load torque
+    rotor_inertia_kg_m2: Annotated[float, Range(0.0, 1e6)] = 0.0
+    #: 1 where the rest of the rotor's inertia is fitted, d = c (Ia − J), else 0
+    with_rotor: Switch = 0
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
@@ -184,17 +210,20 @@ class Efficiency(Effect):
         through_nm = load_nm + self.friction_share * friction_nm
         direction = np.sign(signals.velocity_rad_s[axis])
         with_rotor = bool(self.with_rotor)
-        return loss_columns(signals, axis, through_nm, direction, self.rotor_inertia_kg_m2, with_rotor=with_rotor)
+        return loss_columns(
+            signals, axis, through_nm, direction, self.rotor_inertia_kg_m2, with_rotor=with_rotor
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class InertialCoupling(Effect):
-    """τ_i = c · q̈_j and τ_j = c · q̈_i;  c > 0: both joints accelerate the shared body in the same sense.
+    """τ_i = c · q̈_j and τ_j = c · q̈_i;  c > 0:
+    both joints accelerate the shared body in the same sense.
 
-    A rotor that turns with n_i q̇_i + n_j q̇_j has the energy ½ J (n_i q̇_i + n_j q̇_j)²: c = J n_i n_j has the sign of the
-    two ratios, so that c < 0 is no negative inertia, but a body that the joints turn against each other. Source:
-    a rotor or shaft that both joints turn (paper eq. 25: Ia_m6 beside the diagonal). Signature: another axis'
-    acceleration.
+    A rotor that turns with n_i q̇_i + n_j q̇_j has the energy ½ J (n_i q̇_i + n_j q̇_j)²: c = J n_i
+    n_j has the sign of the two ratios, so that c < 0 is no negative inertia, but a body that the
+    joints turn against each other. Source: a rotor or shaft that both joints turn (paper eq. 25:
+    Ia_m6 beside the diagonal). Signature: another axis' acceleration.
     """
 
     name = "inertial-coupling"
@@ -214,10 +243,10 @@ class InertialCoupling(Effect):
 class Ripple(Effect):
     """τ = a cos(k θ) + b sin(k θ), θ = q_m, at the motor, or θ = q;  k need not be whole.
 
-    A belt's tooth, the wave generator and the flexspline of a strain-wave gear, a cam or a ball in a bearing turn at
-    other rates than the motor. The search proposes k by a periodogram of the residual
-    (`ident.discovery.ripple`). Source: Tuttle & Seering, "A nonlinear model of a harmonic drive gear transmission",
-    IEEE TRA 12 (1996). Signature: a line at order k.
+    A belt's tooth, the wave generator and the flexspline of a strain-wave gear, a cam or a ball in
+    a bearing turn at other rates than the motor. The search proposes k by a periodogram of the
+    residual (`ident.discovery.ripple`). Source: Tuttle & Seering, "A nonlinear model of a harmonic
+    drive gear transmission", IEEE TRA 12 (1996). Signature: a line at order k.
     """
 
     name = "ripple"
@@ -228,7 +257,8 @@ class Ripple(Effect):
     key_settings = ("order", "of_joint")
 
     order: Annotated[float, Range(1e-4, 1e4)]  #: k, periods a revolution of θ
-    of_joint: Switch = 0  #: 1 where θ is the joint's angle, which differs where a motor turns with several joints
+    #: 1 where θ is the joint's angle, which differs where a motor turns with several joints
+    of_joint: Switch = 0
 
     @property
     def side(self) -> GearSide:

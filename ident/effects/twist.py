@@ -1,16 +1,20 @@
-"""How far a joint stands behind its motor where the gear between them is not rigid, and what the gear then passes.
+"""How far a joint stands behind its motor where the gear between them is not rigid,
+and what the gear then passes.
 
-Joint j lags its motor by the twist δ, so that τ(q − δ, q̇ − δ̇, q̈ − δ̈) moves links and payload. To first order in δ that
-is −M_ij δ̈ on each joint i, M the mass matrix, and D_i(δ), what the twist changes without any acceleration of its own:
-gravity and the other torques of posture and speed (`torque_of_twist`).
+Joint j lags its motor by the twist δ, so that τ(q − δ, q̇ − δ̇, q̈ − δ̈) moves links and payload.
+To first order in δ that is −M_ij δ̈ on each joint i, M the mass matrix, and D_i(δ), what the twist
+changes without any acceleration of its own: gravity and the other torques of posture and speed
+(`torque_of_twist`).
 
-The link follows M_jj δ̈ = τ_L + F − y. τ_L is the torque that moves it as fast as its motor, y what a spring with a gap
-passes, and F the link's friction. Where F is that of the motor's speed, as if it were rigid, τ_L + F is known
-beforehand. Where it is that of the link's own speed q̇ − δ̇, friction holds the link while the motor winds up the spring,
-or crosses the gap: until then the motor has neither its weight nor its friction to carry.
+The link follows M_jj δ̈ = τ_L + F − y. τ_L is the torque that moves it as fast as its motor, y what
+a spring with a gap passes, and F the link's friction. Where F is that of the motor's speed, as if
+it were rigid, τ_L + F is known beforehand. Where it is that of the link's own speed q̇ − δ̇,
+friction holds the link while the motor winds up the spring, or crosses the gap: until then the
+motor has neither its weight nor its friction to carry.
 
-Sources: Nordin & Gutman (2002), "Controlling mechanical systems with backlash", Automatica 38, the dead-zone model;
-Spong (1987), "Modeling and control of elastic joint robots", with the encoder on the motor.
+Sources: Nordin & Gutman (2002), "Controlling mechanical systems with backlash", Automatica 38, the
+dead-zone model; Spong (1987), "Modeling and control of elastic joint robots", with the encoder on
+the motor.
 """
 
 from __future__ import annotations
@@ -25,10 +29,13 @@ from ident.effects.signals import STICKING_RAD_S, Signals, curvature
 
 RESOLVED = 0.9  #: Largest resonance in parts of half the sampling rate
 LEAST_SHARE = 0.02  #: Of the mean, below which an inertia is not one of a link
-LEAD_S = 0.03  #: Time before a turn of the torque from which the twist is computed: a flank may be left early
+#: Time before a turn of the torque from which the twist is computed: a flank may be left early
+LEAD_S = 0.03
 SETTLED_S = 0.3  #: Time after the last turn until a flank is in touch again
-LONGEST_HOLD_S = 2.0  #: Time at rest after which a link is taken to stand where its weight pushes it
-POSTURE_S = 0.01  #: Time between two postures in which the derivatives to position and velocity are computed
+#: Time at rest after which a link is taken to stand where its weight pushes it
+LONGEST_HOLD_S = 2.0
+#: Time between two postures in which the derivatives to position and velocity are computed
+POSTURE_S = 0.01
 STEP_RAD = 0.25  #: Largest step of the resonance of flank and link
 MOST_STEPS = 16  #: Of a sample
 
@@ -39,9 +46,11 @@ class DrivenLink:
 
     rate_hz: float  #: sampling rate
     inertia_kg_m2: FloatArray  #: M_jj of link and payload in each posture
-    torque_nm: FloatArray  #: that moves it as its motor moves; with its friction, unless that is `dry_nm`
+    #: that moves it as its motor moves; with its friction, unless that is `dry_nm`
+    torque_nm: FloatArray
     speed_rad_s: FloatArray  #: of its motor, as a joint
-    dry_nm: FloatArray  #: friction that the link's own speed decides on; zero where the torque has it
+    #: friction that the link's own speed decides on; zero where the torque has it
+    dry_nm: FloatArray
 
     @property
     def pushed_nm(self) -> FloatArray:
@@ -49,7 +58,9 @@ class DrivenLink:
         held = np.clip(self.torque_nm, -self.dry_nm, self.dry_nm)
         direction = np.sign(self.speed_rad_s)
         is_moving = np.abs(self.speed_rad_s) > STICKING_RAD_S
-        return np.asarray(np.where(is_moving, self.torque_nm + self.dry_nm * direction, self.torque_nm - held))
+        return np.asarray(
+            np.where(is_moving, self.torque_nm + self.dry_nm * direction, self.torque_nm - held)
+        )
 
 
 def link_of(signals: Signals, axis: int, *, held: bool) -> DrivenLink:
@@ -70,7 +81,8 @@ def link_of(signals: Signals, axis: int, *, held: bool) -> DrivenLink:
     is_moving = np.abs(speed) > STICKING_RAD_S
     if not np.any(is_moving):
         return DrivenLink(signals.rate_hz, inertia, load, speed, np.zeros_like(load))
-    # At rest there is no friction in the prediction; in slow motion there is hardly any but the dry one.
+    # At rest there is no friction in the prediction; in slow motion there is hardly any but the dry
+    # one.
     at_rest = float(np.min(friction[is_moving]))
     return DrivenLink(signals.rate_hz, inertia, load, speed, np.where(is_moving, friction, at_rest))
 
@@ -96,9 +108,10 @@ class Twists:
 def twists(link: DrivenLink, gears: Gears) -> Twists:
     """Follow a link behind each of several gears.
 
-    Where the torque turns, and where friction holds the link, M δ̈ = τ_L + F − y is integrated by small steps, y zero in
-    the gap and never pulling on a flank, in all windows and for all gears at once. Elsewhere a flank is in touch, and
-    the gear is a spring (`spring_torque`). A link without inertia does not lag.
+    Where the torque turns, and where friction holds the link, M δ̈ = τ_L + F − y is integrated by
+    small steps, y zero in the gap and never pulling on a flank, in all windows and for all gears at
+    once. Elsewhere a flank is in touch, and the gear is a spring (`spring_torque`). A link without
+    inertia does not lag.
 
     Args:
         link: what moves it.
@@ -118,12 +131,16 @@ def twists(link: DrivenLink, gears: Gears) -> Twists:
     return around if windows is None else _followed(link, inertia, gears, around, windows)
 
 
-def _bent_springs(pushed_nm: FloatArray, inertia_kg_m2: FloatArray, rate_hz: float, gears: Gears) -> FloatArray:
+def _bent_springs(
+    pushed_nm: FloatArray, inertia_kg_m2: FloatArray, rate_hz: float, gears: Gears
+) -> FloatArray:
     """Twist of each gear's spring alone, shape (g, k)."""
     found: dict[float, FloatArray] = {}
     for compliance in gears.compliance_rad_nm.tolist():
         if compliance not in found:
-            passed = spring_torque(pushed_nm, inertia_kg_m2, rate_hz, compliance, gears.damping_ratio)
+            passed = spring_torque(
+                pushed_nm, inertia_kg_m2, rate_hz, compliance, gears.damping_ratio
+            )
             found[compliance] = compliance * passed
     return np.stack([found[compliance] for compliance in gears.compliance_rad_nm.tolist()])
 
@@ -143,7 +160,8 @@ def _windows(link: DrivenLink, pushed_nm: FloatArray, *, has_gap: bool) -> Windo
     side = np.sign(pushed_nm)
     turns = np.diff(side) != 0
     if not has_gap:
-        # Without a gap only friction does more than a spring: where the motor turns, and where the link is held.
+        # Without a gap only friction does more than a spring: where the motor turns, and where the
+        # link is held.
         moving = np.where(np.abs(link.speed_rad_s) > STICKING_RAD_S, np.sign(link.speed_rad_s), 0.0)
         turns = (np.diff(moving) != 0) & (link.dry_nm[:-1] > 0.0)
     events = np.flatnonzero(turns | _short_holds(link, round(LONGEST_HOLD_S * link.rate_hz))[:-1])
@@ -159,7 +177,9 @@ def _windows(link: DrivenLink, pushed_nm: FloatArray, *, has_gap: bool) -> Windo
 
 
 def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
-    """Samples of the times at rest in which friction holds the link and that last at most so long, shape (k,)."""
+    """Samples of the times at rest in which friction holds the link and that last at most so long,
+    shape (k,).
+    """
     is_held = (np.abs(link.speed_rad_s) <= STICKING_RAD_S) & (link.dry_nm > 0.0)
     edges = np.flatnonzero(np.diff(is_held, prepend=False, append=False))
     for first, end in edges.reshape(-1, 2).tolist():
@@ -168,7 +188,9 @@ def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
     return np.asarray(is_held)
 
 
-def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around: Twists, windows: Windows) -> Twists:
+def _followed(
+    link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around: Twists, windows: Windows
+) -> Twists:
     """Integrate the link in the windows; around them it is known."""
     rate_hz = link.rate_hz
     # A flank too stiff for the steps is as good as one that they resolve.
@@ -185,7 +207,8 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
     twisted = around.twist_rad.copy()
     bent = around.acceleration_rad_s2.copy()
     passed = around.passed_nm.copy()
-    # Means from one sample to the next lie half a sample late: each sample gets that of the means on its two sides.
+    # Means from one sample to the next lie half a sample late: each sample gets that of the means
+    # on its two sides.
     bend_before = np.zeros_like(rate)
     flank_before = np.zeros_like(rate)
     for sample in range(int(windows.length[0])):
@@ -216,7 +239,9 @@ def _followed(link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around:
         mean_bend = (speed - speed_before) * rate_hz
         mean_flank = flanks / steps
         bent[:, at] = mean_bend if sample == 0 else 0.5 * (bend_before[:, :running] + mean_bend)
-        passed[:, at] = mean_flank if sample == 0 else 0.5 * (flank_before[:, :running] + mean_flank)
+        passed[:, at] = (
+            mean_flank if sample == 0 else 0.5 * (flank_before[:, :running] + mean_flank)
+        )
         bend_before = mean_bend
         flank_before = mean_flank
     return Twists(twisted, bent, passed)
@@ -229,7 +254,9 @@ def _flank(
     compliance_rad_nm: FloatArray,
     damping_nm_s_rad: FloatArray,
 ) -> FloatArray:
-    """What a spring passes; of a gear with a gap, what a flank does: nothing in the gap, and it never pulls."""
+    """What a spring passes; of a gear with a gap, what a flank does:
+    nothing in the gap, and it never pulls.
+    """
     pressed = twist_rad - np.clip(twist_rad, -half_gap_rad, half_gap_rad)
     spring = pressed / compliance_rad_nm + damping_nm_s_rad * rate_rad_s
     pushing = np.where(pressed > 0.0, np.maximum(spring, 0.0), np.minimum(spring, 0.0))
@@ -262,12 +289,17 @@ def torque_of_twist(signals: Signals, axis: int, twist_rad: FloatArray) -> Float
 
 
 def spring_torque(
-    torque_nm: FloatArray, inertia_kg_m2: FloatArray, rate_hz: float, compliance_rad_nm: float, damping_ratio: float
+    torque_nm: FloatArray,
+    inertia_kg_m2: FloatArray,
+    rate_hz: float,
+    compliance_rad_nm: float,
+    damping_ratio: float,
 ) -> FloatArray:
-    """Torque y that a spring passes to a link, (ÿ + 2ζω ẏ)/ω² + y = τ with ω² = 1/(c M), shape (k,).
+    """Torque y that a spring passes to a link, (ÿ + 2ζω ẏ)/ω² + y = τ with ω² = 1/(c M),
+    shape (k,).
 
-    By the trapezoidal rule, which is stable at any rate, with its steps stretched to keep the mean resonance. It starts
-    at rest. A compliance of 0 or a link without inertia passes τ.
+    By the trapezoidal rule, which is stable at any rate, with its steps stretched to keep the mean
+    resonance. It starts at rest. A compliance of 0 or a link without inertia passes τ.
 
     Args:
         torque_nm: τ, the torque that a rigid gear would pass, shape (k,).

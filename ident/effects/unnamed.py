@@ -17,10 +17,14 @@ from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
 INTERVALS = 6
-"""Intervals that the variable's range is divided into; cubic B-splines over them have three more coefficients."""
+"""Intervals that the variable's range is divided into;
+cubic B-splines over them have three more coefficients.
+"""
 MOTOR_VARIABLES = frozenset({Abscissa.CURRENT, Abscissa.TORQUE_RATE})
 FOLDED = frozenset({Abscissa.VELOCITY, Abscissa.OTHER_VELOCITY})
-"""Variables taken by magnitude: dry friction jumps at zero, and no smooth function of v follows a jump."""
+"""Variables taken by magnitude: dry friction jumps at zero,
+and no smooth function of v follows a jump.
+"""
 LINEAR_IN_MODEL = frozenset({(Abscissa.VELOCITY, 1), (Abscissa.LOAD, 0), (Abscissa.CURRENT, 0)})
 """Variable and `signed` of p · x that is declared: viscous friction, and a change of the gain."""
 PERIODIC_ORDERS = (1, 2, 3, 4, 6)
@@ -30,9 +34,10 @@ PERIODIC_ORDERS = (1, 2, 3, 4, 6)
 class Smooth(Effect):
     """τ = p · Σ c_k S_k(x).
 
-    S_k are combinations of the cubic B-splines over a uniform division of the range of x (de Boor, A Practical Guide to
-    Splines), and p is 1, or sign(q̇) where `signed`. Of a velocity, x is the magnitude and p its own sign. The declared
-    terms are not among them: p itself (offset, dry friction), and p · x of LINEAR_IN_MODEL.
+    S_k are combinations of the cubic B-splines over a uniform division of the range of x (de Boor,
+    A Practical Guide to Splines), and p is 1, or sign(q̇) where `signed`. Of a velocity, x is the
+    magnitude and p its own sign. The declared terms are not among them: p itself (offset, dry
+    friction), and p · x of LINEAR_IN_MODEL.
     """
 
     declares = Property.SMOOTH
@@ -48,12 +53,16 @@ class Smooth(Effect):
     @property
     def side(self) -> GearSide:
         """Motor where the variable is the motor's, else joint."""
-        return GearSide.MOTOR if self.variable in MOTOR_VARIABLES else GearSide.JOINT
+        if self.variable in MOTOR_VARIABLES:
+            return GearSide.MOTOR
+        return GearSide.JOINT
 
     @property
     def axis_setting(self) -> str:
         """The other axis, where x is its velocity."""
-        return "other_axis" if self.variable is Abscissa.OTHER_VELOCITY else ""
+        if self.variable is Abscissa.OTHER_VELOCITY:
+            return "other_axis"
+        return ""
 
     @property
     def settings_fault(self) -> str:
@@ -77,7 +86,9 @@ class Smooth(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """One linear parameter a combination."""
-        return tuple(Column(f"part {number}", "Nm") for number in range(1, self._combinations().shape[1] + 1))
+        return tuple(
+            Column(f"part {number}", "Nm") for number in range(1, self._combinations().shape[1] + 1)
+        )
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (p, k)."""
@@ -91,20 +102,26 @@ class Smooth(Effect):
         return np.asarray(self._combinations().T @ cubic_basis(x, self.lower, self.upper))
 
     def _combinations(self) -> FloatArray:
-        """Weights of the B-splines in each S_k, shape (INTERVALS + 3, p), orthogonal to those of the declared terms.
+        """Weights of the B-splines in each S_k, shape (INTERVALS + 3, p),
+        orthogonal to those of the declared terms.
 
         The B-splines' weights of a constant are all one, those of x itself rise evenly (Greville).
         """
         if self.variable is Abscissa.OTHER_VELOCITY and self.signed:
-            return np.eye(INTERVALS + 3)  # dry friction of another joint is not declared on this one
-        powers = 2 if (self.variable, self.signed) in LINEAR_IN_MODEL else 1
+            # Dry friction of another joint is not declared on this one
+            return np.eye(INTERVALS + 3)
+        if (self.variable, self.signed) in LINEAR_IN_MODEL:
+            powers = 2
+        else:
+            powers = 1
         declared = np.vander(np.arange(INTERVALS + 3.0), powers)
         return np.asarray(np.linalg.qr(declared, mode="complete")[0][:, powers:])
 
 
 @dataclass(frozen=True, slots=True)
 class Periodic(Effect):
-    """τ = Σ a_k cos kθ + b_k sin kθ, θ the motor's angle, k in PERIODIC_ORDERS; times sign(q̇) where `signed`.
+    """τ = Σ a_k cos kθ + b_k sin kθ, θ the motor's angle, k in PERIODIC_ORDERS;
+    times sign(q̇) where `signed`.
 
     Source: Fourier series of any torque, or friction, that repeats with the motor.
     """
@@ -113,7 +130,9 @@ class Periodic(Effect):
     side = GearSide.MOTOR
     declares = Property.PERIODIC_IN_MOTOR_ANGLE
     abscissa = Abscissa.MOTOR_ANGLE
-    coefficients = tuple(Column(f"{part} {order}", "Nm") for order in PERIODIC_ORDERS for part in ("cosine", "sine"))
+    coefficients = tuple(
+        Column(f"{part} {order}", "Nm") for order in PERIODIC_ORDERS for part in ("cosine", "sine")
+    )
 
     signed: Switch = 0  #: 1 where it turns with the direction of motion, else 0
 
@@ -132,7 +151,12 @@ def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:
     place = np.clip((x - lower) / (upper - lower), 0.0, 1.0) * INTERVALS
     interval = np.minimum(place.astype(np.int64), INTERVALS - 1)
     u = place - interval
-    parts = ((1.0 - u) ** 3, 3.0 * u**3 - 6.0 * u**2 + 4.0, -3.0 * u**3 + 3.0 * u**2 + 3.0 * u + 1.0, u**3)
+    parts = (
+        (1.0 - u) ** 3,
+        3.0 * u**3 - 6.0 * u**2 + 4.0,
+        -3.0 * u**3 + 3.0 * u**2 + 3.0 * u + 1.0,
+        u**3,
+    )
     basis = np.zeros((INTERVALS + 3, len(x)))
     for offset, part in enumerate(parts):
         basis[interval + offset, np.arange(len(x))] = part / 6.0

@@ -1,22 +1,24 @@
-"""The equations of the motors' currents, whitened: what maximum likelihood, weighing and error bars stand on.
+"""The equations of the motors' currents, whitened:
+what maximum likelihood, weighing and error bars stand on.
 
-The errors are those of the currents, e_i ~ (0, σ_i²). With D = diag(g_i σ_i), and τ the torque that links, friction and
-payload need of each motor, W χ + W_uL χ_uL + W_kL χ_kL through T (DriveTrain.to_motor),
+The errors are those of the currents, e_i ~ (0, σ_i²). With D = diag(g_i σ_i), and τ the torque that
+links, friction and payload need of each motor, W χ + W_uL χ_uL + W_kL χ_kL through T
+(DriveTrain.to_motor),
 
     e = T_D (V g − τ),    V = diag(v),    T_D = D⁻¹.
 
 Each motor has an equation of its own then, and a triangle of its rows says all (`Currents`).
 
-A redundantly driven robot has more motors than degrees of freedom: motors can work against each other. This internal
-preload λ moves nothing and is not known, V g = τ + N λ with N the null space of Aᵀ (`ident.model.closed_chain`). The
-most likely λ of each sample, for given g and σ, leaves
+A redundantly driven robot has more motors than degrees of freedom: motors can work against each
+other. This internal preload λ moves nothing and is not known, V g = τ + N λ with N the null space
+of Aᵀ (`ident.model.closed_chain`). The most likely λ of each sample, for given g and σ, leaves
 
     e = T_D (V g − τ),    T_D = P D⁻¹,    P = 1 − D⁻¹N (NᵀD⁻²N)⁻¹ NᵀD⁻¹,
 
-whose entries are the corrections of the currents in units of their σ: a total least squares, as before. P changes from
-sample to sample, so the rows stay (`PreloadedCurrents`). The columns of g are those of corrected currents: with
-measured ones their noise would make the gains smaller (errors in variables; Golub & Van Loan, SIAM J. Numer. Anal. 17
-(1980)).
+whose entries are the corrections of the currents in units of their σ: a total least squares, as
+before. P changes from sample to sample, so the rows are kept (`PreloadedCurrents`). The columns of
+g are those of corrected currents: with measured ones their noise would make the gains smaller
+(errors in variables; Golub & Van Loan, SIAM J. Numer. Anal. 17 (1980)).
 """
 
 from __future__ import annotations
@@ -36,10 +38,11 @@ SETTLED = 1e-10  #: Relative change of σ from round to round, below which it no
 
 @dataclass(frozen=True, slots=True)
 class Currents:
-    """e = V g − W χ − W_kL χ_kL, all motors' rows below each other; each row holds the current of its motor alone.
+    """e = V g − W χ − W_kL χ_kL, all motors' rows below each other;
+    each row holds the current of its motor alone.
 
-    Whitened, each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the likelihood, as P is a
-    projection.
+    Whitened, each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the
+    likelihood, as P is a projection.
     """
 
     drive: FloatArray  #: V, per unit of each gain, shape (k, m)
@@ -102,8 +105,12 @@ class Currents:
             rows=self.rows,
         )
 
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray) -> FloatArray:
-        """Drive columns with the corrected currents, shape (k, m): the derivative of e to each gain."""
+    def corrected(
+        self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
+    ) -> FloatArray:
+        """Drive columns with the corrected currents, shape (k, m):
+        the derivative of e to each gain.
+        """
         del noise
         rows = np.arange(len(residual))
         corrected = whitened.drive.copy()
@@ -111,15 +118,19 @@ class Currents:
         return corrected
 
     def noise(
-        self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
+        self,
+        gains: FloatArray,
+        parameters: FloatArray,
+        free: int = 0,
+        before: FloatArray | None = None,
     ) -> FloatArray:
         """σ of each current [A] around an estimate, shape (m,); 1 for a motor without rows.
 
         Args:
             gains, parameters: of the estimate.
             free: number of estimated parameters, which are shared among the motors.
-            before: σ so far, for one round; None for as many rounds as it takes. The root mean square of v − τ/g needs
-                none.
+            before: σ so far, for one round; None for as many rounds as it takes. The root mean
+                square of v − τ/g needs none.
         """
         del before
         count = len(gains)
@@ -131,14 +142,18 @@ class Currents:
         return np.asarray(np.sqrt(square_sum / freedom))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum; with preload for this σ."""
+        """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum;
+        with preload for this σ.
+        """
         del noise
         std = self.noise(gains, parameters)
         size = std * np.sqrt(np.maximum(self.rows, 1.0))
         return float(self.rows @ np.log(size))
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
-        """χ and σ of each current [A] for given gains, shapes (p,) and (m,): a fixed point of a few rounds."""
+        """χ and σ of each current [A] for given gains, shapes (p,) and (m,):
+        a fixed point of a few rounds.
+        """
         even = np.ones(len(gains))
         parameters = self.whitened(gains, even).parameters(gains)
         noise = self.noise(gains, parameters, free, even)
@@ -153,7 +168,9 @@ class Currents:
 
 @dataclass(frozen=True, slots=True)
 class PreloadedCurrents(Currents):
-    """Motors that can work against each other: as many rows a motor, r, each with the currents of all."""
+    """Motors that can work against each other:
+    as many rows a motor, r, each with the currents of all.
+    """
 
     preload: FloatArray  #: N of each row of a motor, orthonormal, shape (r, m, m − d)
 
@@ -200,7 +217,9 @@ class PreloadedCurrents(Currents):
             rows=self.rows,
         )
 
-    def corrected(self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray) -> FloatArray:
+    def corrected(
+        self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
+    ) -> FloatArray:
         """Take the corrections σ e out of the measured currents."""
         of_motors = residual.reshape(len(gains), -1)
         corrections = noise[:, None] * of_motors
@@ -211,12 +230,17 @@ class PreloadedCurrents(Currents):
         return np.asarray(drive - change.reshape(drive.shape))
 
     def noise(
-        self, gains: FloatArray, parameters: FloatArray, free: int = 0, before: FloatArray | None = None
+        self,
+        gains: FloatArray,
+        parameters: FloatArray,
+        free: int = 0,
+        before: FloatArray | None = None,
     ) -> FloatArray:
-        """σ of each current from its corrections, and from the share of its noise that they show, P_ii.
+        """σ of each current from its corrections, and from the share of its noise that they show,
+        P_ii.
 
-        The corrections of a motor have only what the preload has left of its noise (variance components: Förstner,
-        Allgemeine Vermessungs-Nachrichten 86 (1979)).
+        The corrections of a motor have only what the preload has left of its noise (variance
+        components: Förstner, Allgemeine Vermessungs-Nachrichten 86 (1979)).
         """
         count = len(gains)
         if before is None:

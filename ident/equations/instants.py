@@ -1,7 +1,8 @@
-"""A few rows of a recording: a motion and the currents that made it, for hypotheses about the model itself.
+"""A few rows of a recording: a motion and the currents that made it,
+for hypotheses about the model itself.
 
-A hypothesis that changes the geometry needs columns of its own. Some hundred rows of a run are enough to see a gross
-mistake, and cost little to build again.
+A hypothesis that changes the geometry needs columns of its own. Some hundred rows of a run are
+enough to see a gross mistake, and cost little to build again.
 """
 
 from __future__ import annotations
@@ -50,9 +51,11 @@ class Instants:
 
 
 def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Instants | None:
-    """Take evenly spaced rows of a run; None where the run is too short to decimate, or no row counts.
+    """Take evenly spaced rows of a run; None where the run is too short to decimate,
+    or no row counts.
 
-    The motion is filtered in place of the columns: it is slow enough for that where no number of a fit depends on it.
+    The motion is filtered in place of the columns: it is slow enough for that where no number of a
+    fit depends on it.
 
     Args:
         model: the declared model.
@@ -94,7 +97,9 @@ def _at_every_row(filter_: Decimator, samples: FloatArray, step: int) -> FloatAr
     return np.ascontiguousarray(rows[:, ::step].T)
 
 
-def read_instants(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> tuple[Instants, ...]:
+def read_instants(
+    model: Model, runs: Iterable[Run], conditioning: Conditioning
+) -> tuple[Instants, ...]:
     """Take rows of runs, which are read one after the other; arguments as for `instants_of`.
 
     Raises:

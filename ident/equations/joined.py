@@ -1,4 +1,6 @@
-"""Two systems joined: rows that were reduced one after the other, as if all had been reduced at once."""
+"""Two systems joined: rows that were reduced one after the other,
+as if all had been reduced at once.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +20,22 @@ Cluster = tuple[FloatArray, ...]  #: The rows of each motor in one move, or thei
 def join_systems(first: System, second: System, *, continues_move: bool = False) -> System:
     """Return the system of the rows of both.
 
-    R of two triangles below each other is R of all their rows. The gains do not depend on the order of the two. Their σ
-    does where there are very many moves: clusters are then joined with their neighbours, as in `reduce_rows`.
+    R of two triangles below each other is R of all their rows. The gains do not depend on the order
+    of the two. Their σ does where there are very many moves: clusters are then joined with their
+    neighbours, as in `reduce_rows`.
 
     Args:
         first, second: without instruments. A run that has rows in both counts as one run.
-        continues_move: the last cluster of the first and the first one of the second are parts of one move, which
-            counts as one cluster: its rows are correlated.
+        continues_move: the last cluster of the first and the first one of the second are parts of
+            one move, which counts as one cluster: its rows are correlated.
 
     Raises:
         ValueError: they have other unknowns or other payloads.
     """
     if first.unknowns != second.unknowns or first.payloads != second.payloads:
         raise ValueError(
-            f"found unknowns {len(first.unknowns)} and {len(second.unknowns)}, payloads {first.payloads} and "
-            f"{second.payloads}; expected the same in both"
+            f"found unknowns {len(first.unknowns)} and {len(second.unknowns)}, payloads "
+            f"{first.payloads} and {second.payloads}; expected the same in both"
         )
     new_runs = tuple(name for name in second.runs if name not in first.runs)
     runs = first.runs + new_runs
@@ -68,7 +71,9 @@ def _join_triangles(first: Triangles, second: Triangles) -> Triangles:
 
 
 def _neighbours(cluster_runs: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the first of each pair of clusters that follow each other in one run; no cluster is in two pairs."""
+    """Return the first of each pair of clusters that follow each other in one run;
+    no cluster is in two pairs.
+    """
     pairs: list[int] = []
     index = 0
     while index < len(cluster_runs) - 1:
@@ -95,14 +100,18 @@ def _join_pairs(system: System, pairs: Sequence[int]) -> System:
         own_preload = system.preload[index : index + 1]
         cluster_runs.append(system.cluster_runs[index])
         if index in pairs:
-            cluster = _join_clusters(cluster, system.clusters[index + 1], is_redundant=bool(system.preload))
+            cluster = _join_clusters(
+                cluster, system.clusters[index + 1], is_redundant=bool(system.preload)
+            )
             own_preload = system.preload[index : index + 2]
             index += 1
         clusters.append(cluster)
         if own_preload:
             preload.append(np.concatenate(own_preload))
         index += 1
-    return replace(system, clusters=tuple(clusters), cluster_runs=tuple(cluster_runs), preload=tuple(preload))
+    return replace(
+        system, clusters=tuple(clusters), cluster_runs=tuple(cluster_runs), preload=tuple(preload)
+    )
 
 
 def _join_clusters(first: Cluster, second: Cluster, *, is_redundant: bool) -> Cluster:

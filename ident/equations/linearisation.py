@@ -1,9 +1,10 @@
 """The problem around an estimate as a linear one, and everything that leaves moves out of it.
 
 The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_m, χ, χ_uL); see
-estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not from the measured
-current, so that the noise does not enter it. `motor_jacobian` is that derivative. Error bars leave out one move at a
-time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut_into_folds`).
+estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not
+from the measured current, so that the noise does not enter it. `motor_jacobian` is that derivative.
+Error bars leave out one move at a time (`left_out_shifts`); the search for effects leaves out folds
+of moves (`cut_into_folds`).
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
 FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
 RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it: two effects may be nearly equal
-CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring clusters, above which they are joined
+#: Standard errors of the correlation of neighbouring clusters, above which they are joined
+CORRELATED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Jacobian:
-    """A matrix with the rows of all motors below each other, of which each holds the unknowns of its motor alone.
+    """A matrix with the rows of all motors below each other,
+    of which each holds the unknowns of its motor alone.
 
-    The equation of a motor near the flange has few of them: less than half of the numbers of the matrix are stored.
+    The equation of a motor near the flange has few of them: less than half of the numbers of the
+    matrix are stored.
     """
 
     parts: tuple[FloatArray, ...]  #: of each motor's rows, columns first, shapes (s_i, rows_i)
@@ -98,11 +102,14 @@ class Linearisation:
     gamma: FloatArray  #: 1/g, shape (m,)
     noise: FloatArray  #: σ_i [A], shape (m,)
     free: IntArray  #: which of (gains, parameters) are free, shape (f,)
-    #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
+    #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one,
+    #: shape (f,).
     scale: FloatArray
-    #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None where it is D⁻¹.
+    #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None
+    #: where it is D⁻¹.
     transform: FloatArray | None = None
-    #: Errors that the rows of a run share, and that the rows are decorrelated from; None where there are none.
+    #: Errors that the rows of a run share, and that the rows are decorrelated from; None where
+    #: there are none.
     scatter: RunScatter | None = None
 
     @property
@@ -111,7 +118,9 @@ class Linearisation:
         return int(self.cluster.max()) + 1
 
     def of_clusters(self, per_row: IntArray) -> IntArray:
-        """Each cluster's number, shape (clusters,), of numbers of the observation's rows that clusters do not part."""
+        """Each cluster's number, shape (clusters,), of numbers of the observation's rows that
+        clusters do not part.
+        """
         _, first_rows = np.unique(self.cluster, return_index=True)
         return per_row[self.source[first_rows]]
 
@@ -121,7 +130,9 @@ class Linearisation:
         return slice(int(first), int(end))
 
     def shown(self, motor: int) -> float:
-        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the current's noise."""
+        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the
+        current's noise.
+        """
         rows = self.rows_of(motor)
         if self.transform is None:
             return float(rows.stop - rows.start)
@@ -129,7 +140,8 @@ class Linearisation:
         return float(diagonal.sum() * self.noise[motor] / self.gamma[motor])
 
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
-        """Joint torque columns, shape (m, extra, r), whitened, on the rows of each motor that needs any: (extra, rows).
+        """Joint torque columns, shape (m, extra, r), whitened,
+        on the rows of each motor that needs any: (extra, rows).
 
         Args:
             torque_nm: per unit of each column.
@@ -139,7 +151,9 @@ class Linearisation:
         (decorrelated,) = self.decorrelated_by_motor([whitened])
         return decorrelated
 
-    def whitened_by_motor(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
+    def whitened_by_motor(
+        self, torque_nm: FloatArray, to_motor: FloatArray
+    ) -> dict[int, FloatArray]:
         """The same with what runs share still in the columns; see `decorrelated_by_motor`."""
         by_motor: dict[int, FloatArray] = {}
         if self.transform is not None:
@@ -159,11 +173,15 @@ class Linearisation:
                 by_motor[motor] = own
         return by_motor
 
-    def decorrelated_by_motor(self, each: Sequence[dict[int, FloatArray]]) -> list[dict[int, FloatArray]]:
-        """Take out of whitened columns what the rows of a run share; all together, because that is faster.
+    def decorrelated_by_motor(
+        self, each: Sequence[dict[int, FloatArray]]
+    ) -> list[dict[int, FloatArray]]:
+        """Take out of whitened columns what the rows of a run share;
+        all together, because that is faster.
 
         Args:
-            each: columns on the rows of each motor that needs any, of some candidates, shapes (extra, rows).
+            each: columns on the rows of each motor that needs any, of some candidates, shapes
+                (extra, rows).
         """
         if self.scatter is None:
             return list(each)
@@ -180,8 +198,11 @@ class Linearisation:
                 decorrelated[number][motor] = part
         return decorrelated
 
-    def beside_scatter(self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray) -> Linearisation:
-        """The same problem where the rows of a run share errors, decorrelated from these; the unknowns stay.
+    def beside_scatter(
+        self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray
+    ) -> Linearisation:
+        """The same problem where the rows of a run share errors, decorrelated from these;
+        the unknowns stay.
 
         Args:
             torque_nm: of one standard deviation of each error, shape (m, k, r).
@@ -208,7 +229,9 @@ class Linearisation:
         )
 
     def fitted(self) -> tuple[Linearisation, FloatArray]:
-        """The same around the best fit of its rows, and the step to it, shape (f,), in the scale of the unknowns."""
+        """The same around the best fit of its rows, and the step to it, shape (f,),
+        in the scale of the unknowns.
+        """
         hessian = sum_of_squares(self.jacobian)
         hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
         factor = linalg.cho_factor(hessian, lower=True)
@@ -218,7 +241,9 @@ class Linearisation:
         return replace(self, residual=residual), step
 
     def decorrelated(self, columns: FloatArray) -> FloatArray:
-        """V^(−1/2) times columns, shape (rows,); the columns themselves where runs share no errors."""
+        """V^(−1/2) times columns, shape (rows,);
+        the columns themselves where runs share no errors.
+        """
         if self.scatter is None:
             return columns
         parts: list[FloatArray] = []
@@ -229,7 +254,9 @@ class Linearisation:
         return np.concatenate(parts)
 
     def correlated(self, columns: FloatArray) -> FloatArray:
-        """V times decorrelated columns, shape (rows,); the columns themselves where runs share no errors."""
+        """V times decorrelated columns, shape (rows,);
+        the columns themselves where runs share no errors.
+        """
         if self.scatter is None:
             return columns
         parts: list[FloatArray] = []
@@ -249,7 +276,12 @@ class Linearisation:
 
 
 def linearise(
-    observation: Observation, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
+    observation: Observation,
+    gains: FloatArray,
+    parameters: FloatArray,
+    noise: FloatArray,
+    *,
+    gains_fixed: bool,
 ) -> Linearisation:
     """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
     count = len(gains)
@@ -266,7 +298,9 @@ def linearise(
     residuals: list[FloatArray] = []
     currents: list[FloatArray] = []
     squares = np.zeros(width)
-    for jacobian, residual, current in motor_jacobians(rows_of_motors, preload, gains, parameters, noise):
+    for jacobian, residual, current in motor_jacobians(
+        rows_of_motors, preload, gains, parameters, noise
+    ):
         squares += np.einsum("rf,rf->f", jacobian, jacobian)  # Σ_r J_rf²
         own = np.flatnonzero(jacobian[:, first:].any(axis=0))
         seen.append(own)
@@ -307,7 +341,11 @@ def _inverse_norms(squares: FloatArray) -> FloatArray:
 
 
 def motor_jacobians(
-    rows: Iterable[FloatArray], preload: FloatArray, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+    rows: Iterable[FloatArray],
+    preload: FloatArray,
+    gains: FloatArray,
+    parameters: FloatArray,
+    noise: FloatArray,
 ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
     """J, e and the measured current in units of its noise, of each motor's equations in turn.
 
@@ -340,10 +378,12 @@ def motor_jacobians(
 def motor_jacobian(
     rows: FloatArray, motor: int, gains: FloatArray, parameters: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p) and (r,).
+    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p)
+    and (r,).
 
     Args:
-        rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the same JᵀJ and Jᵀe.
+        rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the
+            same JᵀJ and Jᵀe.
         motor: i.
         gains, parameters: where to linearise.
         noise: σ of each motor's current [A].
@@ -360,7 +400,8 @@ def motor_jacobian(
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (C, f).
+    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c,
+    shape (C, f).
 
     Args:
         grams: G_c = J_cᵀJ_c of each cluster, shape (C, f, f).
@@ -377,7 +418,9 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
 
 
 def _even_unit(hessian: FloatArray) -> FloatArray:
-    """Unit of each unknown in which all are seen equally well, shape (f,): some are in kg, others in kg m²."""
+    """Unit of each unknown in which all are seen equally well, shape (f,):
+    some are in kg, others in kg m².
+    """
     diagonal = np.diag(hessian)
     return 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
 
@@ -393,23 +436,27 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
-    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c, shape (C, f)."""
+    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c,
+    shape (C, f).
+    """
     count = len(shifts)
     centred = shifts - shifts.mean(axis=0)
     return np.asarray((count - 1) / count * (centred.T @ centred))
 
 
 def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> IntArray:
-    """Join neighbouring clusters of a run in pairs, again and again, until they are independent of each other.
+    """Join neighbouring clusters of a run in pairs, again and again,
+    until they are independent of each other.
 
-    Clusters are moves, and pieces of 2 s of longer moves: long compared with the noise of drives, but not with every
-    misfit of a model. The correlation of neighbours, in units in which all unknowns are known equally well, is
+    Clusters are moves, and pieces of 2 s of longer moves: long compared with the noise of drives,
+    but not with every misfit of a model. The correlation of neighbours, in units in which all
+    unknowns are known equally well, is
 
         r = Σ z_cᵀz_c₊₁ / Σ z_cᵀz_c,      z = L⁻¹ s,      L Lᵀ = H,
 
-    and its standard error is the root of Σ (z_cᵀz_c₊₁)² over the same sum; that of independent clusters is a little
-    below zero, because all scores together are zero. Blocks become longer until r no longer shows (batch means:
-    Fishman 1978).
+    and its standard error is the root of Σ (z_cᵀz_c₊₁)² over the same sum; that of independent
+    clusters is a little below zero, because all scores together are zero. Blocks become longer
+    until r no longer shows (batch means: Fishman 1978).
 
     Args:
         grams: G_c of each cluster, shape (C, f, f), in the order of time.
@@ -417,7 +464,8 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         runs: run of each cluster, shape (C,).
 
     Returns:
-        first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as many clusters.
+        first cluster of each block, ascending; at least MIN_MOVES_TO_LEAVE_OUT where there are as
+        many clusters.
     """
     starts = np.arange(len(grams))
     hessian = grams.sum(axis=0)
@@ -462,16 +510,18 @@ def jackknife_covariance(
 ) -> FloatArray:
     """Covariance of (gains, parameters) from leaving out one move at a time, zero for fixed gains.
 
-    The residual of a geared robot is correlated over a move (lag one about 0.67): rows are not independent, moves
-    nearly are (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002, CR3; docs/explanation/uncertainty.md).
-    Where they are not, several are left out together (`independent_blocks`).
+    The residual of a geared robot is correlated over a move (lag one about 0.67): rows are not
+    independent, moves nearly are (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002, CR3;
+    docs/explanation/uncertainty.md). Where they are not, several are left out together
+    (`independent_blocks`).
 
     Args:
         system: of the fit.
         gains, parameters: the estimate, gains in Nm/A, shapes (m,) and (p,).
         noise: σ_i of each motor's current [A], shape (m,).
         gains_fixed: the gains were given.
-        recorded: equations whose residuals count, where those of ``system`` are projected on instruments.
+        recorded: equations whose residuals count, where those of ``system`` are projected on
+            instruments.
 
     Returns:
         shape (m + p, m + p).
@@ -514,7 +564,9 @@ def jackknife_covariance(
 
 @dataclass(frozen=True, slots=True)
 class MotorRows:
-    """Rows of one motor in a problem cut into folds: they follow each other, sorted by fold and cluster."""
+    """Rows of one motor in a problem cut into folds:
+    they follow each other, sorted by fold and cluster.
+    """
 
     motor: int  #: index
     rows: slice  #: among those of the problem
@@ -525,7 +577,8 @@ class MotorRows:
     equations: FloatArray  #: J of these, e and r, columns first, shape (s + 2, rows)
 
     def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, …, a, b).
+        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, …,
+        a, b).
 
         Args:
             first, second: columns first, shapes (…, a, rows) and (…, b, rows).
@@ -537,7 +590,9 @@ class MotorRows:
         return out
 
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
-        """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,) or (p, f)."""
+        """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,)
+        or (p, f).
+        """
         jacobian = self.equations[:-2]
         parts: list[FloatArray] = []
         for step, block in zip(steps, self._blocks(), strict=True):
@@ -551,7 +606,9 @@ class MotorRows:
             yield slice(start, end)
 
     def by_fold(self, products: FloatArray, count: int) -> FloatArray:
-        """Products of each block, shape (blocks, …), summed over each of so many folds, shape (count, …)."""
+        """Products of each block, shape (blocks, …), summed over each of so many folds,
+        shape (count, …).
+        """
         folds, first = np.unique(self.fold, return_index=True)
         out = np.zeros((count, *products.shape[1:]))
         out[folds] = np.add.reduceat(products, first, axis=0)
@@ -560,13 +617,16 @@ class MotorRows:
 
 @dataclass(frozen=True, slots=True)
 class Folds:
-    """A linearised problem cut into folds of complete moves, with everything that cross-validation reuses.
+    """A linearised problem cut into folds of complete moves,
+    with everything that cross-validation reuses.
 
-    A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over blocks.
+    A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over
+    blocks.
     """
 
     linearisation: Linearisation  #: its rows sorted by motor, fold and cluster
-    moves: int  #: number of complete moves distributed over the folds; a cluster may be only a piece of one
+    #: number of complete moves distributed over the folds; a cluster may be only a piece of one
+    moves: int
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
     motors: tuple[MotorRows, ...]  #: the same by motor, those without rows left out
     full_factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
@@ -577,7 +637,8 @@ class Folds:
     part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, m, f, f)
     part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
-    residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
+    #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
+    residual: FloatArray
     #: Cholesky factor of the JᵀJ of the estimate, in which rows of a run share no errors.
     estimate_factor: tuple[FloatArray, bool]
 
@@ -597,11 +658,13 @@ class Folds:
 
 
 def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> Folds:
-    """Deal the moves out to folds in turn, so that every fold sees every run; a move is never parted.
+    """Deal the moves out to folds in turn, so that every fold sees every run;
+    a move is never parted.
 
     Args:
         problem: around an estimate.
-        move_of: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
+        move_of: the move that each cluster is a piece of, shape (clusters,); the clusters
+            themselves when None.
 
     Raises:
         TooFewMoves: to leave some out.
@@ -679,8 +742,12 @@ def _orders_of_motors(problem: Linearisation, order: IntArray) -> list[IntArray]
     return orders
 
 
-def _with_sorted_rows(problem: Linearisation, order: IntArray, orders: Sequence[IntArray]) -> Linearisation:
-    """Sort everything but the Jacobian: all rows by one order, the scatter by those of each motor."""
+def _with_sorted_rows(
+    problem: Linearisation, order: IntArray, orders: Sequence[IntArray]
+) -> Linearisation:
+    """Sort everything but the Jacobian:
+    all rows by one order, the scatter by those of each motor.
+    """
     sorted_rows = {name: getattr(problem, name)[order] for name in LINEARISATION_ROWS}
     scatter = problem.scatter
     if scatter is not None:
@@ -711,7 +778,9 @@ def _described_blocks(
 def _motor_rows(
     problem: Linearisation, fold_of: IntArray, starts: IntArray, orders: Sequence[IntArray]
 ) -> list[MotorRows]:
-    """Sorted rows of each motor that has any; the place of r in their equations is not filled in yet."""
+    """Sorted rows of each motor that has any;
+    the place of r in their equations is not filled in yet.
+    """
     jacobian = problem.jacobian
     motor_of_block = problem.motor[starts]
     found: list[MotorRows] = []
@@ -770,7 +839,9 @@ def _sums_of(by_motor: Sequence[MotorRows], problem: Linearisation) -> _Sums:
 
 
 def _with_sorted_jacobian(problem: Linearisation, by_motor: Sequence[MotorRows]) -> Linearisation:
-    """The same with the Jacobian's rows sorted as the others: views of the equations of each motor."""
+    """The same with the Jacobian's rows sorted as the others:
+    views of the equations of each motor.
+    """
     parts = list(problem.jacobian.parts)
     for own in by_motor:
         parts[own.motor] = own.equations[:-2]
@@ -784,8 +855,12 @@ def _lower_factor(matrix: FloatArray) -> tuple[FloatArray, bool]:
     return factor, True
 
 
-def _estimate_factor(problem: Linearisation, scatter: RunScatter, hessian: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian, from JᵀJ."""
+def _estimate_factor(
+    problem: Linearisation, scatter: RunScatter, hessian: FloatArray
+) -> tuple[FloatArray, bool]:
+    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian,
+    from JᵀJ.
+    """
     jacobian = problem.jacobian
     undone = hessian.copy()
     for motor, (part, seen) in enumerate(zip(jacobian.parts, jacobian.seen, strict=True)):

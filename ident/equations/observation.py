@@ -1,6 +1,8 @@
-"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for everything that looks into a residual.
+"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq.
+17), for everything that looks into a residual.
 
-An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a usual length.
+An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a
+usual length.
 """
 
 from __future__ import annotations
@@ -40,11 +42,14 @@ class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
     current: FloatArray  #: decimated current references of the motors [A], shape (m, r)
-    regressor: FloatArray  #: torque at each joint per unit of each base parameter: W without effects, shape (m, b, r)
+    #: torque at each joint per unit of each base parameter: W without effects, shape (m, b, r)
+    regressor: FloatArray
     effects: FloatArray  #: the same of each effect, the other columns of W, shape (m, e, r)
-    flange: FloatArray  #: columns of the payload's link, also of the payload while it was mounted, shape (m, 10, r)
+    #: columns of the payload's link, also of the payload while it was mounted, shape (m, 10, r)
+    flange: FloatArray
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (m, r)
-    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
+    #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
+    motor_use: BoolArray
     time_s: FloatArray  #: of each row, since the start of its run, shape (r,)
     run: IntArray  #: index of each row's run, shape (r,)
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
@@ -64,7 +69,9 @@ class Observation(Equations):
         return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (m, rows)."""
+        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (m,
+        rows).
+        """
         # An index of −1, no load, takes the last row, which stays zero.
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
@@ -75,7 +82,8 @@ class Observation(Equations):
         return np.asarray(torque)
 
     def motor_columns(self) -> Iterator[FloatArray]:
-        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first, shape (p + 2, r).
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first,
+        shape (p + 2, r).
 
         Of a redundantly driven robot V_i in place of v_i, shape (m + p + 1, r).
         """
@@ -94,7 +102,9 @@ class Observation(Equations):
             yield np.concatenate((current, torque))
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (m, rows)."""
+        """Y = V g: joint torque from the measured current references (eq.
+        4 through R) [Nm], shape (m, rows).
+        """
         if self.preload.size:
             # Σ_m V_amr g_m of each axis a and row r
             torque = np.einsum("amr,m->ar", self.drive[:, :, rows], gains)
@@ -108,7 +118,9 @@ class Observation(Equations):
         return replace(self, **chosen)
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """Add columns to W, torque of shape (m, extra, r) [Nm per unit]; what preload hides of them is left out."""
+        """Add columns to W, torque of shape (m, extra, r) [Nm per unit];
+        what preload hides of them is left out.
+        """
         if self.preload.size:
             # (1 − N Nᵀ) of the torque, row by row
             hidden = np.einsum("alr,apr->lpr", self.preload, torque)
@@ -121,7 +133,8 @@ class Observation(Equations):
         """Reduce the rows to triangles.
 
         Args:
-            demanded: the same rows and columns for the demanded motion: they become the system's instruments.
+            demanded: the same rows and columns for the demanded motion: they become the system's
+                instruments.
         """
         support = self._support()
         if demanded is not None:
@@ -138,7 +151,9 @@ class Observation(Equations):
         )
 
     def _parts(self) -> list[FloatArray]:
-        """[W | W_L]: torque per unit of base parameters, effects and the payload's ten, shapes (m, …, r)."""
+        """[W | W_L]: torque per unit of base parameters, effects and the payload's ten, shapes (m,
+        …, r).
+        """
         parts = [self.regressor, self.effects]
         if self.payloads:
             parts.append(self.flange)
@@ -263,7 +278,8 @@ def observe(
 
 
 def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observation) -> Observation:
-    """Replace the declared columns by those of the demanded motion, where a run's is known; effects' columns stay.
+    """Replace the declared columns by those of the demanded motion, where a run's is known;
+    effects' columns stay.
 
     Args:
         model: the declared model.

@@ -1,12 +1,14 @@
-"""Runs, one after the other, reduced to triangles: the observation matrix is never in memory at once (TSQR).
+"""Runs, one after the other, reduced to triangles:
+the observation matrix is never in memory at once (TSQR).
 
-`reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows have, and all ten
-parameters of the payload of each mounting; `System.holding` then gives some of them a value. The rows of `reduce_runs`
-have the standard parameters: `regrouped` chooses base parameters among them, and moves what is known of the payloads to
-W_kL χ_kL. So the same triangles serve every such choice.
+`reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows
+have, and all ten parameters of the payload of each mounting; `System.holding` then gives some of
+them a value. The rows of `reduce_runs` have the standard parameters: `regrouped` chooses base
+parameters among them, and moves what is known of the payloads to W_kL χ_kL. So the same triangles
+serve every such choice.
 
-A payload has the columns of the link that carries it, in the rows in which it was mounted: triangles hold them once,
-separately for each mounting.
+A payload has the columns of the link that carries it, in the rows in which it was mounted:
+triangles hold them once, separately for each mounting.
 """
 
 from __future__ import annotations
@@ -30,11 +32,14 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, DriveTrain, Model
 
 MAX_CLUSTERS = 256
-"""Moves of very long data are joined with their neighbours: 256 clusters estimate the scatter as well as 3000."""
+"""Moves of very long data are joined with their neighbours:
+256 clusters estimate the scatter as well as 3000.
+"""
 
 BODY = len(LINK_PARAMETERS)  #: Parameters of a payload
 
-ReadRun = tuple[str, Payload | None, Iterable[Rows]]  #: Name of a run, what was mounted, and its rows, piece by piece
+#: Name of a run, what was mounted, and its rows, piece by piece
+ReadRun = tuple[str, Payload | None, Iterable[Rows]]
 
 
 def rows_of_runs(
@@ -45,7 +50,9 @@ def rows_of_runs(
     instruments: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
-    """Differentiate runs one after the other and build their rows; arguments and errors are those of `reduce_runs`."""
+    """Differentiate runs one after the other and build their rows;
+    arguments and errors are those of `reduce_runs`.
+    """
     for run in runs:
         data = differentiate(run, model.drive_train, conditioning)
         if instruments:
@@ -69,7 +76,8 @@ def reduce_runs(
         runs: read while they are reduced; a mounting that several share has one set of unknowns.
         conditioning: the filters.
         payloads: known beforehand; others are added as runs bring them.
-        instruments: add those of the demanded motion to the rows; where it is not known, the recorded one serves.
+        instruments: add those of the demanded motion to the rows; where it is not known, the
+            recorded one serves.
         chunk_rows: rows built at once; the result does not depend on it.
 
     Returns:
@@ -103,7 +111,9 @@ def reduce_built(
     )
 
 
-def standard_equations(model: Model, payloads: Sequence[Payload] = (), runs: Sequence[str] = ()) -> Equations:
+def standard_equations(
+    model: Model, payloads: Sequence[Payload] = (), runs: Sequence[str] = ()
+) -> Equations:
     """The unknowns before any regrouping: every standard parameter, and none of the payloads."""
     names = tuple(column.name for column in model.columns)
     count = len(names)
@@ -135,15 +145,20 @@ def reduce_rows(
 
     Args:
         unknowns: model and columns of the robot; payloads known beforehand.
-        runs: read one after the other; their columns are those of ``unknowns``, and perhaps others for ``flange``.
+        runs: read one after the other; their columns are those of ``unknowns``, and perhaps others
+            for ``flange``.
         support: mask of the columns that each joint has, shape (m, c).
-        flange: which columns are those of the link that carries the payload, shape (10,); none without payloads.
-        given: unknowns that get a value, as for `System.holding`, where all payloads are known beforehand.
+        flange: which columns are those of the link that carries the payload, shape (10,); none
+            without payloads.
+        given: unknowns that get a value, as for `System.holding`, where all payloads are known
+            beforehand.
         instruments: add those of the demanded motion to the rows.
-        compact: reduce the motors' rows of a move to a triangle, and join moves where there are very many.
+        compact: reduce the motors' rows of a move to a triangle, and join moves where there are
+            very many.
 
     Returns:
-        equations with all ten parameters of each payload among the unknowns, but for those that are given.
+        equations with all ten parameters of each payload among the unknowns, but for those that are
+        given.
 
     Raises:
         DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
@@ -162,22 +177,30 @@ def reduce_rows(
 
 @dataclass(frozen=True, slots=True)
 class _Cluster:
-    """Motor rows of one move, or of several that follow each other in one run, in the columns that each motor has."""
+    """Motor rows of one move, or of several that follow each other in one run,
+    in the columns that each motor has.
+    """
 
     mounting: int  #: index into the payloads, −1 without load
     run: int  #: index into the runs
-    #: For each motor the rows, or where they are many their triangle, of [v_i | (T W)_i], with instruments
-    #: [v_i | (T W)_i | (T Z)_i]. Of a redundantly driven robot always the rows, with the torques per unit of all gains,
-    #: V_i, in place of v_i.
+    #: For each motor the rows, or where they are many their triangle, of [v_i | (T W)_i], with
+    #: instruments [v_i | (T W)_i | (T Z)_i]. Of a redundantly driven robot always the rows, with
+    #: the torques per unit of all gains, V_i, in place of v_i.
     factors: tuple[FloatArray, ...]
-    preload: FloatArray  #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
+    #: N of these rows, shape (rows, m, m − d); empty where no motor works against another
+    preload: FloatArray
 
 
 class _Reducer:
     """Triangles of the rows so far, in the columns that each joint and each motor has."""
 
     def __init__(
-        self, unknowns: Equations, support: BoolArray, flange: IntArray, instruments: bool, compact: bool
+        self,
+        unknowns: Equations,
+        support: BoolArray,
+        flange: IntArray,
+        instruments: bool,
+        compact: bool,
     ) -> None:
         self.unknowns = unknowns
         self.flange = flange
@@ -246,7 +269,9 @@ class _Reducer:
         return clusters
 
     def _by_move(self, rows: Rows, motor: int, moves: IntArray) -> list[FloatArray]:
-        """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i], in the rows of each move."""
+        """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i],
+        in the rows of each move.
+        """
         to_motor = self.model.drive_train.to_motor[motor]
         chosen = self.of_motor[motor]
         if self.model.is_redundant:
@@ -264,7 +289,9 @@ class _Reducer:
         return [of_move.T for of_move in np.split(columns, ends, axis=1)]
 
     def system(self, given: Mapping[int, float]) -> System:
-        """The equations with all columns but those that are given; what a joint or motor does not have is zero."""
+        """The equations with all columns but those that are given;
+        what a joint or motor does not have is zero.
+        """
         without_clusters = self._without_clusters()
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
@@ -304,7 +331,9 @@ class _Reducer:
         )
 
     def _joint(self, joint: int) -> FloatArray:
-        """[V | −W | −W_L of each mounting | 0] of a joint: the triangles of all mountings below each other."""
+        """[V | −W | −W_L of each mounting | 0] of a joint:
+        the triangles of all mountings below each other.
+        """
         count = len(self.of_joint)
         columns = self.of_joint[joint]
         motors = np.count_nonzero(columns < count)
@@ -320,7 +349,9 @@ class _Reducer:
         return np.concatenate(parts)
 
     def _motor(self, motor: int) -> FloatArray:
-        """[v_i | W | W_L of each mounting | 0] of a motor: the triangles of all mountings below each other."""
+        """[v_i | W | W_L of each mounting | 0] of a motor:
+        the triangles of all mountings below each other.
+        """
         width = self.leading + len(self.of_motor[motor])
         parts: list[FloatArray] = [np.empty((0, self.leading + self._width))]
         for mounting in self.joints:
@@ -342,7 +373,9 @@ class _Reducer:
         given: GivenUnknowns,
         first: int,
     ) -> tuple[FloatArray, ...]:
-        """Rows of each motor: some columns of a cluster, so many of currents first, without those that are given."""
+        """Rows of each motor: some columns of a cluster, so many of currents first,
+        without those that are given.
+        """
         motors: list[FloatArray] = []
         for motor, factor in enumerate(cluster.factors):
             rows = columns(factor, motor, cluster.mounting)
@@ -387,7 +420,9 @@ def _support_with_currents(model: Model, support: BoolArray) -> BoolArray:
 
 
 def motor_support(train: DriveTrain, support: BoolArray) -> BoolArray:
-    """Mask of the columns of W that the equation of each motor has, from those of each joint, both of shape (m, c)."""
+    """Mask of the columns of W that the equation of each motor has, from those of each joint,
+    both of shape (m, c).
+    """
     is_mixed = np.abs(train.to_motor) > 0.0
     joints_with_column = is_mixed.astype(np.int64) @ support.astype(np.int64)
     return np.asarray(joints_with_column > 0)
@@ -458,8 +493,8 @@ def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -
             if known != payload:
                 raise DataUnfit(
                     run,
-                    f"mounting {payload.mounting!r} carries {payload} here and {known} in another run; "
-                    "give each way of mounting a name of its own",
+                    f"mounting {payload.mounting!r} carries {payload} here and {known} in another "
+                    "run; give each way of mounting a name of its own",
                 )
             return index
     payloads.append(payload)
@@ -479,8 +514,8 @@ def regrouped(
     Args:
         standard: of `reduce_runs`.
         base: the base parameters; those that its rows show, when None.
-        payload_columns: the unknown parameters of each payload, as indices of LINK_PARAMETERS; those that its rows show
-            when None.
+        payload_columns: the unknown parameters of each payload, as indices of LINK_PARAMETERS;
+            those that its rows show when None.
 
     Raises:
         JointStill: a joint never moves, where the base parameters are looked for.
@@ -502,7 +537,8 @@ def regrouped(
 def payload_values(
     payloads: Sequence[Payload], payload_columns: Sequence[Sequence[int]], first: int
 ) -> dict[int, float]:
-    """Values of the payloads' parameters that are no unknowns, zero where not known, for `System.holding`.
+    """Values of the payloads' parameters that are no unknowns, zero where not known,
+    for `System.holding`.
 
     Args:
         payloads: of the system.
@@ -537,7 +573,9 @@ def shown_base(standard: System) -> BaseParameters:
 
 
 def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -> FloatArray:
-    """The columns of W without what a payload adds to a friction that no bare row shows: the two are one parameter."""
+    """The columns of W without what a payload adds to a friction that no bare row shows:
+    the two are one parameter.
+    """
     if not model.friction_by_payload:
         return columns
     columns = columns.copy()
@@ -552,14 +590,17 @@ def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -
 
 
 def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
-    """For each mounting, its unknown parameters that a system in standard parameters shows (LINK_PARAMETERS)."""
+    """For each mounting, its unknown parameters that a system in standard parameters shows
+    (LINK_PARAMETERS).
+    """
     columns = _linear_columns(standard)
     chosen: list[tuple[int, ...]] = []
     for mounting, payload in enumerate(standard.payloads):
         first = len(standard.columns) + BODY * mounting
         flange = columns[:, first : first + BODY]
         norms = np.linalg.norm(flange, axis=0)
-        # On a platform that never turns, most of the ten are rounding errors compared with the mass.
+        # On a platform that never turns, most of the ten are rounding errors compared with the
+        # mass.
         is_shown = norms > SMALLEST_COLUMN * norms.max(initial=0.0)
         unknown: list[int] = []
         for index, name in enumerate(LINK_PARAMETERS):
@@ -570,7 +611,9 @@ def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
 
 
 def _independent_payload_columns(flange: FloatArray, unknown: list[int]) -> tuple[int, ...]:
-    """Those of some parameters of a payload (LINK_PARAMETERS) whose columns do not depend on each other."""
+    """Those of some parameters of a payload (LINK_PARAMETERS)
+    whose columns do not depend on each other.
+    """
     if not unknown:
         return ()
     names = tuple(LINK_PARAMETERS[index] for index in unknown)

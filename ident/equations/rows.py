@@ -1,4 +1,6 @@
-"""Rows of [V | W] of one run in standard parameters, filtered and decimated; the columns of a motor (paper eq. 5)."""
+"""Rows of [V | W] of one run in standard parameters, filtered and decimated;
+the columns of a motor (paper eq. 5).
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from ident.errors import DataUnfit
 from ident.model.model import Model, preload_directions, spread
 from ident.model.robot import Motion
 
-CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
+#: Decimated rows built at once: the regressor of their samples stays in the cache's reach
+CHUNK_ROWS = 256
 FEWEST_ROWS = 10  #: Rows of the shortest run
 
 
@@ -30,12 +33,16 @@ def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
     samples = len(data.time_s)
     if filter_.rows(samples) < FEWEST_ROWS:
         duration_s = samples / data.rate_hz
-        raise DataUnfit(data.name, f"{duration_s:.2g} s are too short to decimate at {cutoff_hz:g} Hz")
+        raise DataUnfit(
+            data.name, f"{duration_s:.2g} s are too short to decimate at {cutoff_hz:g} Hz"
+        )
     return filter_
 
 
 def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray) -> FloatArray:
-    """Parallel decimation of full-rate columns of a run to the observation's rows: shape (..., k) → (..., r)."""
+    """Parallel decimation of full-rate columns of a run to the observation's rows:
+    shape (..., k) → (..., r).
+    """
     filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
     return filter_(columns)
 
@@ -63,10 +70,14 @@ def at_rows(data: Dataset, conditioning: Conditioning) -> Dataset:
     )
 
 
-def row_masks(model: Model, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
-    """Rows of each axis, and of each motor, that count (Observation.use, .motor_use), both of shape (m, r).
+def row_masks(
+    model: Model, data: Dataset, conditioning: Conditioning
+) -> tuple[BoolArray, BoolArray]:
+    """Rows of each axis, and of each motor, that count (Observation.use, .motor_use),
+    both of shape (m, r).
 
-    Preload joins the equations of all motors: of a redundant drive, rows count in which all of them move.
+    Preload joins the equations of all motors: of a redundant drive, rows count in which all of them
+    move.
     """
     drive_train = model.drive_train
     filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
@@ -78,14 +89,16 @@ def row_masks(model: Model, data: Dataset, conditioning: Conditioning) -> tuple[
     invalid_share = _share_without(data.valid, window)
     use = (still_share <= largest_share) & (invalid_share == 0.0)
     motor_still = _share_without(data.motor_moving, window) > largest_share
-    # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must count.
+    # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must
+    # count.
     is_mixed = np.abs(drive_train.to_motor) > 0
     is_turned = np.abs(drive_train.direction) > 0
     motor_use = np.empty_like(use)
     for motor, still in enumerate(motor_still):
         joints = is_mixed[motor] | is_turned[motor]
         motor_use[motor] = use[joints].all(axis=0) & ~still
-    # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it turns with.
+    # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it
+    # turns with.
     for motor in drive_train.coupled:
         stuck = is_turned[motor][:, None] & motor_still[motor][None, :]
         use &= ~stuck
@@ -103,9 +116,11 @@ def _share_without(flags: BoolArray, window: Decimator) -> FloatArray:
 
 
 def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]:
-    """Cut a run's samples into pieces, each with the complete windows of at most ``chunk_rows`` rows.
+    """Cut a run's samples into pieces, each with the complete windows of at most ``chunk_rows``
+    rows.
 
-    Pieces end at a block of the decimator, except at the end of the run, so that the filter needs no padding.
+    Pieces end at a block of the decimator, except at the end of the run, so that the filter needs
+    no padding.
     """
     factor = filter_.factor
     rows = filter_.rows(samples)
@@ -121,20 +136,26 @@ class Rows:
     """Consecutive decimated rows of one run; arrays are joint-first and time-last."""
 
     current: FloatArray  #: current references of the motors [A], shape (m, r)
-    standard: FloatArray  #: torque at each joint per unit of each standard parameter, shape (m, c, r)
+    #: torque at each joint per unit of each standard parameter, shape (m, c, r)
+    standard: FloatArray
     instrument: FloatArray  #: the same for the demanded motion; the same array where none is known
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (m, r)
-    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
+    #: rows of each motor that count: all joints it turns with, and itself, moving, shape (m, r)
+    motor_use: BoolArray
     time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
     move: IntArray  #: number of each row's move within the run, shape (r,)
-    #: Of a redundantly driven robot: torque at each axis per unit of each motor's gain, preload taken out, shape
-    #: (m, m, r), and N, the torques that move nothing, shape (m, m − d, r). Of others (m, 0, r) both.
+    #: Of a redundantly driven robot: torque at each axis per unit of each motor's gain, preload
+    #: taken out, shape (m, m, r), and N, the torques that move nothing, shape (m, m − d, r). Of
+    #: others (m, 0, r) both.
     drive: FloatArray
     preload: FloatArray
 
 
-def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows: int = CHUNK_ROWS) -> Iterator[Rows]:
-    """Build, filter and decimate a run's rows piece by piece; the pieces together do not depend on their length.
+def rows_of(
+    model: Model, data: Dataset, conditioning: Conditioning, chunk_rows: int = CHUNK_ROWS
+) -> Iterator[Rows]:
+    """Build, filter and decimate a run's rows piece by piece;
+    the pieces together do not depend on their length.
 
     Args:
         model: the declared model.
@@ -148,7 +169,9 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     filter_ = row_filter(data, conditioning)
     use, motor_use = row_masks(model, data, conditioning)
     if not use.any():
-        raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
+        raise DataUnfit(
+            data.name, "no row is left after the standstill and validity masks; did the robot move?"
+        )
     samples = len(data.time_s)
     centres = filter_.centres(samples)
     time_s = data.time_s[centres] - data.time_s[0]
@@ -184,7 +207,9 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
 
 
 def _filtered_regressor(model: Model, data: Dataset, part: slice, filter_: Decimator) -> FloatArray:
-    """Columns of the parameters at the joints, shape (m, c, r); those that a joint does not have are zero."""
+    """Columns of the parameters at the joints, shape (m, c, r);
+    those that a joint does not have are zero.
+    """
     regressor = model.regressor(data.motion(part), loaded=data.payload is not None)
     support = model.support
     rows = filter_.rows(regressor.shape[2])
@@ -196,10 +221,12 @@ def _filtered_regressor(model: Model, data: Dataset, part: slice, filter_: Decim
 def _balanced(
     model: Model, data: Dataset, part: slice, filter_: Decimator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows of a redundantly driven robot: columns of the parameters and of the gains at the axes, and N.
+    """Rows of a redundantly driven robot:
+    columns of the parameters and of the gains at the axes, and N.
 
-    Both sides of Aᵀ diag(v) g = Gᵀ W χ go through the filter, because A changes from sample to sample; then, with an A
-    that went through the same filter, they are written as torques of the axes.
+    Both sides of Aᵀ diag(v) g = Gᵀ W χ go through the filter, because A changes from sample to
+    sample; then, with an A that went through the same filter, they are written as torques of the
+    axes.
     """
     loaded = data.payload is not None
     columns, to_motors = model.balance(data.motion(part), loaded=loaded)
@@ -213,7 +240,9 @@ def _balanced(
 
 
 def demanded_at_rows(demanded: Motion, filter_: Decimator) -> Motion:
-    """Decimate a demanded motion to the rows: it is slow enough for their rate, and an instrument need not be exact."""
+    """Decimate a demanded motion to the rows:
+    it is slow enough for their rate, and an instrument need not be exact.
+    """
     return Motion(
         position_rad=filter_(demanded.position_rad.T).T,
         velocity_rad_s=filter_(demanded.velocity_rad_s.T).T,

@@ -1,14 +1,17 @@
-"""What differs from run to run as correlated errors of whitened rows: friction moves with temperature and mounting.
+"""What differs from run to run as correlated errors of whitened rows:
+friction moves with temperature and mounting.
 
-The rows of one motor in one run share the deviation b of their friction from the common one, b ~ N(0, s²). In units of
-the noise and of s, with N the torque per unit of b, their errors have the covariance
+The rows of one motor in one run share the deviation b of their friction from the common one, b ~
+N(0, s²). In units of the noise and of s, with N the torque per unit of b, their errors have the
+covariance
 
     V = 1 + N Nᵀ = 1 + U diag(λ) Uᵀ,      V^(−1/2) = 1 − U diag(1 − 1/√(1 + λ)) Uᵀ,
 
-U the left singular vectors of N and λ its squared singular values. Rows multiplied by V^(−1/2) have independent errors
-again (generalised least squares; Aitken, Proc. R. Soc. Edinburgh 55 (1936)): of the deviations of entire runs little is
-left in them, and nothing that a candidate explains of it counts. Errors of rows that were left out stay independent of
-the others, so folds of moves and of runs need no change. Deviations of a joint that two motors turn are taken as two.
+U the left singular vectors of N and λ its squared singular values. Rows multiplied by V^(−1/2) have
+independent errors again (generalised least squares; Aitken, Proc. R. Soc. Edinburgh 55 (1936)): of
+the deviations of whole runs little is left in them, and nothing that a candidate explains of it
+counts. Errors of rows that were left out stay independent of the others, so folds of moves and of
+runs need no change. Deviations of a joint that two motors turn are taken as two.
 """
 
 from __future__ import annotations
@@ -22,12 +25,16 @@ import scipy  # loads scipy.sparse when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
 
-MOST_DENSE = 32  #: Directions up to which zeros are stored: a product is three times as fast, and the memory is little
+#: Directions up to which zeros are stored: a product is three times as fast, and the memory is
+#: little
+MOST_DENSE = 32
 
 
 @dataclass(frozen=True, slots=True)
 class RunScatter:
-    """Covariance of the whitened rows of each motor, given by orthonormal directions of single runs."""
+    """Covariance of the whitened rows of each motor,
+    given by orthonormal directions of single runs.
+    """
 
     directions: tuple[Any, ...]  #: Uᵀ of each motor, an array or a sparse one, shapes (k_i, rows_i)
     variances: tuple[FloatArray, ...]  #: λ of each direction, shapes (k_i,)
@@ -58,7 +65,9 @@ class RunScatter:
         return self._scaled(motor, columns, self.variances[motor])
 
     def shared(self, motor: int, columns: FloatArray) -> FloatArray:
-        """X (V − 1) Xᵀ of columns on the rows of a motor, columns first, shape (p, rows) → (p, p)."""
+        """X (V − 1) Xᵀ of columns on the rows of a motor, columns first, shape (p, rows) → (p,
+        p).
+        """
         components = self.directions[motor] @ columns.T  # Uᵀ Xᵀ
         variances = self.variances[motor][:, None]
         return np.asarray(components.T @ (variances * components))

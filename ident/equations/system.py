@@ -18,7 +18,10 @@ from ident.model.model import Column, DriveTrain, Model
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """Unknowns of eq. (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1)."""
+    """Unknowns of eq.
+
+    (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1).
+    """
 
     model: Model  #: the declared model
     base: BaseParameters  #: how the base parameters were regrouped
@@ -40,12 +43,16 @@ class Equations:
 
     @property
     def leading(self) -> int:
-        """How many columns of the motors' rows belong to currents: the own one, or with preload those of all motors."""
+        """How many columns of the motors' rows belong to currents:
+        the own one, or with preload those of all motors.
+        """
         return self.axis_count if self.model.is_redundant else 1
 
     @property
     def unknowns(self) -> tuple[Column, ...]:
-        """χ, then χ_uL of each mounting: everything linear that is estimated in addition to the gains."""
+        """χ, then χ_uL of each mounting: everything linear that is estimated in addition to the
+        gains.
+        """
         unknowns = list(self.columns)
         for payload, indices in zip(self.payloads, self.payload_columns, strict=True):
             for index in indices:
@@ -113,25 +120,31 @@ class System(Equations):
     """The equations of several runs as triangles, W_tot = [V | −W | −W_uL | −W_kL χ_kL]."""
 
     joints: Triangles  #: of each joint's rows of W_tot, c = m + p + 1 columns
-    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
-    #: (T W χ + T W_kL χ_kL)_i holds one current alone.
+    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the
+    #: equation g_i v_i = (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles
-    #: For each cluster the rows or the triangle of each motor's rows. Of a redundantly driven robot always the rows, of
-    #: all motors alike, and with the torque per unit of each gain in place of the own current: [V_i | …].
+    #: For each cluster the rows or the triangle of each motor's rows. Of a redundantly driven robot
+    #: always the rows, of all motors alike, and with the torque per unit of each gain in place of
+    #: the own current: [V_i | …].
     clusters: tuple[tuple[FloatArray, ...], ...]
     #: Of each cluster the index of its run, and that of its payload, −1 without load.
     cluster_runs: tuple[tuple[int, int], ...] = ()
-    #: For each cluster the rows of its instruments, [(T [Z | Z_uL])_i | (T Z_kL χ_kL)_i] of the demanded motion; empty
-    #: where none is known.
+    #: For each cluster the rows of its instruments, [(T [Z | Z_uL])_i | (T Z_kL χ_kL)_i] of the
+    #: demanded motion; empty where none is known.
     instruments: tuple[tuple[FloatArray, ...], ...] = ()
-    #: Of a redundantly driven robot, N of each cluster's rows, shapes (rows, m, m − d); of others empty.
+    #: Of a redundantly driven robot, N of each cluster's rows, shapes (rows, m, m − d); of others
+    #: empty.
     preload: tuple[FloatArray, ...] = ()
 
-    def weighted_singular_values(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
-        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
+    def weighted_singular_values(
+        self, solution: FloatArray, free: int, *, gains: bool
+    ) -> FloatArray:
+        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper
+        Table 5).
 
-        An effect's coefficient may have any unit, such as rad/Nm, where others have kg m². Its column is scaled to the
-        median norm of the base parameters' columns: otherwise the condition would depend on that unit.
+        An effect's coefficient may have any unit, such as rad/Nm, where others have kg m². Its
+        column is scaled to the median norm of the base parameters' columns: otherwise the condition
+        would depend on that unit.
 
         Args:
             solution: (g, χ, χ_uL, 1) of eq. (17).
@@ -142,7 +155,9 @@ class System(Equations):
         residual_std = self.joints.residual_std(solution, free)
         matrix = self.joints.stacked(1.0 / residual_std)
         norms = np.linalg.norm(matrix, axis=0)
-        is_base = np.array([column.name in self.base.names for column in self.columns], dtype=np.bool_)
+        is_base = np.array(
+            [column.name in self.base.names for column in self.columns], dtype=np.bool_
+        )
         if is_base.any():
             base = count + np.flatnonzero(is_base)
             effects = count + np.flatnonzero(~is_base)
@@ -161,7 +176,9 @@ class System(Equations):
         return tuple(self.runs[index] for index in sorted(seen))
 
     def preload_of(self, cluster: int) -> FloatArray:
-        """N of a cluster's rows, shape (rows, m, m − d); empty where no motor works against another."""
+        """N of a cluster's rows, shape (rows, m, m − d);
+        empty where no motor works against another.
+        """
         if self.preload:
             return self.preload[cluster]
         return np.empty((0, self.axis_count, 0))
@@ -190,14 +207,17 @@ class System(Equations):
         """Give some unknowns a value: their columns join W_kL χ_kL.
 
         Args:
-            values: by index into ``unknowns``; zero takes a parameter out of the model (paper §4.2).
+            values: by index into ``unknowns``; zero takes a parameter out of the model (paper
+                §4.2).
         """
         given = GivenUnknowns.of(values, len(self.unknowns))
         columns = [column for index, column in enumerate(self.columns) if index not in values]
         payload_columns: list[tuple[int, ...]] = []
         first = len(self.columns)
         for indices in self.payload_columns:
-            unknown = [parameter for index, parameter in enumerate(indices, first) if index not in values]
+            unknown = [
+                parameter for index, parameter in enumerate(indices, first) if index not in values
+            ]
             payload_columns.append(tuple(unknown))
             first += len(indices)
         return replace(
@@ -211,9 +231,11 @@ class System(Equations):
         )
 
     def on_instruments(self) -> System:
-        """Replace each motor's columns by their projection on its instruments: the first of two stages.
+        """Replace each motor's columns by their projection on its instruments:
+        the first of two stages.
 
-        What is left of a column depends on the demanded motion alone; a disturbance that moved the arm is gone from it.
+        What is left of a column depends on the demanded motion alone; a disturbance that moved the
+        arm is gone from it.
         """
         projected = [self._projected(motor) for motor in range(self.axis_count)]
         factors: list[FloatArray] = []
@@ -255,8 +277,8 @@ def require_rows(system: System) -> None:
             names = " and ".join(_joints_of_motor(system, motor))
             raise DataUnfit(
                 runs,
-                f"{names}, which motor {motor + 1} turns with, "
-                "never move at the same time; record moves in which they do, or use another estimator than ml",
+                f"{names}, which motor {motor + 1} turns with, never move at the same time; record "
+                "moves in which they do, or use another estimator than ml",
             )
         if rows <= unknown_count:
             raise DataUnfit(
@@ -297,8 +319,8 @@ def require_distinct(system: System, *, gains: bool) -> None:
         gains: whether the gains are unknown too.
 
     Raises:
-        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the payload, or a
-            motor's current is constant zero.
+        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the
+            payload, or a motor's current is constant zero.
     """
     dependent = _dependent_unknowns(system)
     if dependent:
@@ -329,8 +351,8 @@ def _remedy_of_dependence(system: System, dependent: tuple[str, ...]) -> str:
     has_few_joints = robot.carrier < robot.joint_count - 1
     if has_few_joints and dependent == (KNOWN_PAYLOAD,):
         return (
-            "what is known of the payload does not show behind so few joints: say more of it, as its centre of "
-            "mass (`centre_m`) beside its mass"
+            "what is known of the payload does not show behind so few joints: say more of it, as "
+            "its centre of mass (`centre_m`) beside its mass"
         )
     return "move every joint through more of its range"
 
@@ -349,5 +371,6 @@ def _require_currents(system: System) -> None:
         if system.motors.rows[motor] and is_zero:
             name = f"gain {motor + 1}"
             raise RankDeficient(
-                f"the current of motor {motor + 1} is zero throughout: is its channel connected?", (name,)
+                f"the current of motor {motor + 1} is zero throughout: is its channel connected?",
+                (name,),
             )

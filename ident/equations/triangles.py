@@ -1,10 +1,11 @@
 """Rows reduced to triangles, however many there were.
 
-R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never in memory at once.
-R is unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step is Householder's (LAPACK ``tpqrt``,
-which knows that the upper part is a triangle), so R carries a backward error of some ε ‖column‖ in every column,
-whatever the condition number. The Gram matrix is twice as fast and squares the condition number: singular values below
-√ε ‖W‖ are lost in it (docs/evidence has both, measured).
+R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never
+in memory at once. R is unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step
+is Householder's (LAPACK ``tpqrt``, which knows that the upper part is a triangle), so R carries a
+backward error of some ε ‖column‖ in every column, whatever the condition number. The Gram matrix is
+twice as fast and squares the condition number: singular values below √ε ‖W‖ are lost in it
+(docs/evidence has both, measured).
 """
 
 from __future__ import annotations
@@ -20,12 +21,16 @@ from ident.arrays import FloatArray, IntArray
 BLOCK_ROWS = 1024  #: Rows folded in at once: 80 columns of them stay in a core's own cache
 
 REFLECTORS = 8
-"""Householder vectors applied together; wider blocks cost more inside themselves than they save on the rest."""
+"""Householder vectors applied together; wider blocks cost more inside themselves than they save on
+the rest.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """R of the QR factorisation of each axis' equations; ‖R x‖ is the norm of their residual for any x."""
+    """R of the QR factorisation of each axis' equations;
+    ‖R x‖ is the norm of their residual for any x.
+    """
 
     factors: tuple[FloatArray, ...]  #: one for each axis, shape (≤c, c)
     rows: IntArray  #: number of equations of each axis, shape (m,)
@@ -36,7 +41,9 @@ class Triangles:
         return np.concatenate([factor * scale for factor, scale in pairs])
 
     def residual_std(self, vector: FloatArray, free: int) -> FloatArray:
-        """Standard deviation of each axis' residual R x; ``free`` parameters are shared among the axes (eq. 9)."""
+        """Standard deviation of each axis' residual R x;
+        ``free`` parameters are shared among the axes (eq. 9).
+        """
         square_sum = self.square_sum(vector)
         share = free / len(self.rows)
         freedom = np.maximum(self.rows - share, 1.0)
@@ -64,7 +71,9 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
 
 
 def triangle_of(columns: FloatArray) -> FloatArray:
-    """R of rows that are given column by column, shape (c, k) → (≤c, c); columns that are zero take no part."""
+    """R of rows that are given column by column, shape (c, k) → (≤c, c);
+    columns that are zero take no part.
+    """
     nonzero = np.flatnonzero(columns.any(axis=1))
     out = np.zeros((len(nonzero), len(columns)))
     out[:, nonzero] = qr_update(None, columns[nonzero])
@@ -74,7 +83,8 @@ def triangle_of(columns: FloatArray) -> FloatArray:
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Least squares with unit-norm columns inside: solution and (MᵀM)⁻¹.
 
-    Scaling columns changes no least-squares solution, but spares digits where one is in kg and another in kg m².
+    Scaling columns changes no least-squares solution, but spares digits where one is in kg and
+    another in kg m².
     """
     norms = np.linalg.norm(matrix, axis=0)
     norms[norms == 0.0] = 1.0
@@ -96,10 +106,12 @@ def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
 
     Args:
         triangle: what an earlier call returned, None at the start; left as it is.
-        columns: further rows, column by column with time last, shape (c, k); any k, none too; left as they are.
+        columns: further rows, column by column with time last, shape (c, k); any k, none too; left
+            as they are.
 
     Returns:
-        upper triangular, shape (c, c); with fewer than c independent rows it is singular, but never smaller.
+        upper triangular, shape (c, c); with fewer than c independent rows it is singular, but never
+        smaller.
 
     Raises:
         ValueError: the number of columns is not that of the triangle.
@@ -108,13 +120,16 @@ def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
     if triangle is None:
         triangle = np.zeros((count, count))
     if triangle.shape != (count, count):
-        raise ValueError(f"expected {triangle.shape[0]} columns, as in the rows before, found {count}")
+        raise ValueError(
+            f"expected {triangle.shape[0]} columns, as in the rows before, found {count}"
+        )
     if not count or not rows:
         return triangle
     reflectors = min(REFLECTORS, count)
     out = np.array(triangle, order="F")
     for first in range(0, rows, BLOCK_ROWS):
-        # Time last in C order is (rows, columns) in Fortran order: LAPACK gets it without a transposition.
+        # Time last in C order is (rows, columns) in Fortran order: LAPACK gets it without a
+        # transposition.
         block = np.array(columns[:, first : first + BLOCK_ROWS], order="C")
         out, *_ = lapack.dtpqrt(0, reflectors, out, block.T, overwrite_a=1, overwrite_b=1)
     return np.triu(out)

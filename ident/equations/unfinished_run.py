@@ -1,13 +1,15 @@
 """Rows of a recording that still goes on: each is made once, as soon as no later sample changes it.
 
-A row depends on samples before and after its own instant: on those in the window of the decimator, and through the
-zero-phase low-pass of the positions on those around them. So the newest rows of a recording wait for further samples,
-and the samples before a new row are filtered again with it. What is left of the border is then below 1e-7 of the
-signal: the impulse response of the low-pass decays as exp(−2π sin(π/2N) f t) for order N and cut-off f (Oppenheim &
-Schafer, Discrete-Time Signal Processing, §7.2), with N = 4 by a factor of 1e8 in SETTLED_PERIODS/f.
+A row depends on samples before and after its own instant: on those in the window of the decimator,
+and through the zero-phase low-pass of the positions on those around them. So the newest rows of a
+recording wait for further samples, and the samples before a new row are filtered again with it.
+What is left of the border is then below 1e-7 of the signal: the impulse response of the low-pass
+decays as exp(−2π sin(π/2N) f t) for order N and cut-off f (Oppenheim & Schafer, Discrete-Time
+Signal Processing, §7.2), with N = 4 by a factor of 1e8 in SETTLED_PERIODS/f.
 
-Where no standstill speed is declared, it is derived from the new part alone (`ident.data.dataset.standstill_speed`),
-and the rows may differ from those of the same run read at its end.
+Where no standstill speed is declared, it is derived from the new part alone
+(`ident.data.dataset.standstill_speed`), and the rows may differ from those of the same run read at
+its end.
 """
 
 from __future__ import annotations
@@ -25,9 +27,12 @@ from ident.equations.rows import Rows, row_filter, row_masks, rows_of
 from ident.errors import DataUnfit
 from ident.model.model import Model
 
-SETTLED_PERIODS = 8.0  #: Periods of the position filter's cut-off after which a border no longer shows
+#: Periods of the position filter's cut-off after which a border no longer shows
+SETTLED_PERIODS = 8.0
 SHORTEST_S = 2.01
-"""Shortest part that is filtered, and a window of the decimator: `differentiate` refuses less than 2 s."""
+"""Shortest part that is filtered, and a window of the decimator:
+`differentiate` refuses less than 2 s.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +40,8 @@ class RunProgress:
     """How far a run was made into rows."""
 
     name: str  #: of the run
-    #: Sampling rate when it began. It decides the number of taps of the decimator, and stays: later samples change the
-    #: mean rate in its last digits, and 82.5 samples are rounded up or down.
+    #: Sampling rate when it began. It decides the number of taps of the decimator, and stays: later
+    #: samples change the mean rate in its last digits, and 82.5 samples are rounded up or down.
     rate_hz: float
     rows: int  #: number of rows made of it, from its beginning
     is_complete: bool  #: no sample of it follows
@@ -47,13 +52,19 @@ class NewRows:
     """Rows that a run has given since the last call."""
 
     progress: RunProgress  #: with these rows
-    #: Part of the run that the rows come from, and the rows piece by piece; None where no new row counts.
+    #: Part of the run that the rows come from, and the rows piece by piece; None where no new row
+    #: counts.
     built: tuple[Dataset, tuple[Rows, ...]] | None
     continues_move: bool = False  #: the first of them belong to the move of the last ones before
 
 
 def new_rows(
-    model: Model, run: Run, conditioning: Conditioning, before: RunProgress | None, *, is_complete: bool
+    model: Model,
+    run: Run,
+    conditioning: Conditioning,
+    before: RunProgress | None,
+    *,
+    is_complete: bool,
 ) -> NewRows:
     """Build the rows of a run that were not made before and that no later sample changes.
 
@@ -65,12 +76,15 @@ def new_rows(
         is_complete: no sample follows, so the last rows need not wait.
 
     Raises:
-        DataUnfit: see `differentiate`. An unfinished run that is too short is no error: it gives no rows yet.
+        DataUnfit: see `differentiate`. An unfinished run that is too short is no error: it gives no
+            rows yet.
     """
     samples = len(run.time_s)
     if before is None:
         if samples < 3:
-            raise DataUnfit(run.name, f"{samples} samples; expected at least 3, for a sampling rate")
+            raise DataUnfit(
+                run.name, f"{samples} samples; expected at least 3, for a sampling rate"
+            )
         before = RunProgress(run.name, run.rate_hz, rows=0, is_complete=False)
     filter_ = decimator(before.rate_hz, conditioning.decimation_cutoff_hz)
     settled = ceil(SETTLED_PERIODS * before.rate_hz / conditioning.position_cutoff_hz)
@@ -126,7 +140,9 @@ def _samples_from(run: Run, first: int) -> Run:
     return part
 
 
-def _only_new(model: Model, data: Dataset, conditioning: Conditioning, is_new: BoolArray) -> tuple[Rows, ...]:
+def _only_new(
+    model: Model, data: Dataset, conditioning: Conditioning, is_new: BoolArray
+) -> tuple[Rows, ...]:
     """Build the rows of a part, in which only the new ones count."""
     pieces = []
     first = 0

@@ -1,4 +1,6 @@
-"""Compare the estimators, their filters and their scaling, and find the essential parameters (paper §4.2)."""
+"""Compare the estimators, their filters and their scaling,
+and find the essential parameters (paper §4.2).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from ident.estimators.maximum_likelihood import iv, ml
 from ident.model.model import Model
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
-"""Factors of both cut-offs: an estimator that follows the data alone has the same gains over two octaves."""
+"""Factors of both cut-offs: an estimator that follows the data alone has the same gains over two
+octaves.
+"""
 
 
 RATIO = 20.0  #: r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise
@@ -47,7 +51,8 @@ class EstimatorTrial:
     decimation_cutoff_hz: float  #: cut-off of the decimation filter
     gains: FloatArray | None  #: Nm/A, shape (m,); None where it found none
     std: FloatArray | None  #: of the gains, same shape
-    relative_error_percent: float | None  #: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter
+    #: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter
+    relative_error_percent: float | None
     reason: str = ""  #: why there are no gains
 
 
@@ -63,7 +68,9 @@ class EstimatorComparison:
         return self.trials[: len(ESTIMATORS)]
 
     def spread_percent(self, estimator: str) -> FloatArray | None:
-        """Largest less smallest gain over the filters, in per cent of their mean, shape (m,); None with a failure."""
+        """Largest less smallest gain over the filters, in per cent of their mean, shape (m,);
+        None with a failure.
+        """
         gains = [trial.gains for trial in self.trials if trial.estimator == estimator]
         if any(gain is None for gain in gains):
             return None
@@ -95,7 +102,10 @@ def try_estimators(
             position_cutoff_hz=factor * conditioning.position_cutoff_hz,
             decimation_cutoff_hz=factor * conditioning.decimation_cutoff_hz,
         )
-        progress(f"estimators under {filters.position_cutoff_hz:g} Hz / {filters.decimation_cutoff_hz:g} Hz")
+        progress(
+            f"estimators under {filters.position_cutoff_hz:g} Hz / "
+            f"{filters.decimation_cutoff_hz:g} Hz"
+        )
         try:
             system = regrouped(reduce_runs(model, runs(), filters, instruments=True))
         except IdentificationError as error:
@@ -124,13 +134,21 @@ def try_estimators(
 
 def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> EstimatorTrial:
     return EstimatorTrial(
-        estimator, filters.position_cutoff_hz, filters.decimation_cutoff_hz, None, None, None, reason=str(error)
+        estimator,
+        filters.position_cutoff_hz,
+        filters.decimation_cutoff_hz,
+        None,
+        None,
+        None,
+        reason=str(error),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """A base parameter that was taken out, and its relative standard deviation at that step (eq. 11) [%]."""
+    """A base parameter that was taken out, and its relative standard deviation at that step (eq.
+    11) [%].
+    """
 
     name: str
     std_percent: float
@@ -143,13 +161,18 @@ class Essential:
     system: System  #: without the columns that were taken out
     estimate: Estimate  #: of that system
     removed: tuple[Removal, ...]  #: in the order in which they went
-    whole: Estimate  #: the same estimate among all unknowns; a parameter that was taken out is zero and certain
+    #: the same estimate among all unknowns; a parameter that was taken out is zero and certain
+    whole: Estimate
 
 
-def essential(system: System, estimator: Callable[[System], Estimate], ratio: float = RATIO) -> Essential:
-    """Take out the base parameter with the largest relative σ, estimate again, until max/min of them is below r_σ.
+def essential(
+    system: System, estimator: Callable[[System], Estimate], ratio: float = RATIO
+) -> Essential:
+    """Take out the base parameter with the largest relative σ, estimate again,
+    until max/min of them is below r_σ.
 
-    Gains, columns of effects and the payload's parameters are no base parameters of the robot: they stay.
+    Gains, columns of effects and the payload's parameters are no base parameters of the robot: they
+    stay.
 
     Args:
         system: with all base parameters.
@@ -161,10 +184,13 @@ def essential(system: System, estimator: Callable[[System], Estimate], ratio: fl
         IdentificationError: the estimator refuses.
     """
     if not ratio > 1.0:
-        raise ValueError(f"r_σ is {ratio:g}; it compares a largest with a smallest, so it must be above 1")
+        raise ValueError(
+            f"r_σ is {ratio:g}; it compares a largest with a smallest, so it must be above 1"
+        )
     kept = list(range(len(system.columns)))
     removed: list[Removal] = []
-    current, estimate = system, estimator(system)
+    current = system
+    estimate = estimator(system)
     while True:
         candidates = sum(index < len(system.base.independent) for index in kept)
         relative = relative_std_percent(estimate.parameters, estimate.parameters_std)[:candidates]
@@ -175,14 +201,17 @@ def essential(system: System, estimator: Callable[[System], Estimate], ratio: fl
         current = current.holding({worst: 0.0})
         del kept[worst]
         estimate = estimator(current)
-    count, every = system.axis_count, len(system.unknowns)
+    count = system.axis_count
+    every = len(system.unknowns)
     places = [*kept, *range(len(system.columns), every)]
     parameters = np.zeros(every)
     parameters[places] = estimate.parameters
     within = [*range(count), *(count + place for place in places)]
     covariance = np.zeros((count + every,) * 2)
     covariance[np.ix_(within, within)] = estimate.covariance
-    whole = replace(estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance)
+    whole = replace(
+        estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance
+    )
     return Essential(current, estimate, tuple(removed), whole)
 
 

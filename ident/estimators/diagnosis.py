@@ -1,11 +1,13 @@
 """Faults of a recording, by run, channel or axis, before any of its numbers is believed.
 
-A fit may end with small deviations and be wrong: a payload turned between two runs, two currents exchanged, mA read as
-A. Each mistake leaves a trace of its own. `diagnose` looks for them in the equations of a fit; `exchanged_channels`
-reads the runs again, because the equations of a motor hold its own current alone.
+A fit may end with small deviations and be wrong: a payload turned between two runs, two currents
+exchanged, mA read as A. Each mistake leaves a trace of its own. `diagnose` looks for them in the
+equations of a fit; `exchanged_channels` reads the runs again, because the equations of a motor hold
+its own current alone.
 
-A mistake that leaves no usable number is an error (kinds of `ident.errors.ModelContradicted`), any other a `Diagnosis`.
-The limits were set by `make diagnosis-study`; those of a single number are in `ident.plausible`.
+A mistake that leaves no usable number is an error (kinds of `ident.errors.ModelContradicted`), any
+other a `Diagnosis`. The limits were set by `make diagnosis-study`; those of a single number are in
+`ident.plausible`.
 """
 
 from __future__ import annotations
@@ -18,7 +20,15 @@ import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
 from numpy.typing import ArrayLike
 
-from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_entries, require_names, takes
+from ident.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    as_array,
+    require_entries,
+    require_names,
+    takes,
+)
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -51,19 +61,33 @@ from ident.estimators.refusals import (
 from ident.model.model import Model
 from ident.plausible import CURRENT_RANGE, GAIN_RANGE, TORQUE_RATIO, WEIGHT_RATIO, range_text
 
-LARGEST_AXIS_ERROR_PERCENT = 20.0  #: Clean recordings stay below 15, with every effect undeclared below 40
+#: Clean recordings stay below 15, with every effect undeclared below 40
+LARGEST_AXIS_ERROR_PERCENT = 20.0
 LARGEST_CONDITION = 1e6
-"""Largest condition number. An error of one σ along the weakest direction of the parameters is 1/s_min, and it exceeds
-all parameters together where the condition exceeds s_max ‖χ‖. That is 1e4 to 2e5 in real and simulated recordings."""
-GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0  #: Of another estimator's gain from that of ml: relative, and in σ of ml
+"""Largest condition number.
+
+An error of one σ along the weakest direction of the parameters is 1/s_min, and it exceeds all
+parameters together where the condition exceeds s_max ‖χ‖. That is 1e4 to 2e5 in real and simulated
+recordings.
+"""
+#: Of another estimator's gain from that of ml: relative, and in σ of ml
+GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0
 UNSEEN_SIGMAS = 2.0
-"""A gain that is less than this many σ from zero is no result. One that is less than GAIN_SIGMAS from it is none either
-where its sign or its size is not that of a drive."""
-ABSURD_RATIO = 3.0  #: Of a gain to its nameplate, or the inverse, that no tolerance of a drive explains
-SCALE_BLOCKS = 20  #: Stretches of a run of which each is left out once, for σ of the scale of a current
+"""A gain that is less than this many σ from zero is no result.
+
+One that is less than GAIN_SIGMAS from it is none either where its sign or its size is not that of a
+drive.
+"""
+#: Of a gain to its nameplate, or the inverse, that no tolerance of a drive explains
+ABSURD_RATIO = 3.0
+#: Stretches of a run of which each is left out once, for σ of the scale of a current
+SCALE_BLOCKS = 20
 CHANNEL_FALL = 0.4
-"""Least fall of the logarithm of a motor's error with another current than its own. With any two currents of two real
-robots and of the simulated arm exchanged it is 0.8 and more of both motors, but for one pair of a coupled wrist."""
+"""Least fall of the logarithm of a motor's error with another current than its own.
+
+With any two currents of two real robots and of the simulated arm exchanged it is 0.8 and more of
+both motors, but for one pair of a coupled wrist.
+"""
 CHANNEL_T = 4.0  #: Least mean of the falls of the blocks, in σ of that mean
 CHANNEL_BLOCKS = 8  #: Blocks of moves of which each shows whether an exchange explains it
 ALIKE = 0.25  #: Least squared correlation of two torques of which one is the other's, reversed
@@ -78,7 +102,8 @@ def diagnose(
 ) -> tuple[Diagnosis, ...]:
     """Judge a fit: refuse mistakes that leave no usable number, and name all others.
 
-    A mistake of a recording is the same whatever estimator was asked for, so it is judged by `judged_estimate`.
+    A mistake of a recording is the same whatever estimator was asked for, so it is judged by
+    `judged_estimate`.
 
     Args:
         found: with or without effects; of any estimator.
@@ -87,7 +112,8 @@ def diagnose(
         effort_limit: of the joints, inf where unknown [Nm or N], shape (m,).
 
     Raises:
-        PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: see `refuse_mistakes`.
+        PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: see
+            `refuse_mistakes`.
         PayloadDiffers: see `payload_diagnoses`.
         JointStill: a joint never moves in a run, in place of an error that this explains.
     """
@@ -95,17 +121,25 @@ def diagnose(
     entered_gains: FloatArray | None = None
     if nameplate is not None:
         entered_gains = as_array("nameplate", nameplate, (len(axes),), "one per axis")
-    limits = None if effort_limit is None else np.asarray(effort_limit, dtype=np.float64)
+    if effort_limit is None:
+        limits = None
+    else:
+        limits = np.asarray(effort_limit, dtype=np.float64)
     with with_channel_causes(found.channels, axes):
         return tuple(_diagnoses(found, axes, entered_gains, limits))
 
 
 TRACES_OF_STILL_JOINTS = {"axis-error", "masses-contradict", "payload-differs"}
-"""Diagnoses that an encoder may leave which stood still while its joint moved. One of a joint at rest leaves none."""
+"""Diagnoses that an encoder may leave which stood still while its joint moved.
+
+One of a joint at rest leaves none.
+"""
 
 
 LARGEST_SCATTER = 0.03
-"""Relative σ of every gain that is no trace: recordings that do not contradict each other give 1 % on most axes."""
+"""Relative σ of every gain that is no trace:
+recordings that do not contradict each other give 1 % on most axes.
+"""
 
 
 def _diagnoses(
@@ -139,7 +173,9 @@ def _diagnoses(
     unseen = found.holdout
     if unseen is not None:
         payloads = list(payload_diagnoses(unseen, likeliest.gains, likeliest.parameters))
-        diagnoses += payloads or error_diagnoses(found.model, unseen, estimate, axes, unseen.seen_runs)
+        diagnoses += payloads or error_diagnoses(
+            found.model, unseen, estimate, axes, unseen.seen_runs
+        )
     if effort_limit is not None:
         diagnoses += torque_diagnoses(system, estimate, effort_limit)
     scatter = estimate.gains_std / np.abs(estimate.gains)
@@ -150,17 +186,22 @@ def _diagnoses(
 
 
 def judged_estimate(system: System, estimate: Estimate) -> Estimate:
-    """Return the estimate by which recordings are judged: ``ml``, or with fixed gains IDIM-WLS, whatever was asked for.
+    """Return the estimate by which recordings are judged:
+    ``ml``, or with fixed gains IDIM-WLS, whatever was asked for.
 
-    The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
-    contradict each other; those of ``ml`` do. With fixed gains IDIM-WLS always has an estimate.
+    The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not
+    see that moves contradict each other; those of ``ml`` do. With fixed gains IDIM-WLS always has
+    an estimate.
 
     Args:
         system: the equations.
-        estimate: of these equations, by any method; it is judged itself where ``ml`` does not converge.
+        estimate: of these equations, by any method; it is judged itself where ``ml`` does not
+            converge.
     """
     if estimate.gains_fixed:
-        return estimate if estimate.method is Method.WLS else wls(system, estimate.gains)
+        if estimate.method is Method.WLS:
+            return estimate
+        return wls(system, estimate.gains)
     if not estimate.method.is_of_currents:
         with suppress(IdentificationError):
             return ml(system)
@@ -187,10 +228,14 @@ def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
         )
 
 
-def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str]) -> Iterator[Diagnosis]:
-    """Compare free gains with the nameplate: signs, and sizes outside GAIN_RANGE by more than GAIN_SIGMAS σ.
+def gain_diagnoses(
+    estimate: Estimate, nameplate: FloatArray, axes: Sequence[str]
+) -> Iterator[Diagnosis]:
+    """Compare free gains with the nameplate:
+    signs, and sizes outside GAIN_RANGE by more than GAIN_SIGMAS σ.
 
-    A gain that the moves hardly show is named as well where it may be zero, or where its number is absurd.
+    A gain that the moves hardly show is named as well where it may be zero, or where its number is
+    absurd.
     """
     ratio = estimate.gains / nameplate
     known = estimate.gains_std < np.abs(estimate.gains) / GAIN_SIGMAS
@@ -212,10 +257,11 @@ def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str
             GAIN_UNSEEN,
             (),
             (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}, nameplate {nameplate[axis]:.4g}",
+            f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}, nameplate "
+            f"{nameplate[axis]:.4g}",
             f"a gain that is more than {GAIN_SIGMAS:g} σ from zero",
-            "these moves hardly show this gain: record faster and wider moves of this axis, loaded too, and fit them "
-            "together with these; do not use this gain",
+            "these moves hardly show this gain: record faster and wider moves of this axis, loaded "
+            "too, and fit them together with these; do not use this gain",
         )
     for axis in np.flatnonzero(is_off).tolist():
         gain = f"{estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}"
@@ -225,22 +271,31 @@ def gain_diagnoses(estimate: Estimate, nameplate: FloatArray, axes: Sequence[str
             (axes[axis],),
             f"a gain of {gain}, {ratio[axis]:.3g} times the nameplate",
             f"{range_text(GAIN_RANGE)} of {nameplate[axis]:.4g}, within {GAIN_SIGMAS:g} σ",
-            "is the nameplate of this axis, its gear ratio, the scale of its current or the payload's mass wrong?",
+            "is the nameplate of this axis, its gear ratio, the scale of its current or the "
+            "payload's mass wrong?",
         )
 
 
-def outside(values: FloatArray, margin: FloatArray | float, bounds: tuple[float, float]) -> BoolArray:
+def outside(
+    values: FloatArray, margin: FloatArray | float, bounds: tuple[float, float]
+) -> BoolArray:
     """Whether numbers are outside a range by more than a margin; NaN is not."""
     return np.asarray((values + margin < bounds[0]) | (values - margin > bounds[1]))
 
 
 def scale_diagnoses(
-    measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray, axes: Sequence[str], runs: tuple[str, ...]
+    measured_nm: FloatArray,
+    predicted_nm: FloatArray,
+    use: BoolArray,
+    axes: Sequence[str],
+    runs: tuple[str, ...],
 ) -> Iterator[Diagnosis]:
-    """Compare the torque of a run, from its currents and the gains of a calibration, with what that predicts.
+    """Compare the torque of a run, from its currents and the gains of a calibration,
+    with what that predicts.
 
-    A scale is named where it is outside CURRENT_RANGE by more than GAIN_SIGMAS σ and explains the axis: another payload
-    changes the torque of an axis, too, but leaves 28 % and more of it beside any scale.
+    A scale is named where it is outside CURRENT_RANGE by more than GAIN_SIGMAS σ and explains the
+    axis: another payload changes the torque of an axis, too, but leaves 28 % and more of it beside
+    any scale.
 
     Args:
         measured_nm, predicted_nm: joint torque, shape (m, r).
@@ -291,36 +346,48 @@ def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> TorqueSc
     if product == 0.0 or len(products) < SCALE_BLOCKS:
         return TorqueScale(np.nan, np.nan, 1.0)
     starts = np.arange(SCALE_BLOCKS) * len(products) // SCALE_BLOCKS
-    others = (product - np.add.reduceat(products, starts)) / (square - np.add.reduceat(squares, starts))
+    others = (product - np.add.reduceat(products, starts)) / (
+        square - np.add.reduceat(squares, starts)
+    )
     std = float(np.sqrt((SCALE_BLOCKS - 1) * np.var(others)))
     left = float(np.sqrt(max(0.0, 1.0 - product**2 / (square * size))))
     return TorqueScale(product / square, std, left)
 
 
-_OF_LEAST_SQUARES = 'use `method="ml"`: noise in the currents makes the gains of least squares too small'
+_OF_LEAST_SQUARES = (
+    'use `method="ml"`: noise in the currents makes the gains of least squares too small'
+)
 REMEDIES_OF_DISAGREEMENT = {
     Method.LS: _OF_LEAST_SQUARES,
     Method.WLS: _OF_LEAST_SQUARES,
-    Method.TLS: 'use `method="ml"`: an effect that the model lacks, or a parameter that these moves hardly show, bends '
+    Method.TLS: 'use `method="ml"`: an effect that the model lacks, or a parameter that these '
+    "moves hardly show, bends "
     "tls more; `find_effects` looks for effects",
 }
-"""What to do where an estimator's gain is far from that of ml; iv need not agree with it (`diagnose`)."""
+"""What to do where an estimator's gain is far from that of ml;
+iv need not agree with it (`diagnose`).
+"""
 
 
-def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[str]) -> Iterator[Diagnosis]:
+def estimator_diagnoses(
+    estimate: Estimate, likeliest: Estimate, axes: Sequence[str]
+) -> Iterator[Diagnosis]:
     """Compare the gains of another estimator with those of ml on the same equations."""
     if estimate.gains_fixed or estimate is likeliest:
         return
     change = np.abs(estimate.gains - likeliest.gains)
-    far = (change > GAIN_DIFFERENCE * np.abs(likeliest.gains)) & (change > GAIN_SIGMAS * likeliest.gains_std)
+    far = (change > GAIN_DIFFERENCE * np.abs(likeliest.gains)) & (
+        change > GAIN_SIGMAS * likeliest.gains_std
+    )
     for axis in np.flatnonzero(far).tolist():
         percent = 100.0 * change[axis] / abs(likeliest.gains[axis])
         yield Diagnosis(
             "estimators-disagree",
             (),
             (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, {percent:.0f} % from "
-            f"{likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same rows",
+            f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, {percent:.0f} % "
+            f"from {likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same "
+            "rows",
             f"at most {100.0 * GAIN_DIFFERENCE:.0f} %, or {GAIN_SIGMAS:g} σ",
             REMEDIES_OF_DISAGREEMENT[estimate.method],
         )
@@ -330,9 +397,15 @@ def estimator_diagnoses(estimate: Estimate, likeliest: Estimate, axes: Sequence[
 
 
 def error_diagnoses(
-    model: Model, system: System, estimate: Estimate, axes: Sequence[str], runs: tuple[str, ...] = ()
+    model: Model,
+    system: System,
+    estimate: Estimate,
+    axes: Sequence[str],
+    runs: tuple[str, ...] = (),
 ) -> Iterator[Diagnosis]:
-    """Name axes whose error is above LARGEST_AXIS_ERROR_PERCENT; arguments as for `axis_error_diagnoses`."""
+    """Name axes whose error is above LARGEST_AXIS_ERROR_PERCENT;
+    arguments as for `axis_error_diagnoses`.
+    """
     size, left = joint_torques(system, estimate)
     yield from axis_error_diagnoses(size, left, idle_joints(model, size, left), axes, runs)
 
@@ -343,13 +416,17 @@ def axis_error_diagnoses(
     """Name axes whose error is above LARGEST_AXIS_ERROR_PERCENT.
 
     Args:
-        size, left: torque of each joint and what the model leaves of it, root mean squares [Nm or N], shape (m,).
+        size, left: torque of each joint and what the model leaves of it, root mean squares [Nm or
+            N], shape (m,).
         idle: joints whose error is nothing beside the torques of the others, shape (m,).
         axes: their names.
         runs: that the fit has not seen, empty for its own.
     """
     for axis in np.flatnonzero(100.0 * left > LARGEST_AXIS_ERROR_PERCENT * size).tolist():
-        found = f"an error of {left[axis]:.2g} in {size[axis]:.2g} Nm (or N), {100.0 * left[axis] / size[axis]:.3g} %"
+        found = (
+            f"an error of {left[axis]:.2g} in {size[axis]:.2g} Nm (or N), "
+            f"{100.0 * left[axis] / size[axis]:.3g} %"
+        )
         if idle[axis]:
             yield Diagnosis(
                 "axis-idle",
@@ -366,12 +443,14 @@ def axis_error_diagnoses(
                 (axes[axis],),
                 found,
                 f"some 3 to 15 %, below {LARGEST_AXIS_ERROR_PERCENT:g} %",
-                "look for what contradicts the model on this axis: its current channel and sign, gear ratio, payload, "
-                "friction or an effect that is not declared (`find_effects`)",
+                "look for what contradicts the model on this axis: its current channel and sign, "
+                "gear ratio, payload, friction or an effect that is not declared (`find_effects`)",
             )
 
 
-def torque_diagnoses(system: System, estimate: Estimate, effort_limit: FloatArray) -> Iterator[Diagnosis]:
+def torque_diagnoses(
+    system: System, estimate: Estimate, effort_limit: FloatArray
+) -> Iterator[Diagnosis]:
     """Compare the torques with the effort limits of the URDF: a unit puts all of them above."""
     torque, _ = joint_torques(system, estimate)
     if np.any(np.isfinite(effort_limit)) and np.all(
@@ -383,7 +462,8 @@ def torque_diagnoses(system: System, estimate: Estimate, effort_limit: FloatArra
             (),
             f"torques of {numbers_text(torque)} Nm (or N; root mean square)",
             f"less than the effort limits of the URDF, {numbers_text(effort_limit)}",
-            "are the currents in mA and read as A, is the payload's mass in g and read as kg, or the URDF wrong?",
+            "are the currents in mA and read as A, is the payload's mass in g and read as kg, or "
+            "the URDF wrong?",
         )
 
 
@@ -396,8 +476,9 @@ def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
             (),
             f"a condition number of {estimate.condition:.2g}",
             f"100 to 1e5, below {LARGEST_CONDITION:.0e}",
-            "single parameters mean nothing here, and another motion is not predicted: move all axes together, through "
-            "more of their range, and see whether the URDF rounds its angles (1.57 in place of pi/2)",
+            "single parameters mean nothing here, and another motion is not predicted: move all "
+            "axes together, through more of their range, and see whether the URDF rounds its "
+            "angles (1.57 in place of pi/2)",
         )
 
 
@@ -408,7 +489,8 @@ def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
 def exchanged_channels(
     model: Model, runs: Iterable[Run], conditioning: Conditioning, axes: Sequence[str]
 ) -> Diagnosis | None:
-    """Whether another order of the channels explains each motor that it moves clearly better, in all runs together.
+    """Whether another order of the channels explains each motor that it moves clearly better,
+    in all runs together.
 
     Args:
         model, conditioning: of the fit.
@@ -420,7 +502,8 @@ def exchanged_channels(
     """
     require_names("axes", axes, model.robot.axis_count)
     require_entries("runs", runs, Run, "give a list of runs: [bare, loaded]")
-    if model.is_redundant:  # internal preload is in every current: no motor has an equation without those of the others
+    # Internal preload is in every current: no motor has an equation without those of the others
+    if model.is_redundant:
         return None
     return exchange_shown_by(channel_evidence(model, runs, conditioning), axes)
 
@@ -445,20 +528,25 @@ def exchange_shown_by(evidence: ChannelEvidence, axes: Sequence[str]) -> Diagnos
         tuple(axes[motor] for motor in moved),
         "; ".join(
             f"the motion of {axes[motor]} explains the current of {axes[best[motor]]} (error "
-            f"{100.0 * errors[motor, best[motor]]:.2g} %) rather than its own ({100.0 * errors[motor, motor]:.2g} %)"
+            f"{100.0 * errors[motor, best[motor]]:.2g} %) rather than its own "
+            f"({100.0 * errors[motor, motor]:.2g} %)"
             for motor in moved
         ),
         "each current to follow from the motion of its own axis",
-        "exchange these currents: the drives' node numbers in the cell, and record again, because a log keeps those "
-        "that it was recorded with; or the columns of the import, and import again",
+        "exchange these currents: the drives' node numbers in the cell, and record again, because "
+        "a log keeps those that it was recorded with; or the columns of the import, and import "
+        "again",
     )
 
 
-def require_explained_currents(run: Run, model: Model, conditioning: Conditioning, axes: Sequence[str]) -> None:
-    """Refuse a recording with currents that look like sizes, unless the equations of their motors explain them.
+def require_explained_currents(
+    run: Run, model: Model, conditioning: Conditioning, axes: Sequence[str]
+) -> None:
+    """Refuse a recording with currents that look like sizes,
+    unless the equations of their motors explain them.
 
-    A load that is always carried may come down to zero again and again, with little friction to take its current below.
-    Its motor's equation explains it then, and does not explain a size.
+    A load that is always carried may come down to zero again and again, with little friction to
+    take its current below. Its motor's equation explains it then, and does not explain a size.
 
     Args:
         run: a recording.
@@ -471,7 +559,8 @@ def require_explained_currents(run: Run, model: Model, conditioning: Conditionin
     unsigned = unsigned_currents(run, model.drive_train.ratio)
     if not unsigned.any():
         return
-    # A redundant robot has no equation for one motor, and a run that is too short has too few: the shape decides.
+    # A redundant robot has no equation for one motor, and a run that is too short has too few: the
+    # shape decides.
     if not model.is_redundant:
         with suppress(DataUnfit):
             own_errors = np.diag(channel_errors(model, (run,), conditioning))
@@ -484,10 +573,12 @@ def require_explained_currents(run: Run, model: Model, conditioning: Conditionin
 def unsigned_channels(
     model: Model, runs: Sequence[Run], conditioning: Conditioning, axes: Sequence[str]
 ) -> CurrentUnsigned | None:
-    """Whether a current that has one sign in all runs is a size: while its motor turns both ways nothing explains it.
+    """Whether a current that has one sign in all runs is a size:
+    while its motor turns both ways nothing explains it.
 
-    A load that is always carried has one sign, too, but the equation of its motor explains it. This finds a size that
-    `ident.data.unsigned_current` does not, because friction takes its current through zero between two samples.
+    A load that is always carried has one sign, too, but the equation of its motor explains it. This
+    finds a size that `ident.data.unsigned_current` does not, because friction takes its current
+    through zero between two samples.
 
     Arguments as for `exchanged_channels`.
 
@@ -504,11 +595,14 @@ def unsigned_channels(
     if not len(unsigned):
         return None
     names = tuple(axes[axis] for axis in unsigned.tolist())
-    return CurrentUnsigned(", ".join(run.name for run in runs), names, missing_sign(runs[0].current_a[:, unsigned]))
+    return CurrentUnsigned(
+        ", ".join(run.name for run in runs), names, missing_sign(runs[0].current_a[:, unsigned])
+    )
 
 
 def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> FloatArray:
-    """Share of the current k that the equation of motor i leaves, every gain and parameter of its own, shape (m, m).
+    """Share of the current k that the equation of motor i leaves,
+    every gain and parameter of its own, shape (m, m).
 
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
@@ -520,12 +614,15 @@ def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning
 class ChannelEvidence:
     """How well the equation of each motor explains each current."""
 
-    errors: FloatArray  #: share of the current k that the equation of motor i leaves, shape (m, m); NaN where unknown
+    #: share of the current k that the equation of motor i leaves, shape (m, m); NaN where unknown
+    errors: FloatArray
     #: Square of that share, of which each block of moves has a part, shape (CHANNEL_BLOCKS, m, m).
     block_shares: FloatArray
 
     def is_clearly_better(self, motor: int, channel: int) -> bool:
-        """Whether a motor explains another current better than its own, by CHANNEL_FALL and in the blocks alike."""
+        """Whether a motor explains another current better than its own,
+        by CHANNEL_FALL and in the blocks alike.
+        """
         fall = float(np.log(self.errors[motor, motor] / self.errors[motor, channel]))
         if not fall >= CHANNEL_FALL:
             return False
@@ -540,7 +637,9 @@ class ChannelEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelTriangles:
-    """Rows of one run as triangles: the equation of each motor beside the currents of all, in blocks of moves."""
+    """Rows of one run as triangles: the equation of each motor beside the currents of all,
+    in blocks of moves.
+    """
 
     #: R of each motor's columns and of all currents, by block; None of a block without rows.
     factors: tuple[tuple[FloatArray | None, ...], ...]
@@ -563,7 +662,8 @@ def channel_triangles(model: Model, run: Run, conditioning: Conditioning) -> Cha
         block_of_row = rows.move % CHANNEL_BLOCKS
         for motor, used in enumerate(rows.motor_use):
             mixed = motor_columns(train.to_motor[motor], rows.standard.__getitem__)
-            payload = mixed[model.flange] * (run.payload is not None)  # one body for all mountings will do
+            # One body for all mountings will do
+            payload = mixed[model.flange] * (run.payload is not None)
             columns = np.concatenate((mixed[support[motor]], payload, rows.current))
             for block in np.unique(block_of_row[used]).tolist():
                 chosen = columns[:, used & (block_of_row == block)]
@@ -572,7 +672,9 @@ def channel_triangles(model: Model, run: Run, conditioning: Conditioning) -> Cha
     return ChannelTriangles(tuple(map(tuple, factors)), row_counts)
 
 
-def channel_evidence(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> ChannelEvidence:
+def channel_evidence(
+    model: Model, runs: Iterable[Run], conditioning: Conditioning
+) -> ChannelEvidence:
     """Explain the current of each channel by the equation of each motor.
 
     Raises:
@@ -622,5 +724,8 @@ def _joined_blocks(factors: Sequence[Sequence[FloatArray | None]]) -> dict[int, 
     joined: dict[int, FloatArray] = {}
     for block in sorted(parts):
         own = parts[block]
-        joined[block] = own[0] if len(own) == 1 else triangle(own, own[0].shape[1])
+        if len(own) == 1:
+            joined[block] = own[0]
+        else:
+            joined[block] = triangle(own, own[0].shape[1])
     return joined

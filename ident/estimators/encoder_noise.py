@@ -1,14 +1,18 @@
-"""Noise of encoders whose misfit is tested: how large it is for certain, and how it is correlated in time.
+"""Noise of encoders whose misfit is tested:
+how large it is for certain, and how it is correlated in time.
 
-The certain part is what counts and differences from sample to sample show. A misfit that is far above it has a cause.
+The certain part is what counts and differences from sample to sample show. A misfit that is far
+above it has a cause.
 
-The correlation decides σ of an estimate. Each encoder has white noise and noise that decays over a correlation time τ,
+The correlation decides σ of an estimate. Each encoder has white noise and noise that decays over a
+correlation time τ,
 
     cov(ε_t, ε_s) = σ² ((1 − a) δ_ts + a exp(−|t − s|/τ)),
 
-alike on all encoders. Of ε only the part in the misfit's directions B_t is seen, so that the covariance of a misfit is
-that of ε times B_tᵀ B_s. a and τ maximise the restricted likelihood (Patterson and Thompson, Biometrika 1971, 58): it
-knows that the fitted numbers have taken a part of the noise with them.
+alike on all encoders. Of ε only the part in the misfit's directions B_t is seen, so that the
+covariance of a misfit is that of ε times B_tᵀ B_s. a and τ maximise the restricted likelihood
+(Patterson and Thompson, Biometrika 1971, 58): it knows that the fitted numbers have taken a part of
+the noise with them.
 """
 
 from __future__ import annotations
@@ -60,7 +64,9 @@ class RunDirections:
     basis: FloatArray  #: B, orthonormal columns, shape (k, m, m − d)
 
 
-def estimate_noise(directions: Sequence[RunDirections], jacobian: FloatArray, right: FloatArray) -> MisfitNoise:
+def estimate_noise(
+    directions: Sequence[RunDirections], jacobian: FloatArray, right: FloatArray
+) -> MisfitNoise:
     """Estimate the correlation from the residual of a linear fit.
 
     Args:
@@ -123,6 +129,7 @@ def _correlated(decomposed: Sequence[tuple[FloatArray, FloatArray]], share: floa
     for values, ways in decomposed:
         runs.append(RunNoise(ways, np.sqrt(1.0 - share + share * values)))
     variance = np.concatenate([run.std**2 for run in runs])
-    # A mean square of n numbers with these variances scatters as one of this many independent ones (Satterthwaite).
+    # A mean square of n numbers with these variances scatters as one of this many independent ones
+    # (Satterthwaite).
     effective = np.sum(variance) ** 2 / np.sum(variance**2)
     return MisfitNoise(tuple(runs), float(effective))

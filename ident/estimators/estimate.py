@@ -20,7 +20,9 @@ if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no
     from ident.model.model import Column, Model
 
 SAME_ERROR = 0.01
-"""Share of an error by which another one may be larger and still be the same: 5.76 % and 5.76 % differ by chance."""
+"""Share of an error by which another one may be larger and still be the same:
+5.76 % and 5.76 % differ by chance.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +33,19 @@ class RelativeError:
     total: float  #: of all together [%]
 
     def at(self, place: int) -> float:
-        """Error of an axis [%]; for a joint without a motor (numbers above the axes'), that of all axes together."""
-        return self.axes[place] if place < len(self.axes) else self.total
+        """Error of an axis [%]; for a joint without a motor (numbers above the axes'),
+        that of all axes together.
+        """
+        if place < len(self.axes):
+            return self.axes[place]
+        return self.total
 
 
-def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray) -> RelativeError:
-    """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6); NaN for a joint without a row that counts.
+def relative_error(
+    measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray
+) -> RelativeError:
+    """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6);
+    NaN for a joint without a row that counts.
 
     Args:
         measured_nm, predicted_nm: joint torque, shape (m, r).
@@ -63,11 +72,14 @@ class Estimate:
     gains_fixed: bool  #: the gains were given, not estimated
     unknowns: tuple[Column, ...]  #: name and unit of each parameter: χ, then χ_uL
     parameters: FloatArray  #: their values, shape (p,)
-    covariance: FloatArray  #: of (gains, parameters), shape (m + p, m + p); gains' rows are zero where they were fixed
-    #: Standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (m,).
+    #: of (gains, parameters), shape (m + p, m + p); gains' rows are zero where they were fixed
+    covariance: FloatArray
+    #: Standard deviation of the residual [Nm for joint equations, A for ml's motor equations],
+    #: shape (m,).
     axis_noise: FloatArray
     singular_values: FloatArray  #: of the weighted observation matrix W_r (``tls``: of W_tot)
-    condition: float  #: of W_r, rows of a joint divided by the deviation of this estimate's residual, as in Table 5
+    #: of W_r, rows of a joint divided by the deviation of this estimate's residual, as in Table 5
+    condition: float
     rows: int  #: equations used
     iterations: int = 0  #: of an iterative estimator
 
@@ -83,7 +95,9 @@ class Estimate:
 
     def predicted_torque(self, observation: Observation) -> FloatArray:
         """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (m, r)."""
-        linear = [self.parameters @ observation.of_joint(joint) for joint in range(observation.axis_count)]
+        linear = [
+            self.parameters @ observation.of_joint(joint) for joint in range(observation.axis_count)
+        ]
         return np.stack(linear) + observation.known()
 
     def residual_torque(self, observation: Observation) -> FloatArray:
@@ -104,12 +118,14 @@ class Identification:
     model: Model  #: the declared model
     conditioning: Conditioning  #: the filters
     system: System  #: of the fit
-    holdout: System | None  #: of the runs that were held out, with the unknowns of the fit; None without any
+    #: of the runs that were held out, with the unknowns of the fit; None without any
+    holdout: System | None
     estimate: Estimate  #: from ``system`` alone
     #: All runs, held-out runs last, and their rows; none unless they were asked for.
     gathered: tuple[tuple[Dataset, ...], Observation] | None = None
     channels: tuple[RunChannels, ...] = ()  #: faults of single channels of each run of the fit
-    instants: tuple[Instants, ...] = ()  #: a few rows of each run of the fit, for `ident.estimators.turned_geometry`
+    #: a few rows of each run of the fit, for `ident.estimators.turned_geometry`
+    instants: tuple[Instants, ...] = ()
 
     @property
     def training_error(self) -> RelativeError:
@@ -119,11 +135,14 @@ class Identification:
     @property
     def holdout_error(self) -> RelativeError | None:
         """Relative error on held-out rows [%]; None without any."""
-        return None if self.holdout is None else self.estimate.relative_error(self.holdout)
+        if self.holdout is None:
+            return None
+        return self.estimate.relative_error(self.holdout)
 
     @property
     def current_residual(self) -> tuple[float, ...] | None:
-        """Root mean square of what is left of each motor's current, as `Calibration.current_residual`.
+        """Root mean square of what is left of each motor's current,
+        as `Calibration.current_residual`.
 
         None where a motor has no rows.
         """
@@ -133,4 +152,6 @@ class Identification:
                 seen = system.motors.rows > 0
                 size = system.currents.noise(self.estimate.gains, self.estimate.parameters)
                 left[seen] = size[seen]
-        return tuple(float(f"{one:.6g}") for one in left) if np.isfinite(left).all() else None
+        if np.isfinite(left).all():
+            return tuple(float(f"{one:.6g}") for one in left)
+        return None

@@ -1,21 +1,24 @@
-"""Zeros, lengths and base places of a robot with more encoders than degrees of freedom, from its positions alone.
+"""Zeros, lengths and base places of a robot with more encoders than degrees of freedom,
+from its positions alone.
 
-The pose that fits the m encoders best leaves a misfit of m − d numbers a sample, e(θ) in the directions in which it can
-be. Where the description is right, it is the encoders' noise. θ are the changes of zeros, lengths and base places
-(`ident.model.geometry`), and a delay of each encoder. The whole of them is estimated by Gauss-Newton; linearised around
-that estimate, e ≈ J θ − y, the misfit of every choice of few numbers is a small linear problem. A choice is an
-explanation where it leaves
+The pose that fits the m encoders best leaves a misfit of m − d numbers a sample, e(θ) in the
+directions in which it can be. Where the description is right, it is the encoders' noise. θ are the
+changes of zeros, lengths and base places (`ident.model.geometry`), and a delay of each encoder. The
+whole of them is estimated by Gauss-Newton; linearised around that estimate, e ≈ J θ − y, the misfit
+of every choice of few numbers is a small linear problem. A choice is an explanation where it leaves
 
 - no more than the whole of them does (F test), and
 - no more than the encoders' own noise, which counts and differences from sample to sample show.
 
-The second is absolute. Arms that bend leave a misfit that depends on the pose, and so does every zero and length: some
-three of them always take most of it, but not down to the noise. The explanation with the fewest numbers is taken, one
-before two before three. Numbers that are not in it stay as they are described. More than three wrong numbers
-look like another cause, such as arms that bend, and then nothing is corrected.
+The second is absolute. Arms that bend leave a misfit that depends on the pose, and so does every
+zero and length: some three of them always take most of it, but not down to the noise. The
+explanation with the fewest numbers is taken, one before two before three. Numbers that are not in
+it stay as they are described. More than three wrong numbers look like another cause, such as arms
+that bend, and then nothing is corrected.
 
-Positions are used as they were recorded: a low-pass bends a closed loop, and the encoders' noise is that of their
-counts. Its correlation is estimated (`ident.estimators.encoder_noise`), and all rows are made white by it.
+Positions are used as they were recorded: a low-pass bends a closed loop, and the encoders' noise is
+that of their counts. Its correlation is estimated (`ident.estimators.encoder_noise`), and all rows
+are made white by it.
 """
 
 from __future__ import annotations
@@ -55,24 +58,33 @@ DEGREE = 4  #: Of that polynomial; at 3 Hz it is right to 1e-4 of the amplitude
 SMALLEST_COUNT_RAD = 1e-10  #: Smaller steps between two positions are rounding
 MOST_CAUSES = 3  #: Numbers of an explanation
 MOST_TURNS = 3  #: Estimates of the best choice of so many numbers, until it stays the best
-STEP = 1e-4  #: Change of a length from which the derivative of the closures is taken [of the robot's size]
+#: Change of a length from which the derivative of the closures is taken [of the robot's size]
+STEP = 1e-4
 ITERATIONS = 8
 SETTLED = 1e-10  #: Change at which the iteration ends [rad, or of the robot's size]
-SETTLED_SIGMAS = 0.1  #: Change of all misfits together at which that of all numbers ends [σ of one misfit]
+#: Change of all misfits together at which that of all numbers ends [σ of one misfit]
+SETTLED_SIGMAS = 0.1
 SMALLEST_SINGULAR = 1e-9  #: Relative to the largest: rounding
 LARGEST_STD = 1e-2
-"""Direction of zeros and lengths with a larger σ [rad, or of the robot's size], half a degree: it cannot be seen."""
+"""Direction of zeros and lengths with a larger σ [rad, or of the robot's size], half a degree:
+it cannot be seen.
+"""
 TESTED_STD = 1e-3
-"""Directions of all numbers together with a larger σ test no explanation: they would be estimated so far from the truth
-that a linear problem around them is none of the truth."""
-PROBABILITY = 1e-4  #: That the true explanation is refused, and that noise alone is taken for a wrong description
+"""Directions of all numbers together with a larger σ test no explanation: they would be estimated
+so far from the truth that a linear problem around them is none of the truth.
+"""
+#: That the true explanation is refused, and that noise alone is taken for a wrong description
+PROBABILITY = 1e-4
 SMALLEST_MISFIT = 2e-5
-"""Misfit above the noise [rad, or of the robot's size] below which nothing is said: one twenty times larger moves a
-gain by 7 to 9 of its σ, so this one by less than half of one."""
+"""Misfit above the noise [rad, or of the robot's size] below which nothing is said:
+one twenty times larger moves a gain by 7 to 9 of its σ, so this one by less than half of one.
+"""
 TOLERATED_MISFIT = 1e-5
-"""Misfit above the known noise that an explanation may leave, half of what is not reported: slow noise of an encoder,
-in which neighbouring samples hardly differ, is not among the known noise."""
-TOLERATED_SHARE = 0.02  #: The same as a share of the misfit: of a small one, some three numbers take most by chance
+"""Misfit above the known noise that an explanation may leave, half of what is not reported: slow
+noise of an encoder, in which neighbouring samples hardly differ, is not among the known noise.
+"""
+#: The same as a share of the misfit: of a small one, some three numbers take most by chance
+TOLERATED_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,13 +128,16 @@ class GeometryEstimate:
 class GeometryFinding:
     """What the encoders say of the geometry."""
 
-    #: Root mean square of what is left of the encoders' positions beside the pose that fits them best, a direction
-    #: [rad, or of the robot's size], with the described geometry.
+    #: Root mean square of what is left of the encoders' positions beside the pose that fits them
+    #: best, a direction [rad, or of the robot's size], with the described geometry.
     misfit: float
-    misfit_left: float  #: the same with the causes; where there are none, with all zeros and lengths estimated
-    noise: float  #: the same of the encoders' noise, by counts and by differences from sample to sample
+    #: the same with the causes; where there are none, with all zeros and lengths estimated
+    misfit_left: float
+    #: the same of the encoders' noise, by counts and by differences from sample to sample
+    noise: float
     is_significant: bool  #: the description leaves more misfit than noise does
-    causes: tuple[GeometryEstimate, ...]  #: the explanation with the fewest numbers; empty without one
+    #: the explanation with the fewest numbers; empty without one
+    causes: tuple[GeometryEstimate, ...]
     covariance: FloatArray  #: of their changes, shape (p, p)
     #: Other explanations with as many numbers that these positions cannot distinguish from it.
     alternatives: tuple[tuple[GeometryEstimate, ...], ...]
@@ -132,7 +147,9 @@ class GeometryFinding:
 
     @property
     def corrections(self) -> tuple[GeometryEstimate, ...]:
-        """Causes that can be corrected in the description: none where an encoder is late, or may be instead."""
+        """Causes that can be corrected in the description:
+        none where an encoder is late, or may be instead.
+        """
         for explanation in (self.causes, *self.alternatives):
             if any(one.parameter.kind is GeometryKind.DELAY for one in explanation):
                 return ()
@@ -145,7 +162,9 @@ class GeometryFinding:
 
 
 def thinned(run: Run) -> Positions:
-    """Choose positions of a run that are SPACING_S apart, valid on every axis with the samples around them."""
+    """Choose positions of a run that are SPACING_S apart,
+    valid on every axis with the samples around them.
+    """
     position_rad = np.asarray(run.position_rad, dtype=np.float64)
     time_s = np.asarray(run.time_s, dtype=np.float64)
     samples, axes = position_rad.shape
@@ -191,7 +210,8 @@ def _smallest_step(values: FloatArray) -> float:
 
 
 def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFinding | None:
-    """Compare the description with the encoders, and look for the fewest numbers of it that are wrong.
+    """Compare the description with the encoders, and look for the fewest numbers of it that are
+    wrong.
 
     Args:
         model: of the description.
@@ -201,7 +221,8 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
         None for a robot without redundant encoders, and where there are too few positions.
 
     Raises:
-        ModelError: the loops cannot be closed, or the encoders contradict each other so much that no pose fits them.
+        ModelError: the loops cannot be closed, or the encoders contradict each other so much that
+            no pose fits them.
     """
     if not model.is_redundant:
         return None
@@ -222,7 +243,10 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
     if is_significant:
         chosen, fitted = _explained(problem, _whole(problem))
         causes = chosen[0] if chosen else ()
-        square = fitted.misfit_square_of(causes) if causes else fitted.square_of_description()
+        if causes:
+            square = fitted.misfit_square_of(causes)
+        else:
+            square = fitted.square_of_description()
         left = float(np.sqrt(square / problem.rows))
     else:
         fitted = _with_noise(problem, as_described)
@@ -246,7 +270,8 @@ class _Problem:
 
     model: Model
     parameters: tuple[GeometryParameter, ...]  #: zeros and lengths, base places, delays
-    unit: FloatArray  #: of each: a radian, the robot's size [m], or the time for a radian [s], shape (p,)
+    #: of each: a radian, the robot's size [m], or the time for a radian [s], shape (p,)
+    unit: FloatArray
     runs: tuple[Positions, ...]
     axis_unit: FloatArray  #: a radian, or the robot's size [m], of each axis, shape (m,)
     near_rad: FloatArray  #: of all joints, shape (k, n)
@@ -256,7 +281,9 @@ class _Problem:
     def of(cls, model: Model, runs: Sequence[Positions]) -> _Problem:
         robot = model.robot
         size_m = model.assembly.size_m
-        axis_unit = np.array([1.0 if joint.kind is JointKind.REVOLUTE else size_m for joint in robot.axes])
+        axis_unit = np.array(
+            [1.0 if joint.kind is JointKind.REVOLUTE else size_m for joint in robot.axes]
+        )
         of_description = (*geometry_parameters(robot), *base_places(robot))
         units = [unit_of(model, one) for one in of_description]
         speed = np.concatenate([one.motion[:, :, 0] for one in runs]) / axis_unit
@@ -314,7 +341,9 @@ class _Problem:
         """Robot with changes of all parameters in their units."""
         numbers = zip(self.parameters, changes * self.unit, strict=True)
         described = [
-            GeometryChange(one, float(change)) for one, change in numbers if one.kind is not GeometryKind.DELAY
+            GeometryChange(one, float(change))
+            for one, change in numbers
+            if one.kind is not GeometryKind.DELAY
         ]
         return with_geometry(self.model.robot, described)
 
@@ -328,15 +357,20 @@ class _Problem:
         return self._in_directions(apart)
 
     def _in_directions(self, apart: FloatArray) -> FloatArray:
-        """Differences of the axes [rad or m], shape (k, m), in the directions of a misfit, shape (k (m − d),)."""
+        """Differences of the axes [rad or m], shape (k, m), in the directions of a misfit,
+        shape (k (m − d),).
+        """
         return np.asarray(np.einsum("kmr,km->kr", self.basis, apart / self.axis_unit).ravel())
 
-    def linearised(self, changes: FloatArray, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """e and its derivatives to some parameters, in their units, shapes (k (m − d),) and (k (m − d), p).
+    def linearised(
+        self, changes: FloatArray, chosen: Sequence[int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """e and its derivatives to some parameters, in their units, shapes (k (m − d),)
+        and (k (m − d), p).
 
-        With P = I − A (AᵀA)⁻¹ Aᵀ, a zero moves e by P e_j, a delay by P e_j q̇_j, and a length or place by −P times what
-        the motors' joints move where x stays: J_d dq_d = −∂φ/∂θ. φ is linear in lengths and places, so that a
-        difference of it is exact.
+        With P = I − A (AᵀA)⁻¹ Aᵀ, a zero moves e by P e_j, a delay by P e_j q̇_j, and a length or
+        place by −P times what the motors' joints move where x stays: J_d dq_d = −∂φ/∂θ. φ is linear
+        in lengths and places, so that a difference of it is exact.
         """
         robot = self._changed(changes)
         assembly = self.model.assembly
@@ -364,7 +398,9 @@ class _Problem:
                     longer = with_geometry(robot, (GeometryChange(parameter, STEP * unit),))
                     gap = loops(longer, position_rad, assembly.size_m).residual - closing.residual
                     moved = np.zeros(position_rad.shape)
-                    moved[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, gap)[..., None])[..., 0]
+                    moved[:, rest] = -np.linalg.solve(
+                        r, np.einsum("kcr,kc->kr", q, gap)[..., None]
+                    )[..., 0]
                     column = -np.einsum("kij,kj->ki", hidden, moved[:, motors]) / (STEP * unit)
             columns.append(unit * self._in_directions(column))
         return self._apart(axes_rad, position_rad), np.stack(columns, axis=1)
@@ -372,8 +408,9 @@ class _Problem:
     def noise_std(self, changes: FloatArray) -> float:
         """σ of a misfit by what is known of the encoders, the larger of two.
 
-        One is by the second differences of e from sample to sample, which a smooth motion of what is left does not
-        reach; the other is that of rounding to counts, which an axis at rest shows in no difference.
+        One is by the second differences of e from sample to sample, which a smooth motion of what
+        is left does not reach; the other is that of rounding to counts, which an axis at rest shows
+        in no difference.
         """
         earlier = self.misfit(changes, -1)
         now = self.misfit(changes)
@@ -390,7 +427,8 @@ class _Problem:
         Args:
             square: Σe².
             count: of the numbers that were estimated.
-            noise_std: of a misfit; each sample gives one difference, so that it is known as well as the misfit is.
+            noise_std: of a misfit; each sample gives one difference, so that it is known as well as
+                the misfit is.
         """
         free = self.rows - count
         limit = float(scipy.stats.f.isf(PROBABILITY, free, self.rows))
@@ -416,7 +454,9 @@ def _to_joints(model: Model, jacobian: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _misfit_directions(model: Model, position_rad: FloatArray, axis_unit: FloatArray) -> FloatArray:
-    """Orthonormal directions of the axes in which no motion goes, in their units, shape (k, m, m − d)."""
+    """Orthonormal directions of the axes in which no motion goes, in their units, shape (k, m,
+    m − d).
+    """
     closing = loops(model.robot, position_rad, model.assembly.size_m)
     to_joints, _, _ = _to_joints(model, closing.jacobian)
     to_motors = to_joints[:, list(model.robot.axis_joints)]
@@ -449,12 +489,15 @@ class _Visible:
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """e ≈ J θ − y around an estimate, reduced to triangles, and the noise of all numbers together."""
+    """e ≈ J θ − y around an estimate, reduced to triangles,
+    and the noise of all numbers together.
+    """
 
     problem: _Problem
     jacobian: FloatArray  #: J, shape (k (m − d), p)
     right: FloatArray  #: y, shape (k (m − d),)
-    noise: MisfitNoise | None  #: correlation by which the rows were made white; None before it is known
+    #: correlation by which the rows were made white; None before it is known
+    noise: MisfitNoise | None
     noise_std: float  #: of a misfit, by what is known of the encoders
     triangle: FloatArray  #: R of the white [J | y], shape (p + 1, p + 1)
     misfit_triangle: FloatArray  #: R of [J | y], shape (p + 1, p + 1)
@@ -463,14 +506,21 @@ class _Linearised:
     whole_square: float  #: Σ of the white e² with all that is seen estimated
 
     @classmethod
-    def at(cls, problem: _Problem, changes: FloatArray, noise: MisfitNoise | None, noise_std: float) -> _Linearised:
+    def at(
+        cls, problem: _Problem, changes: FloatArray, noise: MisfitNoise | None, noise_std: float
+    ) -> _Linearised:
         """Linearise around changes of all parameters in their units."""
         misfit, jacobian = problem.linearised(changes, range(len(problem.parameters)))
         return cls.of(problem, jacobian, jacobian @ changes - misfit, noise, noise_std)
 
     @classmethod
     def of(
-        cls, problem: _Problem, jacobian: FloatArray, right: FloatArray, noise: MisfitNoise | None, noise_std: float
+        cls,
+        problem: _Problem,
+        jacobian: FloatArray,
+        right: FloatArray,
+        noise: MisfitNoise | None,
+        noise_std: float,
     ) -> _Linearised:
         """Reduce a linear problem."""
         rows = np.column_stack((jacobian, right))
@@ -502,7 +552,9 @@ class _Linearised:
         )
 
     def moved_to(self, changes: FloatArray) -> _Linearised:
-        """Take the misfit of other changes, with the derivatives from here: they differ by the size of the changes."""
+        """Take the misfit of other changes, with the derivatives from here:
+        they differ by the size of the changes.
+        """
         right = self.jacobian @ changes - self.problem.misfit(changes)
         return _Linearised.of(self.problem, self.jacobian, right, self.noise, self.noise_std)
 
@@ -518,7 +570,9 @@ class _Linearised:
     def candidates(self) -> tuple[int, ...]:
         """Indices of the parameters that alone change a misfit."""
         length = np.linalg.norm(self._columns, axis=0)
-        return tuple(int(index) for index in np.flatnonzero(np.sqrt(self.variance) < TESTED_STD * length))
+        return tuple(
+            int(index) for index in np.flatnonzero(np.sqrt(self.variance) < TESTED_STD * length)
+        )
 
     def whole(self) -> FloatArray:
         """All changes as far as they are seen, in their units."""
@@ -551,7 +605,9 @@ class _Linearised:
         return float(left @ left)
 
     def explains(self, chosen: Sequence[int]) -> bool:
-        """Whether these numbers alone leave no more than all that can be seen, and no more than noise."""
+        """Whether these numbers alone leave no more than all that can be seen,
+        and no more than noise.
+        """
         seen = self.visible.seen
         others = max(seen - len(chosen), 1)
         excess = (self.square_of(chosen) - self.whole_square) / others
@@ -588,11 +644,18 @@ class _Linearised:
         hidden = np.sum(visible.ways[visible.seen :] ** 2, axis=0) > SMALLEST_SINGULAR
         std = np.where(hidden, np.inf, np.sqrt(variances))
         unit = self.problem.unit[described]
-        numbers = zip(self.problem.parameters[: len(described)], values * unit, std * unit, strict=True)
-        return tuple(GeometryEstimate(parameter, float(value), float(one)) for parameter, value, one in numbers)
+        numbers = zip(
+            self.problem.parameters[: len(described)], values * unit, std * unit, strict=True
+        )
+        return tuple(
+            GeometryEstimate(parameter, float(value), float(one))
+            for parameter, value, one in numbers
+        )
 
     def unobservable(self) -> tuple[str, ...]:
-        """Directions that the positions do not show, by the numbers that have the largest part in them."""
+        """Directions that the positions do not show,
+        by the numbers that have the largest part in them.
+        """
         visible = self._description
         return tuple(self._direction(way) for way in visible.ways[visible.seen :])
 
@@ -608,7 +671,9 @@ class _Linearised:
 
 
 def _whole(problem: _Problem) -> _Linearised:
-    """Linearise around the estimate of all numbers; directions that are not seen stay as they are described."""
+    """Linearise around the estimate of all numbers;
+    directions that are not seen stay as they are described.
+    """
     as_described = np.zeros(len(problem.parameters))
     near = _settled(_Linearised.at(problem, as_described, None, 0.0), as_described)
     fitted = _with_noise(problem, near.whole())
@@ -637,7 +702,9 @@ def _settled(start: _Linearised, changes: FloatArray) -> _Linearised:
 
 
 def _explained(problem: _Problem, start: _Linearised) -> tuple[list[tuple[int, ...]], _Linearised]:
-    """Choices of the fewest numbers that explain the misfit, the best first, linearised around the best of them."""
+    """Choices of the fewest numbers that explain the misfit, the best first,
+    linearised around the best of them.
+    """
     for size in range(1, MOST_CAUSES + 1):
         fitted = start
         best: tuple[int, ...] = ()
@@ -649,7 +716,11 @@ def _explained(problem: _Problem, start: _Linearised) -> tuple[list[tuple[int, .
             best = ranked[0]
             fitted = start.moved_to(_refined(problem, fitted, best))
         if best and fitted.explains(best):
-            others = [one for one in combinations(fitted.candidates, size) if one != best and fitted.explains(one)]
+            others = [
+                one
+                for one in combinations(fitted.candidates, size)
+                if one != best and fitted.explains(one)
+            ]
             return [best, *sorted(others, key=fitted.square_of)], fitted
     return [], start
 
@@ -661,7 +732,10 @@ def _refined(problem: _Problem, fitted: _Linearised, chosen: tuple[int, ...]) ->
     for _ in range(ITERATIONS):
         misfit, jacobian = problem.linearised(changes, chosen)
         rows = np.column_stack((jacobian, misfit))
-        white = rows if fitted.noise is None else fitted.noise.white(rows)
+        if fitted.noise is None:
+            white = rows
+        else:
+            white = fitted.noise.white(rows)
         step = -np.linalg.lstsq(white[:, :-1], white[:, -1], rcond=None)[0]
         changes[list(chosen)] += step
         if float(np.max(np.abs(step))) < SETTLED:
@@ -669,7 +743,9 @@ def _refined(problem: _Problem, fitted: _Linearised, chosen: tuple[int, ...]) ->
     return changes
 
 
-def _estimates(fitted: _Linearised, chosen: tuple[int, ...]) -> tuple[tuple[GeometryEstimate, ...], FloatArray]:
+def _estimates(
+    fitted: _Linearised, chosen: tuple[int, ...]
+) -> tuple[tuple[GeometryEstimate, ...], FloatArray]:
     """Changes of the chosen numbers with σ, and their covariance [rad or m]."""
     if not chosen:
         return (), np.zeros((0, 0))
@@ -679,6 +755,7 @@ def _estimates(fitted: _Linearised, chosen: tuple[int, ...]) -> tuple[tuple[Geom
     std = np.sqrt(np.diag(covariance))
     numbers = zip(chosen, values, std, strict=True)
     found = tuple(
-        GeometryEstimate(fitted.problem.parameters[index], float(value), float(one)) for index, value, one in numbers
+        GeometryEstimate(fitted.problem.parameters[index], float(value), float(one))
+        for index, value, one in numbers
     )
     return found, covariance

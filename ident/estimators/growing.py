@@ -1,4 +1,6 @@
-"""A fit that grows with a recording: each new piece is folded into the triangles, and the gains are there at once."""
+"""A fit that grows with a recording: each new piece is folded into the triangles,
+and the gains are there at once.
+"""
 
 from __future__ import annotations
 
@@ -20,32 +22,36 @@ from ident.model.model import Model
 class GrowingFit:
     """Triangles of everything recorded so far. Samples are not kept.
 
-    Begin with ``GrowingFit(model, conditioning, payloads)``. Effects that a cell declares are not in the model of this
-    fit, and nothing of it is diagnosed: it is for a look while a cell is recorded.
+    Begin with ``GrowingFit(model, conditioning, payloads)``. Effects that a cell declares are not
+    in the model of this fit, and nothing of it is diagnosed: it is for a look while a cell is
+    recorded.
     """
 
     model: Model  #: the declared model
     conditioning: Conditioning  #: the filters
     payloads: tuple[Payload, ...]  #: all that will be mounted
-    standard: System | None = None  #: the equations so far, in the standard parameters; None before the first row
+    #: the equations so far, in the standard parameters; None before the first row
+    standard: System | None = None
     runs: tuple[RunProgress, ...] = ()  #: in the order in which they began
 
     def with_run(self, run: Run) -> GrowingFit:
-        """Fold in a run to its end: as a whole, or what is left of one that `with_run_so_far` has folded in.
+        """Fold in a run to its end: as a whole, or what is left of one that `with_run_so_far` has
+        folded in.
 
         Args:
             run: all its samples.
 
         Raises:
-            DataUnfit: see `ident.data.dataset.differentiate`; or it is in the fit already, or carries a payload that is
-                not among ``payloads``.
+            DataUnfit: see `ident.data.dataset.differentiate`; or it is in the fit already, or
+                carries a payload that is not among ``payloads``.
         """
         return self._folded(run, is_complete=True)
 
     def with_run_so_far(self, run: Run) -> GrowingFit:
         """Fold in what is new of a run that still goes on.
 
-        The newest fifth of a second waits for the samples that follow (`ident.equations.unfinished_run`).
+        The newest fifth of a second waits for the samples that follow
+        (`ident.equations.unfinished_run`).
 
         Args:
             run: its samples so far, from the first one on.
@@ -68,24 +74,31 @@ class GrowingFit:
         return replace(self, standard=standard, runs=(*others, found.progress))
 
     def _before(self, run: Run) -> RunProgress | None:
-        """Return how far a run is in the triangles, None for a new one; refuse one that must not be folded in."""
+        """Return how far a run is in the triangles, None for a new one;
+        refuse one that must not be folded in.
+        """
         if run.payload is not None and run.payload not in self.payloads:
             mountings = ", ".join(repr(payload.mounting) for payload in self.payloads) or "none"
             raise DataUnfit(
                 run.name,
-                f"found payload {run.payload}; expected one of those that this fit was begun with (mountings: "
-                f"{mountings}); name all payloads when it begins",
+                f"found payload {run.payload}; expected one of those that this fit was begun with "
+                f"(mountings: {mountings}); name all payloads when it begins",
             )
         for other in self.runs:
             if other.name == run.name:
                 if other.is_complete:
-                    raise DataUnfit(run.name, "found it in this fit already; expected each run once: name runs apart")
+                    raise DataUnfit(
+                        run.name,
+                        "found it in this fit already; expected each run once: name runs apart",
+                    )
                 return other
         return None
 
     @property
     def move_count(self) -> int:
-        """Number of moves that can be left out for σ; one longer than two seconds counts as several."""
+        """Number of moves that can be left out for σ;
+        one longer than two seconds counts as several.
+        """
         if self.standard is None:
             return 0
         return len(self.standard.clusters)
@@ -97,7 +110,8 @@ class GrowingFit:
         return quick_gains(self.standard)
 
     def system(self) -> System:
-        """Return the equations so far in base parameters, for `ident.estimators.maximum_likelihood.ml`.
+        """Return the equations so far in base parameters,
+        for `ident.estimators.maximum_likelihood.ml`.
 
         Raises:
             DataUnfit: a joint has not moved yet.

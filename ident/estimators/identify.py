@@ -23,7 +23,12 @@ from ident.errors import DataUnfit, IdentificationError, JointStill, ModelError
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
-from ident.estimators.limited_currents import LimitedCurrent, limited_currents, noting_limits, without_limited
+from ident.estimators.limited_currents import (
+    LimitedCurrent,
+    limited_currents,
+    noting_limits,
+    without_limited,
+)
 from ident.estimators.maximum_likelihood import iv, ml
 from ident.estimators.method import Method
 from ident.estimators.refusals import (
@@ -57,18 +62,23 @@ def identify(
     Args:
         model: the declared model.
         runs: of the fit: without load, and with a weighed payload where the gains are free.
-        conditioning: the filters; when None, those for the slowest of ``runs`` (`Conditioning.for_rates`), which are
-            then all read before the first is used.
-        holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
+        conditioning: the filters; when None, those for the slowest of ``runs``
+            (`Conditioning.for_rates`), which are then all read before the first is used.
+        holdout: runs that the fit must not see; their payload mountings must be among those of
+            ``runs``.
         method: estimator, or its name.
         fixed_gains: known gains, shape (m,).
-        keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no run is kept.
-        judge: refuse a fit that its data contradict; False where effects are declared that the model lacks here.
+        keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no
+            run is kept.
+        judge: refuse a fit that its data contradict; False where effects are declared that the
+            model lacks here.
         axes: name of each axis in messages, shape (m,); that of its joint when None.
 
     Raises:
-        ModelError: an argument is of another type, there is no such method, or no gain for each motor.
-        RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses its gain's sign.
+        ModelError: an argument is of another type, there is no such method, or no gain for each
+            motor.
+        RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses
+            its gain's sign.
         UnitsMistaken, CurrentReversed: with fixed gains.
         CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
         CurrentConstant, ReadingsDamaged: see `ident.data.run_channels`.
@@ -90,14 +100,20 @@ def identify(
     instants: list[Instants] = []
     channels: list[RunChannels] = []
     kept: list[BuiltRun] = []
-    built = rows_of_runs(model, used, conditioning, instruments=method is Method.IV and not model.is_redundant)
+    built = rows_of_runs(
+        model, used, conditioning, instruments=method is Method.IV and not model.is_redundant
+    )
     built = noting_channels(built, model, axes, channels)
     with_instants = noting_instants(built, model, conditioning, instants)
     standard = reduce_built(
-        model, keeping(with_instants, kept) if keep_rows else with_instants, instruments=method is Method.IV
+        model,
+        keeping(with_instants, kept) if keep_rows else with_instants,
+        instruments=method is Method.IV,
     )
     if not standard.runs:
-        raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
+        raise DataUnfit(
+            "", "no run was given; expected one without load and one with a weighed payload"
+        )
     require_moved(standard, axes)
     system = regrouped(standard)
     del standard  # its clusters hold every column
@@ -106,8 +122,8 @@ def identify(
         estimate = estimate_with(method, system, known_gains)
         jackknifed = estimate
         if known_gains is None:
-            # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that
-            # moves contradict each other; ml's do, where it has an estimate.
+            # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and
+            # do not see that moves contradict each other; ml's do, where it has an estimate.
             with suppress(IdentificationError):
                 jackknifed = estimate if method.is_of_currents else ml(system)
             require_seen_payload(jackknifed, system)
@@ -117,12 +133,22 @@ def identify(
         if judge:
             idle = idle_joints(model, *joint_torques(system, estimate))
             require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
-    left_out = with_signed_currents(each_run(holdout, names, system.payloads), model, conditioning, axes)
+    left_out = with_signed_currents(
+        each_run(holdout, names, system.payloads), model, conditioning, axes
+    )
     built = noting_channels(rows_of_runs(model, left_out, conditioning), model, axes, [])
-    rest = reduce_built(model, keeping(built, kept) if keep_rows else built, payloads=system.payloads)
+    rest = reduce_built(
+        model, keeping(built, kept) if keep_rows else built, payloads=system.payloads
+    )
     unseen = regrouped(rest, system.base, system.payload_columns) if rest.runs else None
     found = Identification(
-        model, conditioning, system, unseen, estimate, channels=tuple(channels), instants=tuple(instants)
+        model,
+        conditioning,
+        system,
+        unseen,
+        estimate,
+        channels=tuple(channels),
+        instants=tuple(instants),
     )
     if not keep_rows:
         return found
@@ -139,7 +165,9 @@ def _known_gains(fixed_gains: ArrayLike | None, model: Model) -> FloatArray | No
         return None
     gains = as_array("fixed_gains", fixed_gains, (model.robot.axis_count,), "one per motor")
     if not gains.all():
-        raise ModelError(f"fixed_gains is {gains.tolist()}; expected no zero: such a motor moves nothing")
+        raise ModelError(
+            f"fixed_gains is {gains.tolist()}; expected no zero: such a motor moves nothing"
+        )
     return gains
 
 
@@ -149,7 +177,8 @@ def _without_limited_currents(
     limits: Sequence[LimitedCurrent],
     fixed_gains: FloatArray | None,
 ) -> Identification:
-    """Fit again without the samples in which a drive gave less current than its reference asked for.
+    """Fit again without the samples in which a drive gave less current than its reference asked
+    for.
 
     Args:
         found: the fit with all samples.
@@ -199,7 +228,10 @@ def require_moved(standard: System, axes: Sequence[str]) -> None:
 
 
 def noting_channels(
-    built: Iterable[tuple[Dataset, Iterable[Rows]]], model: Model, axes: Sequence[str], noted: list[RunChannels]
+    built: Iterable[tuple[Dataset, Iterable[Rows]]],
+    model: Model,
+    axes: Sequence[str],
+    noted: list[RunChannels],
 ) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
     """Yield runs, and note the faults of their channels; refuse those that cannot be used."""
     for data, pieces in built:
@@ -210,7 +242,10 @@ def noting_channels(
 
 
 def noting_instants(
-    built: Iterable[tuple[Dataset, Iterable[Rows]]], model: Model, conditioning: Conditioning, noted: list[Instants]
+    built: Iterable[tuple[Dataset, Iterable[Rows]]],
+    model: Model,
+    conditioning: Conditioning,
+    noted: list[Instants],
 ) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
     """Yield runs, and note a few rows of each, for hypotheses about its geometry."""
     for data, pieces in built:
@@ -220,7 +255,9 @@ def noting_instants(
         yield data, pieces
 
 
-def keeping(built: Iterable[tuple[Dataset, Iterable[Rows]]], kept: list[BuiltRun]) -> Iterator[BuiltRun]:
+def keeping(
+    built: Iterable[tuple[Dataset, Iterable[Rows]]], kept: list[BuiltRun]
+) -> Iterator[BuiltRun]:
     """Yield runs, and keep each with all its rows."""
     for data, pieces in built:
         rows = tuple(pieces)
@@ -235,18 +272,30 @@ def each_run(
 
     Args:
         runs: of a caller.
-        names: of the runs so far, to which theirs are added. No two may have one, unless they are of different logs.
+        names: of the runs so far, to which theirs are added. No two may have one, unless they are
+            of different logs.
         payloads: with the known mountings; None where any is allowed.
     """
     require_kind("runs or holdout", runs, Iterable, "give a list: [bare, loaded]")
     for run in runs:
-        require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
+        require_kind(
+            "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
+        )
         if (run.name, run.digest) in names:
-            raise DataUnfit(run.name, "found two runs of this name; expected another name for each; rename one")
+            raise DataUnfit(
+                run.name, "found two runs of this name; expected another name for each; rename one"
+            )
         names.add((run.name, run.digest))
         if run.payload is not None:
-            require_kind(f"payload of {run.name!r}", run.payload, Payload, "write Payload(name, mounting, known)")
-            if payloads is not None and run.payload.mounting not in (known.mounting for known in payloads):
+            require_kind(
+                f"payload of {run.name!r}",
+                run.payload,
+                Payload,
+                "write Payload(name, mounting, known)",
+            )
+            if payloads is not None and run.payload.mounting not in (
+                known.mounting for known in payloads
+            ):
                 mounting = f"mounting {run.payload.mounting!r}, which no run of the fit carries"
                 raise DataUnfit(run.name, f"held out with {mounting}: it stays unknown")
         yield run
@@ -257,7 +306,8 @@ def with_signed_currents(
 ) -> Iterator[Run]:
     """Yield runs, and refuse one in which drives report the size of the current only.
 
-    A run is judged when the next one is asked for: it has been differentiated then, which refuses what is no recording.
+    A run is judged when the next one is asked for: it has been differentiated then, which refuses
+    what is no recording.
     """
     for run in runs:
         yield run
@@ -271,7 +321,9 @@ def with_signed_currents(
         require_explained_currents(arrays, model, conditioning, axes)
 
 
-def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None = None) -> Estimate:
+def estimate_with(
+    method: Method, system: System, fixed_gains: FloatArray | None = None
+) -> Estimate:
     """Run one estimator by its name.
 
     Raises:
@@ -279,6 +331,11 @@ def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None
     """
     if method is Method.TLS:
         if fixed_gains is not None:
-            raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls, ml or iv")
+            raise DataUnfit(
+                ", ".join(system.runs),
+                "tls needs free gains; with fixed gains choose ls, wls, ml or iv",
+            )
         return tls(system)
-    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml, Method.IV: iv}[method](system, fixed_gains)
+    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml, Method.IV: iv}[method](
+        system, fixed_gains
+    )

@@ -1,4 +1,6 @@
-"""Linear estimators of the paper: IDIM-LS, IDIM-WLS (eqs. 7-11, 15, 16) and IDIM-TLS (eqs. 17-23)."""
+"""Linear estimators of the paper: IDIM-LS, IDIM-WLS (eqs. 7-11, 15, 16) and IDIM-TLS (eqs.
+17-23).
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,13 @@ from ident.estimators.method import Method
 from ident.model.base import independent_columns
 
 MISJUDGED_RATIO = 1.5
-"""Of `parameters_over_noise`: below it the smallest singular value is not the noise of a current."""
+"""Of `parameters_over_noise`: below it the smallest singular value is not the noise of a
+current.
+"""
 NO_COLUMN = 1e-8
-"""Norm of a column, relative to the largest of the same joint, below which the joint does not have this column."""
+"""Norm of a column, relative to the largest of the same joint,
+below which the joint does not have this column.
+"""
 
 
 def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -43,10 +49,11 @@ def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatArray:
     """Standard deviation by which ``wls`` divides the rows of each joint, shape (n,) [Nm].
 
-    With fixed gains it is that of §2.2, `joint_error_std`. Where gains are free, or the robot is redundant, it is that
-    of the global ``ls`` solution for all joints. §2.2 has none to offer there: where a known mass exerts no torque on a
-    joint, as on every wrist, the right-hand side of this joint's own equations (eq. 15) is zero, and so are their
-    solution and its error. A joint of a redundant robot has no equations of its own.
+    With fixed gains it is that of §2.2, `joint_error_std`. Where gains are free, or the robot is
+    redundant, it is that of the global ``ls`` solution for all joints. §2.2 has none to offer
+    there: where a known mass exerts no torque on a joint, as on every wrist, the right-hand side of
+    this joint's own equations (eq. 15) is zero, and so are their solution and its error. A joint of
+    a redundant robot has no equations of its own.
 
     Arguments and errors as for ``ls``.
     """
@@ -56,7 +63,8 @@ def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatA
 
 
 def joint_error_std(triangles: Triangles, gains: FloatArray) -> FloatArray:
-    """Standard deviation of the error of each joint's own equations, solved by least squares (§2.2), shape (n,) [Nm].
+    """Standard deviation of the error of each joint's own equations,
+    solved by least squares (§2.2), shape (n,) [Nm].
 
     Args:
         triangles: of each joint's rows of W_tot.
@@ -79,14 +87,18 @@ def _own_columns(columns: FloatArray) -> FloatArray:
 
 
 def _deviation(size: float, factor: FloatArray, freedom: int) -> float:
-    """Standard deviation of an error of this size; without noise it is rounding error, without rows infinite."""
+    """Standard deviation of an error of this size;
+    without noise it is rounding error, without rows infinite.
+    """
     if not factor.any():
         return np.inf
     rounding = np.finfo(np.float64).eps * float(np.linalg.norm(factor))
     return max(size, rounding) / float(np.sqrt(max(freedom, 1)))
 
 
-def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray | None) -> Estimate:
+def _solve(
+    system: System, weight: FloatArray, method: Method, fixed: FloatArray | None
+) -> Estimate:
     count = system.axis_count
     triangles = system.joints
     stacked = triangles.stacked(weight)
@@ -142,12 +154,14 @@ class Scaling(Enum):
 
 
 def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
-    """Total least squares: the right singular vector of W_tot's smallest singular value, last entry one (eq. 18).
+    """Total least squares: the right singular vector of W_tot's smallest singular value,
+    last entry one (eq. 18).
 
     Args:
         system: of at least one loaded and one unloaded run.
-        scaling: of rows and columns before the decomposition; the paper divides rows by `joint_data_std`. A joint of a
-            redundant robot has no equations of its own: ROWS is RESIDUALS there.
+        scaling: of rows and columns before the decomposition; the paper divides rows by
+            `joint_data_std`. A joint of a redundant robot has no equations of its own: ROWS is
+            RESIDUALS there.
 
     Raises:
         DataUnfit: no run carries a known payload.
@@ -173,13 +187,15 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
 
 
 def joint_data_std(triangles: Triangles) -> FloatArray:
-    """Standard deviation σ_W^j of the data in the equations of each joint (eq. 22 and §3.3), shape (n,).
+    """Standard deviation σ_W^j of the data in the equations of each joint (eq.
+    22 and §3.3), shape (n,).
 
-    It is the smallest singular value of these equations over √(r − c). In eq. (22) c is the number of columns, which
-    must be independent. In the equations of one joint they are not: most parameters are absent from its torque, and
-    some of those that are present cannot be distinguished in it. Columns below NO_COLUMN of the largest norm, and
-    columns that depend on those before them, are left out; c is the number of the others. A joint without any column
-    has an infinite deviation, so no weight.
+    It is the smallest singular value of these equations over √(r − c). In eq. (22) c is the number
+    of columns, which must be independent. In the equations of one joint they are not: most
+    parameters are absent from its torque, and some of those that are present cannot be
+    distinguished in it. Columns below NO_COLUMN of the largest norm, and columns that depend on
+    those before them, are left out; c is the number of the others. A joint without any column has
+    an infinite deviation, so no weight.
 
     Args:
         triangles: of each joint's rows of W_tot.
@@ -195,9 +211,10 @@ def joint_data_std(triangles: Triangles) -> FloatArray:
 def misjudged_joints(system: System) -> tuple[int, ...]:
     """Joints whose σ_W^j is not the noise of a current, by their index; none of a redundant robot.
 
-    Eq. (22) takes the smallest singular value of the joint's equations for noise. Where the moves hardly show one of
-    the joint's parameters, a combination of columns of W, which have no noise, has one as small. σ_W^j is then too
-    small, the rows of this joint count for too much, and ``tls`` bends the gains.
+    Eq. (22) takes the smallest singular value of the joint's equations for noise. Where the moves
+    hardly show one of the joint's parameters, a combination of columns of W, which have no noise,
+    has one as small. σ_W^j is then too small, the rows of this joint count for too much, and
+    ``tls`` bends the gains.
 
     Args:
         system: of the fit.
@@ -209,9 +226,11 @@ def misjudged_joints(system: System) -> tuple[int, ...]:
 
 
 def parameters_over_noise(system: System) -> FloatArray:
-    """Smallest singular value of each joint's equations without its currents, relative to that with them, shape (n,).
+    """Smallest singular value of each joint's equations without its currents,
+    relative to that with them, shape (n,).
 
-    Where noise of the currents determines σ_W^j, everything that the moves show of the parameters is well above it.
+    Where noise of the currents determines σ_W^j, everything that the moves show of the parameters
+    is well above it.
     """
     ratios = []
     for factor in system.joints.factors:
@@ -227,7 +246,9 @@ def parameters_over_noise(system: System) -> FloatArray:
 
 
 def tls_row_std(system: System, scaling: Scaling = Scaling.ROWS) -> FloatArray:
-    """Standard deviation by which ``tls`` divides the rows of each joint, shape (n,); arguments as for ``tls``."""
+    """Standard deviation by which ``tls`` divides the rows of each joint, shape (n,);
+    arguments as for ``tls``.
+    """
     triangles = system.joints
     even = np.ones(len(triangles.factors))
     if scaling in (Scaling.NONE, Scaling.COLUMNS):
@@ -241,7 +262,9 @@ def tls_row_std(system: System, scaling: Scaling = Scaling.ROWS) -> FloatArray:
 def _smallest(
     triangles: Triangles, weight: FloatArray, unit_columns: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Solution with last entry one, its covariance (eq. 23), and the singular values of the scaled W_tot."""
+    """Solution with last entry one, its covariance (eq.
+    23), and the singular values of the scaled W_tot.
+    """
     stacked = triangles.stacked(weight)
     norms = np.ones(stacked.shape[1])
     if unit_columns:

@@ -1,8 +1,9 @@
-"""Drives that give their motor less current than its reference asks for, which neither drive nor log reports.
+"""Drives that give their motor less current than its reference asks for,
+which neither drive nor log reports.
 
-A limit behind the reference shows nothing in the current itself: the reference goes on to grow. But the torque does
-not: the current that the motion needs goes no further than the limit, whenever the reference is beyond it. What is
-recorded there is no torque, and bends the gain.
+A limit behind the reference shows nothing in the current itself: the reference goes on to grow. But
+the torque does not: the current that the motion needs goes no further than the limit, whenever the
+reference is beyond it. What is recorded there is no torque, and bends the gain.
 """
 
 from __future__ import annotations
@@ -19,12 +20,18 @@ from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 
 LEAST_ROWS = 6  #: Rows in which the reference is beyond the limit
-BEYOND_SIGMAS = 6.0  #: By how much a reference exceeds the predicted current there, in σ of a motor's noise
+#: By how much a reference exceeds the predicted current there, in σ of a motor's noise
+BEYOND_SIGMAS = 6.0
 PLATEAU = 0.1  #: Of a limit, by which predicted currents differ where it acts
-LEAST_ON_PLATEAU = 0.8  #: Share of the rows beyond the limit whose predicted current is on the plateau
+#: Share of the rows beyond the limit whose predicted current is on the plateau
+LEAST_ON_PLATEAU = 0.8
 LARGEST_SLOPE = 0.25
-"""Slope of the predicted current over the reference beyond the limit. Where a motor weakens, its torque grows on."""
-LEAST_MISSING = 0.9  #: Share of the rows with a reference well beyond the limit whose torque lacks it
+"""Slope of the predicted current over the reference beyond the limit.
+
+Where a motor weakens, its torque grows on.
+"""
+#: Share of the rows with a reference well beyond the limit whose torque lacks it
+LEAST_MISSING = 0.9
 SAFE = 0.95  #: Of a limit, from which on samples are left out: it is known to some percent
 
 
@@ -70,7 +77,9 @@ def limited_samples(data: Dataset, limits: Sequence[LimitedCurrent]) -> BoolArra
     return limited
 
 
-def noting_limits(channels: RunChannels, data: Dataset, limits: Sequence[LimitedCurrent]) -> RunChannels:
+def noting_limits(
+    channels: RunChannels, data: Dataset, limits: Sequence[LimitedCurrent]
+) -> RunChannels:
     """Return the channels of a run with what its drives did not give.
 
     Args:
@@ -80,7 +89,9 @@ def noting_limits(channels: RunChannels, data: Dataset, limits: Sequence[Limited
     """
     moving = data.motor_moving & data.valid
     limited = limited_samples(data, limits) & moving
-    percent = 100.0 * np.count_nonzero(limited, axis=0) / np.maximum(np.count_nonzero(moving, axis=0), 1)
+    percent = (
+        100.0 * np.count_nonzero(limited, axis=0) / np.maximum(np.count_nonzero(moving, axis=0), 1)
+    )
     torque_limits = np.full(len(percent), np.nan)
     for one in limits:
         torque_limits[one.motor] = one.limit_a

@@ -1,13 +1,14 @@
 """Structured total least squares: the errors are in the current references alone.
 
-The positions of a geared robot are known to a few µrad; what differs from run to run is the current reference. So for
-each motor i, with T from the drive train (g_i v_i = (T τ)_i),
+The positions of a geared robot are known to a few µrad; what differs from run to run is the current
+reference. So for each motor i, with T from the drive train (g_i v_i = (T τ)_i),
 
     v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i,      γ_i = 1/g_i,     e_i ~ (0, σ_i²),
 
-and the estimate minimises Σ_i ‖e_i‖²/σ_i² with σ_i estimated along: the maximum-likelihood member of the paper's
-family. In the paper's terms it is the total least squares of eq. (17) that corrects the columns V only. It does not
-change when a current is given in another unit or the columns are scaled.
+and the estimate minimises Σ_i ‖e_i‖²/σ_i² with σ_i estimated along: the maximum-likelihood member
+of the paper's family. In the paper's terms it is the total least squares of eq. (17) that corrects
+the columns V only. It does not change when a current is given in another unit or the columns are
+scaled.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from ident.estimators.method import Method
 MAX_ITERATIONS = 100
 STEP_TOLERANCE = 1e-7  #: Relative step of the gains; their standard deviations are some 1e-3
 LARGEST_DAMPING = 1e6
-NOISE_ITERATIONS = 20  #: After these σ stays: with internal preload it would settle more slowly than the gains
+#: After these σ stays: with internal preload it would settle more slowly than the gains
+NOISE_ITERATIONS = 20
 
 
 def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -48,10 +50,11 @@ def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 def iv(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     """Two-stage least squares: `ml` with the columns projected on those of the demanded motion.
 
-    Where a torque disturbs the arm inside its position loop, recorded motion and error share a cause, and `ml` is
-    biased. The demanded motion knows nothing of the disturbance: Σ_i γ_i/σ_i² (T Ŵ)_iᵀ e_i = 0 and v̂_iᵀ e_i = 0, with Ŵ
-    and v̂ of that motion, hold in the mean however strong it is (Söderström & Stoica, System Identification, ch. 8; for
-    robots Janot, Vandanjon & Gautier 2014). σ is the jackknife of these conditions.
+    Where a torque disturbs the arm inside its position loop, recorded motion and error share a
+    cause, and `ml` is biased. The demanded motion knows nothing of the disturbance: Σ_i γ_i/σ_i² (T
+    Ŵ)_iᵀ e_i = 0 and v̂_iᵀ e_i = 0, with Ŵ and v̂ of that motion, hold in the mean however strong
+    it is (Söderström & Stoica, System Identification, ch. 8; for robots Janot, Vandanjon & Gautier
+    2014). σ is the jackknife of these conditions.
 
     Arguments and errors are those of `ml`.
 
@@ -63,19 +66,21 @@ def iv(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     if system.model.is_redundant:
         raise DataUnfit(
             ", ".join(system.runs),
-            "the robot has more motors than degrees of freedom, and iv needs an equation for each motor alone; "
-            "choose the method ml",
+            "the robot has more motors than degrees of freedom, and iv needs an equation for each "
+            "motor alone; choose the method ml",
         )
     if not system.instruments:
         raise DataUnfit(
             ", ".join(system.runs),
-            "the demanded motion is not known: the joints do not move from rest to rest at trapezoidal speed; "
-            "choose the method ml, or record point-to-point moves",
+            "the demanded motion is not known: the joints do not move from rest to rest at "
+            "trapezoidal speed; choose the method ml, or record point-to-point moves",
         )
     return _maximum_likelihood(system.on_instruments(), system, Method.IV, fixed_gains)
 
 
-def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_gains: FloatArray | None) -> Estimate:
+def _maximum_likelihood(
+    system: System, recorded: System, method: Method, fixed_gains: FloatArray | None
+) -> Estimate:
     """Estimate from one system; σ from the residuals of the recorded one."""
     require_rows(system)
     if fixed_gains is None:
@@ -108,7 +113,9 @@ def _maximum_likelihood(system: System, recorded: System, method: Method, fixed_
 
 
 def _gauss_newton(system: System) -> tuple[FloatArray, int]:
-    """Gains by variable projection: χ is eliminated for each of them, so that only m unknowns are iterated."""
+    """Gains by variable projection: χ is eliminated for each of them,
+    so that only m unknowns are iterated.
+    """
     currents = system.currents
     gains = _start(system)
     noise = np.ones(system.axis_count)
@@ -145,7 +152,9 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
 
 
 def _start(system: System) -> FloatArray:
-    """Gains of the linear estimate under which the data are most likely: each of them is the best on some data."""
+    """Gains of the linear estimate under which the data are most likely:
+    each of them is the best on some data.
+    """
     currents = system.currents
     even = np.ones(system.axis_count)
 
@@ -164,7 +173,9 @@ def _start(system: System) -> FloatArray:
     return min(usable, key=cost)
 
 
-def _projected_equations(currents: Currents, gains: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _projected_equations(
+    currents: Currents, gains: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Normal equations of relative steps of 1/g, with χ projected out; shapes (m, m) and (m,)."""
     whitened = currents.whitened(gains, noise)
     parameters = whitened.parameters(gains)

@@ -23,4 +23,7 @@ class Method(Enum):
 
     @classmethod
     def _missing_(cls, value: object) -> Method:
-        raise ModelError(f"there is no method {value!r}; expected one of {', '.join(method.value for method in cls)}")
+        raise ModelError(
+            f"there is no method {value!r}; expected one of "
+            f"{', '.join(method.value for method in cls)}"
+        )

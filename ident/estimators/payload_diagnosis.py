@@ -1,4 +1,5 @@
-"""Whether each run carries the payload that it says: a body that was turned, left off or exchanged, by run.
+"""Whether each run carries the payload that it says:
+a body that was turned, left off or exchanged, by run.
 
 Where the declared masses of several payloads contradict each other, these are named, and no run.
 """
@@ -19,15 +20,20 @@ from ident.errors import Diagnosis, PayloadDiffers
 from ident.estimators.payload_ratio import MassContradiction, contradicting_masses
 
 LEAST_SHARE = 0.15  #: Torque of a payload's difference, relative to the payload's
-UNSEEN_SHARE = 0.3  #: The same in a held-out run, where the errors of all other parameters are in it
+#: The same in a held-out run, where the errors of all other parameters are in it
+UNSEEN_SHARE = 0.3
 WRONG_SHARE = 0.6  #: The same, where the gains are not usable: a payload left off has 1 and more
-LEAST_OF_RESIDUAL = 0.3  #: The same, relative to the residual of the run: beside a light payload every error is large
+#: The same, relative to the residual of the run: beside a light payload every error is large
+LEAST_OF_RESIDUAL = 0.3
 LARGEST_PROBABILITY = 1e-4  #: That chance makes a difference as large, over all runs
 TIED = 0.7  #: Of the largest share: two runs of one mounting contradict each other alike
-CLEARLY_LESS = 0.9  #: Sum of squares that the likelier one of two hypotheses leaves, relative to the other
+#: Sum of squares that the likelier one of two hypotheses leaves, relative to the other
+CLEARLY_LESS = 0.9
 SEEN = 0.02  #: Least share of a column that must remain beside all others, to be estimated
 OF_A_BODY = np.array([0.04] * 6 + [0.2] * 3 + [1.0])
-"""Sizes of the ten parameters of 1 kg that is 0.2 m off the flange: with few moves, what such a body shows most."""
+"""Sizes of the ten parameters of 1 kg that is 0.2 m off the flange:
+with few moves, what such a body shows most.
+"""
 LEAST_MOVES = 3  #: For each direction in which a run's payload is estimated
 
 
@@ -36,10 +42,14 @@ class PayloadDifference:
     """By how much the body on the flange in one run differs from what the fit has there."""
 
     run: str  #: name of the run
-    #: What must be added to the ten parameters in this run, as far as its moves see them [SI], shape (10,).
+    #: What must be added to the ten parameters in this run, as far as its moves see them [SI],
+    #: shape (10,).
     difference: FloatArray
-    share: float  #: torque of the difference, relative to that of the payload (root mean squares, as currents in σ)
-    #: That chance makes a difference as large: Wald test with the scatter of the moves, F distribution.
+    #: torque of the difference, relative to that of the payload (root mean squares, as currents in
+    #: σ)
+    share: float
+    #: That chance makes a difference as large: Wald test with the scatter of the moves, F
+    #: distribution.
     probability: float
     loaded: bool  #: the run says that it carries a payload
     left: float  #: sum of squares that the difference leaves, relative to that of the fit
@@ -48,7 +58,8 @@ class PayloadDifference:
 def payload_diagnoses(
     system: System, gains: FloatArray, parameters: FloatArray, held: int | None = None
 ) -> Iterator[Diagnosis]:
-    """Name payloads whose masses contradict each other, or runs that carry another payload than they say.
+    """Name payloads whose masses contradict each other,
+    or runs that carry another payload than they say.
 
     Arguments as for `payload_differences`.
 
@@ -70,22 +81,28 @@ def payload_diagnoses(
         worst = max(tied, key=lambda one: one.share)
     runs = tuple(one.run for one in tied)
     evidence = (
-        f"on the flange a body that differs by {100.0 * worst.share:.0f} % of the payload's torque, its mass by "
-        f"{worst.difference[9]:+.2g} kg (by chance with p = {worst.probability:.0e})"
+        f"on the flange a body that differs by {100.0 * worst.share:.0f} % of the payload's "
+        f"torque, its mass by {worst.difference[9]:+.2g} kg (by chance with p = "
+        f"{worst.probability:.0e})"
     )
     expected = "the same body, mounted in the same way, in all runs that say so"
     if len(runs) > 1:
         expected += "; one of these runs"
-    remedy = "was it mounted in this run, and not turned? give each way of mounting a name of its own"
+    remedy = (
+        "was it mounted in this run, and not turned? give each way of mounting a name of its own"
+    )
     if held is not None and worst.share > WRONG_SHARE:
-        raise PayloadDiffers(f"run {', '.join(runs)}", found=evidence, expected=expected, remedy=remedy)
+        raise PayloadDiffers(
+            f"run {', '.join(runs)}", found=evidence, expected=expected, remedy=remedy
+        )
     yield Diagnosis("payload-differs", runs, (), evidence, expected, remedy)
 
 
 def likeliest_masses(
     system: System, gains: FloatArray, parameters: FloatArray, found: Sequence[PayloadDifference]
 ) -> MassContradiction | None:
-    """Return the contradiction of masses, unless another payload in a single run leaves clearly less.
+    """Return the contradiction of masses, unless another payload in a single run leaves clearly
+    less.
 
     Args:
         system, gains, parameters: of a fit with free gains.
@@ -108,22 +125,26 @@ def _without_unlikely_bare_runs(tied: list[PayloadDifference]) -> list[PayloadDi
 def payload_differences(
     system: System, gains: FloatArray, parameters: FloatArray, held: int | None = None
 ) -> list[PayloadDifference]:
-    """Estimate what each run carries beside what it should, with all other unknowns, and return what is not chance.
+    """Estimate what each run carries beside what it should, with all other unknowns,
+    and return what is not chance.
 
-    A payload has the columns of the link that carries it. With δ for one run alone and all unknowns x,
+    A payload has the columns of the link that carries it. With δ for one run alone and all unknowns
+    x,
 
         e = J x + X δ,    X = J_flange in the rows of this run,
 
-    δ is estimated in the directions that J leaves visible. Its covariance is from leaving out moves.
+    δ is estimated in the directions that J leaves visible. Its covariance is from leaving out
+    moves.
 
     Args:
         system: of the fit, or of runs that it has not seen.
         gains, parameters: of the fit, shapes (m,) and (p,).
-        held: how many of (gains, parameters) are not in x, because they were given; all of them when None, as in runs
-            that the fit has not seen.
+        held: how many of (gains, parameters) are not in x, because they were given; all of them
+            when None, as in runs that the fit has not seen.
 
     Returns:
-        differences above LEAST_SHARE of the payload's torque, and less probable than LARGEST_PROBABILITY.
+        differences above LEAST_SHARE of the payload's torque, and less probable than
+        LARGEST_PROBABILITY.
     """
     leading = len(system.base.independent)
     leading_names = tuple(column.name for column in system.columns[:leading])
@@ -135,7 +156,9 @@ def payload_differences(
     else:
         first_unknown = held
         least_share = LEAST_SHARE
-    moves = _normalised(_move_equations(system, gains, parameters, first_unknown, with_weight=bool(held)))
+    moves = _normalised(
+        _move_equations(system, gains, parameters, first_unknown, with_weight=bool(held))
+    )
     fit = _normal_equations(moves)
     found: list[PayloadDifference] = []
     for run in range(len(system.runs)):
@@ -164,14 +187,19 @@ class _NormalEquations:
 
 
 def _move_equations(
-    system: System, gains: FloatArray, parameters: FloatArray, first_unknown: int, *, with_weight: bool
+    system: System,
+    gains: FloatArray,
+    parameters: FloatArray,
+    first_unknown: int,
+    *,
+    with_weight: bool,
 ) -> list[_MoveEquations]:
     """Equations of each move; arguments as for `payload_differences`.
 
     Args:
         first_unknown: gains and parameters before this one are no unknowns.
-        with_weight: the weight of the payload is one. With given gains, which may all be off, it is an unknown of all
-            runs together.
+        with_weight: the weight of the payload is one. With given gains, which may all be off, it is
+            an unknown of all runs together.
     """
     first_base = system.axis_count
     last_base = first_base + len(system.base.independent)
@@ -179,7 +207,9 @@ def _move_equations(
     noise = system.currents.noise(gains, parameters)
     moves = []
     for index, cluster in enumerate(system.clusters):
-        by_motor = list(motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise))
+        by_motor = list(
+            motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
+        )
         jacobian = np.concatenate([of_motor[0] for of_motor in by_motor])
         residual = np.concatenate([of_motor[1] for of_motor in by_motor])
         unknowns = jacobian[:, first_unknown:]
@@ -244,10 +274,13 @@ def _difference_in(
     own_moves = [moves[index] for index in inside]
     # XᵀX, XᵀJ and Xᵀe of this run, for a body of OF_A_BODY.
     flange = np.concatenate([move.flange for move in own_moves]) * OF_A_BODY
-    cross = np.sum([move.flange.T @ move.jacobian for move in own_moves], axis=0) * OF_A_BODY[:, None]
+    cross = (
+        np.sum([move.flange.T @ move.jacobian for move in own_moves], axis=0) * OF_A_BODY[:, None]
+    )
     own_score = np.sum([move.flange.T @ move.residual for move in own_moves], axis=0) * OF_A_BODY
 
-    # Directions of δ that remain visible beside all other unknowns: eigenvectors of the Schur complement.
+    # Directions of δ that remain visible beside all other unknowns: eigenvectors of the Schur
+    # complement.
     visible, directions = np.linalg.eigh(flange.T @ flange - cross @ fit.inverse @ cross.T)
     alone = np.sum((flange @ directions) ** 2, axis=0)
     is_visible = (visible > SEEN * alone) & (visible > 1e-9 * visible[-1])

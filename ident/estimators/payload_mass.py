@@ -1,16 +1,18 @@
 """How gains and parameters depend on the mass of a known payload: the derivative of the estimator.
 
-The known payload alone gives the gains their scale, so a wrong mass bends all of them, and where nothing else is known
-of the payload, no residual shows it. With e(g, χ, m) the whitened residual of the motors' equations, J its derivative
-to the unknowns and w = −∂e/∂m the column of the mass, an estimate that makes ‖e‖ least moves by
+The known payload alone gives the gains their scale, so a wrong mass bends all of them, and where
+nothing else is known of the payload, no residual shows it. With e(g, χ, m) the whitened residual of
+the motors' equations, J its derivative to the unknowns and w = −∂e/∂m the column of the mass, an
+estimate that makes ‖e‖ least moves by
 
     dθ/dm = (JᵀJ)⁻¹ Jᵀ w,      θ = (g, χ, χ_uL),
 
-to the first order in the noise. If the mass is all that is known, J θ = m w, and every gain is proportional to m. With
-the drawing of a payload (centre, inertia) known too, a wrong mass contradicts it, and each gain answers in its own way.
+to the first order in the noise. If the mass is all that is known, J θ = m w, and every gain is
+proportional to m. With the drawing of a payload (centre, inertia) known too, a wrong mass
+contradicts it, and each gain answers in its own way.
 
-The column of the mass is that of the link that carries the payload, in the rows in which it is mounted. Beside the base
-parameters this is no new column: W_st = W · grouping (`ident.model.base`).
+The column of the mass is that of the link that carries the payload, in the rows in which it is
+mounted. Beside the base parameters this is no new column: W_st = W · grouping (`ident.model.base`).
 """
 
 from __future__ import annotations
@@ -38,15 +40,17 @@ class MassResponse:
     payload: str  #: name of the body; in several mountings it is the same body
     mass_kg: float  #: as it was taken for known
     gain_per_kg: FloatArray  #: dg/dm of each motor [Nm at the joint per A and kg], shape (m,)
-    parameters_per_kg: FloatArray  #: d(χ, χ_uL)/dm of each parameter of the estimate [its unit per kg], shape (p,)
+    #: d(χ, χ_uL)/dm of each parameter of the estimate [its unit per kg], shape (p,)
+    parameters_per_kg: FloatArray
 
 
 def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ...]:
     """Differentiate an estimate to the mass of each known payload.
 
-    For the estimators of the joints' equations (``ls``, ``wls``, ``tls``) the motors' equations are used with the same
-    weights, which is the same to the first order in the noise unless axes are coupled. Where the mass of one body is
-    all that is known, ``ls`` and ``wls`` are proportional to it.
+    For the estimators of the joints' equations (``ls``, ``wls``, ``tls``) the motors' equations are
+    used with the same weights, which is the same to the first order in the noise unless axes are
+    coupled. Where the mass of one body is all that is known, ``ls`` and ``wls`` are proportional to
+    it.
 
     Args:
         system: that the estimate was made from.
@@ -62,13 +66,16 @@ def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ..
         if MASS in payload.known:
             bodies.setdefault(payload.name, []).append(mounting)
     columns = [_mass_column(system, mountings) for mountings in bodies.values()]
-    known = [(name, column) for name, column in zip(bodies, columns, strict=True) if column is not None]
+    known = [
+        (name, column) for name, column in zip(bodies, columns, strict=True) if column is not None
+    ]
     if not known:
         return ()
     mass_alone = all(set(payload.known) <= {MASS} for payload in system.payloads)
     if len(known) == 1 and mass_alone and estimate.method in (Method.LS, Method.WLS):
         ((name, _),) = known
-        # The last column of W_tot is proportional to m, so the solution is too; the weights of wls only change alike.
+        # The last column of W_tot is proportional to m, so the solution is too; the weights of wls
+        # only change alike.
         mass_kg = system.payloads[bodies[name][0]].known[MASS]
         shifts = np.concatenate((estimate.gains, estimate.parameters))[:, None] / mass_kg
     else:
@@ -84,7 +91,9 @@ def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ..
 
 
 MotorColumns = list[tuple[FloatArray, ...]]
-"""A column of W on the rows of each motor, cluster by cluster; on the rows of the demanded motion likewise."""
+"""A column of W on the rows of each motor, cluster by cluster;
+on the rows of the demanded motion likewise.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +105,9 @@ class _MassColumn:
 
 
 def _mass_column(system: System, mountings: Sequence[int]) -> _MassColumn | None:
-    """Torque of each motor per kg of a payload, zero where it is not mounted; None where it cannot be rebuilt."""
+    """Torque of each motor per kg of a payload, zero where it is not mounted;
+    None where it cannot be rebuilt.
+    """
     mass_alone = all(set(system.payloads[mounting].known) == {MASS} for mounting in mountings)
     weights = None if mass_alone else _weights(system)
     if weights is None and not mass_alone:
@@ -116,11 +127,15 @@ def _mass_column(system: System, mountings: Sequence[int]) -> _MassColumn | None
             made.append(tuple(own))
         return made
 
-    return _MassColumn(on(system.clusters, system.leading), on(system.instruments, 0) if system.instruments else [])
+    return _MassColumn(
+        on(system.clusters, system.leading), on(system.instruments, 0) if system.instruments else []
+    )
 
 
 def _weights(system: System) -> FloatArray | None:
-    """Sum of base columns that is the column of the payload link's mass; None where some are not in the system."""
+    """Sum of base columns that is the column of the payload link's mass;
+    None where some are not in the system.
+    """
     base = system.base
     if tuple(column.name for column in system.columns[: len(base.names)]) != base.names:
         return None
@@ -130,7 +145,9 @@ def _weights(system: System) -> FloatArray | None:
 def _with_columns(system: System, added: Sequence[_MassColumn]) -> System:
     """Put columns before the last one, that of what is known, on the motors' rows."""
 
-    def widened(parts: Sequence[tuple[FloatArray, ...]], columns: Sequence[MotorColumns]) -> MotorColumns:
+    def widened(
+        parts: Sequence[tuple[FloatArray, ...]], columns: Sequence[MotorColumns]
+    ) -> MotorColumns:
         made: MotorColumns = []
         for cluster, rows in enumerate(parts):
             own: list[FloatArray] = []
@@ -154,13 +171,16 @@ def _with_columns(system: System, added: Sequence[_MassColumn]) -> System:
 
 
 def _responses(extended: System, estimate: Estimate, count: int) -> FloatArray:
-    """dθ/dm of (gains, parameters) for each of the last `count` columns of W, shape (m + p, count)."""
+    """dθ/dm of (gains, parameters) for each of the last `count` columns of W, shape (m + p,
+    count).
+    """
     if estimate.method is Method.IV and extended.instruments:
         extended = extended.on_instruments()
     gains = estimate.gains
     values = np.concatenate((estimate.parameters, np.zeros(count)))
     if estimate.method.is_of_currents:
-        # That of these equations: on instruments it is not that of the recorded motion, which the estimate has.
+        # That of these equations: on instruments it is not that of the recorded motion, which the
+        # estimate has.
         noise = extended.currents.noise(gains, values)
     elif estimate.method is Method.LS:
         noise = 1.0 / np.abs(gains)

@@ -1,13 +1,13 @@
 """Whether the declared masses of several payloads agree with each other.
 
-The weight of the payloads gives the gains their scale, so one wrong mass alone leaves no residual. Two of them do: the
-torques show how many times as heavy one is as the other. The hypothesis is one more unknown, the factor s − 1 of what
-is known of one body,
+The weight of the payloads gives the gains their scale, so one wrong mass alone leaves no residual.
+Two of them do: the torques show how many times as heavy one is as the other. The hypothesis is one
+more unknown, the factor s − 1 of what is known of one body,
 
     v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL + (s − 1) T W_kL χ_kL[body])_i + e_i.
 
-It competes with the hypothesis that a single run carries another body than it says (`payload_diagnosis`): what leaves
-less is named.
+It competes with the hypothesis that a single run carries another body than it says
+(`payload_diagnosis`): what leaves less is named.
 """
 
 from __future__ import annotations
@@ -19,11 +19,17 @@ import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
 
 from ident.arrays import FloatArray
-from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shifts, motor_jacobian, scatter_of
+from ident.equations.linearisation import (
+    MIN_MOVES_TO_LEAVE_OUT,
+    left_out_shifts,
+    motor_jacobian,
+    scatter_of,
+)
 from ident.equations.system import System
 from ident.errors import Diagnosis
 
-LEAST_CHANGE = 0.1  #: Of a mass beside the others: an effect that the model lacks may look like a smaller one
+#: Of a mass beside the others: an effect that the model lacks may look like a smaller one
+LEAST_CHANGE = 0.1
 LARGEST_PROBABILITY = 1e-4  #: That chance makes as large a factor, over all bodies
 SAME = 1.01  #: What two hypotheses leave, relative to each other, where neither is the likelier one
 STEPS = 10  #: Of Gauss-Newton
@@ -49,15 +55,17 @@ class MassContradiction:
             "masses-contradict",
             (),
             (),
-            f"the masses of {names} contradict each other: by the torques {self.body} is {self.ratio:.2f} ± "
-            f"{self.std:.2f} times as heavy beside {beside} as declared",
+            f"the masses of {names} contradict each other: by the torques {self.body} is "
+            f"{self.ratio:.2f} ± {self.std:.2f} times as heavy beside {beside} as declared",
             "masses that the torques confirm",
-            f"weigh {names} again, and look what was mounted in each run; a wrong mass of any of them makes every gain "
-            "wrong",
+            f"weigh {names} again, and look what was mounted in each run; a wrong mass of any of "
+            "them makes every gain wrong",
         )
 
 
-def contradicting_masses(system: System, gains: FloatArray, parameters: FloatArray) -> MassContradiction | None:
+def contradicting_masses(
+    system: System, gains: FloatArray, parameters: FloatArray
+) -> MassContradiction | None:
     """Find the payload whose mass contradicts those of the others most; None where no mass does.
 
     Args:
@@ -65,7 +73,11 @@ def contradicting_masses(system: System, gains: FloatArray, parameters: FloatArr
         gains, parameters: of the fit, shapes (m,) and (p,).
     """
     bodies = _known_bodies(system)
-    if len(bodies) < 2 or system.model.is_redundant or len(system.clusters) < MIN_MOVES_TO_LEAVE_OUT:
+    if (
+        len(bodies) < 2
+        or system.model.is_redundant
+        or len(system.clusters) < MIN_MOVES_TO_LEAVE_OUT
+    ):
         return None
     found: list[MassContradiction] = []
     for body, mountings in bodies.items():
@@ -110,7 +122,9 @@ def _with_factor(
             trial = values + step
             keeps_signs = np.all(trial[:count] * values[:count] > 0.0)
             if keeps_signs:
-                trial_grams, trial_scores, trial_left = _normal_equations(clusters, count, trial, noise)
+                trial_grams, trial_scores, trial_left = _normal_equations(
+                    clusters, count, trial, noise
+                )
                 if trial_left <= left:
                     break
             step = 0.5 * step
@@ -132,7 +146,9 @@ def _with_factor(
 
 
 def _extended(system: System, mountings: Sequence[int]) -> list[list[FloatArray]]:
-    """Rows of each cluster and motor, with what is known of one body as a column before the last."""
+    """Rows of each cluster and motor, with what is known of one body as a column before the
+    last.
+    """
     clusters: list[list[FloatArray]] = []
     for (_, mounting), rows in zip(system.cluster_runs, system.clusters, strict=True):
         is_mounted = float(mounting in mountings)

@@ -1,25 +1,29 @@
-"""Gains by linear algebra alone, for a look after each move: total least squares that corrects the currents.
+"""Gains by linear algebra alone, for a look after each move:
+total least squares that corrects the currents.
 
-The rows of motor i are g_i v_i − (T W χ + T W_uL χ_uL)_i = (T W_kL χ_kL)_i + g_i e_i. Only the current v_i has an
-error, e_i ~ (0, σ_i²), as in `ident.estimators.maximum_likelihood`. Rows are divided by an expected error g_i σ_i.
-Columns without errors come first in one QR factorisation of all rows (mixed LS-TLS: Golub, Hoffman & Stewart, Linear
-Algebra Appl. 88/89 (1987); Van Huffel & Vandewalle, The Total Least Squares Problem, §3.5)::
+The rows of motor i are g_i v_i − (T W χ + T W_uL χ_uL)_i = (T W_kL χ_kL)_i + g_i e_i. Only the
+current v_i has an error, e_i ~ (0, σ_i²), as in `ident.estimators.maximum_likelihood`. Rows are
+divided by an expected error g_i σ_i. Columns without errors come first in one QR factorisation of
+all rows (mixed LS-TLS: Golub, Hoffman & Stewart, Linear Algebra Appl. 88/89 (1987); Van Huffel &
+Vandewalle, The Total Least Squares Problem, §3.5)::
 
                                       [ R_χχ  R_χk  R_χV ]
     Q [ −T W  −T W_uL | −T W_kL χ_kL | V ] = [       R_kk  R_kV ]
                                       [             R_VV ]
 
-- R_VV has what remains of the currents when robot and payload have explained what they can. Its smallest generalised
-  singular value, in units of the expected errors r_i/g_i², gives the ratio of the gains.
+- R_VV has what remains of the currents when robot and payload have explained what they can. Its
+  smallest generalised singular value, in units of the expected errors r_i/g_i², gives the ratio of
+  the gains.
 - R_kk + R_kV g = 0 gives their scale: the known weight of the payload.
 - R_χχ χ + R_χk + R_χV g = 0 gives the parameters.
 
-The expected errors come from the residuals of the solution before. The fixed point of these passes is the estimate of
-`ml`; PASSES of them are close to it. `ls` and `wls` are as linear, but noise of the currents makes their gains too
-small, by ten per cent and more where `ml` is off by one (docs/evidence/stopping.md).
+The expected errors come from the residuals of the solution before. The fixed point of these passes
+is the estimate of `ml`; PASSES of them are close to it. `ls` and `wls` are as linear, but noise of
+the currents makes their gains too small, by ten per cent and more where `ml` is off by one
+(docs/evidence/stopping.md).
 
-A redundantly driven robot has unknown preload in each row, so its gains are those of `tls`. σ is that of `ml`, by
-leaving out one move at a time: rows are correlated, moves hardly.
+A redundantly driven robot has unknown preload in each row, so its gains are those of `tls`. σ is
+that of `ml`, by leaving out one move at a time: rows are correlated, moves hardly.
 """
 
 from __future__ import annotations
@@ -38,7 +42,9 @@ from ident.errors import RankDeficient
 from ident.estimators.least_squares import tls
 from ident.plausible import LARGEST_GAIN_STD
 
-PASSES = 4  #: Solutions, each with the errors that the one before has left; `ml` is then nearer than a fiftieth of σ
+#: Solutions, each with the errors that the one before has left; `ml` is then nearer than a fiftieth
+#: of σ
+PASSES = 4
 
 
 class Unknown(Enum):
@@ -46,7 +52,9 @@ class Unknown(Enum):
 
     NO_PAYLOAD = "nothing recorded with a payload of known mass, which gives all gains their scale"
     NO_MOTION = "an axis has not moved yet"
-    NOT_DISTINGUISHED = "the moves do not distinguish payload and robot: record them without load too"
+    NOT_DISTINGUISHED = (
+        "the moves do not distinguish payload and robot: record them without load too"
+    )
     NO_CURRENT = "the current of a motor is zero throughout: is its channel connected?"
     FEW_ROWS = "too few rows in which a motor moves"
     FEW_MOVES = f"fewer than {MIN_MOVES_TO_LEAVE_OUT} moves"
@@ -57,10 +65,13 @@ class Unknown(Enum):
 class QuickGains:
     """The quick linear estimate of the gains."""
 
-    gains: FloatArray | None  #: [Nm at the joint per A, or N], shape (m,); None where they are not known yet
-    gains_std: FloatArray | None  #: σ of each, by leaving out one move at a time, shape (m,); None likewise
+    #: [Nm at the joint per A, or N], shape (m,); None where they are not known yet
+    gains: FloatArray | None
+    #: σ of each, by leaving out one move at a time, shape (m,); None likewise
+    gains_std: FloatArray | None
     unknown: Unknown | None = None  #: why they are not known; None where they are
-    axes: tuple[int, ...] = ()  #: axes that this is about, by their index; none where it is about all
+    #: axes that this is about, by their index; none where it is about all
+    axes: tuple[int, ...] = ()
 
     @property
     def std_percent(self) -> FloatArray | None:
@@ -144,7 +155,9 @@ def mixed_tls(system: System) -> tuple[FloatArray, FloatArray]:
     rows = np.maximum(system.motors.rows, 1)
     # At first all rows have the same weight, and each current the same share of noise.
     weight = np.ones(system.axis_count)
-    error_in_gains = np.array([float(factor[:, 0] @ factor[:, 0]) for factor in system.motors.factors])
+    error_in_gains = np.array(
+        [float(factor[:, 0] @ factor[:, 0]) for factor in system.motors.factors]
+    )
     for _ in range(PASSES):
         gains, parameters = _solve_once(system, weight, error_in_gains)
         weight = np.sqrt(rows) / _residual_norms(system, gains, parameters)
@@ -152,13 +165,16 @@ def mixed_tls(system: System) -> tuple[FloatArray, FloatArray]:
     return gains, parameters
 
 
-def _solve_once(system: System, weight: FloatArray, error_in_gains: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _solve_once(
+    system: System, weight: FloatArray, error_in_gains: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Solve the rows once.
 
     Args:
         system: the equations.
         weight: 1/(g_i σ_i) of each motor's rows, shape (m,).
-        error_in_gains: r_i (weight_i σ_i)², the expected square of the errors in the column of each gain, shape (m,).
+        error_in_gains: r_i (weight_i σ_i)², the expected square of the errors in the column of each
+            gain, shape (m,).
     """
     count = system.axis_count
     parts = []
@@ -167,8 +183,10 @@ def _solve_once(system: System, weight: FloatArray, error_in_gains: FloatArray) 
         drive[:, motor] = factor[:, 0]
         parts.append(weight[motor] * np.concatenate((-factor[:, 1:], drive), axis=1))
     stacked = np.concatenate(parts)
-    payload = stacked.shape[1] - count - 1  # index of the column −T W_kL χ_kL; those of the gains follow it
-    # Unit columns, because kg and kg m² differ in size; those of the gains in units of their errors.
+    # Index of the column −T W_kL χ_kL; those of the gains follow it
+    payload = stacked.shape[1] - count - 1
+    # Unit columns, because kg and kg m² differ in size; those of the gains in units of their
+    # errors.
     scale = np.linalg.norm(stacked, axis=0)
     scale[scale == 0.0] = 1.0
     scale[-count:] = np.sqrt(error_in_gains)
@@ -176,7 +194,8 @@ def _solve_once(system: System, weight: FloatArray, error_in_gains: FloatArray) 
     of_gains = slice(payload + 1, None)
     _, _, directions = np.linalg.svd(upper[of_gains, of_gains])
     direction = directions[-1]
-    # The payload has the coefficient one, so `scale` in scaled columns: R_kk scale + R_kV (size direction) = 0.
+    # The payload has the coefficient one, so `scale` in scaled columns: R_kk scale + R_kV (size
+    # direction) = 0.
     weight_of_payload = upper[payload, payload] * scale[payload]
     size = -weight_of_payload / (upper[payload, of_gains] @ direction)
     known = np.concatenate((scale[payload : payload + 1], size * direction))

@@ -34,21 +34,35 @@ from ident.model.robot import JointKind
 from ident.plausible import GAIN_RANGE, LARGEST_GAIN_STD, UNIT_RATIO, range_text
 
 LEAST_WEIGHT = 1e-3
-"""Share of the known payload's torque in a joint's, where it is largest. In a recording it is 0.1 and more."""
+"""Share of the known payload's torque in a joint's, where it is largest.
+
+In a recording it is 0.1 and more.
+"""
 LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
 LARGEST_UNKNOWN_PERCENT = 25.0
-"""Largest relative errors of a fit. A robot with every effect undeclared stays below 15 in total and 40 on an axis; a
-model that explains nothing leaves 100. The last is of an axis whose gain is smaller than its own σ."""
-COLLAPSED_GAIN = 1e-6  #: Share of the largest gain: no two drives differ as much, and the error of nothing is small
-IDLE_TORQUE, IDLE_ERROR = 1e-3, 1e-2
-"""Torque and error of an idle axis, relative to the largest torque of any: 0.01 Nm of a wrist beside the 30 Nm of a
-shoulder is below every friction. The wrist of a real robot carries 0.02 of it and more."""
+"""Largest relative errors of a fit.
+
+A robot with every effect undeclared stays below 15 in total and 40 on an axis; a model that
+explains nothing leaves 100. The last is of an axis whose gain is smaller than its own σ.
+"""
+#: Share of the largest gain: no two drives differ as much, and the error of nothing is small
+COLLAPSED_GAIN = 1e-6
+IDLE_TORQUE = 1e-3
+IDLE_ERROR = 1e-2
+"""Torque and error of an idle axis, relative to the largest torque of any: 0.01 Nm of a wrist
+beside the 30 Nm of a shoulder is below every friction. The wrist of a real robot carries 0.02 of it
+and more.
+"""
 EXCHANGE = 0.4
-"""Least fall of the logarithm of the motors' errors, in sum, of a fixed gain with the other sign."""
-LEVEL = 0.05  #: Largest rise of the same, where it decides nothing and the sign of the friction must
+"""Least fall of the logarithm of the motors' errors, in sum,
+of a fixed gain with the other sign.
+"""
+#: Largest rise of the same, where it decides nothing and the sign of the friction must
+LEVEL = 0.05
 SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
-FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")  #: Names of the friction of a joint or of its coupled motor
+#: Names of the friction of a joint or of its coupled motor
+FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")
 WIDEST_RANGE_RAD = 8.0 * np.pi  #: No arm's joint turns four times: cables go through it
 LARGEST_CURRENT_A = 1000.0  #: A servo amplifier of a robot gives a tenth of it
 FRICTION_SIGMAS = 15.0  #: In the σ of independent rows, which is some three times too small
@@ -67,7 +81,8 @@ def refuse_mistakes(
         nameplate: gains by the data sheet, shape (m,); None where they are not known.
 
     Raises:
-        PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: the first that applies.
+        PayloadUnseen, UnitsMistaken, CurrentReversed, ModelContradicted, RolesExchanged: the first
+            that applies.
     """
     if estimate.gains_fixed:
         require_weight(system, estimate)
@@ -104,16 +119,27 @@ def with_channel_causes(runs: Sequence[RunChannels], axes: Sequence[str]) -> Ite
         raise still from error
     except (ModelContradicted, NotConverged, PayloadUnseen) as error:
         # The other contradictions have a cause of their own: signs, units or roles.
-        is_unexplained = type(error) in {ModelContradicted, NotConverged, PayloadDiffers, PayloadUnseen}
-        still = still_joint(runs, axes, "a fit that contradicts itself") if is_unexplained else None
+        is_unexplained = type(error) in {
+            ModelContradicted,
+            NotConverged,
+            PayloadDiffers,
+            PayloadUnseen,
+        }
+        if is_unexplained:
+            still = still_joint(runs, axes, "a fit that contradicts itself")
+        else:
+            still = None
         if still is None:
             raise
         raise still from error
 
 
 @contextmanager
-def with_unit_causes(runs: Sequence[RunChannels], model: Model, axes: Sequence[str]) -> Iterator[None]:
-    """Say where a fit does not settle, or sees no payload, that the recordings seem to be in other units.
+def with_unit_causes(
+    runs: Sequence[RunChannels], model: Model, axes: Sequence[str]
+) -> Iterator[None]:
+    """Say where a fit does not settle, or sees no payload,
+    that the recordings seem to be in other units.
 
     Args:
         runs: of the fit.
@@ -145,14 +171,16 @@ def unlikely_units(runs: Sequence[RunChannels], model: Model, axes: Sequence[str
         widest = int(np.argmax(turned_rad))
         if turned_rad[widest] > WIDEST_RANGE_RAD:
             return (
-                f"found {axes[widest]} turning by {turned_rad[widest]:.4g} rad in run {run.run!r}; expected a joint's "
-                "angle in rad: are these degrees, counts, or the motor's angle before the gear?"
+                f"found {axes[widest]} turning by {turned_rad[widest]:.4g} rad in run {run.run!r}; "
+                "expected a joint's angle in rad: are these degrees, counts, or the motor's angle "
+                "before the gear?"
             )
         largest = int(np.argmax(run.limits))
         if run.limits[largest] > LARGEST_CURRENT_A:
             return (
-                f"found a current of {run.limits[largest]:.4g} A of {axes[largest]} in run {run.run!r}; expected "
-                "amperes: are these milliamperes, or thousandths of the rated current?"
+                f"found a current of {run.limits[largest]:.4g} A of {axes[largest]} in run "
+                f"{run.run!r}; expected amperes: are these milliamperes, or thousandths of the "
+                "rated current?"
             )
     return ""
 
@@ -163,17 +191,24 @@ def unlikely_units(runs: Sequence[RunChannels], model: Model, axes: Sequence[str
 def require_seen_payload(estimate: Estimate, system: System) -> None:
     """Refuse gains if the data do not fix their common scale.
 
-    The weight of the payload fixes it. If a run is declared loaded but was not, or the other way round, its moves
-    disagree with the others about the scale, and σ of all gains grows together. Gains beside which that weight is
-    nothing have no scale, however small their σ.
+    The weight of the payload fixes it. If a run is declared loaded but was not, or the other way
+    round, its moves disagree with the others about the scale, and σ of all gains grows together.
+    Gains beside which that weight is nothing have no scale, however small their σ.
 
     Raises:
-        PayloadUnseen: every gain is uncertain by more than LARGEST_GAIN_STD, or the weight is below LEAST_WEIGHT.
+        PayloadUnseen: every gain is uncertain by more than LARGEST_GAIN_STD, or the weight is below
+            LEAST_WEIGHT.
         MassesContradict: the first, because the masses of several payloads contradict each other.
     """
-    relative, rows = estimate.gains_std / np.abs(estimate.gains), system.joints.factors
-    torque = [LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains) for factor in rows]
-    weightless = all(np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True))
+    relative = estimate.gains_std / np.abs(estimate.gains)
+    rows = system.joints.factors
+    torque = [
+        LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains)
+        for factor in rows
+    ]
+    weightless = all(
+        np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True)
+    )
     if weightless or not float(np.min(relative)) <= LARGEST_GAIN_STD:
         require_agreeing_masses(system, estimate)
         raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
@@ -189,7 +224,9 @@ def require_agreeing_masses(system: System, estimate: Estimate) -> None:
     masses = likeliest_masses(system, estimate.gains, estimate.parameters, found)
     if masses is not None:
         one = masses.diagnosis
-        raise MassesContradict("the payloads", found=one.found, expected=one.expected, remedy=one.remedy)
+        raise MassesContradict(
+            "the payloads", found=one.found, expected=one.expected, remedy=one.remedy
+        )
 
 
 def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
@@ -203,28 +240,33 @@ def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
             "all drive gains",
             found=numbers_text(gains),
             expected=f"the signs of the nameplate: {numbers_text(nameplate)}",
-            remedy="were the payload's run and the run without load exchanged (look at `Run.payload` of each run), "
-            "or do all currents count the other way?",
+            remedy="were the payload's run and the run without load exchanged (look at "
+            "`Run.payload` of each run), or do all currents count the other way?",
         )
 
 
 def require_plausible(
     estimate: Estimate, error: RelativeError, axes: Sequence[str], idle: BoolArray | None = None
 ) -> None:
-    """Refuse a fit whose model contradicts its data: no number of it can be believed, however small its σ.
+    """Refuse a fit whose model contradicts its data:
+    no number of it can be believed, however small its σ.
 
-    The payload's weight sets the sign of all gains. Taken from the wrong runs it reverses them, and all torques with
-    them: the residual stays the same, but the dry friction of every joint then drives the robot.
+    The payload's weight sets the sign of all gains. Taken from the wrong runs it reverses them, and
+    all torques with them: the residual stays the same, but the dry friction of every joint then
+    drives the robot.
 
     Args:
         estimate: with σ of its gains.
         error: of the fit.
         axes: name of each axis.
-        idle: of `idle_joints`: a relative error of nothing is nothing, where the gain is known; none when None.
+        idle: of `idle_joints`: a relative error of nothing is nothing, where the gain is known;
+            none when None.
 
     Raises:
-        ModelContradicted: the relative error is above one of the LARGEST_..._PERCENT, or a gain has collapsed.
-        RolesExchanged: dry friction is negative on every joint, on most of them by more than five σ.
+        ModelContradicted: the relative error is above one of the LARGEST_..._PERCENT, or a gain has
+            collapsed.
+        RolesExchanged: dry friction is negative on every joint, on most of them by more than five
+            σ.
     """
     unknown = estimate.gains_std > np.abs(estimate.gains)
     excess = np.array(error.axes) / np.where(unknown, LARGEST_UNKNOWN_PERCENT, LARGEST_AXIS_PERCENT)
@@ -236,21 +278,33 @@ def require_plausible(
     if not (error.total <= LARGEST_TOTAL_PERCENT and excess[worst] <= 1.0):
         raise ModelContradicted(
             "the fit",
-            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on axis {axes[worst]}, "
-            f"with a gain of {estimate.gains[worst]:.3g} ± {estimate.gains_std[worst]:.2g}",
-            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis {LARGEST_AXIS_PERCENT:g} %, "
-            f"{LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller than its σ",
-            remedy="look for what contradicts the model: two channels exchanged or one reversed, a wrong drive train, "
-            "gravity or URDF, positions not in rad, a payload or drawing that is not of the body that was mounted",
+            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on "
+            f"axis {axes[worst]}, with a gain of {estimate.gains[worst]:.3g} ± "
+            f"{estimate.gains_std[worst]:.2g}",
+            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis "
+            f"{LARGEST_AXIS_PERCENT:g} %, {LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller "
+            "than its σ",
+            remedy="look for what contradicts the model: two channels exchanged or one reversed, a "
+            "wrong drive train, gravity or URDF, positions not in rad, a payload or drawing that "
+            "is not of the body that was mounted",
         )
     parameters = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
-    dry = [(one.name, v, std) for one, v, std in parameters if one.name.startswith("fs") and one.name[2:].isdigit()]
-    if dry and all(v < 0.0 for _, v, _ in dry) and np.median([v + 5.0 * std for _, v, std in dry]) < 0.0:
+    dry = [
+        (one.name, v, std)
+        for one, v, std in parameters
+        if one.name.startswith("fs") and one.name[2:].isdigit()
+    ]
+    if (
+        dry
+        and all(v < 0.0 for _, v, _ in dry)
+        and np.median([v + 5.0 * std for _, v, std in dry]) < 0.0
+    ):
         raise RolesExchanged(
             "the dry friction of all joints",
             found=", ".join(f"{name} = {v:.3g} ± {std:.2g}" for name, v, std in dry),
             expected="above 0, because friction takes energy",
-            remedy="were the payload's run and the run without load exchanged? do fixed gains have the right sign?",
+            remedy="were the payload's run and the run without load exchanged? do fixed gains have "
+            "the right sign?",
         )
 
 
@@ -261,7 +315,8 @@ def require_units(gains: FloatArray, nameplate: FloatArray) -> None:
     """Refuse gains that are all off the nameplate by a factor that only a unit has.
 
     Raises:
-        UnitsMistaken: each is more than UNIT_RATIO times, or less than 1/UNIT_RATIO of, its nameplate.
+        UnitsMistaken: each is more than UNIT_RATIO times, or less than 1/UNIT_RATIO of, its
+            nameplate.
     """
     ratio = np.abs(gains / nameplate)
     if np.all(ratio < 1.0 / UNIT_RATIO):
@@ -273,13 +328,15 @@ def require_units(gains: FloatArray, nameplate: FloatArray) -> None:
     raise UnitsMistaken(
         "all drive gains",
         found=f"{numbers_text(ratio)} times the nameplate",
-        expected=f"{range_text(GAIN_RANGE)}, and within a factor of {UNIT_RATIO:g} on one axis at least",
+        expected=f"{range_text(GAIN_RANGE)}, and within a factor of {UNIT_RATIO:g} on one "
+        "axis at least",
         remedy=cause,
     )
 
 
 def require_weight(system: System, estimate: Estimate) -> None:
-    """Refuse fixed gains with which a weighed payload has another weight, by a factor that only a unit has.
+    """Refuse fixed gains with which a weighed payload has another weight,
+    by a factor that only a unit has.
 
     Raises:
         UnitsMistaken: more than UNIT_RATIO times, or less than 1/UNIT_RATIO of what was declared.
@@ -292,7 +349,8 @@ def require_weight(system: System, estimate: Estimate) -> None:
             "the weight of the payload",
             found=f"{ratio:.3g} times the declared one, by these gains",
             expected=f"1, and within a factor of {UNIT_RATIO:g} at least",
-            remedy="are the currents in mA and read as A, is its mass in g and read as kg, or was it not mounted?",
+            remedy="are the currents in mA and read as A, is its mass in g and read as kg, or was "
+            "it not mounted?",
         )
 
 
@@ -300,12 +358,19 @@ def weight_ratio(system: System, estimate: Estimate) -> tuple[float, float]:
     """Size of W_kL χ_kL that the currents ask for with given gains, and WEIGHT_SIGMAS of its σ."""
     if system.model.is_redundant:  # no motor has an equation of its own
         whitened = system.currents.whitened(estimate.gains, np.ones(len(estimate.gains)))
-        torque, right = np.column_stack((whitened.linear, whitened.known)), whitened.drive @ estimate.gains
+        torque = np.column_stack((whitened.linear, whitened.known))
+        right = whitened.drive @ estimate.gains
         return _last(torque, right, int(system.motors.rows.sum()))
-    # Weighted by the size of each current: the residuals of a fit with a wrong weight say nothing about noise.
-    factors = [factor / max(float(np.linalg.norm(factor[:, 0])), 1e-300) for factor in system.motors.factors]
+    # Weighted by the size of each current: the residuals of a fit with a wrong weight say nothing
+    # about noise.
+    factors = [
+        factor / max(float(np.linalg.norm(factor[:, 0])), 1e-300)
+        for factor in system.motors.factors
+    ]
     rows = np.concatenate(factors)
-    scale = np.concatenate([np.full(len(f), 1.0 / g) for f, g in zip(factors, estimate.gains, strict=True)])
+    scale = np.concatenate(
+        [np.full(len(f), 1.0 / g) for f, g in zip(factors, estimate.gains, strict=True)]
+    )
     return _last(rows[:, 1:] * scale[:, None], rows[:, 0], int(system.motors.rows.sum()))
 
 
@@ -320,24 +385,30 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
     """Refuse fixed gains of which some explain the data with the other sign.
 
     Raises:
-        CurrentReversed: with the other sign the errors fall by EXCHANGE, or they stay and the friction, which drove the
-            axis, brakes it.
+        CurrentReversed: with the other sign the errors fall by EXCHANGE, or they stay and the
+            friction, which drove the axis, brakes it.
     """
 
     def tried(signs: FloatArray) -> tuple[float, FloatArray]:
         """Σ log of the motors' errors, and the friction of each axis in σ."""
         one = wls(system, estimate.gains * signs)
         friction = np.zeros(len(axes))
-        for column, value, std in zip(one.unknowns, one.parameters, one.parameters_std, strict=True):
+        for column, value, std in zip(
+            one.unknowns, one.parameters, one.parameters_std, strict=True
+        ):
             if (of_friction := FRICTION.match(column.name)) is not None:
                 number = int(of_friction[2]) - 1
                 friction[number if of_friction[1] else joints.index(number)] += value / std
         errors = np.maximum(system.currents.noise(one.gains, one.parameters), smallest)
         return float(np.sum(np.log(errors))), friction
 
-    joints, redundant = system.model.robot.axis_joints, system.model.is_redundant
-    own = range(len(axes)) if redundant else [0] * len(axes)  # where a motor's rows have its current
-    size = np.array([np.linalg.norm(f[:, column]) for f, column in zip(system.motors.factors, own, strict=True)])
+    joints = system.model.robot.axis_joints
+    redundant = system.model.is_redundant
+    # Where a motor's rows have its current
+    own = range(len(axes)) if redundant else [0] * len(axes)
+    size = np.array(
+        [np.linalg.norm(f[:, column]) for f, column in zip(system.motors.factors, own, strict=True)]
+    )
     smallest = SMALL_ERROR * size / np.sqrt(np.maximum(system.motors.rows, 1))
     smallest[smallest == 0.0] = 1.0  # a motor without current
     signs = np.ones(len(axes))
@@ -353,7 +424,8 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
         if not better:
             break
         before, _, signs, friction = min(better, key=lambda one: one[:2])
-    if np.median(friction) < 0.0:  # without a payload the data fix the signs up to a common one, which friction shows
+    # Without a payload the data fix the signs up to a common one, which friction shows
+    if np.median(friction) < 0.0:
         signs = -signs
     turned = [axis for axis, sign in zip(axes, signs, strict=True) if sign < 0.0]
     if 0 < len(turned) < len(axes):
@@ -361,7 +433,8 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
             f"axis {', '.join(turned)}",
             found="a current that explains the motion with the other sign of its gain",
             expected="the sign of the fixed gain",
-            remedy="does the drive, or the import, count this current the other way? correct its sign",
+            remedy="does the drive, or the import, count this current the other way? "
+            "correct its sign",
         )
 
 
@@ -369,7 +442,9 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
 
 
 def joint_torques(system: System, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Torque of each joint, and what the model leaves of it: root mean squares [Nm or N], both of shape (m,)."""
+    """Torque of each joint, and what the model leaves of it:
+    root mean squares [Nm or N], both of shape (m,).
+    """
     gains = np.concatenate((estimate.gains, np.zeros(len(estimate.parameters) + 1)))
     whole = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
     rows = np.maximum(system.joints.rows, 1)
@@ -378,7 +453,8 @@ def joint_torques(system: System, estimate: Estimate) -> tuple[FloatArray, Float
 
 
 def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
-    """Joints whose torque and error are nothing beside the torque of another joint of the kind, shape (m,).
+    """Joints whose torque and error are nothing beside the torque of another joint of the kind,
+    shape (m,).
 
     Args:
         model: of the fit.

@@ -1,28 +1,34 @@
-"""Gross mistakes of geometry: gravity that points elsewhere, a position that counts the other way, a zero far off.
+"""Gross mistakes of geometry: gravity that points elsewhere, a position that counts the other way,
+a zero far off.
 
-Each makes the equations of most motors wrong at once, and its traces look like those of wrong currents: a gain of the
-wrong sign, a large error, an iteration that does not converge. So geometry is judged before the currents are.
+Each makes the equations of most motors wrong at once, and its traces look like those of wrong
+currents: a gain of the wrong sign, a large error, an iteration that does not converge. So geometry
+is judged before the currents are.
 
 **Fit.** Each hypothesis about the geometry is fitted to some hundred rows of each run,
 
     v_i = s_i (T W χ)_i        of motor i, with s_i = ± 1/g_i,
 
-by least squares for χ and s in turn, each motor weighted by its own error. Signs and a common scale of s are free, and
-each s_i within LARGEST_FACTOR of its nameplate: neither reversed currents nor a payload of wrong mass, nor any unit,
-take part in the judgement. Everything is done in products of the columns [W | v_i].
+by least squares for χ and s in turn, each motor weighted by its own error. Signs and a common scale
+of s are free, and each s_i within LARGEST_FACTOR of its nameplate: neither reversed currents nor a
+payload of wrong mass, nor any unit, take part in the judgement. Everything is done in products of
+the columns [W | v_i].
 
-**Gravity** enters W linearly, W(g) = A + Σ_k g_k G_k, so products of [A | G_x | G_y | G_z | v_i] serve every direction.
-A direction opposite to the right one is stationary; therefore the search begins at 26 directions and goes on from the
-best by Gauss-Newton. σ of the direction comes from leaving out parts of the moves in turn.
+**Gravity** enters W linearly, W(g) = A + Σ_k g_k G_k, so products of [A | G_x | G_y | G_z | v_i]
+serve every direction. A direction opposite to the right one is stationary; therefore the search
+begins at 26 directions and goes on from the best by Gauss-Newton. σ of the direction comes from
+leaving out parts of the moves in turn.
 
-**Readings.** A position is read the other way, or from another zero: descriptions differ in whether an arm stands
-upright or lies at zero. The search begins at zeros in steps of 45° and goes on from the best; a small zero offset is
-an effect of the description (`ident.effects.geometry_corrections.ZeroOffset`): its linear column leads less far.
+**Readings.** A position is read the other way, or from another zero: descriptions differ in whether
+an arm stands upright or lies at zero. The search begins at zeros in steps of 45° and goes on from
+the best; a small zero offset is an effect of the description
+(`ident.effects.geometry_corrections.ZeroOffset`): its linear column leads less far.
 
-**Judgement.** Another gravity makes other parameters identifiable. So each part of the moves is predicted from a fit of
-the others, and a hypothesis must lower the errors of these predictions, in sum over the motors and in most parts. It
-must do so beside each small correction as well: gravity that leans by some degrees, or a zero that is off by some. A
-large turn of one joint imitates them, where the joint moves little.
+**Judgement.** Another gravity makes other parameters identifiable. So each part of the moves is
+predicted from a fit of the others, and a hypothesis must lower the errors of these predictions, in
+sum over the motors and in most parts. It must do so beside each small correction as well: gravity
+that leans by some degrees, or a zero that is off by some. A large turn of one joint imitates them,
+where the joint moves little.
 """
 
 from __future__ import annotations
@@ -57,12 +63,18 @@ GEOMETRY = frozenset((GRAVITY_TURNED, POSITION_REVERSED, ZERO_TURNED))  #: Names
 
 PARTS = 8  #: Parts of the moves, of which each is predicted from the others
 LEAST_FALL = 0.5
-"""Least fall of the logarithm of the motors' errors, in sum. See `make diagnosis-study` for false alarms."""
+"""Least fall of the logarithm of the motors' errors, in sum.
+
+See `make diagnosis-study` for false alarms.
+"""
 LEAST_T = 4.0  #: Least mean of the falls of the parts, in σ of that mean
-SMALLEST_TURN_DEG = 10.0  #: Smaller turns of gravity are no gross mistake: they are an effect of the mounting
+#: Smaller turns of gravity are no gross mistake: they are an effect of the mounting
+SMALLEST_TURN_DEG = 10.0
 LARGEST_DIRECTION_STD_DEG = 10.0  #: A direction that is less certain is not named
 ALIKE_FALL = 0.85
-"""Share of the largest fall above which a hypothesis is as good: a mirror image of an arm has the same torques."""
+"""Share of the largest fall above which a hypothesis is as good:
+a mirror image of an arm has the same torques.
+"""
 LARGEST_FACTOR = 3.0  #: Of a gain beside its nameplate and the other gains
 SCREENED_ROWS = 500  #: Rows of all runs together with which every recording is screened
 ZERO_TURNS_DEG = (45.0, 90.0, 135.0, 180.0, -135.0, -90.0, -45.0)
@@ -70,21 +82,26 @@ ZERO_TURNS_DEG = (45.0, 90.0, 135.0, 180.0, -135.0, -90.0, -45.0)
 ZERO_REACH_RAD = 0.5  #: How far it goes from there
 ZERO_TOLERANCE_RAD = 2e-3
 SMALL_ZERO = float(np.deg2rad(ZERO_TURNS_DEG[0])) - ZERO_REACH_RAD
-"""Largest small correction of a zero [rad or m]: from there on, the search for large ones finds it."""
+"""Largest small correction of a zero [rad or m]:
+from there on, the search for large ones finds it.
+"""
 SUSPECT_ERROR = 0.2
-"""Error of the worst current, of its size, from which another zero is looked for: 45° of a joint that bears anything
-leave more."""
-SUSPECT_FALL = 0.25  #: Fall of the errors of the fits themselves, as LEAST_FALL, above which predictions are judged
+"""Error of the worst current, of its size, from which another zero is looked for:
+45° of a joint that bears anything leave more.
+"""
+#: Fall of the errors of the fits themselves, as LEAST_FALL, above which predictions are judged
+SUSPECT_FALL = 0.25
 RIDGE = 1e-7  #: Added to products of columns of unit length, for combinations that no row shows
-FIT_ROUNDS, NEXT_ROUNDS = 6, 2  #: Rounds of a fit from the nameplate, and of one from a neighbouring solution
+#: Rounds of a fit from the nameplate, and of one from a neighbouring solution
+FIT_ROUNDS, NEXT_ROUNDS = 6, 2
 TURN_ROUNDS = 6  #: Of Gauss-Newton
 LARGEST_STEP_RAD = 0.5  #: Up to which a step of the direction is trusted
 UNTIL_RIGHT = "gains and errors mean nothing until it is right"  #: End of each remedy for a fit
 RUN_UNTIL_RIGHT = "what is predicted of this run means nothing until it is right"
 """The same for a run that the fit has not seen: its gains are those of other recordings."""
 WHICH_IS_WRONG = (
-    "these moves do not tell them apart: look how the base is mounted and where the zeros are, or record moves through "
-    "more of the range of all joints; correct what is wrong, and fit again"
+    "these moves do not tell them apart: look how the base is mounted and where the zeros are, or "
+    "record moves through more of the range of all joints; correct what is wrong, and fit again"
 )
 """Remedy where several explain the same."""
 WEIGHTY = tuple(index for index, name in enumerate(LINK_PARAMETERS) if name.startswith("m"))
@@ -113,7 +130,9 @@ class PositionReading:
         signs = np.ones(motion.position_rad.shape[1])
         signs[self.axis] = self.sign
         return Motion(
-            self.positions(motion.position_rad), motion.velocity_rad_s * signs, motion.acceleration_rad_s2 * signs
+            self.positions(motion.position_rad),
+            motion.velocity_rad_s * signs,
+            motion.acceleration_rad_s2 * signs,
         )
 
     def text(self, axes: Sequence[str]) -> str:
@@ -143,20 +162,27 @@ class TurnedGeometry:
     """Another geometry than the declared one, which predicts left-out moves clearly better."""
 
     gravity: GravityFound | None  #: where gravity is turned
-    readings: tuple[PositionReading, ...]  #: else the reading of a position; then others that explain the same
-    reversed_currents: tuple[int, ...]  #: axes whose gains have another sign than their nameplates in this geometry
-    before_percent: FloatArray  #: error of each motor's current on left-out moves, as declared, shape (m,)
+    #: else the reading of a position; then others that explain the same
+    readings: tuple[PositionReading, ...]
+    #: axes whose gains have another sign than their nameplates in this geometry
+    reversed_currents: tuple[int, ...]
+    #: error of each motor's current on left-out moves, as declared, shape (m,)
+    before_percent: FloatArray
     after_percent: FloatArray  #: the same in this geometry
 
     def model(self, declared: Model) -> Model:
-        """The model with this gravity; for another reading of a position see `corrected_positions`."""
+        """The model with this gravity; for another reading of a position see
+        `corrected_positions`.
+        """
         if self.gravity is None:
             return declared
         return with_gravity(declared, self.gravity.found_m_s2)
 
     def corrected_positions(self, position_rad: FloatArray) -> FloatArray:
         """Positions of a run in this geometry [rad or m], shape (k, m)."""
-        return position_rad if self.gravity is not None else self.readings[0].positions(position_rad)
+        if self.gravity is not None:
+            return position_rad
+        return self.readings[0].positions(position_rad)
 
     def diagnosis(self, axes: Sequence[str], runs: tuple[str, ...] = ()) -> Diagnosis:
         """Name the mistake.
@@ -170,22 +196,26 @@ class TurnedGeometry:
         errors = f"errors of {_percents(self.after_percent)} % of the currents of left-out moves"
         declared = f"{_percents(self.before_percent)} % as declared"
         alike = [one.text(axes) for one in self.readings[0 if self.gravity is not None else 1 :]]
-        others = f"; explained as well by {' or '.join(alike)}" if alike else ""
+        if alike:
+            others = f"; explained as well by {' or '.join(alike)}"
+        else:
+            others = ""
         if self.gravity is not None:
             found = self.gravity
             std_m_s2 = float(np.linalg.norm(found.found_m_s2) * np.deg2rad(found.std_deg))
             suggested_m_s2 = suggested_gravity(found.found_m_s2, np.full(3, std_m_s2))
             remedy = (
-                f"how is the base mounted? correct `gravity_m_s2` of the cell: {_numbers(suggested_m_s2)} m/s² by "
-                f"these recordings; {until_right}"
+                "how is the base mounted? correct `gravity_m_s2` of the cell: "
+                f"{_numbers(suggested_m_s2)} m/s² by these recordings; {until_right}"
             )
             unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
             return Diagnosis(
                 GRAVITY_TURNED,
                 runs,
                 (),
-                f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg from what "
-                f"the cell says, with {errors}, {declared}{others}",
+                f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± "
+                f"{found.std_deg:.1f} deg from what the cell says, with {errors}, "
+                f"{declared}{others}",
                 f"gravity along the declared {_numbers(found.declared_m_s2)}",
                 which_is_wrong if alike else remedy,
             )
@@ -194,8 +224,8 @@ class TurnedGeometry:
         if reading.sign > 0.0:
             turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
             remedy = (
-                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the zero in the "
-                f"controller, and fit again: {until_right}"
+                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the "
+                f"zero in the controller, and fit again: {until_right}"
             )
             return Diagnosis(
                 ZERO_TURNED,
@@ -207,19 +237,22 @@ class TurnedGeometry:
             )
         if reading.axis in self.reversed_currents:
             remedy = (
-                f"reverse the <axis> of the joint of {name} in the URDF; or, in the cell file, its row of "
-                "`drive_train.ratio` (`lead_mm` of a prismatic axis) and the sign of its nameplate gain"
+                f"reverse the <axis> of the joint of {name} in the URDF; or, in the cell file, its "
+                "row of `drive_train.ratio` (`lead_mm` of a prismatic axis) and the sign of its "
+                "nameplate gain"
             )
         else:
             remedy = (
-                f"reverse the row of {name} in `drive_train.ratio` of the cell file (`lead_mm` of a prismatic axis), "
-                "and leave its nameplate gain; of an import with `side: joint`, name it in `reversed` of `position`"
+                f"reverse the row of {name} in `drive_train.ratio` of the cell file (`lead_mm` of "
+                "a prismatic axis), and leave its nameplate gain; of an import with `side: joint`, "
+                "name it in `reversed` of `position`"
             )
         return Diagnosis(
             POSITION_REVERSED,
             runs,
             (name,),
-            f"a position that counts the other way: so read, it leaves {errors}, {declared}{others}",
+            f"a position that counts the other way: so read, it leaves {errors}, "
+            f"{declared}{others}",
             "each position to count about the axis of its joint in the URDF",
             f"{remedy}; {until_right}",
         )
@@ -240,17 +273,20 @@ def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
 
 
 @takes(model=Model, instants=Sequence)
-def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: ArrayLike) -> TurnedGeometry | None:
+def find_turned_geometry(
+    model: Model, instants: Sequence[Instants], gains: ArrayLike
+) -> TurnedGeometry | None:
     """Look for another geometry that explains recordings clearly better than the declared one.
 
     Args:
-        model: the declared model; a redundantly driven robot is not judged, because internal preload is in every
-            current.
+        model: the declared model; a redundantly driven robot is not judged, because internal
+            preload is in every current.
         instants: rows of all runs.
         gains: nameplate, shape (m,).
 
     Returns:
-        the hypothesis with the largest fall of the errors; None where the declared geometry is as good as any.
+        the hypothesis with the largest fall of the errors; None where the declared geometry is as
+        good as any.
     """
     require_entries("instants", instants, Instants, "give `Identification.instants`")
     if model.is_redundant or not instants:
@@ -277,13 +313,22 @@ def find_turned_geometry(model: Model, instants: Sequence[Instants], gains: Arra
         return None
     best = max(one.fall(before) for one in better)
     alike = [one for one in better if one.fall(before) >= ALIKE_FALL * best]
-    # A mirror image of an arm needs more reversed currents than the mistake itself does. Where a zero half a turn away
-    # explains the same as another gravity, the mounting is named first: it is declared once for the whole arm.
-    alike.sort(key=lambda one: (one.contradictions(nameplate), one.gravity is None, -one.fall(before)))
+    # A mirror image of an arm needs more reversed currents than the mistake itself does. Where a
+    # zero half a turn away explains the same as another gravity, the mounting is named first: it is
+    # declared once for the whole arm.
+    alike.sort(
+        key=lambda one: (one.contradictions(nameplate), one.gravity is None, -one.fall(before))
+    )
     chosen = alike[0]
     fewest = chosen.contradictions(nameplate)
-    alike += [one for one in small if one.fall(before) >= ALIKE_FALL * best and not chosen.is_better(one)]
-    readings = [one.reading for one in alike if one.reading is not None and one.contradictions(nameplate) == fewest]
+    alike += [
+        one for one in small if one.fall(before) >= ALIKE_FALL * best and not chosen.is_better(one)
+    ]
+    readings = [
+        one.reading
+        for one in alike
+        if one.reading is not None and one.contradictions(nameplate) == fewest
+    ]
     against = np.flatnonzero(chosen.fit.per_unit * nameplate < 0.0)
     return TurnedGeometry(
         gravity=chosen.gravity,
@@ -303,8 +348,9 @@ def _thinned(instants: Sequence[Instants]) -> tuple[Instants, ...]:
 def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArray) -> bool:
     """Whether another geometry may explain rows better, by the errors of the fits themselves.
 
-    No direction of gravity leaves less than three directions at once, each with moments of its own, and another
-    reading of a position has as many parameters as the declared one. Nearly all recordings need no other judgement.
+    No direction of gravity leaves less than three directions at once, each with moments of its own,
+    and another reading of a position has as many parameters as the declared one. Nearly all
+    recordings need no other judgement.
 
     Args:
         model: the declared model.
@@ -319,7 +365,9 @@ def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArra
     as_read = improved(square, rows, start, reference, FIT_ROUNDS)
     limit = _log_error(square, as_read) - SUSPECT_FALL
     current_square = square[:, -1, -1]
-    errors = np.sqrt(left_over(square, as_read) / np.where(current_square > 0.0, current_square, 1.0))
+    errors = np.sqrt(
+        left_over(square, as_read) / np.where(current_square > 0.0, current_square, 1.0)
+    )
     is_gross = float(errors.max()) > SUSPECT_ERROR
     any_gravity = weighed.square[:, 0]
     if _log_error(any_gravity, improved(any_gravity, rows, start, reference, FIT_ROUNDS)) < limit:
@@ -346,13 +394,16 @@ def _turned_zeros(model: Model, axis: int) -> tuple[PositionReading, ...]:
     """Readings of an angle from other zeros; none of a prismatic joint."""
     if model.robot.axes[axis].kind is JointKind.PRISMATIC:
         return ()
-    return tuple(PositionReading(axis, zero_rad=float(np.deg2rad(turn_deg))) for turn_deg in ZERO_TURNS_DEG)
+    return tuple(
+        PositionReading(axis, zero_rad=float(np.deg2rad(turn_deg))) for turn_deg in ZERO_TURNS_DEG
+    )
 
 
 def _best_zero(
     model: Model, instants: Sequence[Instants], axis: int, start: MotorFit, reference: FloatArray
 ) -> PositionReading | None:
-    """The reading of an angle whose fit leaves least; None of a prismatic joint, or where no loop can be closed so.
+    """The reading of an angle whose fit leaves least;
+    None of a prismatic joint, or where no loop can be closed so.
 
     Args:
         model: the declared model.
@@ -374,13 +425,19 @@ def _best_zero(
         return None
     near = begins[int(np.argmin(levels))]
     bounds = (near - ZERO_REACH_RAD, near + ZERO_REACH_RAD)
-    found = scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD})
+    found = scipy.optimize.minimize_scalar(
+        left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD}
+    )
     best = float(found.x) if found.fun < min(levels) else near
     return PositionReading(axis, zero_rad=best if best <= np.pi else best - 2.0 * np.pi)
 
 
 def _other_readings(
-    model: Model, instants: Sequence[Instants], before: Judged, start: MotorFit, reference: FloatArray
+    model: Model,
+    instants: Sequence[Instants],
+    before: Judged,
+    start: MotorFit,
+    reference: FloatArray,
 ) -> list[Judged]:
     """Judge each position the other way, and each angle from its best other zero."""
     few = _thinned(instants)
@@ -402,16 +459,22 @@ def _other_readings(
         fit = improved(square, rows, near, reference, FIT_ROUNDS)
         fitted = np.maximum(np.sqrt(left_over(square, fit)), before.smallest)
         falls = np.log(before.floored_error / fitted)
-        if np.sum(falls) < LEAST_FALL:  # prediction is never better than the fit: most hypotheses end here
+        # Prediction is never better than the fit: most hypotheses end here
+        if np.sum(falls) < LEAST_FALL:
             continue
         judged.append(replace(judge_hypothesis(products, near, reference), reading=reading))
     return judged
 
 
 def _small_corrections(
-    model: Model, instants: Sequence[Instants], weighed: GravityProducts, start: MotorFit, reference: FloatArray
+    model: Model,
+    instants: Sequence[Instants],
+    weighed: GravityProducts,
+    start: MotorFit,
+    reference: FloatArray,
 ) -> list[Judged]:
-    """Judge the best small correction of gravity, and of each zero; none that grows beyond what is small.
+    """Judge the best small correction of gravity, and of each zero;
+    none that grows beyond what is small.
 
     Args:
         model: the declared model.
@@ -422,7 +485,9 @@ def _small_corrections(
     """
     judged = list[Judged]()
     declared = model.robot.gravity_m_s2
-    tilted = _judged_gravity(weighed, declared, _descended(weighed, declared, start, reference), reference)
+    tilted = _judged_gravity(
+        weighed, declared, _descended(weighed, declared, start, reference), reference
+    )
     if tilted.gravity is not None and tilted.gravity.turned_deg < SMALLEST_TURN_DEG:
         judged.append(tilted)
     few = _thinned(instants)
@@ -431,7 +496,9 @@ def _small_corrections(
             reading = _small_zero(model, few, axis, start, reference)
             if reading is not None:
                 products = products_of_reading(model, instants, reading)
-                judged.append(replace(judge_hypothesis(products, start, reference), reading=reading))
+                judged.append(
+                    replace(judge_hypothesis(products, start, reference), reading=reading)
+                )
         except ModelError:  # the loops of a closed chain cannot be closed so
             continue
     return judged
@@ -452,10 +519,14 @@ def _small_zero(
         return _left_with_zero(model, instants, axis, zero, start, reference)
 
     bounds = (-SMALL_ZERO, SMALL_ZERO)
-    found = scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD})
+    found = scipy.optimize.minimize_scalar(
+        left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD}
+    )
     zero = float(found.x)
     is_at_bound = SMALL_ZERO - abs(zero) < 2.0 * ZERO_TOLERANCE_RAD
-    return None if is_at_bound else PositionReading(axis, zero_rad=zero)
+    if is_at_bound:
+        return None
+    return PositionReading(axis, zero_rad=zero)
 
 
 def _left_with_zero(
@@ -473,7 +544,9 @@ def _left_with_zero(
     Raises:
         ModelError: the loops of a closed chain cannot be closed so.
     """
-    products = products_of_reading(model, instants, PositionReading(axis, zero_rad=zero), part_count=1)
+    products = products_of_reading(
+        model, instants, PositionReading(axis, zero_rad=zero), part_count=1
+    )
     square = products.square[:, 0]
     rows = products.rows.sum(axis=1)
     return _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS))
@@ -483,17 +556,25 @@ def _turned_gravity(
     weighed: GravityProducts, declared: FloatArray, start: MotorFit, reference: FloatArray
 ) -> Judged | None:
     """Judge the best direction of gravity; None where it is near the declared one, or uncertain."""
-    judged = _judged_gravity(weighed, declared, best_gravity(weighed, declared, start, reference), reference)
+    judged = _judged_gravity(
+        weighed, declared, best_gravity(weighed, declared, start, reference), reference
+    )
     gravity = judged.gravity
     if gravity is None or gravity.std_deg > LARGEST_DIRECTION_STD_DEG:
         return None
-    return judged if gravity.turned_deg >= max(SMALLEST_TURN_DEG, 3.0 * gravity.std_deg) else None
+    if gravity.turned_deg >= max(SMALLEST_TURN_DEG, 3.0 * gravity.std_deg):
+        return judged
+    return None
 
 
 def _judged_gravity(
-    weighed: GravityProducts, declared: FloatArray, solution: tuple[FloatArray, MotorFit], reference: FloatArray
+    weighed: GravityProducts,
+    declared: FloatArray,
+    solution: tuple[FloatArray, MotorFit],
+    reference: FloatArray,
 ) -> Judged:
-    """Judge a direction of gravity by predictions of each part of the moves, σ of it by a jackknife.
+    """Judge a direction of gravity by predictions of each part of the moves,
+    σ of it by a jackknife.
 
     Args:
         weighed: products for any direction of gravity.
@@ -556,7 +637,9 @@ def best_gravity(
 def _descended(
     weighed: GravityProducts, gravity: FloatArray, near: MotorFit, reference: FloatArray
 ) -> tuple[FloatArray, MotorFit]:
-    """Gravity that explains all rows best near another one, by Gauss-Newton, and its fit; arguments as before."""
+    """Gravity that explains all rows best near another one, by Gauss-Newton, and its fit;
+    arguments as before.
+    """
     square = weighed.square.sum(axis=1)
     level, fit = _fit_under(weighed, gravity, near, reference)
     for _ in range(TURN_ROUNDS):
@@ -630,10 +713,20 @@ def is_confirmed(
     fixed = gains * signs if gains_fixed else None
     corrected = _corrected(geometry, runs)
     try:
-        found = identify(geometry.model(model), corrected, conditioning, method=method, fixed_gains=fixed, judge=False)
+        found = identify(
+            geometry.model(model),
+            corrected,
+            conditioning,
+            method=method,
+            fixed_gains=fixed,
+            judge=False,
+        )
     except IdentificationError:
         return False
-    limit = LARGEST_TOTAL_PERCENT if before_percent is None else before_percent
+    if before_percent is None:
+        limit = LARGEST_TOTAL_PERCENT
+    else:
+        limit = before_percent
     return found.training_error.total < limit
 
 
@@ -650,14 +743,17 @@ class Judged:
     """A hypothesis with the errors of its predictions."""
 
     fit: MotorFit  #: of all rows
-    left: FloatArray  #: of each motor's current on each part, by the fit of the others, sums of squares, shape (m, P)
+    #: of each motor's current on each part, by the fit of the others, sums of squares, shape (m, P)
+    left: FloatArray
     current_square: FloatArray  #: sums of squares of the currents likewise, shape (m, P)
     reading: PositionReading | None = None
     gravity: GravityFound | None = None
 
     @property
     def smallest(self) -> FloatArray:
-        """Error below which a current needs no other explanation, root of the sum of squares, shape (m,)."""
+        """Error below which a current needs no other explanation, root of the sum of squares,
+        shape (m,).
+        """
         size = np.sqrt(self.current_square.sum(axis=1))
         return np.asarray(np.where(size > 0.0, SMALL_ERROR * size, 1.0))
 
@@ -675,14 +771,17 @@ class Judged:
         return np.asarray(100.0 * np.sqrt(share))
 
     def fall(self, before: Judged) -> float:
-        """Fall of the logarithm of the errors from those of another hypothesis, in sum over the motors."""
+        """Fall of the logarithm of the errors from those of another hypothesis,
+        in sum over the motors.
+        """
         return float(np.sum(np.log(before.floored_error / self.floored_error)))
 
     def is_better(self, before: Judged) -> bool:
         """Whether the errors fall by LEAST_FALL, and in the parts alike."""
         if self.fall(before) < LEAST_FALL:
             return False
-        # The mean error of a part is added on both sides, so that a part of few rows does not decide.
+        # The mean error of a part is added on both sides, so that a part of few rows does not
+        # decide.
         usual = np.minimum(before.floored_error, self.floored_error)[:, None] ** 2 / PARTS
         ratio = (before.left + usual) / (self.left + usual)
         falls = 0.5 * np.sum(np.log(ratio), axis=0)
@@ -690,10 +789,11 @@ class Judged:
         return bool(np.mean(falls) > LEAST_T * std)
 
     def stands_beside(self, small: Sequence[Judged]) -> bool:
-        """Whether a hypothesis is better than all small corrections; a turn of gravity, whether none is better than it.
+        """Whether a hypothesis is better than all small corrections;
+        a turn of gravity, whether none is better than it.
 
-        Gravity that is turned by 15° is another explanation of the same size as a zero that is off by 15°. Where the
-        joints before this one hardly move, nothing tells the two apart.
+        Gravity that is turned by 15° is another explanation of the same size as a zero that is off
+        by 15°. Where the joints before this one hardly move, nothing tells the two apart.
         """
         if self.gravity is not None:
             return not any(one.is_better(self) for one in small)
@@ -702,7 +802,8 @@ class Judged:
     def contradictions(self, gains: FloatArray) -> float:
         """Number of currents with another sign than the nameplate.
 
-        That of a reversed axis counts half: where the axis of the URDF points the other way, both are reversed.
+        That of a reversed axis counts half: where the axis of the URDF points the other way, both
+        are reversed.
         """
         against = self.fit.per_unit * gains < 0.0
         count = float(np.count_nonzero(against))
@@ -737,12 +838,15 @@ def judge_hypothesis(products: Products, start: MotorFit, reference: FloatArray)
 class MotorFit:
     """Parameters with which all motors' equations hold best."""
 
-    per_unit: FloatArray  #: s, current per unit of torque [A/Nm or A/N] up to a common factor, shape (m,)
+    #: s, current per unit of torque [A/Nm or A/N] up to a common factor, shape (m,)
+    per_unit: FloatArray
     parameters: FloatArray  #: χ in the same scale, shape (c,)
     weight: FloatArray  #: 1/σ² of each motor's current [1/A²], shape (m,)
 
     def in_reading(self, reading: PositionReading) -> MotorFit:
-        """The fit from which that of a reading begins: friction brakes the motion of a reversed position."""
+        """The fit from which that of a reading begins:
+        friction brakes the motion of a reversed position.
+        """
         signs = np.ones(len(self.per_unit))
         signs[reading.axis] = reading.sign
         return replace(self, per_unit=self.per_unit * signs)
@@ -768,7 +872,9 @@ def first_fit(model: Model, products: Products, reference: FloatArray) -> MotorF
     return MotorFit(signs * reference, np.zeros(square.shape[1] - 1), weight)
 
 
-def improved(square: FloatArray, rows: IntArray, start: MotorFit, reference: FloatArray, rounds: int) -> MotorFit:
+def improved(
+    square: FloatArray, rows: IntArray, start: MotorFit, reference: FloatArray, rounds: int
+) -> MotorFit:
     """Fit χ, s and the weights in turn.
 
     Args:
@@ -800,7 +906,9 @@ def improved(square: FloatArray, rows: IntArray, start: MotorFit, reference: Flo
 
 
 def left_over(square: FloatArray, fit: MotorFit) -> FloatArray:
-    """What a fit leaves of each motor's current [A²], sums of squares, shape (m,); arguments as for `improved`."""
+    """What a fit leaves of each motor's current [A²], sums of squares, shape (m,);
+    arguments as for `improved`.
+    """
     torque = (square[:, :-1, :-1] @ fit.parameters) @ fit.parameters
     mixed = square[:, :-1, -1] @ fit.parameters
     explained = 2.0 * fit.per_unit * mixed - fit.per_unit**2 * torque
@@ -816,7 +924,9 @@ def _log_error(square: FloatArray, fit: MotorFit) -> float:
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve normal equations in columns of unit length, with RIDGE; columns of rounding errors get zero."""
+    """Solve normal equations in columns of unit length, with RIDGE;
+    columns of rounding errors get zero.
+    """
     size = np.sqrt(np.diag(normal))
     size[size <= SMALLEST_COLUMN * size.max(initial=0.0)] = np.inf
     scaled = normal / np.outer(size, size)
@@ -842,7 +952,9 @@ class Products:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GravityProducts:
-    """Products of the columns [A | G_x | G_y | G_z | v_i] of each motor, each part of the moves for itself."""
+    """Products of the columns [A | G_x | G_y | G_z | v_i] of each motor,
+    each part of the moves for itself.
+    """
 
     square: FloatArray  #: shape (m, PARTS, c + 3 f + 1, c + 3 f + 1)
     rows: IntArray  #: shape (m, PARTS)
@@ -863,7 +975,9 @@ class GravityProducts:
         return Products(self.turned(self.square, gravity_m_s2), self.rows)
 
     def turned(self, square: FloatArray, gravity_m_s2: FloatArray) -> FloatArray:
-        """Products of [W(g) | v_i] from those of [A | G_x | G_y | G_z | v_i], shapes (…, c + 3 f + 1, c + 3 f + 1)."""
+        """Products of [W(g) | v_i] from those of [A | G_x | G_y | G_z | v_i], shapes (…,
+        c + 3 f + 1, c + 3 f + 1).
+        """
         last = square.shape[-1] - 1
         kept = np.append(np.arange(self.columns), last)
         out = square[..., kept[:, None], kept]
@@ -874,7 +988,9 @@ class GravityProducts:
         out[..., self.weighty, :] += with_all
         out[..., :, self.weighty] += np.swapaxes(with_all, -1, -2)
         for component, size in enumerate(gravity_m_s2):
-            out[..., self.weighty[:, None], self.weighty] += size * heavy[..., self.along(component)]
+            out[..., self.weighty[:, None], self.weighty] += (
+                size * heavy[..., self.along(component)]
+            )
         return out
 
     def turn(self, square: FloatArray, gravity_m_s2: FloatArray, fit: MotorFit) -> FloatArray:
@@ -888,7 +1004,8 @@ class GravityProducts:
         last = square.shape[-1] - 1
         count = self.columns
         size = float(np.linalg.norm(gravity_m_s2))
-        sideways = scipy.linalg.null_space(gravity_m_s2[None])  # two directions across gravity, (3, 2)
+        # Two directions across gravity, (3, 2)
+        sideways = scipy.linalg.null_space(gravity_m_s2[None])
         basis = np.zeros((last + 1, count + 3))
         basis[:count, :count] = np.eye(count)
         basis[last, -1] = 1.0
@@ -905,7 +1022,9 @@ class GravityProducts:
         return np.asarray(sideways @ solution[-2:])
 
 
-def gravity_products(model: Model, instants: Sequence[Instants], part_count: int = PARTS) -> GravityProducts:
+def gravity_products(
+    model: Model, instants: Sequence[Instants], part_count: int = PARTS
+) -> GravityProducts:
     """Products for any direction of gravity, of runs with any payloads.
 
     Args:
@@ -930,7 +1049,10 @@ def gravity_products(model: Model, instants: Sequence[Instants], part_count: int
         moving = _motor_columns(weightless, one, one.motion, mountings)
         at_rest = [_motor_columns(unit, one, rest, mountings)[:, weighty] for unit in pulled]
         square, counted = _products(
-            np.concatenate((moving, *at_rest, one.current_a[:, None]), axis=1), one, parts, part_count
+            np.concatenate((moving, *at_rest, one.current_a[:, None]), axis=1),
+            one,
+            parts,
+            part_count,
         )
         squares.append(square)
         rows.append(counted)
@@ -958,7 +1080,9 @@ def products_of_reading(
 
 
 def _parts(instants: Sequence[Instants], part_count: int) -> list[IntArray]:
-    """Which part each row of each run is in: moves with rows that count, dealt out in turn over all runs."""
+    """Which part each row of each run is in:
+    moves with rows that count, dealt out in turn over all runs.
+    """
     dealt = 0
     parts = list[IntArray]()
     for one in instants:
@@ -974,8 +1098,12 @@ def _mountings(instants: Sequence[Instants]) -> list[str]:
     return sorted({one.mounting for one in instants if one.mounting is not None})
 
 
-def _motor_columns(model: Model, one: Instants, motion: Motion, mountings: Sequence[str]) -> FloatArray:
-    """Columns (T W)_i of the standard parameters, then of the body of each mounting, shape (m, c, k)."""
+def _motor_columns(
+    model: Model, one: Instants, motion: Motion, mountings: Sequence[str]
+) -> FloatArray:
+    """Columns (T W)_i of the standard parameters, then of the body of each mounting, shape (m, c,
+    k).
+    """
     standard = model.regressor(motion, loaded=one.mounting is not None)
     bodies = np.zeros((len(standard), len(LINK_PARAMETERS) * len(mountings), standard.shape[2]))
     if one.mounting is not None:
@@ -985,8 +1113,12 @@ def _motor_columns(model: Model, one: Instants, motion: Motion, mountings: Seque
     return np.asarray(np.tensordot(model.drive_train.to_motor, columns, axes=1))
 
 
-def _products(columns: FloatArray, one: Instants, parts: IntArray, part_count: int) -> tuple[FloatArray, IntArray]:
-    """Products of the columns of each motor over its rows of each part, and how many rows; from shape (m, c, k)."""
+def _products(
+    columns: FloatArray, one: Instants, parts: IntArray, part_count: int
+) -> tuple[FloatArray, IntArray]:
+    """Products of the columns of each motor over its rows of each part, and how many rows;
+    from shape (m, c, k).
+    """
     count = len(columns)
     square = np.zeros((count, part_count, columns.shape[1], columns.shape[1]))
     rows = np.zeros((count, part_count), dtype=np.int64)

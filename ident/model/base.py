@@ -1,4 +1,6 @@
-"""Base parameters: the smallest set of standard columns that spans the same torques (paper §2.1, QR method)."""
+"""Base parameters: the smallest set of standard columns that spans the same torques (paper §2.1,
+QR method).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from scipy import linalg
 from ident.arrays import FloatArray
 
 SMALLEST_COLUMN = 1e-9  #: Norm of a column, relative to the largest, that is rounding error
-CLEAR = 1e-3  #: Share of a column's norm that is left of it where it is clearly independent of others
+#: Share of a column's norm that is left of it where it is clearly independent of others
+CLEAR = 1e-3
 SMALLEST_WEIGHT = 1e-6  #: Smaller weights count as zero
 
 
@@ -23,19 +26,22 @@ class BaseParameters:
     names: tuple[str, ...]  #: leading name and what is regrouped with it
 
 
-def independent_columns(matrix: FloatArray, tolerance: float = 1e-8, smallest: float = SMALLEST_COLUMN) -> list[int]:
+def independent_columns(
+    matrix: FloatArray, tolerance: float = 1e-8, smallest: float = SMALLEST_COLUMN
+) -> list[int]:
     """Indices of a largest set of independent columns, ascending; of equals the first are taken.
 
-    A column is independent if, after projection off the chosen columns, more than ``tolerance`` of its norm remains.
-    Columns of which more than CLEAR remains are taken first: where gravity is vertical but for a millionth, the mass
-    of a horizontal carriage and its rotor's inertia differ by a millionth of a constant force. The offset of the
-    friction is this force, and the choice; the difference of the two would stand for it with weights of a million.
+    A column is independent if, after projection off the chosen columns, more than ``tolerance`` of
+    its norm remains. Columns of which more than CLEAR remains are taken first: where gravity is
+    vertical but for a millionth, the mass of a horizontal carriage and its rotor's inertia differ
+    by a millionth of a constant force. The offset of the friction is this force, and the choice;
+    the difference of the two would stand for it with weights of a million.
 
     Args:
         matrix: shape (r, c).
         tolerance: relative to each column's norm.
-        smallest: columns with a norm below this share of the largest count as zero: normalised, one of them could be
-            chosen, and the condition number would become 1e16.
+        smallest: columns with a norm below this share of the largest count as zero: normalised, one
+            of them could be chosen, and the condition number would become 1e16.
     """
     norms = np.linalg.norm(matrix, axis=0)
     is_nonzero = norms > smallest * float(norms.max(initial=0.0))
@@ -47,7 +53,8 @@ def independent_columns(matrix: FloatArray, tolerance: float = 1e-8, smallest: f
         for column in candidates:
             unit = matrix[:, column] / norms[column]
             rest = unit - basis @ (basis.T @ unit)
-            rest -= basis @ (basis.T @ rest)  # twice is enough (Kahan): the first projection cancels digits
+            # Twice is enough (Kahan): the first projection cancels digits
+            rest -= basis @ (basis.T @ rest)
             share = float(np.linalg.norm(rest))
             if share > smallest_share:
                 independent.append(column)
@@ -58,7 +65,9 @@ def independent_columns(matrix: FloatArray, tolerance: float = 1e-8, smallest: f
     return sorted(independent)
 
 
-def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:
+def base_parameters(
+    triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8
+) -> BaseParameters:
     """Find them in the triangular factor of an observation matrix.
 
     Taking columns in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).

@@ -1,13 +1,16 @@
-"""Bodies: the ten inertial parameters of a link or payload, and the matrix that is positive definite for real ones.
+"""Bodies: the ten inertial parameters of a link or payload,
+and the matrix that is positive definite for real ones.
 
-With the inertia tensor I and the first moment h about the link frame's origin, and the mass m, the pseudo-inertia is
+With the inertia tensor I and the first moment h about the link frame's origin, and the mass m, the
+pseudo-inertia is
 
     P = [ Σ   h ]        Σ = ½ tr(I)·1 − I = ∫ r rᵀ dm.
         [ hᵀ  m ],
 
-P ≻ 0 holds for every distribution of positive mass, and only then: m > 0, I about the centre of mass ≻ 0 and the
-triangle inequality of its principal moments together (Wensing, Kim, Slotine: Linear Matrix Inequalities for Physically
-Consistent Inertial Parameter Identification, 2018). P is linear in the ten parameters: a linear matrix inequality.
+P ≻ 0 holds for every distribution of positive mass, and only then: m > 0, I about the centre of
+mass ≻ 0 and the triangle inequality of its principal moments together (Wensing, Kim, Slotine:
+Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification, 2018). P is
+linear in the ten parameters: a linear matrix inequality.
 """
 
 from __future__ import annotations
@@ -24,7 +27,9 @@ from ident.errors import ModelError
 LOADED = "_loaded"
 """Ends the name of what a payload adds to a friction parameter (`Model.friction_by_payload`)."""
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
-"""Inertia about the link frame's origin, first moments, mass, in the paper's order; a payload is a link too (§2.2)."""
+"""Inertia about the link frame's origin, first moments, mass, in the paper's order;
+a payload is a link too (§2.2).
+"""
 
 LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
 ROUNDING = 1e-3  #: Share of its size by which rounding in a drawing may make an inertia impossible
@@ -36,17 +41,19 @@ class Payload:
     """A weighed body as it was mounted; each mounting has its own unknowns.
 
     Raises:
-        ModelError: a name is not in LINK_PARAMETERS, a value is no finite number, the mass is not above zero, or no
-            body has such an inertia.
+        ModelError: a name is not in LINK_PARAMETERS, a value is no finite number, the mass is not
+            above zero, or no body has such an inertia.
     """
 
     name: str  #: of the body
-    mounting: str  #: names one way of mounting it; runs that share it share their unknown parameters
-    #: Known inertial parameters by their names in LINK_PARAMETERS, in the frame of the joint that carries it (paper
-    #: eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
+    #: names one way of mounting it; runs that share it share their unknown parameters
+    mounting: str
+    #: Known inertial parameters by their names in LINK_PARAMETERS, in the frame of the joint that
+    #: carries it (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
     known: dict[str, float] = field(default_factory=dict)
-    #: Tolerance of the weighed mass [kg], a standard deviation; 0 where none is declared. `Calibration.payload_mass`
-    #: has what it makes of each gain, and `weigh` has it in σ; σ of the gains does not. A cell file has its own.
+    #: Tolerance of the weighed mass [kg], a standard deviation; 0 where none is declared.
+    #: `Calibration.payload_mass` has what it makes of each gain, and `weigh` has it in σ; σ of the
+    #: gains does not. A cell file has its own.
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -61,18 +68,27 @@ class Payload:
                 f"payload {self.name!r} has the known parameters {found}; expected names among "
                 f"{expected}; write its mass as {{'m': 4.59}}"
             )
-        require_kind("mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01")
+        require_kind(
+            "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
+        )
         if not 0.0 <= self.mass_tolerance_kg < inf:
             found = f"a mass tolerance of {self.mass_tolerance_kg:g} kg"
-            raise ModelError(f"payload {self.name!r} has {found}; expected zero or more; give that of the scale")
+            raise ModelError(
+                f"payload {self.name!r} has {found}; expected zero or more; give that of the scale"
+            )
         bad = [f"{name} = {value}" for name, value in self.known.items() if not isfinite(value)]
         if bad:
             raise ModelError(
-                f"payload {self.name!r} has {', '.join(bad)}; expected finite numbers; leave out what is not known"
+                f"payload {self.name!r} has {', '.join(bad)}; expected finite numbers; leave out "
+                "what is not known"
             )
         mass_kg = self.known.get("m")
-        if mass_kg is not None and not mass_kg > 0.0:  # a negative mass would reverse the sign of every gain
-            raise ModelError(f"payload {self.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg; weigh it")
+        # A negative mass would reverse the sign of every gain
+        if mass_kg is not None and not mass_kg > 0.0:
+            raise ModelError(
+                f"payload {self.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg; "
+                "weigh it"
+            )
         _require_possible_inertia(self)
 
     @property
@@ -83,10 +99,12 @@ class Payload:
 
 
 def _require_possible_inertia(payload: Payload) -> None:
-    """Refuse an inertia that no distribution of mass has, as far as what is known says so; a point mass may be.
+    """Refuse an inertia that no distribution of mass has, as far as what is known says so;
+    a point mass may be.
 
     Raises:
-        ModelError: the second moments Σ, or the pseudo-inertia where the centre is known too, have a negative value.
+        ModelError: the second moments Σ, or the pseudo-inertia where the centre is known too, have
+            a negative value.
     """
     known = payload.known
     moments = set(LINK_PARAMETERS[:6])
@@ -97,7 +115,8 @@ def _require_possible_inertia(payload: Payload) -> None:
     if set(known) != set(LINK_PARAMETERS):
         pseudo = pseudo[:3, :3]
     size = max(float(np.trace(pseudo[:3, :3])), 0.0)
-    # The rows of the second moments and of the mass have other units: compare them at a common size.
+    # The rows of the second moments and of the mass have other units: compare them at a common
+    # size.
     scale = np.ones(len(pseudo))
     if size > 0.0:
         scale[:3] = np.sqrt(size)
@@ -109,9 +128,10 @@ def _require_possible_inertia(payload: Payload) -> None:
     values = [f"{name} = {known[name]:g}" for name in LINK_PARAMETERS if name in known]
     inertia = ", ".join(values)
     raise ModelError(
-        f"payload {payload.name!r} has an inertia that no body has: {inertia} [kg m², kg m, kg]; expected one whose "
-        "principal moments are positive, none above the sum of the others, about the joint's origin (Huygens-Steiner "
-        "with mx, my, mz included); check signs and frame, or give the mass alone"
+        f"payload {payload.name!r} has an inertia that no body has: {inertia} [kg m², kg m, kg]; "
+        "expected one whose principal moments are positive, none above the sum of the others, "
+        "about the joint's origin (Huygens-Steiner with mx, my, mz included); check signs and "
+        "frame, or give the mass alone"
     )
 
 
@@ -128,11 +148,15 @@ def _require_no_negative_moment(payload: Payload) -> None:
             found.append(f"{name} = {value:g} kg m²")
     if found:
         negative = ", ".join(found)
-        raise ModelError(f"payload {payload.name!r} has {negative}; expected moments of inertia of zero or more")
+        raise ModelError(
+            f"payload {payload.name!r} has {negative}; expected moments of inertia of zero or more"
+        )
 
 
 def pseudo_inertia(link: FloatArray) -> FloatArray:
-    """P of a link's parameters in the order of LINK_PARAMETERS, shape (10,) → (4, 4) [kg m², kg m, kg]."""
+    """P of a link's parameters in the order of LINK_PARAMETERS, shape (10,) → (4, 4) [kg m², kg m,
+    kg].
+    """
     inertia = _symmetric(link[:6])
     first_moment = link[6:9]
     out = np.empty((4, 4))
@@ -144,7 +168,9 @@ def pseudo_inertia(link: FloatArray) -> FloatArray:
 
 
 def link_parameters(pseudo: FloatArray) -> FloatArray:
-    """The inverse of `pseudo_inertia`, shape (4, 4) → (10,); a matrix that is not symmetric counts as its mean."""
+    """The inverse of `pseudo_inertia`, shape (4, 4) → (10,);
+    a matrix that is not symmetric counts as its mean.
+    """
     symmetric = 0.5 * (pseudo + pseudo.T)
     second_moments = symmetric[:3, :3]
     inertia = np.trace(second_moments) * np.eye(3) - second_moments
@@ -157,11 +183,14 @@ class Body:
 
     mass_kg: float  #: of the link
     centre_m: FloatArray  #: centre of mass in the link frame, shape (3,)
-    inertia_kg_m2: FloatArray  #: tensor about the centre of mass, axes of the link frame, shape (3, 3)
+    #: tensor about the centre of mass, axes of the link frame, shape (3, 3)
+    inertia_kg_m2: FloatArray
 
     @property
     def parameters(self) -> FloatArray:
-        """About the link frame's origin (Huygens-Steiner), in the order of LINK_PARAMETERS, shape (10,)."""
+        """About the link frame's origin (Huygens-Steiner), in the order of LINK_PARAMETERS,
+        shape (10,).
+        """
         mass = self.mass_kg
         inertia = self.inertia_kg_m2 + mass * _steiner(self.centre_m)
         first_moment = mass * self.centre_m

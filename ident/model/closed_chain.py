@@ -1,16 +1,19 @@
 """Motion of a closed chain: how the passive joints follow the motors.
 
-Every loop is cut, so that a tree with n joints remains, and closed again by φ(q) = 0 (`ident.model.robot.Closure`).
-With J = ∂φ/∂q, d = n − rank J coordinates x move independently, and
+Every loop is cut, so that a tree with n joints remains, and closed again by φ(q) = 0
+(`ident.model.robot.Closure`). With J = ∂φ/∂q, d = n − rank J coordinates x move independently, and
 
     q̇ = G ẋ,    J G = 0,    q̇_a = A ẋ,    q̈ = G ẍ + h,    J h = −J̇ q̇  (h zero in the rows of x).
 
-x are d of the joints themselves, so that G is the identity in their rows and solves J_d G_d = −J_x in the others. With
-as many motors as degrees of freedom (m = d), x are the motors' joints, and A = I. A robot without closures has G = A =
-I. (Briot & Gautier, Multibody System Dynamics 2015, eqs. of the tree and its closure; Khalil & Dombre, Modeling,
-Identification and Control of Robots, ch. 7.)
+x are d of the joints themselves, so that G is the identity in their rows and solves J_d G_d = −J_x
+in the others. With as many motors as degrees of freedom (m = d), x are the motors' joints, and A =
+I. A joint that follows another in a fixed ratio is a row of φ, too: G then has that ratio. A robot
+without closures and followers has G = A = I. (Briot & Gautier, Multibody System Dynamics 2015, eqs.
+of the tree and its closure; Khalil & Dombre, Modeling, Identification and Control of Robots, ch.
+7.)
 
-Rows of φ that are lengths are divided by the size of the robot: a condition number then compares like with like.
+Rows of φ that are lengths are divided by the size of the robot: a condition number then compares
+like with like.
 """
 
 from __future__ import annotations
@@ -22,22 +25,29 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.errors import ModelError
-from ident.model.closures import loops, origin
+from ident.model.closures import loops, origin, with_followers
 from ident.model.robot import Closure, JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
-"""Largest condition (Frobenius) of J_d, the derivatives to the joints that follow, and of A for a redundant drive;
-mechanisms stay below 30 in their workspace."""
+"""Largest condition (Frobenius) of J_d, the derivatives to the joints that follow,
+and of A for a redundant drive; mechanisms stay below 30 in their workspace.
+"""
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
-NEARLY_CLOSED = 1e-4  #: The same on the way to other positions: one more step of Newton leaves its square
+#: The same on the way to other positions: one more step of Newton leaves its square
+NEARLY_CLOSED = 1e-4
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
 LARGEST_MISFIT = 0.02
-"""Largest difference between a measured position of a redundant drive's motor and the pose that fits all of them best
-[rad, or m divided by the robot's size]: a bent arm stays below it, a wrong zero or sign does not."""
+"""Largest difference between a measured position of a redundant drive's motor and the pose that
+fits all of them best [rad, or m divided by the robot's size]: a bent arm stays below it, a wrong
+zero or sign does not.
+"""
 LONGEST_STRIDE = 64
-"""At least every 64th sample is reached from the assembly pose; the others start from their neighbours."""
-STRIDE_RAD = 0.25  #: Largest motion between two such samples [rad, or m divided by the robot's size]
+"""At least every 64th sample is reached from the assembly pose;
+the others start from their neighbours.
+"""
+#: Largest motion between two such samples [rad, or m divided by the robot's size]
+STRIDE_RAD = 0.25
 STEP_RAD = 0.15  #: Longest step on that way [rad, or m divided by the robot's size]
 LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
 MAX_ITERATIONS = 30
@@ -46,7 +56,9 @@ SMALLEST_SIZE_M = 1e-3  #: Of a robot
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assembly:
-    """Joints of a robot that its closures leave free, and those that follow, found at its assembly pose."""
+    """Joints of a robot that its closures leave free, and those that follow,
+    found at its assembly pose.
+    """
 
     position_rad: FloatArray  #: of all joints, closed exactly, shape (n,)
     independent: tuple[int, ...]  #: joints that are x, d of them
@@ -74,22 +86,23 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     """Close the loops at the assembly pose, and count what remains free.
 
     Args:
-        robot: with closures; a robot without any has n independent joints.
+        robot: with closures or couplings; a robot without any has n independent joints.
         mobility: d as its maker declares it; not checked when None.
 
     Raises:
-        ModelError: a closure names no direction or cannot close there, the mobility is another one, the motors do not
-            move every degree of freedom, or the pose is singular.
+        ModelError: a closure names no direction or cannot close there, the mobility is another one,
+            the motors do not move every degree of freedom, or the pose is singular.
     """
     count = robot.joint_count
     joints = tuple(range(count))
     start = np.zeros(count)
     if robot.assembly_rad is not None:
         start = np.asarray(robot.assembly_rad, dtype=np.float64)
-    if not robot.closures:
+    if not robot.is_constrained:
         size_m = _size(robot, start)
         return Assembly(start, joints, (), size_m, condition=1.0)
     _check(robot, start)
+    start = with_followers(robot, start)
     size_m = _size(robot, start)
     position = _closed_near(robot, start, size_m)
     jacobian = loops(robot, position[None], size_m).jacobian[0]
@@ -97,8 +110,9 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     found = free.shape[1]
     if mobility is not None and found != mobility:
         raise ModelError(
-            f"the closures leave {found} degrees of freedom at the assembly pose; expected {mobility} as declared: "
-            "is a closure missing, or does one hold a direction that must be free (`directions`)?"
+            f"the closures leave {found} degrees of freedom at the assembly pose; expected "
+            f"{mobility} as declared: is a closure missing, or does one hold a direction that must "
+            "be free (`directions`)?"
         )
     motors = robot.axis_joints
     _require_driven(robot, position, free, size_m)
@@ -112,14 +126,15 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
         condition = float(_condition(triangle)[0])
     if condition > LARGEST_CONDITION:
         raise ModelError(
-            f"the assembly pose is close to a singularity: condition {condition:.3g} of the closures; expected below "
-            f"{LARGEST_CONDITION:g}: give a pose inside the workspace"
+            f"the assembly pose is close to a singularity: condition {condition:.3g} of the "
+            f"closures; expected below {LARGEST_CONDITION:g}: give a pose inside the workspace"
         )
     return Assembly(position, independent, dependent, size_m, condition)
 
 
 def _require_driven(robot: Robot, position: FloatArray, free: FloatArray, size_m: float) -> None:
-    """Refuse motors that do not move every free motion of the joints, shape (n, d), at the assembly pose.
+    """Refuse motors that do not move every free motion of the joints, shape (n, d),
+    at the assembly pose.
 
     Raises:
         ModelError: they do not.
@@ -132,31 +147,35 @@ def _require_driven(robot: Robot, position: FloatArray, free: FloatArray, size_m
     names = ", ".join(robot.joints[joint].name for joint in motors)
     if has_enough and _generic_rank(robot, position, free, size_m) == mobility:
         raise ModelError(
-            f"the robot is singular at the assembly pose: there the motors {names} do not move all of its {mobility} "
-            "degrees of freedom, beside it they do; give an assembly pose inside the workspace"
+            f"the robot is singular at the assembly pose: there the motors {names} do not move all "
+            f"of its {mobility} degrees of freedom, beside it they do; give an assembly pose "
+            "inside the workspace"
         )
     raise ModelError(
-        f"the motors {names} do not move all {mobility} degrees of freedom that the closures leave; name a joint that "
-        "each motor drives, one for each degree of freedom at least (`motors`)"
+        f"the motors {names} do not move all {mobility} degrees of freedom that the closures "
+        "leave; name a joint that each motor drives, one for each degree of freedom at least "
+        "(`motors`)"
     )
 
 
 def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     """Let all joints follow the motors' joints.
 
-    Of the several poses that belong to a position of the motors, it is the one that is reached from the assembly pose
-    by moving them there in a straight line: a function of the position alone, whatever was asked before. Samples
-    between two such poses start from an interpolation, which leads to the same pose.
+    Of the several poses that belong to a position of the motors, it is the one that is reached from
+    the assembly pose by moving them there in a straight line: a function of the position alone,
+    whatever was asked before. Samples between two such poses start from an interpolation, which
+    leads to the same pose.
 
     Args:
         robot: with n joints and m motors.
         assembly: of the robot.
-        axes: motion of the motors' joints, arrays of shape (k, m). A redundantly driven robot (m > d) gets the pose
-            that fits them best.
+        axes: motion of the motors' joints, arrays of shape (k, m). A redundantly driven robot (m >
+            d) gets the pose that fits them best.
 
     Raises:
-        ModelError: the loops cannot be closed at a position, the positions of a redundant drive's motors do not fit
-            each other, or it is close to a singularity, where small errors of position are large forces.
+        ModelError: the loops cannot be closed at a position, the positions of a redundant drive's
+            motors do not fit each other, or it is close to a singularity, where small errors of
+            position are large forces.
     """
     motors = list(robot.axis_joints)
     x = list(assembly.independent)
@@ -164,7 +183,7 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     axes_rad = np.asarray(axes.position_rad, dtype=np.float64)
     samples = len(axes_rad)
     count = robot.joint_count
-    if not robot.closures:
+    if not robot.is_constrained:
         identity = np.broadcast_to(np.eye(count), (samples, count, count))
         return TreeMotion(axes, identity, identity, np.ones(samples))
     position = positions(robot, assembly, axes_rad)
@@ -204,7 +223,8 @@ def _require_regular(robot: Robot, axes_rad: FloatArray, condition: FloatArray, 
     if condition[worst] > LARGEST_CONDITION:
         raise ModelError(
             f"the motion comes close to a singularity at {_at(robot, axes_rad[worst])}: condition "
-            f"{condition[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record moves away from it"
+            f"{condition[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record "
+            "moves away from it"
         )
 
 
@@ -212,10 +232,11 @@ def _require_regular(robot: Robot, axes_rad: FloatArray, condition: FloatArray, 
 class Reach:
     """Poses that belong to positions of the motors' joints, where there are any."""
 
-    position_rad: FloatArray  #: of all joints; where the loops do not close, of some pose near by, shape (k, n)
+    #: of all joints; where the loops do not close, of some pose near by, shape (k, n)
+    position_rad: FloatArray
     gap: FloatArray  #: |φ| that is left, in units of the robot's size or radians, shape (k,)
-    #: Largest difference between a motor's position and that of its joint [rad or m], shape (k,): not zero where motors
-    #: of a redundant drive do not fit each other.
+    #: Largest difference between a motor's position and that of its joint [rad or m], shape (k,):
+    #: not zero where motors of a redundant drive do not fit each other.
     misfit: FloatArray
     condition: FloatArray  #: of J_d by the Frobenius norm, shape (k,)
 
@@ -226,10 +247,12 @@ class Reach:
 
 
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
-    """Positions of all joints [rad or m], shape (k, n), of those of the motors' joints, shape (k, m); see `follow`.
+    """Positions of all joints [rad or m], shape (k, n), of those of the motors' joints, shape (k,
+    m); see `follow`.
 
     Raises:
-        ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not fit each other.
+        ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not
+            fit each other.
     """
     found = reach(robot, assembly, axes_rad)
     units = _units(robot, assembly)
@@ -249,8 +272,9 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
         raise ModelError(
-            f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} of the robot's size "
-            "is left open; expected positions inside the workspace: are signs, zeros and units of the axes right?"
+            f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} "
+            "of the robot's size is left open; expected positions inside the workspace: are signs, "
+            "zeros and units of the axes right?"
         )
     return found.position_rad
 
@@ -280,7 +304,9 @@ def _condition(triangle: FloatArray) -> FloatArray:
 
 
 def _condition_of_motors(robot: Robot, assembly: Assembly, to_motors: FloatArray) -> FloatArray:
-    """Condition of A in each sample, shape (k,): where it is large, motors hardly move some of the coordinates x."""
+    """Condition of A in each sample, shape (k,):
+    where it is large, motors hardly move some of the coordinates x.
+    """
     if robot.axis_count == assembly.mobility:
         return np.ones(len(to_motors))
     units_of_x = _unit_of_each(robot, assembly.independent, assembly.size_m)
@@ -298,9 +324,11 @@ def _at(robot: Robot, axes_rad: FloatArray) -> str:
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
-    """Close the loops at positions of the motors' joints [rad or m], shape (k, m), as far as they close."""
+    """Close the loops at positions of the motors' joints [rad or m], shape (k, m),
+    as far as they close.
+    """
     samples = len(axes_rad)
-    if not robot.closures:
+    if not robot.is_constrained:
         return Reach(
             position_rad=axes_rad,
             gap=np.zeros(samples),
@@ -345,12 +373,17 @@ def _every(stride: int, samples: int) -> IntArray:
 
 
 def _largest_misfit(found_rad: FloatArray, axes_rad: FloatArray) -> FloatArray:
-    """Largest difference of a motor's joint from its measured position in each sample, shape (k,)."""
+    """Largest difference of a motor's joint from its measured position in each sample,
+    shape (k,).
+    """
     return np.asarray(np.max(np.abs(found_rad - axes_rad), axis=1))
 
 
-def reach_near(robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray) -> Reach:
-    """Close the loops from poses near by, as those of the same robot with slightly other lengths or zeros.
+def reach_near(
+    robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray
+) -> Reach:
+    """Close the loops from poses near by, as those of the same robot with slightly other lengths or
+    zeros.
 
     Args:
         robot: whose loops are closed.
@@ -364,9 +397,15 @@ def reach_near(robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad:
 
 
 def _newton(
-    robot: Robot, assembly: Assembly, position: FloatArray, axes_rad: FloatArray, *, on_the_way: bool = False
+    robot: Robot,
+    assembly: Assembly,
+    position: FloatArray,
+    axes_rad: FloatArray,
+    *,
+    on_the_way: bool = False,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Close the loops at given positions of the motors' joints, from near by: positions, gaps and conditions.
+    """Close the loops at given positions of the motors' joints, from near by:
+    positions, gaps and conditions.
 
     ``on_the_way`` to other positions it is enough to stay near the pose.
     """
@@ -383,6 +422,7 @@ def _newton(
     is_redundant = len(motors) > len(x)
     if not is_redundant:
         position[:, motors] = axes_rad
+    position = with_followers(robot, position)
     for _ in range(MAX_ITERATIONS):
         closing = loops(robot, position, assembly.size_m)
         gap = np.max(np.abs(closing.residual), axis=1)
@@ -400,7 +440,8 @@ def _newton(
             change_x = _least_squares(to_joints[:, motors], misfit)
             change += np.einsum("knd,kd->kn", to_joints, change_x)  # G Δx
         step = np.max(np.abs(change), axis=1)
-        is_lost = ~(step < LONGEST_STEP_RAD)  # where there is no pose, Newton's steps become longer and longer
+        # Where there is no pose, Newton's steps become longer and longer
+        is_lost = ~(step < LONGEST_STEP_RAD)
         change[is_lost] = 0.0
         position += change
         is_closed = (gap < largest_gap) & (step < longest_step_rad)
@@ -410,7 +451,9 @@ def _newton(
 
 
 def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray:
-    """Positions between known samples, shape (len(finer), n): cubic polynomials with the slopes of differences."""
+    """Positions between known samples, shape (len(finer), n):
+    cubic polynomials with the slopes of differences.
+    """
     slope = np.gradient(found, coarse, axis=0)
     before = np.searchsorted(coarse, finer, side="right") - 1
     before = np.clip(before, 0, len(coarse) - 2)
@@ -455,13 +498,18 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     closure, gaps = _worst_closure(robot, np.abs(residual))
     values = ", ".join(map(_gap, closure.directions, gaps * size_m, gaps))
     raise ModelError(
-        f"closure {closure.name!r} cannot close at the assembly pose: {values} apart where it is declared; expected a "
-        "pose of all joints at which the frames of every closure nearly coincide (assembly_deg, assembly_mm)"
+        f"closure {closure.name!r} cannot close at the assembly pose: {values} apart where it is "
+        "declared; expected a pose of all joints at which the frames of every closure nearly "
+        "coincide (assembly_deg, assembly_mm)"
     )
 
 
-def _closed_by(robot: Robot, start: FloatArray, size_m: float, moved: list[int]) -> FloatArray | None:
-    """Close the loops by moving some joints less than half a turn; None where Newton's iteration does not."""
+def _closed_by(
+    robot: Robot, start: FloatArray, size_m: float, moved: list[int]
+) -> FloatArray | None:
+    """Close the loops by moving some joints less than half a turn;
+    None where Newton's iteration does not.
+    """
     position = start.copy()
     for _ in range(MAX_ITERATIONS):
         closing = loops(robot, position[None], size_m)
@@ -500,7 +548,9 @@ def _gap(direction: str, length_m: float, angle_rad: float) -> str:
 
 
 def _independent(free: FloatArray) -> tuple[int, ...]:
-    """Joints that move most independently of each other, by pivoted QR of the free motions, shape (n, d)."""
+    """Joints that move most independently of each other, by pivoted QR of the free motions,
+    shape (n, d).
+    """
     remaining = free.copy()
     chosen: list[int] = []
     for _ in range(free.shape[1]):
@@ -544,23 +594,41 @@ def _check(robot: Robot, start: FloatArray) -> None:
         ModelError: of the assembly pose, the motors or a closure.
     """
     if start.shape != (robot.joint_count,):
-        raise ModelError(f"the assembly pose has shape {start.shape}; expected a position of each joint")
+        raise ModelError(
+            f"the assembly pose has shape {start.shape}; expected a position of each joint"
+        )
     if not robot.motors:
-        raise ModelError("a robot with closures needs the list of its motors' joints (`motors`); found none")
+        raise ModelError(
+            "a robot with closures or couplings needs the list of its motors' joints (`motors`); "
+            "found none"
+        )
     driven = sorted(set(robot.motors))
     if len(driven) < len(robot.motors):
         twice = [robot.joints[joint].name for joint in driven if robot.motors.count(joint) > 1]
-        raise ModelError(f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)")
+        raise ModelError(
+            f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)"
+        )
+    for coupling in robot.couplings:
+        if coupling.follower in robot.motors:
+            name = robot.joints[coupling.follower].name
+            leader = robot.joints[coupling.leader].name
+            raise ModelError(
+                f"joint {name!r} follows {leader!r} and has a motor; expected one or the other "
+                "(`motors`)"
+            )
     for joint, position in zip(robot.joints, start, strict=True):
-        # Poses are reached from the assembly pose in small steps, so a turn too many costs time in each of them.
+        # Poses are reached from the assembly pose in small steps, so a turn too many costs time in
+        # each of them.
         if joint.kind is JointKind.REVOLUTE and not abs(position) <= 2.0 * np.pi:
             raise ModelError(
-                f"the assembly pose has {joint.name} at {np.degrees(position):.6g}°; expected -360° to 360° "
-                "(assembly_deg): whole turns change no pose"
+                f"the assembly pose has {joint.name} at {np.degrees(position):.6g}°; expected "
+                "-360° to 360° (assembly_deg): whole turns change no pose"
             )
     for closure in robot.closures:
         if not closure.directions:
-            raise ModelError(f"closure {closure.name!r} holds no direction; expected some of x, y, z, rx, ry, rz")
+            raise ModelError(
+                f"closure {closure.name!r} holds no direction; expected some of x, y, z, rx, ry, rz"
+            )
 
 
 def _size(robot: Robot, position: FloatArray) -> float:

@@ -1,6 +1,9 @@
-"""Equations of loop closures: how far the two frames of each are apart, and the derivatives of that.
+"""Equations of loop closures: how far the two frames of each are apart,
+and the derivatives of that.
 
-A closure says that two frames of the tree coincide in some directions of the first (`ident.model.robot.Closure`).
+A closure says that two frames of the tree coincide in some directions of the first
+(`ident.model.robot.Closure`). A joint that follows another one adds a row, φ = q − multiplier ·
+q_leader − offset (`ident.model.robot.JointCoupling`).
 """
 
 from __future__ import annotations
@@ -18,26 +21,29 @@ _INDEX = {"x": 0, "y": 1, "z": 2}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loops:
-    """φ, J and J̇ q̇ of all closures over k samples."""
+    """φ, J and J̇ q̇ of all closures, then of all couplings, over k samples."""
 
     residual: FloatArray  #: shape (k, c)
     jacobian: FloatArray  #: shape (k, c, n)
     bias: FloatArray  #: shape (k, c); empty without a velocity
 
 
-def loops(robot: Robot, position: FloatArray, size_m: float = 1.0, velocity: FloatArray | None = None) -> Loops:
+def loops(
+    robot: Robot, position: FloatArray, size_m: float = 1.0, velocity: FloatArray | None = None
+) -> Loops:
     """φ, J and J̇ q̇ with lengths divided by the size of the robot.
 
     Args:
-        robot: with closures.
-        position, velocity: of all joints [rad or m, and per s], shape (k, n); without velocities J̇ q̇ is empty.
+        robot: with closures or couplings.
+        position, velocity: of all joints [rad or m, and per s], shape (k, n); without velocities J̇
+            q̇ is empty.
         size_m: that divides lengths.
     """
     samples = len(position)
     placed = poses(robot, position)
     axes_of_joints = np.array([joint.axis for joint in robot.joints])
     axes = (placed.rotation[1:] @ axes_of_joints[:, None, :, None])[..., 0]
-    width = sum(len(closure.directions) for closure in robot.closures)
+    width = sum(len(closure.directions) for closure in robot.closures) + len(robot.couplings)
     residual = np.empty((samples, width))
     jacobian = np.empty((samples, width, robot.joint_count))
     if velocity is None:
@@ -59,12 +65,38 @@ def loops(robot: Robot, position: FloatArray, size_m: float = 1.0, velocity: Flo
             bias[:, first:end] = own.bias
             bias[:, lengths] /= size_m
         first = end
+    for row, coupling in enumerate(robot.couplings, start=first):
+        follower = coupling.follower
+        leader = coupling.leader
+        unit = size_m
+        if robot.joints[follower].kind is JointKind.REVOLUTE:
+            unit = 1.0
+        followed = coupling.multiplier * position[:, leader] + coupling.offset
+        residual[:, row] = (position[:, follower] - followed) / unit
+        jacobian[:, row] = 0.0
+        jacobian[:, row, follower] = 1.0 / unit
+        jacobian[:, row, leader] = -coupling.multiplier / unit
+        if moved is not None:
+            bias[:, row] = 0.0
     return Loops(residual, jacobian, bias)
+
+
+def with_followers(robot: Robot, position: FloatArray) -> FloatArray:
+    """Positions of all joints [rad or m], shape (…, n),
+    with each follower where its leader puts it.
+    """
+    out = position.copy()
+    for coupling in robot.couplings:
+        leader_position = position[..., coupling.leader]
+        out[..., coupling.follower] = coupling.multiplier * leader_position + coupling.offset
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Spin:
-    """Motion of every link with all joint accelerations zero; arrays of shape (n + 1, k, 3), in the base frame."""
+    """Motion of every link with all joint accelerations zero;
+    arrays of shape (n + 1, k, 3), in the base frame.
+    """
 
     angular: FloatArray  #: ω
     linear: FloatArray  #: velocity of the frame's origin
@@ -72,7 +104,9 @@ class _Spin:
     linear_bias: FloatArray  #: its origin's acceleration
 
 
-def _spin(robot: Robot, placed: Poses, axes: FloatArray, position: FloatArray, velocity: FloatArray) -> _Spin:
+def _spin(
+    robot: Robot, placed: Poses, axes: FloatArray, position: FloatArray, velocity: FloatArray
+) -> _Spin:
     """Motion of every link, from the base outwards."""
     shape = (robot.joint_count + 1, len(position), 3)
     w = np.zeros(shape)
@@ -102,7 +136,9 @@ _LAST = np.array([2, 0, 1])  #: Component before each one
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of vectors, shape (…, 3); without the checks of numpy's, which take longer than the products."""
+    """Cross products of vectors, shape (…, 3);
+    without the checks of numpy's, which take longer than the products.
+    """
     positive = a[..., _NEXT] * b[..., _LAST]
     negative = a[..., _LAST] * b[..., _NEXT]
     return np.asarray(positive - negative)
@@ -114,8 +150,12 @@ def origin(placed: Poses, place: Place) -> FloatArray:
     return np.asarray(placed.origin_m[at] + placed.rotation[at] @ place.translation_m)
 
 
-def _columns(robot: Robot, placed: Poses, axes: FloatArray, place: Place) -> tuple[FloatArray, FloatArray]:
-    """Velocity of a frame's origin, and its angular velocity, per unit of each joint's: shapes (n, k, 3)."""
+def _columns(
+    robot: Robot, placed: Poses, axes: FloatArray, place: Place
+) -> tuple[FloatArray, FloatArray]:
+    """Velocity of a frame's origin, and its angular velocity, per unit of each joint's:
+    shapes (n, k, 3).
+    """
     linear = np.zeros_like(axes)
     angular = np.zeros_like(axes)
     revolute: list[int] = []
@@ -132,13 +172,16 @@ def _columns(robot: Robot, placed: Poses, axes: FloatArray, place: Place) -> tup
     return linear, angular
 
 
-def _closure(robot: Robot, closure: Closure, placed: Poses, axes: FloatArray, moved: _Spin | None) -> Loops:
+def _closure(
+    robot: Robot, closure: Closure, placed: Poses, axes: FloatArray, moved: _Spin | None
+) -> Loops:
     """φ, J and J̇ q̇ of one closure, in m and rad.
 
-    Lengths are Rᵀ(p₂ − p₁) in the first frame. Angles are entries of E = R₁ᵀR₂ that are zero where the frames are
-    parallel and that change by the angle: the second frame's axis b along the first one's c, for a turn about a, with
-    (a, b, c) cyclic. Where the frames may turn about one axis, it is that axis of the second frame that must be
-    parallel to the first one's: this holds at every angle.
+    Lengths are Rᵀ(p₂ − p₁) in the first frame. Angles are entries of E = R₁ᵀR₂ that are zero where
+    the frames are parallel and that change by the angle: the second frame's axis b along the first
+    one's c, for a turn about a, with (a, b, c) cyclic. Where the frames may turn about one axis, it
+    is that axis of the second frame that must be parallel to the first one's: this holds at every
+    angle.
     """
     first = closure.first
     second = closure.second
@@ -197,7 +240,9 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatArray) -> FloatArray:
-    """Acceleration of p₂ − p₁ as the first frame sees it, with all joint accelerations zero, shape (k, 3)."""
+    """Acceleration of p₂ − p₁ as the first frame sees it, with all joint accelerations zero,
+    shape (k, 3).
+    """
     v1, dv1 = _place_motion(moved, placed, closure.first)
     v2, dv2 = _place_motion(moved, placed, closure.second)
     at = closure.first.joint + 1
@@ -208,8 +253,12 @@ def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatA
     return dv2 - dv1 - _cross(dw1, gap) - coriolis + centripetal
 
 
-def _relative_turn(moved: _Spin, closure: Closure, to_frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angular velocity of the second frame in the first one, and its rate with all joint accelerations zero."""
+def _relative_turn(
+    moved: _Spin, closure: Closure, to_frame: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angular velocity of the second frame in the first one,
+    and its rate with all joint accelerations zero.
+    """
     first = closure.first.joint + 1
     second = closure.second.joint + 1
     w1 = moved.angular[first]

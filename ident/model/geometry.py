@@ -1,9 +1,11 @@
-"""What a description may have wrong of a closed chain: zeros of driven joints, lengths of links, places on the base.
+"""What a description may have wrong of a closed chain:
+zeros of driven joints, lengths of links, places on the base.
 
-A parameter is a number that the description gives; its change is what has to be added to that number. The zero of a
-joint is added to all of its recorded positions (`zero_offset_deg` of the cell file). A length is the distance from
-the origin of a link's joint to the next joint, or to the frame that closes a loop, along the described direction. A
-place is a coordinate of a joint's origin on the base.
+A parameter is a number that the description gives; its change is what has to be added to that
+number. The zero of a joint is added to all of its recorded positions (`zero_offset_deg` of the cell
+file). A length is the distance from the origin of a link's joint to the next joint, or to the frame
+that closes a loop, along the described direction. A place is a coordinate of a joint's origin on
+the base.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from ident.errors import ModelError
 from ident.model.robot import Closure, Joint, JointKind, Place, Robot, skew
 
 DIRECTIONS = ("x", "y", "z")  #: Axes of the base
-SHORTEST_LENGTH_M = 1e-6  #: Origins that are closer to each other have no direction along which to be wrong
+#: Origins that are closer to each other have no direction along which to be wrong
+SHORTEST_LENGTH_M = 1e-6
 
 
 class GeometryKind(Enum):
@@ -28,7 +31,8 @@ class GeometryKind(Enum):
     ZERO = "zero"  #: of a driven joint [rad; m of a prismatic joint]
     LENGTH = "length"  #: of a link, between two points of it [m]
     PLACE = "place"  #: coordinate of a joint on the base, in the axes of the base [m]
-    DELAY = "delay"  #: of a joint's encoder behind the others [s], which is no number of the description
+    #: of a joint's encoder behind the others [s], which is no number of the description
+    DELAY = "delay"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +40,11 @@ class GeometryParameter:
     """One number of a robot's description."""
 
     kind: GeometryKind
-    joint: str  #: name of the joint: the one with the zero, on the base, or late, or the one that moves the link
-    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x, y or z.
+    #: name of the joint: the one with the zero, on the base, or late, or the one that moves the
+    #: link
+    joint: str
+    #: Of a length: name of the joint or of the closure at the other end of the link; of a place: x,
+    #: y or z.
     end: str = ""
 
     @property
@@ -63,7 +70,8 @@ class GeometryChange:
 
 
 def geometry_parameters(robot: Robot) -> tuple[GeometryParameter, ...]:
-    """Return the zeros of all driven joints, in the order of the axes, then the lengths of all moving links.
+    """Return the zeros of all driven joints, in the order of the axes,
+    then the lengths of all moving links.
 
     Of a length of zero there is no direction, and the places of joints on the base are no lengths.
     """
@@ -76,12 +84,16 @@ def base_places(robot: Robot) -> tuple[GeometryParameter, ...]:
     places: list[GeometryParameter] = []
     for joint in robot.joints:
         if joint.parent < 0:
-            places += [GeometryParameter(GeometryKind.PLACE, joint.name, axis) for axis in DIRECTIONS]
+            places += [
+                GeometryParameter(GeometryKind.PLACE, joint.name, axis) for axis in DIRECTIONS
+            ]
     return tuple(places)
 
 
 def encoder_delays(robot: Robot) -> tuple[GeometryParameter, ...]:
-    """Return the delays of the encoders, in the order of the axes; `with_geometry` knows none of them."""
+    """Return the delays of the encoders, in the order of the axes;
+    `with_geometry` knows none of them.
+    """
     return tuple(GeometryParameter(GeometryKind.DELAY, joint.name) for joint in robot.axes)
 
 
@@ -236,7 +248,9 @@ def _is_end(robot: Robot, parameter: GeometryParameter, link: int, end: str) -> 
     return name == parameter.joint and end == parameter.end
 
 
-def _moved_closure(robot: Robot, parameter: GeometryParameter, closure: Closure, change_m: float) -> Closure:
+def _moved_closure(
+    robot: Robot, parameter: GeometryParameter, closure: Closure, change_m: float
+) -> Closure:
     """A closure whose frames move with a length."""
     ends: list[Place] = []
     for place in (closure.first, closure.second):

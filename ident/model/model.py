@@ -1,9 +1,11 @@
-"""The declared model: rigid links, rotors, friction and offsets, each a column (paper eqs. 1 and 25).
+"""The declared model: rigid links, rotors, friction and offsets, each a column (paper eqs.
+1 and 25).
 
-The torques τ of the m axes need d equations of virtual power, Aᵀ τ = Gᵀ W χ, with W of the tree of all joints and G, A
-of `ident.model.closed_chain`. A serial robot has G = A = I. With as many motors as degrees of freedom A is the identity
-too, and each axis has an equation of its own. With more motors than that, the part of τ in the null space of Aᵀ, the
-internal preload, moves nothing and is in no equation: the columns are then those of the least τ without it,
+The torques τ of the m axes need d equations of virtual power, Aᵀ τ = Gᵀ W χ, with W of the tree of
+all joints and G, A of `ident.model.closed_chain`. A serial robot has G = A = I. With as many motors
+as degrees of freedom A is the identity too, and each axis has an equation of its own. With more
+motors than that, the part of τ in the null space of Aᵀ, the internal preload, moves nothing and is
+in no equation: the columns are then those of the least τ without it,
 
     τ = B Gᵀ W χ,    B = A (AᵀA)⁻¹,    Aᵀ B = I.
 """
@@ -26,21 +28,31 @@ from ident.model.pivots import pivot_motion, pivot_rates
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
 from ident.model.robot import JointKind, Motion, Robot
 
-DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
+DRIVE_UNITS = {
+    JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"),
+    JointKind.PRISMATIC: ("N", "m/s", "kg"),
+}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
 REMEMBERED_BYTES = 2**28
-"""Largest size of the motions of closed chains that a model stores: a fit needs those of the same few runs again."""
+"""Largest size of the motions of closed chains that a model stores:
+a fit needs those of the same few runs again.
+"""
 LARGEST_CONDITION = 1e8  #: Of a drive train that is invertible
-JOINT_COLUMNS = 14  #: Standard parameters of a joint: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off
-ROTOR_INERTIA, VISCOUS_FRICTION, DRY_FRICTION, OFFSET = range(10, JOINT_COLUMNS)  #: Ia, fv, fs, off among them
+#: Standard parameters of a joint: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off
+JOINT_COLUMNS = 14
+#: Ia, fv, fs, off among them
+ROTOR_INERTIA, VISCOUS_FRICTION, DRY_FRICTION, OFFSET = range(10, JOINT_COLUMNS)
 COUPLED_COLUMNS = 3  #: Parameters of a motor that turns with several joints: Iam, fvm, fsm
 
 
 @dataclass(frozen=True, slots=True)
 class DriveTrain:
-    """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24)."""
+    """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq.
+    24).
+    """
 
-    ratio: FloatArray  #: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do
+    #: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do
+    ratio: FloatArray
 
     if TYPE_CHECKING:  # whatever becomes an array
 
@@ -54,14 +66,20 @@ class DriveTrain:
             remedy = ""
             if ratio.ndim == 1:
                 remedy = "; write np.diag(gear_ratios)"
-            raise ModelError(f"the drive train must be a square matrix, found shape {ratio.shape}{remedy}")
+            raise ModelError(
+                f"the drive train must be a square matrix, found shape {ratio.shape}{remedy}"
+            )
         condition = float(np.linalg.cond(ratio))
         if not condition <= LARGEST_CONDITION:
-            raise ModelError(f"the drive train is not invertible (condition {condition:.3g}): {ratio.tolist()}")
+            raise ModelError(
+                f"the drive train is not invertible (condition {condition:.3g}): {ratio.tolist()}"
+            )
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """The joint that each motor belongs to: its own, or that of its largest ratio where it does not drive that."""
+        """The joint that each motor belongs to:
+        its own, or that of its largest ratio where it does not drive that.
+        """
         joints: list[int] = []
         for motor, row in enumerate(self.ratio):
             joint = motor
@@ -79,18 +97,24 @@ class DriveTrain:
 
     @property
     def direction(self) -> FloatArray:
-        """Rows r_i = R_i / N_i, shape (n, n): τ_joint = Σ_i r_iᵀ g_i v_i with the joint drive gains g_i."""
+        """Rows r_i = R_i / N_i, shape (n, n):
+        τ_joint = Σ_i r_iᵀ g_i v_i with the joint drive gains g_i.
+        """
         return self.ratio / self.reduction[:, None]
 
     @property
     def to_motor(self) -> FloatArray:
-        """T with g_i v_i = (T τ_joint)_i, the inverse of the transposed directions, shape (n, n)."""
+        """T with g_i v_i = (T τ_joint)_i, the inverse of the transposed directions, shape (n,
+        n).
+        """
         inverse = np.linalg.inv(self.direction.T)
         return np.asarray(inverse, dtype=np.float64)
 
     @property
     def coupled(self) -> tuple[int, ...]:
-        """Motors that turn with more than one joint: their rotor inertia and friction need further columns."""
+        """Motors that turn with more than one joint:
+        their rotor inertia and friction need further columns.
+        """
         joint_counts = np.count_nonzero(self.ratio, axis=1)
         motors = np.flatnonzero(joint_counts > 1)
         return tuple(motors.tolist())
@@ -98,7 +122,9 @@ class DriveTrain:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One parameter, with the values that physics allows it: a spring may have either sign, a compliance not."""
+    """One parameter, with the values that physics allows it:
+    a spring may have either sign, a compliance not.
+    """
 
     name: str  #: of the parameter
     unit: str  #: of its value
@@ -121,26 +147,34 @@ class Column:
 class Model:
     """A robot and its drive train, with the standard parameters χ_st in the paper's order.
 
-    A joint has fourteen: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off; of a joint without a motor the last
-    four are zero columns. A motor that turns with several joints adds three (eq. 25): Iam, fvm, fsm. Its rotor inertia
-    and viscous friction act on the joints through r rᵀ; the diagonal of that is already in Ia and fv, so Iam and fvm
-    carry the off-diagonal part, as in the paper.
+    A joint has fourteen: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off; of a joint
+    without a motor the last four are zero columns. A motor that turns with several joints adds
+    three (eq. 25): Iam, fvm, fsm. Its rotor inertia and viscous friction act on the joints through
+    r rᵀ; the diagonal of that is already in Ia and fv, so Iam and fvm carry the off-diagonal part,
+    as in the paper.
 
-    Friction is not the same in all runs: it falls while the arm warms up, and changes with the torque on the gears.
-    Where the runs without load come first, the change looks like other gains. With `friction_by_payload`, each friction
-    parameter has one more at the end, NAME_loaded: what is added to it while a payload is mounted. The paper has none.
+    Friction is not the same in all runs: it falls while the arm warms up, and changes with the
+    torque on the gears. Where the runs without load come first, the change looks like other gains.
+    With `friction_by_payload`, each friction parameter has one more at the end, NAME_loaded: what
+    is added to it while a payload is mounted. The paper has none.
     """
 
     robot: Robot
     drive_train: DriveTrain  #: between motors and the joints of the axes
-    friction_by_payload: bool = False  #: whether friction with a payload is another one than without
-    assembly: Assembly = field(init=False, compare=False, repr=False)  #: which joints are free, and how the loops close
+    #: whether friction with a payload is another one than without
+    friction_by_payload: bool = False
+    #: which joints are free, and how the loops close
+    assembly: Assembly = field(init=False, compare=False, repr=False)
     #: Followed motions by the digest of what was asked, the last one first.
-    _followed: tuple[tuple[bytes, TreeMotion], ...] = field(default=(), init=False, compare=False, repr=False)
+    _followed: tuple[tuple[bytes, TreeMotion], ...] = field(
+        default=(), init=False, compare=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         require_kind("robot", self.robot, Robot, "read it from a URDF: robot_from_urdf(urdf_text)")
-        require_kind("drive_train", self.drive_train, DriveTrain, "write DriveTrain(np.diag(gear_ratios))")
+        require_kind(
+            "drive_train", self.drive_train, DriveTrain, "write DriveTrain(np.diag(gear_ratios))"
+        )
         ratio = self.drive_train.ratio
         axes = self.robot.axis_count
         if len(ratio) != axes:
@@ -152,13 +186,15 @@ class Model:
         off_diagonal = ratio - np.diag(np.diag(ratio))
         if self.is_redundant and off_diagonal.any():
             raise ModelError(
-                "the robot has more motors than degrees of freedom, and motors that turn with the joint of another; "
-                "expected a diagonal drive train there"
+                "the robot has more motors than degrees of freedom, and motors that turn with the "
+                "joint of another; expected a diagonal drive train there"
             )
 
     @property
     def is_redundant(self) -> bool:
-        """Whether there are more motors than degrees of freedom, so that they can work against each other."""
+        """Whether there are more motors than degrees of freedom,
+        so that they can work against each other.
+        """
         return self.robot.axis_count > self.assembly.mobility
 
     @property
@@ -216,21 +252,27 @@ class Model:
 
     @property
     def _coupled_columns(self) -> IntArray:
-        """First column of each motor that turns with several joints, shape (coupled,): Iam, then fvm and fsm."""
+        """First column of each motor that turns with several joints, shape (coupled,):
+        Iam, then fvm and fsm.
+        """
         first = JOINT_COLUMNS * self.robot.joint_count
         count = len(self.drive_train.coupled)
         return first + COUPLED_COLUMNS * np.arange(count)
 
     @property
     def friction_columns(self) -> IntArray:
-        """Columns of fv and fs of each axis, and of fvm and fsm of each motor that turns with several joints."""
+        """Columns of fv and fs of each axis, and of fvm and fsm of each motor that turns with
+        several joints.
+        """
         of_axes = self._axis_columns[:, None] + np.array([VISCOUS_FRICTION, DRY_FRICTION])
         of_coupled = self._coupled_columns[:, None] + np.array([1, 2])
         return np.concatenate((of_axes.ravel(), of_coupled.ravel()))
 
     @property
     def loaded_friction_columns(self) -> IntArray:
-        """Columns of what a payload adds to the friction parameters, in the order of `friction_columns`; or empty."""
+        """Columns of what a payload adds to the friction parameters,
+        in the order of `friction_columns`; or empty.
+        """
         coupled = len(self.drive_train.coupled)
         declared = JOINT_COLUMNS * self.robot.joint_count + COUPLED_COLUMNS * coupled
         count = 0
@@ -246,7 +288,9 @@ class Model:
 
     @property
     def support(self) -> BoolArray:
-        """Mask of the standard parameters that load each axis, shape (m, c); all else in the regressor is zero."""
+        """Mask of the standard parameters that load each axis, shape (m, c);
+        all else in the regressor is zero.
+        """
         out = np.zeros((self.robot.axis_count, len(self.columns)), dtype=np.bool_)
         for axis, first in enumerate(self._axis_columns.tolist()):
             drive = slice(first + ROTOR_INERTIA, first + JOINT_COLUMNS)
@@ -256,7 +300,7 @@ class Model:
         for link in range(self.robot.joint_count):
             first = JOINT_COLUMNS * link
             own = slice(first, first + len(LINK_PARAMETERS))
-            if self.robot.closures:
+            if self.robot.is_constrained:
                 out[:, own] = True
                 continue
             joint = link
@@ -264,7 +308,9 @@ class Model:
                 out[joint, own] = True
                 joint = self.robot.joints[joint].parent
         direction = self.drive_train.direction
-        for motor, first in zip(self.drive_train.coupled, self._coupled_columns.tolist(), strict=True):
+        for motor, first in zip(
+            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
+        ):
             is_turned = direction[motor] != 0.0
             out[:, first : first + COUPLED_COLUMNS] = is_turned[:, None]
         if self.friction_by_payload:
@@ -276,7 +322,8 @@ class Model:
 
         Args:
             motion: of the m axes over k samples.
-            loaded: whether a payload is mounted. Its inertia has the columns of the link that carries it.
+            loaded: whether a payload is mounted. Its inertia has the columns of the link that
+                carries it.
 
         Returns:
             shape (m, c, k) [Nm or N per unit], time last.
@@ -284,7 +331,7 @@ class Model:
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             position, velocity, acceleration = self._joint_first(motion)
             return self._tree_regressor(position, velocity, acceleration, loaded=loaded)
         columns, to_motors = self.balance(motion, loaded=loaded)
@@ -320,7 +367,7 @@ class Model:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         states = self._joint_first(motion)
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             return follow(self.robot, self.assembly, motion)
         content = b"".join(state.tobytes() for state in states)
         digest = blake2b(content).digest()
@@ -330,7 +377,8 @@ class Model:
             found = follow(self.robot, self.assembly, motion)
             for array in _arrays(found):
                 array.flags.writeable = False
-        # Replaced at once: of two threads, one may lose what the other has added, but neither finds half of it.
+        # Replaced at once: of two threads, one may lose what the other has added, but neither finds
+        # half of it.
         newest = _newest([(digest, found), *stored.items()])
         object.__setattr__(self, "_followed", newest)
         return found
@@ -338,13 +386,17 @@ class Model:
     def _tree_regressor(
         self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, *, loaded: bool
     ) -> FloatArray:
-        """Torque at each joint of the tree per unit of every standard parameter, shape (n, c, k)."""
+        """Torque at each joint of the tree per unit of every standard parameter, shape (n, c,
+        k).
+        """
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
         of_joints = out[:, : JOINT_COLUMNS * count]
         by_link = of_joints.reshape(count, count, JOINT_COLUMNS, samples)
-        fill_rigid(self.robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)])
+        fill_rigid(
+            self.robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)]
+        )
         axes = list(self.robot.axis_joints)
         for joint in axes:
             own = by_link[joint, joint]
@@ -354,7 +406,9 @@ class Model:
             own[OFFSET] = 1.0
         direction = self.drive_train.direction
         motor_speed = direction @ velocity[axes]
-        for motor, first in zip(self.drive_train.coupled, self._coupled_columns.tolist(), strict=True):
+        for motor, first in zip(
+            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
+        ):
             r = direction[motor]
             cross = _off_diagonal(r)
             out[axes, first] = cross @ acceleration[axes]
@@ -379,8 +433,11 @@ class Model:
             loaded[self.friction_columns] += standard[self.loaded_friction_columns]
         return loaded
 
-    def torques(self, motion: Motion, standard: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Torque of links and payload at each axis, the same with friction of the axes, and all [Nm or N], each (m, k).
+    def torques(
+        self, motion: Motion, standard: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Torque of links and payload at each axis, the same with friction of the axes,
+        and all [Nm or N], each (m, k).
 
         Those of a redundant drive are without preload.
 
@@ -394,7 +451,7 @@ class Model:
         position, velocity, acceleration = self._joint_first(motion)
         links = standard[self.link_columns]
         followed = None
-        if self.robot.closures:
+        if self.robot.is_constrained:
             followed = self.follow(motion)
             joints = self._first(followed.joints)
             tree_load = rigid_torque(self.robot, joints[0], joints[1], joints[2], links)
@@ -408,7 +465,9 @@ class Model:
         geared = load + viscous * velocity + dry * np.sign(velocity)
         total = geared + rotor * acceleration + offset
         direction = self.drive_train.direction
-        for motor, first in zip(self.drive_train.coupled, self._coupled_columns.tolist(), strict=True):
+        for motor, first in zip(
+            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
+        ):
             inertia, viscous, dry = standard[first : first + COUPLED_COLUMNS]
             r = direction[motor]
             smooth = _off_diagonal(r) @ (inertia * acceleration + viscous * velocity)
@@ -420,7 +479,8 @@ class Model:
         return load, geared, total
 
     def inertia(self, position_rad: FloatArray, standard: FloatArray) -> FloatArray:
-        """Mass matrix of links and payload: torque at axis i per unit of acceleration of axis j, shape (m, m, k).
+        """Mass matrix of links and payload: torque at axis i per unit of acceleration of axis j,
+        shape (m, m, k).
 
         Args:
             position_rad: of the axes [rad or m], shape (k, m).
@@ -430,7 +490,7 @@ class Model:
             ModelError: the loops cannot be closed.
         """
         links = standard[self.link_columns]
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             position = np.ascontiguousarray(position_rad.T)
             return mass_matrix(self.robot, position, links)
         still = np.zeros_like(position_rad)
@@ -444,9 +504,12 @@ class Model:
         return self.at_axes(followed, per_axis)
 
     def leverage(self, followed: TreeMotion) -> FloatArray:
-        """Torque at each axis per unit of torque on each place without a motor (`Robot.places`), shape (u, m, k)."""
+        """Torque at each axis per unit of torque on each place without a motor (`Robot.places`),
+        shape (u, m, k).
+        """
         samples = len(followed.to_joints)
-        unit = np.eye(self.robot.joint_count)[:, list(self.robot.passive_joints)]
+        undriven = list(self.robot.place_joints[self.robot.axis_count :])
+        unit = np.eye(self.robot.joint_count)[:, undriven]
         of_joints = np.repeat(unit[:, :, None], samples, axis=2)
         rates = pivot_rates(self.robot, followed.joints.position_rad)
         of_pivots = np.transpose(rates, (2, 1, 0))
@@ -455,8 +518,10 @@ class Model:
         return np.ascontiguousarray(np.swapaxes(of_axes, 0, 1))
 
     def at_places(self, followed: TreeMotion) -> Motion:
-        """Motion of all places (`Robot.places`) from that of the joints, arrays of shape (k, places)."""
-        joints = [*self.robot.axis_joints, *self.robot.passive_joints]
+        """Motion of all places (`Robot.places`) from that of the joints, arrays of shape (k,
+        places).
+        """
+        joints = list(self.robot.place_joints)
         tree = followed.joints
         pivots = pivot_motion(self.robot, self.assembly, tree)
 
@@ -470,7 +535,9 @@ class Model:
         )
 
     def at_axes(self, followed: TreeMotion, torque: FloatArray) -> FloatArray:
-        """Torques of all joints as torques of the axes, B Gᵀ τ [Nm or N], shapes (n, …, k) and (m, …, k)."""
+        """Torques of all joints as torques of the axes, B Gᵀ τ [Nm or N], shapes (n, …, k) and (m,
+        …, k).
+        """
         # Gᵀ τ: Σ_n G_knd τ_nk of each coordinate d and sample k
         projected = np.einsum("knd,n...k->d...k", followed.to_joints, torque)
         if not self.is_redundant:
@@ -479,7 +546,9 @@ class Model:
         return spread(projected, to_motors)
 
     def _joint_first(self, motion: Motion) -> list[FloatArray]:
-        """Positions, velocities and accelerations of the axes, shape (m, k) each, once their shapes are checked."""
+        """Positions, velocities and accelerations of the axes, shape (m, k) each,
+        once their shapes are checked.
+        """
         count = self.robot.axis_count
         shapes = [np.shape(state) for state in _states(motion)]
         expected = (*shapes[0][:1], count)
@@ -521,7 +590,9 @@ def _newest(motions: Sequence[tuple[bytes, TreeMotion]]) -> tuple[tuple[bytes, T
 
 
 def _off_diagonal(direction: FloatArray) -> FloatArray:
-    """r rᵀ without its diagonal, shape (m, m): how a motor's rotor couples the joints that it turns with."""
+    """r rᵀ without its diagonal, shape (m, m):
+    how a motor's rotor couples the joints that it turns with.
+    """
     return np.outer(direction, direction) - np.diag(direction**2)
 
 

@@ -1,16 +1,19 @@
-"""Pivots that a closed chain is cut at: joints without a motor that the tree of joints does not have.
+"""Pivots that a closed chain is cut at:
+joints without a motor that the tree of joints does not have.
 
-A loop is cut at one of its joints, and closed again by equations (`ident.model.robot.Closure`). Where the two frames of
-a closure can only turn about one axis a of the first of them, the cut joint is a pivot. With the angular velocities of
-the two links, its speed and its power are
+A loop is cut at one of its joints, and closed again by equations (`ident.model.robot.Closure`).
+Where the two frames of a closure can only turn about one axis a of the first of them, the cut joint
+is a pivot. With the angular velocities of the two links, its speed and its power are
 
     ψ̇ = a · (ω₂ − ω₁) = J_ψ q̇,    τ_ψ ψ̇ = (J_ψᵀ τ_ψ)ᵀ q̇,
 
-so that a torque τ_ψ in the pivot acts as J_ψᵀ τ_ψ on the joints of the tree (virtual power, as for a passive joint in
-Briot & Gautier, Multibody System Dynamics 2015). Both links turn about parallel axes on their way to the pivot, or the
-closure holds the other two angles; then a · (ω₂ − ω₁) counts every revolute joint of the loop.
+so that a torque τ_ψ in the pivot acts as J_ψᵀ τ_ψ on the joints of the tree (virtual power, as for
+a passive joint in Briot & Gautier, Multibody System Dynamics 2015). Both links turn about parallel
+axes on their way to the pivot, or the closure holds the other two angles; then a · (ω₂ − ω₁) counts
+every revolute joint of the loop.
 
-A ball joint turns about three axes at once and has no such angle: it is no pivot here, and friction in it has no name.
+A ball joint turns about three axes at once and has no such angle: it is no pivot here, and friction
+in it has no name.
 """
 
 from __future__ import annotations
@@ -25,23 +28,26 @@ from ident.model.closed_chain import CLOSED, MAX_ITERATIONS, Assembly, assemble,
 from ident.model.closures import loops
 from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, poses
 
-ALIKE = 1e-7  #: Difference of two joints' speeds, relative to the largest, below which they turn alike
+#: Difference of two joints' speeds, relative to the largest, below which they turn alike
+ALIKE = 1e-7
 PARALLEL = 1e-6  #: Sine of the angle between two axes that count as parallel
 AWAY = (0.0, 0.06, -0.09)
 """Lengths of the motions from the assembly pose after which speeds are compared [rad or m]."""
 
 
 def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
-    """Find the pivots that loops are cut at, and in which friction differs from that of every joint of the tree.
+    """Find the pivots that loops are cut at, and in which friction differs from that of every joint
+    of the tree.
 
-    In a parallelogram, opposite joints turn alike at every pose; friction in one of them is friction in the other for
-    the motors. Such a pivot is left out, so that an effect has one name.
+    In a parallelogram, opposite joints turn alike at every pose; friction in one of them is
+    friction in the other for the motors. Such a pivot is left out, so that an effect has one name.
 
     Args:
         robot: with closures.
 
     Returns:
-        one a closure at most, in their order; none where the closures cannot be closed (`assemble` says why).
+        one a closure at most, in their order; none where the closures cannot be closed (`assemble`
+        says why).
     """
     candidates = [_pivot_of(robot, index) for index in range(len(robot.closures))]
     turning = tuple(pivot for pivot in candidates if pivot is not None)
@@ -99,8 +105,9 @@ def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
 def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
     """Motion of the p pivots from that of all n joints, arrays of shape (k, p).
 
-    An angle is zero where the two frames of the closure are parallel. It is the one within half a turn of the angle at
-    the assembly pose. The relative angular acceleration is that of joints about axes that the links before them turn,
+    An angle is zero where the two frames of the closure are parallel. It is the one within half a
+    turn of the angle at the assembly pose. The relative angular acceleration is that of joints
+    about axes that the links before them turn,
 
         ψ̈ = J_ψ q̈ + a · Σ ± ω_parent × (a_j q̇_j).
 
@@ -135,7 +142,9 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
 
 
 def _pivot_of(robot: Robot, index: int) -> Pivot | None:
-    """Return the pivot that a closure is of; None of one that turns about no axis or about several."""
+    """Return the pivot that a closure is of;
+    None of one that turns about no axis or about several.
+    """
     closure = robot.closures[index]
     lengths = [axis for axis, name in enumerate("xyz") if name in closure.directions]
     free = [axis for axis, name in enumerate("xyz") if f"r{name}" not in closure.directions]
@@ -151,7 +160,9 @@ def _pivot_of(robot: Robot, index: int) -> Pivot | None:
 
 
 def _is_planar(robot: Robot, pivot: Pivot) -> bool:
-    """Whether every revolute joint of the loop turns about the pivot's axis: it then does so at every position."""
+    """Whether every revolute joint of the loop turns about the pivot's axis:
+    it then does so at every position.
+    """
     placed = poses(robot, np.zeros((1, robot.joint_count)))
     about = _axis(robot, placed, pivot)
     loop = _loop(robot, robot.closures[pivot.closure])
@@ -163,7 +174,9 @@ def _is_planar(robot: Robot, pivot: Pivot) -> bool:
 
 
 def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
-    """Revolute joints of a loop: 1 where one turns the second frame, −1 where it turns the first."""
+    """Revolute joints of a loop: 1 where one turns the second frame,
+    −1 where it turns the first.
+    """
     signs: dict[int, float] = {}
     for place, sign in ((closure.second, 1.0), (closure.first, -1.0)):
         joint = place.joint
@@ -210,7 +223,9 @@ def _angular_velocities(robot: Robot, placed: Poses, velocity_rad_s: FloatArray)
 
 
 def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:
-    """Speeds of all joints and pivots in free motions at and near the assembly pose, shape (motions, n + p)."""
+    """Speeds of all joints and pivots in free motions at and near the assembly pose,
+    shape (motions, n + p).
+    """
     draw = np.random.default_rng(0)
     assembled = loops(robot, assembly.position_rad[None], assembly.size_m)
     free = null_space(assembled.jacobian[0])

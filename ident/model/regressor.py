@@ -1,20 +1,21 @@
 """Joint torques as a linear function of the links' inertial parameters, for many samples at once.
 
-Motions are screws (w, u): angular part, and linear part at the origin of the frame in which they are written. Three
-kinds of them go from link to link by the same matrices, and therefore in one product: the velocity V = (ω, v), the
-acceleration A = (α, a′) and the screw S_j of every joint j that moves the link,
+Motions are screws (w, u): angular part, and linear part at the origin of the frame in which they
+are written. Three kinds of them go from link to link by the same matrices, and therefore in one
+product: the velocity V = (ω, v), the acceleration A = (α, a′) and the screw S_j of every joint j
+that moves the link,
 
-    V_i = X V + S q̇,        A_i = X A + S q̈ + V × S q̇,        S_j,i = X S_j,        X = Σ_f f(q) X_f,
+    V_i = X V + S q̇,    A_i = X A + S q̈ + V × S q̇,    S_j,i = X S_j,    X = Σ_f f(q) X_f,
 
-with constant 6 × 6 matrices X_f and f of (1, cos q, sin q) for a revolute joint, (1, q) for a prismatic one. Gravity is
-a base acceleration of −g. With a = a′ + ω × v, the acceleration of the link frame's origin, Newton-Euler gives the
-wrench there,
+with constant 6 × 6 matrices X_f and f of (1, cos q, sin q) for a revolute joint, (1, q) for a
+prismatic one. Gravity is a base acceleration of −g. With a = a′ + ω × v, the acceleration of the
+link frame's origin, Newton-Euler gives the wrench there,
 
     n = I α + ω × (I ω) + h × a,        f = m a + α × h + ω × (ω × h),        h = m c,
 
-linear in (I, h, m): a 6 × 10 matrix Y. The torque of joint j is the power of the wrench over its screw, S_jᵀ Y (paper
-eqs. 1-2, IDM_st without drive chain). Only what joint j moves is ever computed; every operation is a plain product of
-arrays that are contiguous in time.
+linear in (I, h, m): a 6 × 10 matrix Y. The torque of joint j is the power of the wrench over its
+screw, S_jᵀ Y (paper eqs. 1-2, IDM_st without drive chain). Only what joint j moves is ever
+computed; every operation is a plain product of arrays that are contiguous in time.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray
 from ident.model.robot import Joint, JointKind, Robot, skew
 
-BLOCK_SAMPLES = 4096  #: Samples computed at once: with fewer, most of the time goes into the calls of numpy
+#: Samples computed at once: with fewer, most of the time goes into the calls of numpy
+BLOCK_SAMPLES = 4096
 
 
 def fill_rigid(
@@ -38,14 +40,16 @@ def fill_rigid(
     out: FloatArray,
     wanted: BoolArray | None = None,
 ) -> None:
-    """Write the columns of the rigid links into an array of the caller, who may use it again for the next piece.
+    """Write the columns of the rigid links into an array of the caller,
+    who may use it again for the next piece.
 
     Args:
         robot: n joints.
-        position, velocity, acceleration: of the joints [rad or m, and their derivatives], shape (n, k), time last.
-        out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k): joint, link,
-            parameter, sample; a view into a wider layout will do. Only links that the joint moves are written, so the
-            rest may be zeroed once.
+        position, velocity, acceleration: of the joints [rad or m, and their derivatives], shape (n,
+            k), time last.
+        out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k):
+            joint, link, parameter, sample; a view into a wider layout will do. Only links that the
+            joint moves are written, so the rest may be zeroed once.
         wanted: parameters of each link that are written, shape (n, 10); all when None.
     """
     links = _links(robot)
@@ -62,12 +66,20 @@ def fill_rigid(
         if end - first != size:
             work = _work(robot, links, end - first)
         for index, link in enumerate(links):
-            _move(link, work, index, position[index, block], velocity[index, block], acceleration[index, block])
+            _move(
+                link,
+                work,
+                index,
+                position[index, block],
+                velocity[index, block],
+                acceleration[index, block],
+            )
             screws = work.screws[index]
             _fill_wrench(work.inertia, work.moments, screws[0], screws[1])
             for screw, mover in zip(screws[2:], link.movers, strict=True):
                 row = out[mover, index, :, block]
-                # Most joints turn or slide along an axis of their link's frame: their own row is one of Y's.
+                # Most joints turn or slide along an axis of their link's frame: their own row is
+                # one of Y's.
                 if mover == index and link.component is not None:
                     _copy_row(work, link.component, row, inertias[index], moments[index])
                 else:
@@ -75,9 +87,15 @@ def fill_rigid(
 
 
 def _copy_row(
-    work: _Work, component: int, row: FloatArray, inertias: Sequence[slice], moments: Sequence[slice]
+    work: _Work,
+    component: int,
+    row: FloatArray,
+    inertias: Sequence[slice],
+    moments: Sequence[slice],
 ) -> None:
-    """Write one row of Y, for the joint whose screw is a unit vector, into the spans of the parameters."""
+    """Write one row of Y, for the joint whose screw is a unit vector,
+    into the spans of the parameters.
+    """
     of_inertia = row[:6]
     of_moments = row[6:]
     is_angular = component < 3
@@ -91,9 +109,15 @@ def _copy_row(
 
 
 def _project_row(
-    work: _Work, screw: FloatArray, row: FloatArray, inertias: Sequence[slice], moments: Sequence[slice]
+    work: _Work,
+    screw: FloatArray,
+    row: FloatArray,
+    inertias: Sequence[slice],
+    moments: Sequence[slice],
 ) -> None:
-    """Write SᵀY of a joint, Σ_d S_dk Y_dck of parameter c and sample k, into the spans of the parameters."""
+    """Write SᵀY of a joint, Σ_d S_dk Y_dck of parameter c and sample k,
+    into the spans of the parameters.
+    """
     of_inertia = row[:6]
     of_moments = row[6:]
     angular = screw[:3]
@@ -113,9 +137,15 @@ def _spans(wanted: BoolArray) -> list[slice]:
 
 
 def rigid_torque(
-    robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, parameters: FloatArray
+    robot: Robot,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    parameters: FloatArray,
 ) -> FloatArray:
-    """Torque of the rigid links [Nm or N], shape (n, k): the columns of `fill_rigid` times ``parameters``, (n, 10)."""
+    """Torque of the rigid links [Nm or N], shape (n, k):
+    the columns of `fill_rigid` times ``parameters``, (n, 10).
+    """
     links = _links(robot)
     inertias = [_inertia(own) for own in parameters]
     out = np.empty_like(position)
@@ -157,7 +187,8 @@ def _fill_inertial_wrench(wrench: FloatArray, screws: FloatArray, inertia: Float
 
 
 def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Torque of the rigid links at joint i per unit of acceleration of joint j, Σ S_iᵀ M S_j over the links, (n, n, k).
+    """Torque of the rigid links at joint i per unit of acceleration of joint j,
+    Σ S_iᵀ M S_j over the links, (n, n, k).
 
     Args:
         robot: n joints.
@@ -191,7 +222,9 @@ def _add_cross(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 
 def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cosine and sine to the last digit of one, by the half-angle: numpy has a vector tangent, four times as fast."""
+    """Cosine and sine to the last digit of one, by the half-angle:
+    numpy has a vector tangent, four times as fast.
+    """
     tangent = np.tan(0.5 * angle)
     square = tangent * tangent
     share = 1.0 / (1.0 + square)
@@ -201,7 +234,9 @@ def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _inertia(parameters: FloatArray) -> FloatArray:
-    """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS), shape (6, 6)."""
+    """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS),
+    shape (6, 6).
+    """
     tensor = parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3)
     first_moment = skew(parameters[6:9])
     mass = parameters[9] * np.eye(3)
@@ -210,8 +245,11 @@ def _inertia(parameters: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Constants of a link. Its joint turns or slides along z of the joint's frame: there cos q and sin q, or q, touch
-    two components in three, and most robots' links have that frame already."""
+    """Constants of a link.
+
+    Its joint turns or slides along z of the joint's frame: there cos q and sin q, or q, touch two
+    components in three, and most robots' links have that frame already.
+    """
 
     parent: int
     movers: tuple[int, ...]
@@ -219,13 +257,15 @@ class _Link:
     fixed: FloatArray  #: from the parent's frame to the joint's at q = 0, shape (6, 6)
     back: FloatArray | None  #: from the joint's frame to the link's; None where they are the same
     own: FloatArray  #: S in the link's frame, shape (6,)
-    component: int | None  #: the only one that S has, where it is 1; None where S is no axis of the frame
+    #: the only one that S has, where it is 1; None where S is no axis of the frame
+    component: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Arrays that every block uses again: V, A and the movers' screws of each link, shape (2 + movers, 6, k) (the base
-    is the last), room for products, and Y."""
+    """Arrays that every block uses again: V, A and the movers' screws of each link,
+    shape (2 + movers, 6, k) (the base is the last), room for products, and Y.
+    """
 
     screws: tuple[FloatArray, ...]
     products: FloatArray
@@ -264,7 +304,9 @@ def _link(joint: Joint, movers: tuple[int, ...]) -> _Link:
         parent=joint.parent,
         movers=movers,
         revolute=revolute,
-        fixed=_blocks(turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)),
+        fixed=_blocks(
+            turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)
+        ),
         back=back,
         own=own,
         component=component,
@@ -272,7 +314,9 @@ def _link(joint: Joint, movers: tuple[int, ...]) -> _Link:
 
 
 def _frame_about(axis: FloatArray) -> FloatArray:
-    """Rotation to a frame whose z is an axis, shape (3, 3); its x is near the axis of the frame most across to it."""
+    """Rotation to a frame whose z is an axis, shape (3, 3);
+    its x is near the axis of the frame most across to it.
+    """
     across = np.eye(3)[np.argmin(np.abs(axis))]
     cosine = axis @ across
     x = (across - axis * cosine) / np.sqrt(1.0 - cosine**2)
@@ -301,7 +345,12 @@ def _work(robot: Robot, links: tuple[_Link, ...], samples: int, *, movers: bool 
 
 
 def _move(
-    link: _Link, work: _Work, index: int, position: FloatArray, velocity: FloatArray, acceleration: FloatArray
+    link: _Link,
+    work: _Work,
+    index: int,
+    position: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
 ) -> None:
     """Carry the parent's screws to a link, through the frame of its joint."""
     before = work.screws[link.parent]
@@ -369,8 +418,11 @@ def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray
     return out
 
 
-def _fill_wrench(inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> None:
-    """Y, in two parts: the moment of unit inertias, shape (3, 6, k); moment and force of unit (h, m), shape (6, 4, k).
+def _fill_wrench(
+    inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray
+) -> None:
+    """Y, in two parts: the moment of unit inertias, shape (3, 6, k);
+    moment and force of unit (h, m), shape (6, 4, k).
 
     What is zero in every motion is left as it is.
     """

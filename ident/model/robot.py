@@ -26,7 +26,8 @@ class Joint:
     name: str  #: as in the URDF
     kind: JointKind  #: revolute or prismatic
     parent: int  #: index of the joint before it, -1 for the base
-    rotation: FloatArray  #: rotation of the joint frame in the parent's frame at position zero, (3, 3)
+    #: rotation of the joint frame in the parent's frame at position zero, (3, 3)
+    rotation: FloatArray
     translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
 
@@ -40,7 +41,8 @@ class Place:
     translation_m: FloatArray  #: its origin there, (3,)
 
 
-PIVOT = "pivot"  #: What the name of a closure follows in the name of the joint that the loop was cut at
+#: What the name of a closure follows in the name of the joint that the loop was cut at
+PIVOT = "pivot"
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 """Along and about the axes of the first frame of a closure."""
@@ -48,15 +50,29 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closure:
-    """A joint that closes a loop of the tree: two frames on two links that coincide in some directions.
+    """A joint that closes a loop of the tree:
+    two frames on two links that coincide in some directions.
 
-    A ball joint coincides in x, y, z; a hinge about z in x, y, z, rx, ry; in a planar mechanism x, y are enough.
+    A ball joint coincides in x, y, z; a hinge about z in x, y, z, rx, ry; in a planar mechanism x,
+    y are enough.
     """
 
     name: str  #: as the cell file has it
     first: Place  #: frame whose axes the directions are
     second: Place  #: frame that coincides with it
     directions: tuple[str, ...]  #: of DIRECTIONS; in the others the links move freely
+
+
+@dataclass(frozen=True, slots=True)
+class JointCoupling:
+    """A joint without a motor that follows another one by a gear or a linkage:
+    q = multiplier · q_leader + offset.
+    """
+
+    follower: int  #: index of the joint that follows
+    leader: int  #: index of the joint that it follows, which follows none itself
+    multiplier: float  #: [rad or m of the follower, per rad or m of the leader]
+    offset: float  #: position of the follower where the leader is at zero [rad or m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,19 +85,35 @@ class Pivot:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a motor."""
+    """A tree of n joints on a fixed base, in a closed chain with loop closures and joints without a
+    motor.
+
+    Joints without a motor may also follow others in a fixed ratio (`couplings`).
+    """
 
     joints: tuple[Joint, ...]  #: depth first from the base
-    gravity_m_s2: FloatArray  #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    gravity_m_s2: FloatArray
     closures: tuple[Closure, ...] = ()  #: none of a serial robot
-    motors: tuple[int, ...] = ()  #: joint that each axis drives, in the order of the axes; empty: every joint is driven
-    #: Positions of all joints at which the closures hold: which of several ways of assembly is meant. Shape (n,).
+    #: joint that each axis drives, in the order of the axes; empty: every joint is driven
+    motors: tuple[int, ...] = ()
+    #: Positions of all joints at which the closures hold: which of several ways of assembly is
+    #: meant. Shape (n,).
     assembly_rad: FloatArray | None = None
-    platform: Place | None = None  #: frame of the link that carries the payload; None: that of the last joint
+    #: frame of the link that carries the payload; None: that of the last joint
+    platform: Place | None = None
     #: Gravity before its direction was corrected, shape (3,); None where it was not.
     declared_gravity_m_s2: FloatArray | None = None
-    #: Joints at which loops are cut, without those in which friction is the same as in a joint of the tree.
+    #: Joints at which loops are cut, without those in which friction is the same as in a joint of
+    #: the tree.
     pivots: tuple[Pivot, ...] = ()
+    #: Joints that follow another one in a fixed ratio (`<mimic>` of a URDF).
+    couplings: tuple[JointCoupling, ...] = ()
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether joints depend on each other: loops close, or joints follow others."""
+        return bool(self.closures or self.couplings)
 
     @property
     def joint_count(self) -> int:
@@ -118,11 +150,24 @@ class Robot:
         return tuple(joint for joint in range(len(self.joints)) if joint not in self.axis_joints)
 
     @property
+    def place_joints(self) -> tuple[int, ...]:
+        """Joints at which an effect can act: those of the axes, then those without a motor.
+
+        A follower is none: it turns as its leader does, so friction or a spring in it is one in its
+            leader.
+        """
+        followers = {coupling.follower for coupling in self.couplings}
+        passive = [joint for joint in self.passive_joints if joint not in followers]
+        return (*self.axis_joints, *passive)
+
+    @property
     def places(self) -> tuple[Joint, ...]:
-        """Where an effect can act: the driven joints, those without a motor, and the pivots that loops are cut at."""
-        passive = [self.joints[joint] for joint in self.passive_joints]
+        """Where an effect can act: the joints of `place_joints`,
+        and the pivots that loops are cut at.
+        """
+        joints = [self.joints[joint] for joint in self.place_joints]
         pivots = [self._as_joint(pivot) for pivot in self.pivots]
-        return (*self.axes, *passive, *pivots)
+        return (*joints, *pivots)
 
     def _as_joint(self, pivot: Pivot) -> Joint:
         closure = self.closures[pivot.closure]
@@ -149,7 +194,7 @@ class Robot:
     @property
     def undriven_names(self) -> tuple[str, ...]:
         """Names of the places without a motor, in the order of `places`."""
-        return (*self.passive_names, *self.pivot_names)
+        return tuple(place.name for place in self.places[self.axis_count :])
 
     @property
     def axis_count(self) -> int:
@@ -186,7 +231,9 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Poses of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i."""
+    """Poses of n + 1 frames in the base frame over k samples;
+    frame 0 is the base, frame i + 1 moves with joint i.
+    """
 
     rotation: FloatArray  #: shape (n + 1, k, 3, 3)
     origin_m: FloatArray  #: shape (n + 1, k, 3)

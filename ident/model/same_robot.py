@@ -1,9 +1,9 @@
 """Whether base parameters that were identified can be those of a robot.
 
-Some changes of the standard parameters leave every torque as it is: W_st N = 0, whatever the motion (paper §2.1). Base
-parameters β = G χ_st do not change with them, so G N = 0. That holds of any data of the robot, also of data that
-determine fewer base parameters than the robot has; N depends on the lengths, twists and kinds of joints, and another
-robot's is another.
+Some changes of the standard parameters leave every torque as it is: W_st N = 0, whatever the motion
+(paper §2.1). Base parameters β = G χ_st do not change with them, so G N = 0. That holds of any data
+of the robot, also of data that determine fewer base parameters than the robot has; N depends on the
+lengths, twists and kinds of joints, and another robot's is another.
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ STATES = 60  #: States on which W_st is computed; each gives a row for every joi
 RANGE = 1.5  #: Positions, speeds and accelerations are drawn from ± this [rad or m, s]
 RANK_TOLERANCE = 1e-9  #: Singular values below this share of the largest are rounding error
 WEIGHT_TOLERANCE = 1e-2
-"""Share of a weight that may differ. Filtered data determine it to four digits; a length that differs by a few
-millimetres is the correction of a description, not another robot."""
+"""Share of a weight that may differ.
+
+Filtered data determine it to four digits; a length that differs by a few millimetres is the
+correction of a description, not another robot.
+"""
 ROUNDED = 2e-6  #: Weights are written with six decimals, and left out below
 TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
 """A standard parameter that a base parameter gathers, in its name: " + 0.4*m3"."""
@@ -32,17 +35,18 @@ TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
 def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
     """Return the base parameter that contradicts a robot most; None where they can be this robot's.
 
-    Closed chains are not compared: their regressor needs a motion on which the loops close. Nor is what a payload adds
-    to friction, which no geometry changes.
+    Closed chains are not compared: their regressor needs a motion on which the loops close. Nor is
+    what a payload adds to friction, which no geometry changes.
 
     Args:
         model: of the robot.
-        names: of the base parameters, each a leading standard parameter of this model and what it gathers.
+        names: of the base parameters, each a leading standard parameter of this model and what it
+            gathers.
     """
     compared = [name for name in names if not _leading_name(name).endswith(LOADED)]
     # Standard parameters as they are, none gathered with others, are right for their robot.
     is_grouped = any(TERM.search(name) for name in compared)
-    if model.robot.closures or not is_grouped:
+    if model.robot.is_constrained or not is_grouped:
         return None
     columns: list[int] = []
     column_names: list[str] = []
@@ -65,7 +69,8 @@ def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
     allowed_weight = is_gathered * WEIGHT_TOLERANCE * largest_weight + is_seen * ROUNDED
     allowed = np.linalg.norm(allowed_weight * by_torque, axis=1)
     excess = change / allowed
-    excess[~is_seen[leading]] = 0.0  # it moves nothing here, as a link's moment does where gravity is along the axis
+    # It moves nothing here, as a link's moment does where gravity is along the axis
+    excess[~is_seen[leading]] = 0.0
     worst = int(np.argmax(excess))
     if excess[worst] > 1.0:
         return compared[worst]

@@ -1,7 +1,7 @@
 """Gravity as a person types it into a description: without the digits that are noise.
 
-A component that is noise brings base parameters that the robot does not have, and a condition number that is tenfold:
-gravity along an axis of the base is exactly along it, or it is not.
+A component that is noise brings base parameters that the robot does not have, and a condition
+number that is tenfold: gravity along an axis of the base is exactly along it, or it is not.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ FEWEST_DECIMALS = 2
 
 
 def suggested_gravity(found_m_s2: FloatArray, std_m_s2: FloatArray) -> FloatArray:
-    """Return gravity of the same size, rounded to what its σ supports, and along an axis where that is within 2 σ.
+    """Return gravity of the same size, rounded to what its σ supports,
+    and along an axis where that is within 2 σ.
 
     Args:
         found_m_s2: as it was estimated, shape (3,).

@@ -1,8 +1,10 @@
-"""Reading a URDF: the joint tree for identification, bodies and effort limits for the planner and the prior.
+"""Reading a URDF: the joint tree for identification,
+bodies and effort limits for the planner and the prior.
 
-The reader takes from a URDF what identification needs and skips the rest (meshes, transmissions, plugins). Joints are
-ordered and merged as Pinocchio does it, which the tests compare with: depth first, branches in the order of their
-joints' names, fixed joints merged into the moving joint before them.
+The reader takes from a URDF what identification needs and skips the rest (meshes, transmissions,
+plugins). Joints are ordered and merged as Pinocchio does it, which the tests compare with: depth
+first, branches in the order of their joints' names, fixed joints merged into the moving joint
+before them.
 """
 
 from __future__ import annotations
@@ -18,16 +20,25 @@ from ident.arrays import FloatArray, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import Body
 from ident.model.pivots import cut_pivots
-from ident.model.robot import DIRECTIONS, Closure, Joint, JointKind, Place, Robot, poses
+from ident.model.robot import (
+    DIRECTIONS,
+    Closure,
+    Joint,
+    JointCoupling,
+    JointKind,
+    Place,
+    Robot,
+    poses,
+)
 
 SAME_POSITION = 1e-3  #: Largest difference of two statements of one position [rad or m]
-LINKAGE = (
-    "no <mimic>: it is a joint without a motor, and what couples it is described by `closures` and `motors`, as of a "
-    "closed chain (of a parallelogram, the link behind it keeps the direction of the link before its leader: one "
-    "closure of the two links about the joints' axis); a gear or belt of another ratio between joints is not supported"
+FOLLOWS_BY_ITSELF = "no `hold` of it: a joint that mimics an axis is read as one that follows it"
+"""What to do about a held joint that follows an axis."""
+XACRO_SPACES = (
+    "{http://www.ros.org/wiki/xacro}",
+    "{http://ros.org/wiki/xacro}",
+    "{http://wiki.ros.org/xacro}",
 )
-"""What to do about a joint that follows an axis."""
-XACRO_SPACES = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}", "{http://wiki.ros.org/xacro}")
 """Namespaces of xacro, as its files name them."""
 XACRO_EXPRESSION = "${"
 UNBOUND_PREFIX = "unbound prefix"  #: Of the parser's message
@@ -39,7 +50,8 @@ class UrdfRobot:
     """The n moving joints of a URDF."""
 
     joints: tuple[Joint, ...]  #: their geometry, depth first from the base
-    #: What each joint moves, in its frame, links behind fixed joints included; mass zero where none is given.
+    #: What each joint moves, in its frame, links behind fixed joints included; mass zero where none
+    #: is given.
     bodies: tuple[Body, ...]
     effort_limit: FloatArray  #: [Nm or N], shape (n,); inf where none is given
     links: Mapping[str, Place]  #: frame of every link of the URDF, by name
@@ -55,7 +67,8 @@ class LinkPair:
     name: str  #: of the closure
     first: str  #: link
     second: str  #: link
-    directions: tuple[str, ...]  #: of ident.model.robot.DIRECTIONS, along and about the axes of the first link
+    #: of ident.model.robot.DIRECTIONS, along and about the axes of the first link
+    directions: tuple[str, ...]
 
 
 def robot_from_urdf(
@@ -69,27 +82,35 @@ def robot_from_urdf(
 ) -> Robot:
     """Read the kinematic tree of a URDF, and close its loops.
 
+    A joint with `<mimic>` is no axis: it follows the joint that it names, and what its link weighs
+    loads that axis.
+
     Args:
         urdf: text of the URDF; fixed joints are merged into their parents, inertias are not used.
         gravity_m_s2: gravity in the base frame.
         closures: which links coincide; none of a serial robot.
-        motors: joint of each axis of a closed chain, in the order of the axes.
-        assembly_rad: roughly, the position of every joint at which the closures hold [rad; m of a prismatic joint];
-            joints that are not named are at 0.
+        motors: joint of each axis of a closed chain, in the order of the axes. Without closures,
+            every joint that follows none has a motor.
+        assembly_rad: roughly, the position of every joint at which the closures hold [rad; m of a
+            prismatic joint]; joints that are not named are at 0.
         platform: link that carries the payload; that of the last joint when None.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, one of more than one degree of freedom, or one that
-            mimics another (`hold_joints` fixes those of a gripper with their leader); a closure,
-            motor, assembly pose or platform names what it does not have.
+        ModelError: the text is no URDF, has no moving joint, or one of more than one degree of
+            freedom; a closure, motor, assembly pose or platform names what it does not have; a
+            joint mimics one that does not move, or itself, or is in a closed chain.
     """
     found = read_urdf(urdf)
-    for name, mimic in mimics_of(urdf).items():
-        followed = f"joint {mimic.leader!r} (multiplier {mimic.multiplier:g})"
-        raise ModelError(f"joint {name!r} mimics {followed}; expected {LINKAGE}")
     if assembly_rad is None:
         assembly_rad = {}
     index = {joint.name: number for number, joint in enumerate(found.joints)}
+    couplings = _couplings(mimics_of(urdf), index)
+    if couplings and closures:
+        follower = found.joints[couplings[0].follower].name
+        raise ModelError(
+            f"joint {follower!r} has <mimic>, and the robot has closures; expected one of the two: "
+            "delete <mimic>, and describe what couples the joint as a closure"
+        )
     _require_joints("the list of motors", motors, index)
     _require_joints("the assembly pose", assembly_rad, index)
     closed = tuple(_closure(found, pair) for pair in closures)
@@ -97,18 +118,28 @@ def robot_from_urdf(
     if platform is not None:
         carrier = _place_of(found, platform, "the platform")
         if carrier.joint < 0:
-            raise ModelError(f"the platform {platform!r} does not move; expected the link that carries the payload")
+            raise ModelError(
+                f"the platform {platform!r} does not move; expected the link that "
+                "carries the payload"
+            )
+    driven = tuple(index[name] for name in motors)
+    if couplings and not driven:
+        followers = {coupling.follower for coupling in couplings}
+        driven = tuple(number for number in index.values() if number not in followers)
     robot = Robot(
         joints=found.joints,
         gravity_m_s2=np.asarray(gravity_m_s2, dtype=np.float64),
         closures=closed,
-        motors=tuple(index[name] for name in motors),
+        motors=driven,
         platform=carrier,
+        couplings=couplings,
     )
-    if not closed:
+    if not robot.is_constrained:
         return robot
     pose = [assembly_rad.get(joint.name, 0.0) for joint in found.joints]
     robot = replace(robot, assembly_rad=np.array(pose))
+    if not closed:
+        return robot
     return replace(robot, pivots=cut_pivots(robot))
 
 
@@ -120,7 +151,9 @@ def _require_joints(source: str, names: Iterable[str], joints: Mapping[str, int]
     """
     for name in names:
         if name not in joints:
-            raise ModelError(f"{source} names joint {name!r}; the URDF has the moving joints {', '.join(joints)}")
+            raise ModelError(
+                f"{source} names joint {name!r}; the URDF has the moving joints {', '.join(joints)}"
+            )
 
 
 def _place_of(found: UrdfRobot, link: str, source: str) -> Place:
@@ -141,13 +174,18 @@ def _closure(found: UrdfRobot, pair: LinkPair) -> Closure:
     Raises:
         ModelError: it has a link that the URDF does not have, or unknown directions.
     """
-    require_kind("an entry of closures", pair, LinkPair, "write LinkPair(name, first, second, directions)")
+    require_kind(
+        "an entry of closures", pair, LinkPair, "write LinkPair(name, first, second, directions)"
+    )
     source = f"closure {pair.name!r}"
     are_known = set(pair.directions) <= set(DIRECTIONS)
     are_distinct = len(set(pair.directions)) == len(pair.directions)
     if not (pair.directions and are_known and are_distinct):
         given = ", ".join(pair.directions) or "none"
-        raise ModelError(f"{source} has the directions {given}; expected some of {', '.join(DIRECTIONS)}, each once")
+        raise ModelError(
+            f"{source} has the directions {given}; expected some of "
+            f"{', '.join(DIRECTIONS)}, each once"
+        )
     return Closure(
         name=pair.name,
         first=_place_of(found, pair.first, source),
@@ -158,7 +196,9 @@ def _closure(found: UrdfRobot, pair: LinkPair) -> Closure:
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """A joint that follows another one: q = multiplier · q_leader + offset, the `<mimic>` of a URDF."""
+    """A joint that follows another one:
+    q = multiplier · q_leader + offset, the `<mimic>` of a URDF.
+    """
 
     leader: str  #: name of the joint that it follows
     multiplier: float
@@ -171,22 +211,26 @@ class Mimic:
 
 
 def hold_joints(urdf: str, position_rad: Mapping[str, float]) -> str:
-    """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's) are fixed.
+    """Return a URDF in which joints that are no axes of the arm (a gripper's, a mobile base's)
+    are fixed.
 
     Args:
         urdf: text of the URDF.
-        position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint that mimics a held
-            one, directly or through others, follows it. Joints of type floating and planar can only be held at 0.
+        position_rad: position of each held joint [rad; m for a prismatic joint], by name. A joint
+            that mimics a held one, directly or through others, follows it. Joints of type floating
+            and planar can only be held at 0.
 
     Raises:
-        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held there: it mimics one that
-            moves, or one by which it is elsewhere.
+        ModelError: the text is no URDF, a name is no movable joint, or a joint cannot be held
+            there: it mimics one that moves, or one by which it is elsewhere.
     """
     robot = _root(urdf)
     movable = _movable(robot)
     for name in position_rad:
         if name not in movable:
-            raise ModelError(f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}")
+            raise ModelError(
+                f"no movable joint {name!r} in the URDF; expected one of {', '.join(movable)}"
+            )
     mimics = _mimics(movable)
     followed = _followed(mimics, position_rad)
     for name, position in position_rad.items():
@@ -213,6 +257,56 @@ def _movable(robot: Element) -> dict[str, Element]:
     return {_name(joint): joint for joint in joints}
 
 
+def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
+    """Return how a joint follows the joint at the head of its chain of followers.
+
+    Args:
+        name: of a joint that mimics another one.
+        mimics: of the URDF (`mimics_of`).
+
+    Raises:
+        ModelError: the chain leads back to one of its joints.
+    """
+    seen = {name}
+    found = mimics[name]
+    while found.leader in mimics:
+        if found.leader in seen:
+            raise ModelError(
+                f"joint {name!r} mimics {mimics[name].leader!r}, which follows it in turn; "
+                "expected a joint at the head that mimics none"
+            )
+        seen.add(found.leader)
+        before = mimics[found.leader]
+        # q = a (b q_leader + c) + d
+        found = Mimic(
+            leader=before.leader,
+            multiplier=found.multiplier * before.multiplier,
+            offset=found.multiplier * before.offset + found.offset,
+        )
+    return found
+
+
+def _couplings(mimics: Mapping[str, Mimic], index: Mapping[str, int]) -> tuple[JointCoupling, ...]:
+    """Return how each follower depends on a joint that follows none."""
+    couplings: list[JointCoupling] = []
+    for name in mimics:
+        mimic = first_leader(name, mimics)
+        if mimic.leader not in index:
+            moving = ", ".join(joint for joint in index if joint not in mimics) or "none"
+            raise ModelError(
+                f"joint {name!r} mimics {mimic.leader!r}, which is no joint of the URDF that "
+                f"moves; expected one of {moving}; hold {name!r} where it stays (`hold_joints`)"
+            )
+        coupling = JointCoupling(
+            follower=index[name],
+            leader=index[mimic.leader],
+            multiplier=mimic.multiplier,
+            offset=mimic.offset,
+        )
+        couplings.append(coupling)
+    return tuple(couplings)
+
+
 def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
     """What each of some joints follows, by its name; without those that follow none."""
     found: dict[str, Mimic] = {}
@@ -223,13 +317,17 @@ def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
         multiplier = _finite(mimic.get("multiplier", "1"))
         offset = _finite(mimic.get("offset", "0"))
         if multiplier is None or offset is None:
-            raise ModelError(f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number")
+            raise ModelError(
+                f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number"
+            )
         found[name] = Mimic(mimic.get("joint", ""), multiplier, offset)
     return found
 
 
 def _followed(mimics: Mapping[str, Mimic], position_rad: Mapping[str, float]) -> dict[str, float]:
-    """Return the position of every joint that follows held ones, through any number of others [rad or m]."""
+    """Return the position of every joint that follows held ones,
+    through any number of others [rad or m].
+    """
     followed: dict[str, float] = {}
     for _ in mimics:  # a chain is no longer than the number of its followers
         for name, mimic in mimics.items():
@@ -256,13 +354,14 @@ def _require_free(
     if elsewhere is not None:
         if not np.isclose(position, elsewhere, rtol=0.0, atol=SAME_POSITION):
             raise ModelError(
-                f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by which it is at "
-                f"{elsewhere:g}; expected the same position [rad or m], or `hold` of one of the two"
+                f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by "
+                f"which it is at {elsewhere:g}; expected the same position [rad or m], or `hold` "
+                "of one of the two"
             )
     elif mimic.leader in movable:
         raise ModelError(
-            f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), which moves: it follows "
-            f"and cannot be held; expected {LINKAGE}"
+            f"joint {name!r} mimics joint {mimic.leader!r} (multiplier {mimic.multiplier:g}), "
+            f"which moves: it follows and cannot be held; expected {FOLLOWS_BY_ITSELF}"
         )
 
 
@@ -302,11 +401,13 @@ def _roll_pitch_yaw(rotation: FloatArray) -> tuple[float, float, float]:
 def read_urdf(urdf: str) -> UrdfRobot:
     """Read joints, bodies and effort limits of a URDF.
 
-    A link without a readable mass or centre of mass counts as massless, one without a readable inertia as a point mass:
-    they only guide the choice of moves, and a URDF for identification need not have them.
+    A link without a readable mass or centre of mass counts as massless, one without a readable
+    inertia as a point mass: they only guide the choice of moves, and a URDF for identification need
+    not have them.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of freedom.
+        ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of
+            freedom.
     """
     links, joints_behind, root = _tree(urdf)
     places = {root: Place(-1, np.eye(3), np.zeros(3))}
@@ -329,7 +430,9 @@ def read_urdf(urdf: str) -> UrdfRobot:
         places[link] = here
         pending += [(here, behind) for behind in joints_behind[link]]
     if not joints:
-        raise ModelError("the URDF has no moving joint; expected at least one revolute or prismatic joint")
+        raise ModelError(
+            "the URDF has no moving joint; expected at least one revolute or prismatic joint"
+        )
     return UrdfRobot(tuple(joints), tuple(bodies), np.array(effort_limit), places)
 
 
@@ -343,7 +446,8 @@ def _place_behind(before: Place, element: Element) -> Place:
     )
 
 
-LONGEST_NAME = 255  #: Characters of a path in the place of a text; a longer one is not repeated in a message
+#: Characters of a path in the place of a text; a longer one is not repeated in a message
+LONGEST_NAME = 255
 
 
 def _root(urdf: str) -> Element:
@@ -353,18 +457,24 @@ def _root(urdf: str) -> Element:
     except (ParseError, TypeError) as error:
         if UNBOUND_PREFIX in str(error):
             raise ModelError(
-                f"the URDF cannot be read: {error}, a prefix of a name whose namespace is not declared; expected "
-                'xmlns:PREFIX="..." in <robot>, or elements without a prefix; a file with xacro: is expanded by '
+                f"the URDF cannot be read: {error}, a prefix of a name whose namespace is not "
+                "declared; expected "
+                'xmlns:PREFIX="..." in <robot>, or elements without a prefix; a file with xacro: '
+                "is expanded by "
                 "`xacro robot.urdf.xacro > robot.urdf`"
             ) from error
         if _looks_like_file_name(str(urdf)):
-            raise ModelError(f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()") from error
+            raise ModelError(
+                f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()"
+            ) from error
         raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
     space = robot.tag.removesuffix("robot")
     is_robot = robot.tag == space + "robot"
     is_namespace = not space or space.startswith("{")
     if not (is_robot and is_namespace):
-        raise ModelError(f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>")
+        raise ModelError(
+            f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>"
+        )
     if robot.get("version", "1.0") not in ("1.0", "1.1"):
         raise ModelError(f"the URDF is of version {robot.get('version')}; expected 1.0 or 1.1")
     _require_expanded(robot)
@@ -400,7 +510,9 @@ def _require_expanded(robot: Element) -> None:
 
 
 def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
-    """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
+    """Return the links, the joints behind each (last name first, to be popped),
+    and the link without a parent.
+    """
     robot = _root(urdf)
     links = {_name(link): link for link in robot.findall("link")}
     joints = {_name(joint): joint for joint in robot.findall("joint")}
@@ -414,19 +526,27 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
         child = _link_at(joints[name], "child")
         for link in (parent, child):
             if link not in links:
-                raise ModelError(f"joint {name!r} connects link {link!r}, which the URDF does not have")
+                raise ModelError(
+                    f"joint {name!r} connects link {link!r}, which the URDF does not have"
+                )
         if child in children:
             raise ModelError(f"link {child!r} is the child of two joints; expected a tree")
         children.add(child)
         behind[parent].append(joints[name])
     if not links:
-        raise ModelError("the URDF has no <link>; expected the links of an arm, and the joints between them")
+        raise ModelError(
+            "the URDF has no <link>; expected the links of an arm, and the joints between them"
+        )
     roots = [name for name in links if name not in children]
     if not roots:
-        raise ModelError("every link of the URDF is behind a joint; expected a tree, with one link that is the base")
+        raise ModelError(
+            "every link of the URDF is behind a joint; expected a tree, with one link "
+            "that is the base"
+        )
     if len(roots) != 1:
         raise ModelError(
-            f"the URDF has {len(roots)} links without a parent ({', '.join(roots)}); expected one, the base"
+            f"the URDF has {len(roots)} links without a parent ({', '.join(roots)}); expected "
+            "one, the base"
         )
     return links, behind, roots[0]
 
@@ -443,13 +563,17 @@ def _joint(element: Element, at: Place) -> Joint:
     """Read a moving joint.
 
     Raises:
-        ModelError: it has several degrees of freedom, an axis without a direction, or lies too far away.
+        ModelError: it has several degrees of freedom, an axis without a direction, or lies too far
+            away.
     """
     name = _name(element)
     kind = element.get("type", "")
     if kind not in KINDS:
         found = element.get("type")
-        raise ModelError(f"joint {name!r} is of type {found!r}; expected revolute, continuous, prismatic or fixed")
+        raise ModelError(
+            f"joint {name!r} is of type {found!r}; expected revolute, continuous, "
+            "prismatic or fixed"
+        )
     axis = np.array([1.0, 0.0, 0.0])
     declared = element.find("axis")
     if declared is not None:
@@ -458,12 +582,14 @@ def _joint(element: Element, at: Place) -> Joint:
     if length > 0.0:
         axis = axis / length
     if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
-        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
+        raise ModelError(
+            f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one"
+        )
     distance = float(np.max(np.abs(at.translation_m)))
     if not distance <= LARGEST_DISTANCE_M:
         raise ModelError(
-            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
-            "is the URDF in mm?"
+            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most "
+            f"{LARGEST_DISTANCE_M:g} m: is the URDF in mm?"
         )
     return Joint(
         name=name,
@@ -476,7 +602,9 @@ def _joint(element: Element, at: Place) -> Joint:
 
 
 def _effort_limit(element: Element) -> float:
-    """Effort limit of a moving joint; the limit element must be complete, and only a continuous joint may lack it."""
+    """Effort limit of a moving joint; the limit element must be complete,
+    and only a continuous joint may lack it.
+    """
     name = _name(element)
     limit = element.find("limit")
     if limit is None:
@@ -543,19 +671,25 @@ def _joined(first: Body, second: Body) -> Body:
 
 
 def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
-    """Rotation and translation of an <origin>; the angles are about the fixed axes x, y, z, in this order."""
+    """Rotation and translation of an <origin>;
+    the angles are about the fixed axes x, y, z, in this order.
+    """
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
     if "quat_xyzw" in origin.attrib:
-        raise ModelError(f"{name!r} has an origin with quat_xyzw, which URDF 1.0 does not know; expected rpy")
+        raise ModelError(
+            f"{name!r} has an origin with quat_xyzw, which URDF 1.0 does not know; expected rpy"
+        )
     angles = _vector(origin, "rpy", name)
     translation = _vector(origin, "xyz", name)
     return _rotation(angles), translation
 
 
 def _rotation(angles_rad: FloatArray) -> FloatArray:
-    """Rotation by angles about the fixed axes x, y, z, in this order, shape (3, 3); by its unit quaternion."""
+    """Rotation by angles about the fixed axes x, y, z, in this order, shape (3, 3);
+    by its unit quaternion.
+    """
     half = 0.5 * angles_rad
     cx, cy, cz = map(cos, half)
     sx, sy, sz = map(sin, half)
@@ -585,7 +719,9 @@ def _name(element: Element) -> str:
     """Name of a link or joint."""
     name = element.get("name", "")
     if not name:
-        raise ModelError(f"a {element.tag} of the URDF has no name; expected one for each link and joint")
+        raise ModelError(
+            f"a {element.tag} of the URDF has no name; expected one for each link and joint"
+        )
     return name
 
 
@@ -608,7 +744,9 @@ def _vector(element: Element, key: str, name: str) -> FloatArray:
     text = element.get(key, "0 0 0")
     numbers = [_finite(word) for word in text.split()]
     if len(numbers) != 3 or None in numbers:
-        raise ModelError(f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers")
+        raise ModelError(
+            f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers"
+        )
     return np.array(numbers, dtype=np.float64)
 
 
@@ -617,7 +755,9 @@ def _number(element: Element, key: str, name: str) -> float:
     text = element.get(key, "")
     number = _finite(text)
     if number is None:
-        raise ModelError(f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected a number")
+        raise ModelError(
+            f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected a number"
+        )
     return number
 
 

@@ -1,4 +1,6 @@
-"""What makes standard parameters those of a robot that can exist, as constraints of a semidefinite programme."""
+"""What makes standard parameters those of a robot that can exist,
+as constraints of a semidefinite programme.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,13 @@ from ident.errors import IdentificationError
 from ident.model.bodies import pseudo_inertia
 from ident.model.model import JOINT_COLUMNS, ROTOR_INERTIA, Model
 
-MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
-_ATTEMPTS: tuple[dict[str, bool | float], ...] = ({}, {"equilibrate_enable": False}, {"max_step_fraction": 0.9})
+#: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
+MARGIN = 1e-4
+_ATTEMPTS: tuple[dict[str, bool | float], ...] = (
+    {},
+    {"equilibrate_enable": False},
+    {"max_step_fraction": 0.9},
+)
 """Settings of Clarabel, tried in turn: some programmes end in a numerical error with the first."""
 
 
@@ -32,11 +39,13 @@ class NotPhysical(IdentificationError):
 class Consistency:
     """Conditions on n links and on the s parameters that are no link's.
 
-    Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry friction fs and fsm,
-    and Iam and fvm of motors that turn with several joints, are not negative; the kinetic energy of the rotors and the
-    power lost to viscous friction are not negative in any motion, that is
+    Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry
+    friction fs and fsm, and Iam and fvm of motors that turn with several joints, are not negative;
+    the kinetic energy of the rotors and the power lost to viscous friction are not negative in any
+    motion, that is
 
-        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0, and the same with fv and fvm (paper eq. 25),
+        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0, and the same with fv and fvm (paper eq.
+        25),
 
     which without coupled motors is Ia ≥ 0 and fv ≥ 0. Offsets are free.
     """
@@ -45,11 +54,13 @@ class Consistency:
     scalars: IntArray  #: indices of the other parameters, shape (s,)
     scales: FloatArray  #: size of each of these, which the programme takes for one, shape (s,)
     positive: tuple[int, ...]  #: parameters that may not be negative
-    #: For each set of motors that turn with the same joints: parameters, and the contribution of each to the symmetric
-    #: matrix that must be positive semidefinite, shape (p, k, k).
+    #: For each set of motors that turn with the same joints: parameters, and the contribution of
+    #: each to the symmetric matrix that must be positive semidefinite, shape (p, k, k).
     dissipative: tuple[tuple[tuple[int, ...], FloatArray], ...]
 
-    def constraints(self, cp: Any, links: Sequence[Any], scalars: Any, margin: float, room: float) -> list[Any]:
+    def constraints(
+        self, cp: Any, links: Sequence[Any], scalars: Any, margin: float, room: float
+    ) -> list[Any]:
         """Constraints on the links relative to their priors, and on the scaled other parameters.
 
         Args:
@@ -97,14 +108,16 @@ class Consistency:
         return True
 
 
-def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[int] = frozenset()) -> Consistency:
+def consistency_of(
+    model: Model, scales: FloatArray, other_friction: frozenset[int] = frozenset()
+) -> Consistency:
     """Conditions for a model's standard parameters.
 
     Args:
         model: the declared model.
         scales: size of each parameter that is no link's, in their order, shape (s,).
-        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv alone may have any
-            sign.
+        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv
+            alone may have any sign.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     coupled = model.drive_train.coupled
@@ -121,7 +134,9 @@ def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[i
             positive.append(index[f"fsm{motor + 1}"])
     dissipative: list[tuple[tuple[int, ...], FloatArray]] = []
     for axes in _turned_together(model):
-        motors = [motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])]
+        motors = [
+            motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])
+        ]
         for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
             if single == "fv" and other_friction.intersection(axes):
                 continue
@@ -141,7 +156,9 @@ def consistency_of(model: Model, scales: FloatArray, other_friction: frozenset[i
 
 
 def _contributions(model: Model, axes: Sequence[int], motors: Sequence[int]) -> FloatArray:
-    """Contribution of each axis', then each motor's parameter to the matrix over these axes, shape (p, k, k)."""
+    """Contribution of each axis', then each motor's parameter to the matrix over these axes,
+    shape (p, k, k).
+    """
     parts = [np.diag(unit) for unit in np.eye(len(axes))]
     for motor in motors:
         r = model.drive_train.direction[motor, list(axes)]
@@ -150,7 +167,9 @@ def _contributions(model: Model, axes: Sequence[int], motors: Sequence[int]) -> 
 
 
 def driven_scalars(model: Model) -> IntArray:
-    """Columns of rotors, friction and offsets, without those of joints that have no motor, shape (s,)."""
+    """Columns of rotors, friction and offsets, without those of joints that have no motor,
+    shape (s,).
+    """
     others = [model.link_columns.ravel()]
     drive = np.arange(ROTOR_INERTIA, JOINT_COLUMNS)
     for joint in model.robot.passive_joints:
@@ -166,7 +185,9 @@ def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
     return np.array(relative)
 
 
-def solve_programme(cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[Any]) -> None:
+def solve_programme(
+    cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[Any]
+) -> None:
     """Solve a programme by Clarabel; its unknowns have their values then.
 
     Raises:

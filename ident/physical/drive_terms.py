@@ -1,14 +1,17 @@
 """Rotors and friction as inertias, dampers and dry friction of single joints and of motors.
 
-The standard parameters of a motor that turns with several joints are split so that a fit sees them (paper eq. 25): with
-r the motor's direction, Iam and fvm are the off-diagonal part of r rᵀ, and the diagonal is in Ia and fv of the joints.
-Simulators have it the other way round: a rotor t acts on the joints as t r rᵀ, with its diagonal, and a joint has an
-inertia too. With t of each coupled motor m and a of each joint,
+The standard parameters of a motor that turns with several joints are split so that a fit sees them
+(paper eq. 25): with r the motor's direction, Iam and fvm are the off-diagonal part of r rᵀ, and the
+diagonal is in Ia and fv of the joints. Simulators have it the other way round: a rotor t acts on
+the joints as t r rᵀ, with its diagonal, and a joint has an inertia too. With t of each coupled
+motor m and a of each joint,
 
-    diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) = diag(a) + Σ_m t_m r_m r_mᵀ,    t_m = Iam_m,  a = Ia − Σ_m Iam_m r_m²,
+    diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) = diag(a) + Σ_m t_m r_m r_mᵀ,
+    t_m = Iam_m,    a = Ia − Σ_m Iam_m r_m²,
 
-and the same with fv and fvm. No simulator has a negative a or t. Where identified values would need one, t_m is as
-large as a ≥ 0 allows, the diagonal is still right, and the rest of Iam_m is named as left out.
+and the same with fv and fvm. No simulator has a negative a or t. Where identified values would need
+one, t_m is as large as a ≥ 0 allows, the diagonal is still right, and the rest of Iam_m is named as
+left out.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ ROUNDING = 1e-12  #: Share of a parameter below which what is left of it is roun
 
 @dataclass(frozen=True, slots=True)
 class LeftOver:
-    """A part of a standard parameter that single joints and motors cannot have: its column times this is missing."""
+    """A part of a standard parameter that single joints and motors cannot have:
+    its column times this is missing.
+    """
 
     name: str  #: of the standard parameter
     value: float  #: what is missing of it [unit]
@@ -39,7 +44,8 @@ class Terms:
     """Inertia, damping or dry friction, none of them negative."""
 
     of_axes: FloatArray  #: of the joint of each axis alone, shape (m,)
-    of_motors: FloatArray  #: of each motor along its direction, zero for one that turns with one joint, shape (m,)
+    #: of each motor along its direction, zero for one that turns with one joint, shape (m,)
+    of_motors: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,10 +99,11 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
 
 
 def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArray:
-    """The least Iam or fvm that couple the joints alike, none of them negative where that is possible, shape (c,).
+    """The least Iam or fvm that couple the joints alike,
+    none of them negative where that is possible, shape (c,).
 
-    Both motors of a differential couple its joints with opposite signs: the torque shows their difference, and what
-    both have in common would only need room at the joints.
+    Both motors of a differential couple its joints with opposite signs: the torque shows their
+    difference, and what both have in common would only need room at the joints.
 
     Args:
         of_motors: Iam or fvm of the motors that turn with several joints, shape (c,).

@@ -1,40 +1,45 @@
-"""Full standard parameters from an estimate and a prior on the links, with what each of them rests on.
+"""Full standard parameters from an estimate and a prior on the links,
+with what each of them rests on.
 
-An estimate knows gains, base parameters and payload alone. The bodies of the links are many more numbers; a CAD model
-knows them roughly. Both together give every standard parameter.
+An estimate knows gains, base parameters and payload alone. The bodies of the links are many more
+numbers; a CAD model knows them roughly. Both together give every standard parameter.
 
 **Prior.** With L Lᵀ the pseudo-inertia of a link by the URDF (`ident.model.bodies`), the link is
 
     P = L (1 + t E) Lᵀ,    E symmetric, E_ii ~ N(0, 1), E_ij ~ N(0, ½) for i ≠ j.
 
-The tolerance t is one relative standard deviation of the mass and of each second moment ∫x² dm, in whatever frame they
-are taken: rotations leave the distribution of E as it is, so L may be any root of P by the URDF. The centre of mass
-is known to t/√2 of √(∫x² dm / m) along each axis. −log of the density is, to second order in t, the divergence
-(tr Q − log det Q − 4)/t² by which `ident.physical.physical` measures distances (Lee, Wensing, Park: Geometric Robot
-Dynamic Identification, 2020). Rotors, friction and offsets have no prior.
+The tolerance t is one relative standard deviation of the mass and of each second moment ∫x² dm, in
+whatever frame they are taken: rotations leave the distribution of E as it is, so L may be any root
+of P by the URDF. The centre of mass is known to t/√2 of √(∫x² dm / m) along each axis. −log of the
+density is, to second order in t, the divergence (tr Q − log det Q − 4)/t² by which
+`ident.physical.physical` measures distances (Lee, Wensing, Park: Geometric Robot Dynamic
+Identification, 2020). Rotors, friction and offsets have no prior.
 
-**Weights.** With θ = (g, β, u) of the estimate (gains, base parameters, coefficients of effects and payload),
-x = (g, χ_st, u), and T x the θ that x amounts to, the Gaussian posterior is where
+**Weights.** With θ = (g, β, u) of the estimate (gains, base parameters, coefficients of effects and
+payload), x = (g, χ_st, u), and T x the θ that x amounts to, the Gaussian posterior is where
 
     ‖R (T x − θ̂)‖² + Σ_links ‖E‖²_F
 
-is least, R the triangle of the motors' equations around the estimate (`ident.equations.currents`). The covariance C of
-the estimate comes from leaving out moves; its rank is their number at most, so its inverse is no weight. RᵀR is
-divided by the mean ratio of the variances in C to those in (RᵀR)⁻¹ instead, which makes data and prior comparable.
+is least, R the triangle of the motors' equations around the estimate (`ident.equations.currents`).
+The covariance C of the estimate comes from leaving out moves; its rank is their number at most, so
+its inverse is no weight. RᵀR is divided by the mean ratio of the variances in C to those in (RᵀR)⁻¹
+instead, which makes data and prior comparable.
 
-**Gains.** The gains stay those of the estimate, and the parameters are those that belong to them: g = ĝ in x. What the
-prior would make of the gains, with g free, is a second solution of the same equations (`FullParameters.gains`).
+**Gains.** The gains stay those of the estimate, and the parameters are those that belong to them: g
+= ĝ in x. What the prior would make of the gains, with g free, is a second solution of the same
+equations (`FullParameters.gains`).
 
-**σ and flags.** A solution is linear, x̂ = A θ̂ + B ε with ε the prior's deviations of one. Its errors are those of the
-data and those of the prior, each with its own covariance:
+**σ and flags.** A solution is linear, x̂ = A θ̂ + B ε with ε the prior's deviations of one. Its
+errors are those of the data and those of the prior, each with its own covariance:
 
     cov x̂ = A C Aᵀ + B Bᵀ.
 
-A parameter is *data* where the first part is the larger one, else *prior*. The ratio of posterior to prior σ says less:
-of a known sum Izz1 + Ia1, Ia1 has no prior, and still the prior of Izz1 decides on it.
+A parameter is *data* where the first part is the larger one, else *prior*. The ratio of posterior
+to prior σ says less: of a known sum Izz1 + Ia1, Ia1 has no prior, and still the prior of Izz1
+decides on it.
 
-**Consistency.** Where x̂ is no possible robot, the nearest one in the metric of the posterior takes its place
-(`ident.physical.consistency`). σ remains that of the unbounded solution.
+**Consistency.** Where x̂ is no possible robot, the nearest one in the metric of the posterior takes
+its place (`ident.physical.consistency`). σ remains that of the unbounded solution.
 """
 
 from __future__ import annotations
@@ -53,13 +58,21 @@ from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import link_parameters, pseudo_inertia
 from ident.model.model import Model
-from ident.physical.consistency import MARGIN, NotPhysical, consistency_of, relative_to_prior, solve_programme
+from ident.physical.consistency import (
+    MARGIN,
+    NotPhysical,
+    consistency_of,
+    relative_to_prior,
+    solve_programme,
+)
 from ident.physical.full_set import LARGEST_TOLERANCE, LEAST_TOLERANCE
 from ident.physical.prior_check import PriorCheck, check_prior
 
-_DEPENDENT = 1e-10  #: Diagonal of R, of columns of norm one, below which an unknown is not determined
+#: Diagonal of R, of columns of norm one, below which an unknown is not determined
+_DEPENDENT = 1e-10
 _LOOSE = 1e-9  #: Singular value, of columns of norm one, relative to the largest, that is none
-_ROOM = 1e-6  #: Least value of what may not be negative, in units of its scale: above the solver's tolerance
+#: Least value of what may not be negative, in units of its scale: above the solver's tolerance
+_ROOM = 1e-6
 LARGER_PART = 0.5  #: Share of a variance above which it is the larger part
 
 
@@ -80,14 +93,16 @@ class LinkPrior:
     def __post_init__(self) -> None:
         if not LEAST_TOLERANCE <= self.tolerance <= LARGEST_TOLERANCE:
             raise ModelError(
-                f"the tolerance of the prior is {self.tolerance:g}; expected {LEAST_TOLERANCE:g} to "
-                f"{LARGEST_TOLERANCE:g}, one relative standard deviation of masses and second moments"
+                f"the tolerance of the prior is {self.tolerance:g}; expected {LEAST_TOLERANCE:g} "
+                f"to {LARGEST_TOLERANCE:g}, one relative standard deviation of masses and second "
+                "moments"
             )
         for number, link in enumerate(self.links, start=1):
             if np.linalg.eigvalsh(pseudo_inertia(link))[0] <= 0.0:
                 raise ModelError(
-                    f"link {number} of the prior is no possible body: its pseudo-inertia has a negative eigenvalue; "
-                    "expected a mass and an inertia for each moving link; correct the URDF"
+                    f"link {number} of the prior is no possible body: its pseudo-inertia has a "
+                    "negative eigenvalue; expected a mass and an inertia for each moving link; "
+                    "correct the URDF"
                 )
 
     @property
@@ -97,7 +112,9 @@ class LinkPrior:
         return np.linalg.cholesky(pseudo_inertias)
 
     def directions(self) -> FloatArray:
-        """Change of each link's ten parameters for one σ of ten independent numbers, columns, shape (n, 10, 10)."""
+        """Change of each link's ten parameters for one σ of ten independent numbers, columns,
+        shape (n, 10, 10).
+        """
         basis = _symmetric_basis()
         directions: list[FloatArray] = []
         for factor in self.factors:
@@ -106,7 +123,9 @@ class LinkPrior:
         return np.array(directions)
 
     def drawn(self, rng: np.random.Generator) -> FloatArray:
-        """Links of a robot that the prior describes, shape (n, 10); bodies that cannot exist are drawn again."""
+        """Links of a robot that the prior describes, shape (n, 10);
+        bodies that cannot exist are drawn again.
+        """
         drawn: list[FloatArray] = []
         for link, directions in zip(self.links, self.directions(), strict=True):
             body = link + directions @ rng.standard_normal(10)
@@ -126,11 +145,13 @@ class FullParameters:
     standard_std: FloatArray  #: shape (c,)
     prior_std: FloatArray  #: before the data; infinite for rotors, friction and offsets, shape (c,)
     prior_share: FloatArray  #: share of the prior in each variance, 0 to 1, shape (c,)
-    gains: FloatArray  #: what the prior would make of the gains; not those that the parameters belong to, shape (m,)
+    #: what the prior would make of the gains; not those that the parameters belong to, shape (m,)
+    gains: FloatArray
     gains_std: FloatArray  #: of these, shape (m,)
     base: FloatArray  #: base parameters of `standard`, shape (b,)
     base_std: FloatArray  #: shape (b,)
-    eigenvalues: FloatArray  #: smallest one of each link's pseudo-inertia, as a share of its prior's, shape (n,)
+    #: smallest one of each link's pseudo-inertia, as a share of its prior's, shape (n,)
+    eigenvalues: FloatArray
     bounded: bool  #: the unbounded solution was no possible robot
     variance_ratio: float  #: mean variance of the estimate over that of independent rows
     check: PriorCheck  #: whether data and prior agree
@@ -149,7 +170,9 @@ class FullParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Equations:
-    """Rows of data and prior for the unknowns x = (g, χ_st, u), whitened: M x = y + e, cov e = 1."""
+    """Rows of data and prior for the unknowns x = (g, χ_st, u), whitened:
+    M x = y + e, cov e = 1.
+    """
 
     model: Model
     data: FloatArray  #: R T, scaled by the ratio of variances, shape (r, x)
@@ -183,7 +206,8 @@ class _Solution:
     """Least-squares solution of the equations."""
 
     values: FloatArray  #: x̂, shape (x,)
-    factor: FloatArray  #: F: ‖F (x − x̂)‖² is what x costs more than x̂, for the unknowns that are free
+    #: F: ‖F (x − x̂)‖² is what x costs more than x̂, for the unknowns that are free
+    factor: FloatArray
     free: int  #: first unknown that is free
     from_data: FloatArray  #: A C Aᵀ, shape (x, x)
     from_prior: FloatArray  #: B Bᵀ, shape (x, x)
@@ -200,7 +224,10 @@ class _Solution:
 
 
 def full_parameters(
-    system: System, estimate: Estimate, prior: LinkPrior, other_friction: frozenset[int] = frozenset()
+    system: System,
+    estimate: Estimate,
+    prior: LinkPrior,
+    other_friction: frozenset[int] = frozenset(),
 ) -> FullParameters:
     """Find all standard parameters of a robot, and what the prior would make of its gains.
 
@@ -208,12 +235,12 @@ def full_parameters(
         system: of the fit.
         estimate: from it.
         prior: of each link, in the order of the robot's joints.
-        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv alone may have any
-            sign.
+        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv
+            alone may have any sign.
 
     Raises:
-        ModelError: the prior is of another number of links, the robot has a closed chain, or the fit has left base
-            parameters out.
+        ModelError: the prior is of another number of links, the robot has a closed chain, or the
+            fit has left base parameters out.
         NotPhysical: no possible robot was found, or it does not pass its own test.
         ModuleNotFoundError: the solution has to be bounded, and cvxpy or Clarabel is not installed.
     """
@@ -268,7 +295,8 @@ def full_parameters(
 
 
 def _solved(equations: _Equations, first: int) -> _Solution:
-    """Solve the equations for all unknowns from ``first`` on; those before keep the values of the estimate.
+    """Solve the equations for all unknowns from ``first`` on;
+    those before keep the values of the estimate.
 
     Raises:
         NotPhysical: data and prior do not determine every unknown.
@@ -284,7 +312,10 @@ def _solved(equations: _Equations, first: int) -> _Solution:
     q, upper = np.linalg.qr(free / scale)
     smallest = float(np.abs(np.diag(upper)).min())
     if smallest < _DEPENDENT:
-        raise NotPhysical("data and prior together do not determine every parameter", f"smallest share {smallest:.1e}")
+        raise NotPhysical(
+            "data and prior together do not determine every parameter",
+            f"smallest share {smallest:.1e}",
+        )
     inverse = linalg.solve_triangular(upper, q.T) / scale[:, None]  # M⁺ of the free unknowns
     rows = len(equations.data)
     prior_rows = len(matrix) - rows
@@ -310,20 +341,22 @@ def _require_full(system: System, prior: LinkPrior) -> None:
         ModelError: as of `full_parameters`.
     """
     robot = system.model.robot
-    if robot.closures:
+    if robot.is_constrained:
         raise ModelError(
-            "the robot has a closed chain; expected a serial robot, each joint with a motor: for the links of a loop "
-            "no masses are computed"
+            "the robot has a closed chain, or joints that follow others; expected a serial robot, "
+            "each joint with a motor: for links that move together no masses are computed"
         )
     if len(prior.links) != robot.joint_count:
         raise ModelError(
-            f"the prior has {len(prior.links)} moving links, the robot {robot.joint_count}; give the URDF of this robot"
+            f"the prior has {len(prior.links)} moving links, the robot {robot.joint_count}; give "
+            "the URDF of this robot"
         )
     names = tuple(column.name for column in system.columns[: len(system.base.names)])
     if names != system.base.names:
         missing = sorted(set(system.base.names) - set(names))
         raise ModelError(
-            f"the fit has left out {', '.join(missing)}; expected all base parameters: fit without leaving any out"
+            f"the fit has left out {', '.join(missing)}; expected all base parameters: fit without "
+            "leaving any out"
         )
 
 
@@ -346,7 +379,9 @@ def _triangle(system: System, estimate: Estimate) -> FloatArray:
 
 
 def _variance_ratio(triangle: FloatArray, covariance: FloatArray) -> float:
-    """Mean ratio of the variances of an estimate to those of independent rows; one where the estimate has none."""
+    """Mean ratio of the variances of an estimate to those of independent rows;
+    one where the estimate has none.
+    """
     scale = np.linalg.norm(triangle, axis=0)
     inverse = linalg.solve_triangular(triangle / scale, np.eye(len(triangle)))
     independent = np.sum(inverse**2, axis=1) / scale**2
@@ -381,7 +416,9 @@ def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> tuple[_E
     of_links = np.zeros((prior.links.size, unknown_count))
     right = [np.zeros(len(loose))]
     first = 0
-    for link, directions, columns in zip(prior.links, prior.directions(), system.model.link_columns, strict=True):
+    for link, directions, columns in zip(
+        prior.links, prior.directions(), system.model.link_columns, strict=True
+    ):
         end = first + len(link)
         whitening = np.linalg.inv(directions)
         of_links[first:end, gains + columns] = whitening
@@ -401,7 +438,9 @@ def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> tuple[_E
 
 
 def _any_standard(system: System, estimate: Estimate) -> FloatArray:
-    """Standard parameters with the base parameters of an estimate: those that lead them, shape (c,)."""
+    """Standard parameters with the base parameters of an estimate:
+    those that lead them, shape (c,).
+    """
     leading = list(system.base.independent)
     standard = np.zeros(system.base.grouping.shape[1])
     standard[leading] = estimate.parameters[: len(leading)]
@@ -409,10 +448,12 @@ def _any_standard(system: System, estimate: Estimate) -> FloatArray:
 
 
 def _loose_drives(system: System, columns: FloatArray, size: float) -> FloatArray:
-    """Rows for combinations of rotors and friction that no torque shows and no link's prior bounds, shape (k, c).
+    """Rows for combinations of rotors and friction that no torque shows and no link's prior bounds,
+    shape (k, c).
 
-    Two motors that both turn two joints, one of them against the other, have rotors whose difference alone is seen.
-    Such a combination is zero, give or take what would make the total torque if it were seen.
+    Two motors that both turn two joints, one of them against the other, have rotors whose
+    difference alone is seen. Such a combination is zero, give or take what would make the total
+    torque if it were seen.
 
     Args:
         system: of the fit.
@@ -435,7 +476,9 @@ def _loose_drives(system: System, columns: FloatArray, size: float) -> FloatArra
 def _possible(
     equations: _Equations, prior: LinkPrior, solution: _Solution, other_friction: frozenset[int]
 ) -> tuple[FloatArray, bool]:
-    """Return x̂, or the x nearest to it that is a possible robot, ‖F (x − x̂)‖ least; and whether that was needed."""
+    """Return x̂, or the x nearest to it that is a possible robot, ‖F (x − x̂)‖ least;
+    and whether that was needed.
+    """
     model = equations.model
     own = equations.standard
     standard = solution.values[own]
@@ -472,7 +515,9 @@ def _possible(
     solve_programme(cp, objective, constraints, (step,))
     found = solution.values + steps @ step.value
     if not consistency.is_met(factors, found[own], 0.5 * MARGIN):
-        raise NotPhysical("the solution has an impossible link or drive", "outside of its own constraints")
+        raise NotPhysical(
+            "the solution has an impossible link or drive", "outside of its own constraints"
+        )
     return found, True
 
 

@@ -1,4 +1,6 @@
-"""The full parameters of a robot as a calibration keeps them: each with its σ and what it rests on."""
+"""The full parameters of a robot as a calibration keeps them:
+each with its σ and what it rests on.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,9 @@ from dataclasses import dataclass
 
 LEAST_TOLERANCE = 0.01  #: Of a prior
 LARGEST_TOLERANCE = 0.5
-"""Above it, a link of the prior's distribution is often no possible body: first order in t is not enough."""
+"""Above it, a link of the prior's distribution is often no possible body:
+first order in t is not enough.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +23,8 @@ class FullParameter:
     unit: str
     basis: str  #: `data` or `prior`: which of the two has the larger part in its variance
     prior_share: float  #: the prior's part in it, 0 to 1
-    prior: float | None  #: value by the prior; None for rotors, friction and offsets, which have none
+    #: value by the prior; None for rotors, friction and offsets, which have none
+    prior: float | None
     prior_std: float | None  #: σ by the prior's tolerance; None likewise
 
 
@@ -44,7 +49,8 @@ class FullSet:
     bounded: bool  #: values were moved to those of a robot that can exist
     chi_square: float  #: misfit of data and prior
     degrees_of_freedom: float  #: its mean where the prior is right
-    #: How heavy all links are by the data, relative to the prior; None where the data do not show it.
+    #: How heavy all links are by the data, relative to the prior; None where the data do not show
+    #: it.
     mass_ratio: float | None
     mass_ratio_std: float | None  #: its σ, the prior's tolerance included; None likewise
     contradictions: tuple[str, ...]  #: why the prior is wrong; empty where the data agree with it

@@ -1,4 +1,6 @@
-"""Physically consistent standard parameters: bodies, rotors and friction that could exist and have the same torque."""
+"""Physically consistent standard parameters:
+bodies, rotors and friction that could exist and have the same torque.
+"""
 
 from __future__ import annotations
 
@@ -28,15 +30,22 @@ from ident.physical.consistency import (
     solve_programme,
 )
 
-_ROOM = 2.0  #: The first programme has this multiple of the margin, so that the second has room to search
+#: The first programme has this multiple of the margin, so that the second has room to search
+_ROOM = 2.0
 _SCALAR_ROOM = 2e-7
-"""Lower bound of drive-chain parameters that may not be negative [share of the total torque]: above the solver's
-tolerance, and too small to count as a change; the second programme has half of it."""
+"""Lower bound of drive-chain parameters that may not be negative [share of the total torque]: above
+the solver's tolerance, and too small to count as a change; the second programme has half of it.
+"""
 _TRACE = 1e-8
-"""Weight that bounds the links in the first programme where the torque does not; the norm it is added to is exact."""
+"""Weight that bounds the links in the first programme where the torque does not;
+the norm it is added to is exact.
+"""
 _RIDGE = 1e-6
-"""Weight of the drive-chain parameters in the second: decides between those that the torque cannot distinguish."""
-_INVISIBLE = 1e-9  #: Change of the relative torque below which a unit step leaves the torque unchanged
+"""Weight of the drive-chain parameters in the second:
+decides between those that the torque cannot distinguish.
+"""
+#: Change of the relative torque below which a unit step leaves the torque unchanged
+_INVISIBLE = 1e-9
 _ENTRIES = 16  #: Of the matrix Q of a link
 
 
@@ -50,7 +59,8 @@ class Programme:
     triangle: FloatArray  #: a torque of relative size ‖triangle @ base‖, shape (b, b)
 
     def nearest(self, base: FloatArray) -> FloatArray:
-        """Find the consistent standard parameters whose torque is nearest to that of ``base``, shape (b,) → (c,).
+        """Find the consistent standard parameters whose torque is nearest to that of ``base``,
+        shape (b,) → (c,).
 
         Raises:
             NotPhysical: the solver found none.
@@ -79,8 +89,9 @@ class Programme:
     def with_base(self, standard: FloatArray, base: FloatArray) -> FloatArray:
         """Change standard parameters, shape (c,), so that they have given base parameters.
 
-        The change is the least one, each parameter measured by the prior of its link or its scale. All of it in the
-        leading parameters would be more than a light link has, where the torque hardly shows a base parameter.
+        The change is the least one, each parameter measured by the prior of its link or its scale.
+        All of it in the leading parameters would be more than a light link has, where the torque
+        hardly shows a base parameter.
         """
         sizes = np.array([np.linalg.norm(self._scaled(unit)) for unit in np.eye(len(standard))])
         unit_change = np.zeros(len(sizes))
@@ -92,11 +103,12 @@ class Programme:
     def closest_to_prior(
         self, start: FloatArray, directions: FloatArray, base: FloatArray, farthest: float
     ) -> FloatArray:
-        """Find the standard parameters nearest to the prior with almost the same torque, shape (c,).
+        """Find the standard parameters nearest to the prior with almost the same torque,
+        shape (c,).
 
-        The distance of a link is the divergence tr Q − log det Q − 4 (Lee, Wensing, Park: Geometric Robot Dynamic
-        Identification, 2020): it does not depend on frames and units, and grows without limit towards an
-        impossible body.
+        The distance of a link is the divergence tr Q − log det Q − 4 (Lee, Wensing, Park: Geometric
+        Robot Dynamic Identification, 2020): it does not depend on frames and units, and grows
+        without limit towards an impossible body.
 
         Args:
             start: consistent standard parameters, shape (c,).
@@ -109,7 +121,8 @@ class Programme:
         """
         import cvxpy as cp  # noqa: PLC0415 - as above
 
-        # Orthonormal steps: the solver gets neither kg with kg m² nor two directions that are almost one.
+        # Orthonormal steps: the solver gets neither kg with kg m² nor two directions that are
+        # almost one.
         scaled = np.column_stack([self._scaled(change) for change in directions.T])
         steps, upper = np.linalg.qr(scaled)
         rotation = np.linalg.inv(upper)
@@ -142,7 +155,9 @@ class Programme:
         return np.concatenate((links.ravel(), scalars))
 
     def _standard(self, links: FloatArray, scalars: FloatArray) -> FloatArray:
-        """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters, shape (c,)."""
+        """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters,
+        shape (c,).
+        """
         conditions = self.consistency
         standard = np.zeros(self.grouping.shape[1])
         standard[conditions.scalars] = conditions.scales * scalars
@@ -165,10 +180,12 @@ def _parameters_per_entry(factor: FloatArray) -> FloatArray:
 
 
 DEFAULT_MASS_KG = 1.0  #: Mass of a link without one in the URDF
-DEFAULT_RADIUS_M = 0.1  #: Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist
+#: Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist
+DEFAULT_RADIUS_M = 0.1
 _THINNEST = 1e-6
-"""Smallest share of a ball's second moment that a link of the URDF may have in any direction: rods and plates pass,
-rounding errors around zero do not."""
+"""Smallest share of a ball's second moment that a link of the URDF may have in any direction:
+rods and plates pass, rounding errors around zero do not.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +197,8 @@ class InertiaPrior:
 
 
 def urdf_links(urdf: str) -> FloatArray:
-    """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints, shape (n, 10).
+    """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints,
+    shape (n, 10).
 
     Raises:
         ModelError: the text is no URDF.
@@ -189,10 +207,11 @@ def urdf_links(urdf: str) -> FloatArray:
 
 
 def inertia_prior(urdf: str) -> InertiaPrior:
-    """Take the URDF's inertias where a body can have them, else those of a solid ball about the centre of mass.
+    """Take the URDF's inertias where a body can have them,
+    else those of a solid ball about the centre of mass.
 
-    The ball has DEFAULT_RADIUS_M, and the URDF's mass and centre of mass; without a mass, DEFAULT_MASS_KG at the
-    origin of the link frame.
+    The ball has DEFAULT_RADIUS_M, and the URDF's mass and centre of mass; without a mass,
+    DEFAULT_MASS_KG at the origin of the link frame.
 
     Raises:
         ModelError: the text is no URDF.
@@ -222,7 +241,8 @@ def _ball_of(link: FloatArray) -> FloatArray:
     return Body(mass, centre, inertia).parameters
 
 
-_SAME = 1e-4  #: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
+#: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
+_SAME = 1e-4
 _ROUNDING = 1e-9  #: Share of the largest column, and of a singular value, that is rounding error
 _LARGEST_REST = 1e-6  #: Of a column of norm one that is a combination of the leading ones
 
@@ -231,8 +251,8 @@ def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
     """Draw independent states within limits, to test statements about every motion.
 
     Args:
-        limits: middle of the range, half the range, speed and acceleration of each joint, in four rows [rad or m, and
-            their derivatives], shape (4, n).
+        limits: middle of the range, half the range, speed and acceleration of each joint, in four
+            rows [rad or m, and their derivatives], shape (4, n).
         samples: k.
         seed: the same seed gives the same states.
     """
@@ -249,8 +269,9 @@ def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
 def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BaseParameters:
     """Compute the weights of standard parameters in each base parameter to full precision.
 
-    A calibration has the weights of the grouping as text of six decimals; its leading names are exact. Every column is
-    a combination of the leading ones (paper §2.1), so the weights follow from any motion that is rich enough.
+    A calibration has the weights of the grouping as text of six decimals; its leading names are
+    exact. Every column is a combination of the leading ones (paper §2.1), so the weights follow
+    from any motion that is rich enough.
 
     Args:
         model: the declared model of the robot.
@@ -258,16 +279,17 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
         columns: the model's regressor of such a motion, rows of all joints, shape (m, c).
 
     Raises:
-        ModelError: the names are not those of this robot: unknown, or with other weights (another geometry, other
-            gravity), or too few (not everything was identifiable in the fit) or too many.
+        ModelError: the names are not those of this robot: unknown, or with other weights (another
+            geometry, other gravity), or too few (not everything was identifiable in the fit) or too
+            many.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     leading = [name.split(" ", 1)[0] for name in names]
     foreign = [name for name in leading if name not in index]
     if foreign:
         raise ModelError(
-            f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; use the cell of the "
-            "fit, with its drive train"
+            f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; "
+            "use the cell of the fit, with its drive train"
         )
     order = np.argsort([index[name] for name in leading])
     independent = [index[leading[i]] for i in order]
@@ -280,15 +302,15 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     weights, _, rank, _ = linalg.lstsq(chosen, unit, cond=_ROUNDING)
     if rank < len(independent):
         raise ModelError(
-            f"the calibration has {len(independent)} base parameters, this robot only {rank}: another geometry, "
-            "gravity or drive train"
+            f"the calibration has {len(independent)} base parameters, this robot only {rank}: "
+            "another geometry, gravity or drive train"
         )
     rest = np.linalg.norm(unit - chosen @ weights, axis=0)
     missing = [model.columns[column].name for column in np.flatnonzero(rest > _LARGEST_REST)]
     if missing:
         raise ModelError(
-            f"the calibration lacks {', '.join(missing)}, which this robot's torque depends on: its data did not "
-            "determine them, or it is of another robot"
+            f"the calibration lacks {', '.join(missing)}, which this robot's torque depends on: "
+            "its data did not determine them, or it is of another robot"
         )
     grouping = weights * scale / scale[independent, None]
     grouping[:, independent] = np.eye(len(independent))
@@ -316,15 +338,19 @@ def _require_same_weights(name: str, row: FloatArray, index: Mapping[str, int]) 
         tolerance = _SAME * max(1.0, abs(declared))
         if not abs(found - declared) <= tolerance:
             raise ModelError(
-                f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; this robot's "
-                f"geometry gives {found:.6g}: it is not the robot, the gravity or the drive train of the fit"
+                f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; "
+                f"this robot's geometry gives {found:.6g}: it is not the robot, the gravity or the "
+                "drive train of the fit"
             )
 
 
-EXACT = 1e-6  #: Share of the torque below which a consistent set counts as predicting the identified torque
+#: Share of the torque below which a consistent set counts as predicting the identified torque
+EXACT = 1e-6
 SLACK = 0.1
-"""If the nearest torque is not the identified one, bodies are sought among all that are at most this share farther from
-it: right at the nearest there is no choice left, and the errors of the data decide on the bodies."""
+"""If the nearest torque is not the identified one, bodies are sought among all that are at most
+this share farther from it: right at the nearest there is no choice left, and the errors of the data
+decide on the bodies.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -335,7 +361,8 @@ class PhysicalParameters:
     standard: FloatArray  #: χ_st, shape (c,)
     base: BaseParameters  #: grouping of the base parameters
     identified: FloatArray  #: given values of the base parameters, shape (b,)
-    realised: FloatArray  #: base parameters of `standard`, shape (b,); those identified where a consistent set exists
+    #: base parameters of `standard`, shape (b,); those identified where a consistent set exists
+    realised: FloatArray
     #: ‖Δτ‖/‖τ‖ of the realised against the identified torque on the given motion [%].
     torque_change_percent: RelativeError
     #: Smallest one of each link's pseudo-inertia, as a share of its prior's; at least about MARGIN.
@@ -362,18 +389,19 @@ def physical_parameters(
 ) -> PhysicalParameters:
     """Find physically consistent standard parameters that predict the torque of base parameters.
 
-    Consistent is what `ident.physical.consistency` says. The first programme finds
-    the torque nearest to the identified one (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); the second finds, of
-    all sets with this torque, the one nearest to the prior.
+    Consistent is what `ident.physical.consistency` says. The first programme finds the torque
+    nearest to the identified one (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); the second
+    finds, of all sets with this torque, the one nearest to the prior.
 
     Args:
         model: the declared model.
         base: the grouping of its base parameters.
         values: identified values, shape (b,).
-        columns: the model's regressor of a rich motion, shape (n, c, k), whose torque measures the distance.
+        columns: the model's regressor of a rich motion, shape (n, c, k), whose torque measures the
+            distance.
         prior: expected links.
-        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv alone may have any
-            sign.
+        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv
+            alone may have any sign.
 
     Raises:
         NotPhysical: no set was found, or it does not pass its own test.

@@ -1,14 +1,15 @@
 """Whether data contradict a prior: by its total misfit, and by how heavy they find its links.
 
-Rows of data and prior in units of their σ, M x = y, leave a misfit r = (1 − Q Qᵀ) y, Q an orthonormal basis of M. With
-S the covariance of the rows, that of r is Σ = (1 − Q Qᵀ) S (1 − Q Qᵀ). S is not quite one: the weights of the data are
-those of independent rows, and their errors are not. ‖r‖² has the mean tr Σ and the variance 2 tr Σ², so
-‖r‖² tr Σ / tr Σ² has nearly the chi-square distribution with (tr Σ)² / tr Σ² degrees of freedom (Satterthwaite,
-Biometrics Bulletin 2 (1946)).
+Rows of data and prior in units of their σ, M x = y, leave a misfit r = (1 − Q Qᵀ) y, Q an
+orthonormal basis of M. With S the covariance of the rows, that of r is Σ = (1 − Q Qᵀ) S (1 − Q Qᵀ).
+S is not quite one: the weights of the data are those of independent rows, and their errors are not.
+‖r‖² has the mean tr Σ and the variance 2 tr Σ², so ‖r‖² tr Σ / tr Σ² has nearly the chi-square
+distribution with (tr Σ)² / tr Σ² degrees of freedom (Satterthwaite, Biometrics Bulletin 2 (1946)).
 
-The misfit is weak against one mistake that all links share: 30 % too heavy is 1.5 σ for a tolerance of 20 %, one link
-at a time. A prior whose links all weigh 1 + s times what it says adds a column to M, M x − s c = y; s by least squares,
-with its σ by S, is a test of that alone, and so is the same for each link.
+The misfit is weak against one mistake that all links share: 30 % too heavy is 1.5 σ for a tolerance
+of 20 %, one link at a time. A prior whose links all weigh 1 + s times what it says adds a column to
+M, M x − s c = y; s by least squares, with its σ by S, is a test of that alone, and so is the same
+for each link.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class PriorCheck:
     chi_square: float  #: scaled misfit of data and prior
     degrees_of_freedom: float  #: its mean where the prior is right
     mass_ratio: float  #: how heavy all links are, by the data, relative to the prior
-    mass_ratio_std: float  #: its σ, the prior's tolerance included; infinite where the data do not show it
+    #: its σ, the prior's tolerance included; infinite where the data do not show it
+    mass_ratio_std: float
     link_ratios: FloatArray  #: the same of each link, shape (n,)
     link_ratio_stds: FloatArray  #: shape (n,); infinite for a link that the data do not show
 
@@ -68,8 +70,8 @@ def check_prior(
     """Test a prior.
 
     Args:
-        matrix: M, the rows of the data first, those of the links' prior last, ten a link, in the order of the upper
-            triangle of a symmetric 4 × 4 matrix, shape (r, x).
+        matrix: M, the rows of the data first, those of the links' prior last, ten a link, in the
+            order of the upper triangle of a symmetric 4 × 4 matrix, shape (r, x).
         right: y, shape (r,).
         data_covariance: S of the rows of the data, shape (d, d); that of the prior's is one.
         links: n.

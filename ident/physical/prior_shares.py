@@ -1,8 +1,10 @@
-"""What each parameter of a chosen set of bodies rests on: the base parameters of the fit, or the prior on the links.
+"""What each parameter of a chosen set of bodies rests on:
+the base parameters of the fit, or the prior on the links.
 
-`ident.physical.physical` takes, of all sets χ with the identified base parameters G χ = β̂, the one nearest to the prior
-χ₀. To first order the distance is (χ − χ₀)ᵀ S⁻¹ (χ − χ₀), with S the covariance of the prior; rotors, friction and
-offsets have none, S⁻¹ = 0. With the columns of N a basis of the null space of G, the choice is linear,
+`ident.physical.physical` takes, of all sets χ with the identified base parameters G χ = β̂, the one
+nearest to the prior χ₀. To first order the distance is (χ − χ₀)ᵀ S⁻¹ (χ − χ₀), with S the
+covariance of the prior; rotors, friction and offsets have none, S⁻¹ = 0. With the columns of N a
+basis of the null space of G, the choice is linear,
 
     χ = A β̂ + B χ₀,    B = N (Nᵀ S⁻¹ N)⁻¹ Nᵀ S⁻¹,    A = (1 − B) G⁺,
 
@@ -26,11 +28,14 @@ from ident.physical.full_parameters import LinkPrior
 _LOOSE = 1e-10  #: Singular value, relative to the largest, that counts as zero
 
 
-def prior_shares(model: Model, grouping: FloatArray, covariance: FloatArray, prior: LinkPrior) -> FloatArray:
-    """Share of the prior in the variance of each standard parameter of a chosen set, 0 to 1, shape (c,).
+def prior_shares(
+    model: Model, grouping: FloatArray, covariance: FloatArray, prior: LinkPrior
+) -> FloatArray:
+    """Share of the prior in the variance of each standard parameter of a chosen set, 0 to 1,
+    shape (c,).
 
-    A parameter that has no prior and that no torque depends on, as the rotor of a joint without a motor, has a share of
-    0: it is zero.
+    A parameter that has no prior and that no torque depends on, as the rotor of a joint without a
+    motor, has a share of 0: it is zero.
 
     Args:
         model: the declared model.

@@ -1,8 +1,8 @@
 """A clear way between two positions of the axes, where the straight one is not clear.
 
-Two trees of positions grow, one from each end; each of their branches is a straight way that is clear. A tree grows
-towards a random position, then the other one towards what it has reached, until they meet (RRT-Connect; Kuffner &
-LaValle, ICRA 2000).
+Two trees of positions grow, one from each end; each of their branches is a straight way that is
+clear. A tree grows towards a random position, then the other one towards what it has reached, until
+they meet (RRT-Connect; Kuffner & LaValle, ICRA 2000).
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from ident.arrays import FloatArray
 from ident.planning.clearance import Checker
 
 MOST_BRANCHES = 200  #: Of both trees
-SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  #: Of the way to a position, the first that is clear is gone
+#: Of the way to a position, the first that is clear is gone
+SHARES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)
 SAME = 1e-9  #: Distance of two positions that are the same, as a share of the room
 
 
@@ -27,7 +28,9 @@ class _Tree:
     def grow(
         self, checker: Checker, target: FloatArray, lower: FloatArray, upper: FloatArray
     ) -> tuple[int, FloatArray] | None:
-        """Go towards a position from the nearest one: number and position of what is reached; None where it is shut."""
+        """Go towards a position from the nearest one: number and position of what is reached;
+        None where it is shut.
+        """
         room = np.where(upper > lower, upper - lower, 1.0)
         differences = np.array(self._positions) - target
         distances = np.linalg.norm(differences / room, axis=1)
@@ -59,7 +62,8 @@ def clear_way(
     upper: FloatArray,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, ...] | None:
-    """Return the positions between start and end at which a clear way turns; None where no way was found.
+    """Return the positions between start and end at which a clear way turns;
+    None where no way was found.
 
     Args:
         checker: of the robot and its room.
@@ -103,7 +107,8 @@ def clear_way(
 def farthest_towards(
     checker: Checker, start: FloatArray, target: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray | None:
-    """Return the farthest of some positions on the way to a target that the robot can go to; None where it is shut.
+    """Return the farthest of some positions on the way to a target that the robot can go to;
+    None where it is shut.
 
     Args:
         checker: of the robot and its room.

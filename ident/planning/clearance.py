@@ -1,12 +1,15 @@
-"""Clearance of an arm from itself, from obstacles and from the walls of its workspace, all along a move.
+"""Clearance of an arm from itself, from obstacles and from the walls of its workspace,
+all along a move.
 
-Links are capsules: a capsule is a segment with a radius, so the distance of two capsules, or of a capsule and a box, is
-that of their segments less the radii. These distances have closed forms (`segment_to_segment`, `segment_to_box`).
+Links are capsules: a capsule is a segment with a radius, so the distance of two capsules, or of a
+capsule and a box, is that of their segments less the radii. These distances have closed forms
+(`segment_to_segment`, `segment_to_box`).
 
-A synchronised point-to-point move is a straight line in joint space, q(s) = q₀ + s Δq, so no point of a capsule on link
-b moves relative to link a by more than Σ_k |Δq_k| ℓ_k from its start to its end, with k the joints between the two and
-ℓ_k the longest lever from joint k to the capsule. A stretch of half-width h about s is clear when the distance at s is
-at least h times that; else it is halved. So nothing is jumped over, whatever the speed.
+A synchronised point-to-point move is a straight line in joint space, q(s) = q₀ + s Δq, so no point
+of a capsule on link b moves relative to link a by more than Σ_k |Δq_k| ℓ_k from its start to its
+end, with k the joints between the two and ℓ_k the longest lever from joint k to the capsule. A
+stretch of half-width h about s is clear when the distance at s is at least h times that; else it is
+halved. So nothing is jumped over, whatever the speed.
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ from ident.model.robot import JointKind, Robot, poses
 _Point = tuple[float, float, float]
 BASE = -1  #: Index of the link that does not move
 RESOLUTION_M = 0.004
-"""A stretch in which nothing moves farther than this, and which is still not known to be clear, counts as blocked."""
+"""A stretch in which nothing moves farther than this, and which is still not known to be clear,
+counts as blocked.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +72,19 @@ class Obstruction:
     position: tuple[float, ...]  #: of the axes there [rad or m]
 
 
-CLOSURES = "the closures"  #: What is in the way where the loops of a closed chain do not close, or are nearly singular
-WORKSPACE_END = "the end of the workspace"  #: What is in the way of a body that must not leave the workspace
+#: What is in the way where the loops of a closed chain do not close, or are nearly singular
+CLOSURES = "the closures"
+#: What is in the way of a body that must not leave the workspace
+WORKSPACE_END = "the end of the workspace"
 LARGEST_PLANNED_CONDITION = 60.0
-"""Largest condition of the closures in a planned pose (Frobenius): nearer to a singularity, forces in loops grow."""
+"""Largest condition of the closures in a planned pose (Frobenius):
+nearer to a singularity, forces in loops grow.
+"""
 LARGEST_PLANNED_MISFIT = 0.01
-"""Motors of a redundant drive may differ by this on the way between two poses that fit [rad or m]: they work against
-each other there, which is what separates their gains, and no more than their position loops can bear."""
+"""Motors of a redundant drive may differ by this on the way between two poses that fit [rad or m]:
+they work against each other there, which is what separates their gains, and no more than their
+position loops can bear.
+"""
 STEP_SHARE = 0.05  #: Of the way between two poses of a closed chain that are examined
 
 
@@ -86,13 +97,16 @@ class _Reached:
 
 
 class Checker:
-    """Distances of the pairs of bodies in a scene, for many postures of the arm; whether a closed chain gets there."""
+    """Distances of the pairs of bodies in a scene, for many postures of the arm;
+    whether a closed chain gets there.
+    """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
         self.robot = robot
         self.scene = scene
         self._assembly = assemble(robot)
-        # Bodies are the capsules in their order, then the boxes; the ends of a box are opposite corners.
+        # Bodies are the capsules in their order, then the boxes; the ends of a box are opposite
+        # corners.
         names: list[str] = []
         frames: list[int] = []
         ends: list[tuple[_Point, _Point]] = []
@@ -121,16 +135,17 @@ class Checker:
         self._first, self._second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
 
     def margins(self, position: FloatArray) -> FloatArray:
-        """Compute the smallest distance beyond the minimum in each posture [m], negative where bodies are closer.
+        """Compute the smallest distance beyond the minimum in each posture [m],
+        negative where bodies are closer.
 
         Args:
             position: of the axes [rad or m], shape (k, m).
 
         Returns:
-            shape (k,); inf where there is nothing to keep away from, −inf where the loops of a closed chain do not
-            close, or nearly have a singularity.
+            shape (k,); inf where there is nothing to keep away from, −inf where the loops of a
+            closed chain do not close, or nearly have a singularity.
         """
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             margins = self._margins(position, self._everywhere)
             return np.asarray(margins.min(axis=0, initial=np.inf))
         found = self._reached(position)
@@ -138,8 +153,10 @@ class Checker:
         return np.where(found.usable, margins.min(axis=0, initial=np.inf), -np.inf)
 
     def fitting(self, position: FloatArray) -> FloatArray:
-        """Positions of the axes that fit each other, near given ones, shape (…, m): the same where they are free."""
-        if not self.robot.closures:
+        """Positions of the axes that fit each other, near given ones, shape (…, m):
+        the same where they are free.
+        """
+        if not self.robot.is_constrained:
             return position
         found = reach(self.robot, self._assembly, np.atleast_2d(position))
         of_axes = found.position_rad[:, list(self.robot.axis_joints)]
@@ -162,8 +179,10 @@ class Checker:
         return _Reached(found.position_rad, found.closed & is_regular & fits)
 
     def apart(self, position: FloatArray) -> FloatArray:
-        """Share of postures, shape (k, n), in which each of the scene's pairs does not touch, shape (pairs,)."""
-        if self.robot.closures:
+        """Share of postures, shape (k, n), in which each of the scene's pairs does not touch,
+        shape (pairs,).
+        """
+        if self.robot.is_constrained:
             found = self._reached(position)
             position = found.joints[found.usable]
         margins = self._margins(position, self._everywhere)[: len(self.scene.pairs)]
@@ -176,7 +195,7 @@ class Checker:
         Args:
             start, end: positions of the axes [rad or m], shape (m,).
         """
-        if self.robot.closures:
+        if self.robot.is_constrained:
             (found,) = self._ways(start[None], end[None])
             return found
         travel_m = self._travel_of_rows(start, end)
@@ -198,8 +217,12 @@ class Checker:
         return None
 
     def _travel_of_rows(self, start: FloatArray, end: FloatArray) -> FloatArray:
-        """Bound on the path of any point of one body relative to the other, of each row of `_margins` [m]."""
-        travel_m = [self._relative_travel(first, second, start, end) for first, second in self._pairs]
+        """Bound on the path of any point of one body relative to the other,
+        of each row of `_margins` [m].
+        """
+        travel_m = [
+            self._relative_travel(first, second, start, end) for first, second in self._pairs
+        ]
         outside = len(self.scene.capsules)  # a body that does not move
         for index in self._confined:
             travel_m.append(self._relative_travel(index, outside, start, end))
@@ -215,17 +238,19 @@ class Checker:
         confined = self._confined[row - len(self._pairs)]
         return Obstruction(self._names[confined], WORKSPACE_END, margin_m, where)
 
-    def farthest(self, start: FloatArray, ends: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray | None:
+    def farthest(
+        self, start: FloatArray, ends: FloatArray, lower: FloatArray, upper: FloatArray
+    ) -> FloatArray | None:
         """Choose the first of some ends that the robot can go to; None where it can go to none.
 
         Args:
             start, lower, upper: positions of the axes [rad or m], shape (m,).
-            ends: shape (e, m). Motors of a redundant drive are moved to positions that fit each other, which may be
-                outside the limits.
+            ends: shape (e, m). Motors of a redundant drive are moved to positions that fit each
+                other, which may be outside the limits.
         """
         ends = self.fitting(ends)
         is_inside = np.all((ends >= lower) & (ends <= upper), axis=1)
-        if not self.robot.closures:
+        if not self.robot.is_constrained:
             for end in ends[is_inside]:
                 if self.obstruction(start, end) is None:
                     return np.asarray(end)
@@ -237,7 +262,9 @@ class Checker:
         return None
 
     def _ways(self, starts: FloatArray, ends: FloatArray) -> list[Obstruction | None]:
-        """Look at poses of straight ways so close to each other that nothing happens between them."""
+        """Look at poses of straight ways so close to each other that nothing happens between
+        them.
+        """
         shares = np.linspace(0.0, 1.0, round(1.0 / STEP_SHARE) + 1)
         position = starts[:, None] + (ends - starts)[:, None] * shares[:, None]
         ways, samples, axes = position.shape
@@ -245,9 +272,10 @@ class Checker:
         usable = found.usable.reshape(ways, samples)
         margins = self._margins(found.joints, self._everywhere).reshape(-1, ways, samples)
         placed = self._placed(found.joints).reshape(-1, ways, samples, 3, 2)
-        # A body moves at most as far between two poses as the fastest of its ends: from the nearer one at most half of
-        # that, and two bodies that both move come closer by all of it. (The way of an end between poses is taken as
-        # straight; it is bent by less than a hundredth of its length.)
+        # A body moves at most as far between two poses as the fastest of its ends: from the nearer
+        # one at most half of that, and two bodies that both move come closer by all of it. (The way
+        # of an end between poses is taken as straight; it is bent by less than a hundredth of its
+        # length.)
         steps = np.linalg.norm(np.diff(placed, axis=2), axis=3)
         travel = steps.max(axis=(0, 2, 3), initial=0.0)
         share_of_travel = self._shares_of_travel()
@@ -267,7 +295,9 @@ class Checker:
         return obstructions
 
     def _shares_of_travel(self) -> FloatArray:
-        """Share of the travel of an end by which the bodies of each row of `_margins` may come closer."""
+        """Share of the travel of an end by which the bodies of each row of `_margins` may come
+        closer.
+        """
         shares: list[float] = []
         for pair in self._pairs:
             both_move = max(pair) < len(self.scene.capsules)
@@ -288,7 +318,8 @@ class Checker:
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Margin of each pair, then of each confined capsule, shape (pairs + confined, k).
 
-        Where spheres around both bodies are farther apart than needed, it is the margin of the spheres.
+        Where spheres around both bodies are farther apart than needed, it is the margin of the
+        spheres.
         """
         placed = self._placed(position)
         start = placed[..., 0]
@@ -320,7 +351,9 @@ class Checker:
                 out[last] = np.minimum(start_margin, end_margin) - self._radius[index]
         return out
 
-    def _relative_travel(self, first: int, second: int, start: FloatArray, end: FloatArray) -> float:
+    def _relative_travel(
+        self, first: int, second: int, start: FloatArray, end: FloatArray
+    ) -> float:
         """Bound on the path of any point of one body relative to another one [m]."""
         first_chain = self._chain(first)
         second_chain = self._chain(second)
@@ -336,7 +369,9 @@ class Checker:
         end: FloatArray,
         travel_m: float = 0.0,
     ) -> float:
-        """Add the path that the joints of a chain, which are not in another one, can move a capsule along [m]."""
+        """Add the path that the joints of a chain, which are not in another one,
+        can move a capsule along [m].
+        """
         if body >= len(self.scene.capsules):
             return travel_m
         capsule = self.scene.capsules[body]
@@ -372,7 +407,9 @@ class Checker:
 
 
 def _pairs_with_boxes(scene: Scene) -> list[tuple[int, int]]:
-    """Pairs of each capsule that moves with each box, whose indices follow those of the capsules."""
+    """Pairs of each capsule that moves with each box,
+    whose indices follow those of the capsules.
+    """
     pairs: list[tuple[int, int]] = []
     first_box = len(scene.capsules)
     for index, capsule in enumerate(scene.capsules):
@@ -382,7 +419,9 @@ def _pairs_with_boxes(scene: Scene) -> list[tuple[int, int]]:
 
 
 def _margin_inside(point_m: FloatArray, box: Box) -> FloatArray:
-    """Distance of points inside a box from its nearest face [m], shape (k, 3) → (k,); negative outside."""
+    """Distance of points inside a box from its nearest face [m], shape (k, 3) → (k,);
+    negative outside.
+    """
     from_lower = point_m - np.array(box.lower_m)
     from_upper = np.array(box.upper_m) - point_m
     return np.asarray(np.minimum(from_lower, from_upper).min(axis=1))
@@ -393,9 +432,9 @@ def segment_to_segment(
 ) -> FloatArray:
     """Compute the distance of two segments in each sample [m], shape (k,).
 
-    The squared distance of points s and t along the segments is a convex quadratic. Its minimum over s, clipped to
-    the segment, gives the best t, and t, clipped, the best s (Ericson, Real-Time Collision Detection, 5.1.9). For
-    parallel segments the first s may be any.
+    The squared distance of points s and t along the segments is a convex quadratic. Its minimum
+    over s, clipped to the segment, gives the best t, and t, clipped, the best s (Ericson, Real-Time
+    Collision Detection, 5.1.9). For parallel segments the first s may be any.
 
     Args:
         start, end, other_start, other_end: ends of the segments [m], shape (k, 3).
@@ -415,12 +454,15 @@ def segment_to_segment(
     return _length(nearest)
 
 
-def segment_to_box(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+def segment_to_box(
+    start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
     """Compute the distance of a segment from an axis-aligned box in each sample [m], shape (k,).
 
-    Where the two overlap it is minus the shortest displacement that separates them. Half the derivative of the squared
-    distance along the segment, d · excess(t), is piecewise linear and never falls. It bends where the segment crosses
-    the plane of a face; between two bends its zero follows from a straight line.
+    Where the two overlap it is minus the shortest displacement that separates them. Half the
+    derivative of the squared distance along the segment, d · excess(t), is piecewise linear and
+    never falls. It bends where the segment crosses the plane of a face; between two bends its zero
+    follows from a straight line.
 
     Args:
         start, end: ends of the segment [m], shape (k, 3).
@@ -452,10 +494,11 @@ def segment_to_box(start: FloatArray, end: FloatArray, lower: FloatArray, upper:
 
 
 def _depth(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Shortest displacement of a segment out of a box that it enters, shape (k,); not positive where they are apart.
+    """Shortest displacement of a segment out of a box that it enters, shape (k,);
+    not positive where they are apart.
 
-    It is along a normal of a face of their Minkowski difference: an edge of the box, or the cross product of one with
-    the segment.
+    It is along a normal of a face of their Minkowski difference: an edge of the box, or the cross
+    product of one with the segment.
     """
     edges = np.broadcast_to(np.eye(3), (len(start), 3, 3))
     along = end - start

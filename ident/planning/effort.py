@@ -1,9 +1,10 @@
 """Torque that a motion needs of the joints, compared with what their drives can give.
 
-A drive whose current is at its limit falls behind its set-point, and trips with a following error. So a plan must know
-the torque of its moves before they are made: it comes from the expected robot, as the information of a plan does, and
-the limits are the efforts of the URDF. Both are known roughly: expected inertias and friction are guesses, and a gain
-may differ from its nameplate by 30 %. Planned moves therefore stay below the limit by `EFFORT_MARGIN`.
+A drive whose current is at its limit falls behind its set-point, and trips with a following error.
+So a plan must know the torque of its moves before they are made: it comes from the expected robot,
+as the information of a plan does, and the limits are the efforts of the URDF. Both are known
+roughly: expected inertias and friction are guesses, and a gain may differ from its nameplate by 30
+%. Planned moves therefore stay below the limit by `EFFORT_MARGIN`.
 """
 
 from __future__ import annotations
@@ -57,9 +58,13 @@ def effort_shares(
 
 
 def believable_efforts(
-    expectation: Expectation, effort: FloatArray, position: FloatArray, payloads: Sequence[int | None]
+    expectation: Expectation,
+    effort: FloatArray,
+    position: FloatArray,
+    payloads: Sequence[int | None],
 ) -> FloatArray:
-    """Return effort limits with inf for those that gravity alone exceeds, shape (n,): such an arm could not stand.
+    """Return effort limits with inf for those that gravity alone exceeds, shape (n,):
+    such an arm could not stand.
 
     Exporters write one effort for all joints of all robots, which is no limit of a drive.
 

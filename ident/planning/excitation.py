@@ -1,14 +1,15 @@
 """Predicted information of an experiment about the drive gains (paper §2.3; optimal design).
 
-With T from the drive train the fit's model is v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i, e_i of standard
-deviation σ_i, γ_i = 1/g_i (see ident/estimators/maximum_likelihood.py). Its rows, differentiated by the unknowns and
-divided by σ_i, are
+With T from the drive train the fit's model is v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i +
+e_i, e_i of standard deviation σ_i, γ_i = 1/g_i (see ident/estimators/maximum_likelihood.py). Its
+rows, differentiated by the unknowns and divided by σ_i, are
 
-    ∂/∂χ = γ_i (T W)_i / σ_i,      ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,      ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
+    ∂/∂χ = γ_i (T W)_i / σ_i,    ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,    ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
 
-with τ the total expected torque. The information about all unknowns is the sum of JᵀJ over the rows, and the covariance
-of ln g the inverse of its Schur complement: the part of the gains' columns that is independent of all others. The
-expectation before a fit is a nominal robot, made from the URDF: good enough to choose moves, never to fit.
+with τ the total expected torque. The information about all unknowns is the sum of JᵀJ over the
+rows, and the covariance of ln g the inverse of its Schur complement: the part of the gains' columns
+that is independent of all others. The expectation before a fit is a nominal robot, made from the
+URDF: good enough to choose moves, never to fit.
 """
 
 from __future__ import annotations
@@ -35,20 +36,26 @@ IntArray = NDArray[np.intp]
 
 UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the better source
 UNSEEN = 1e-9  #: Share of a column that counts as nothing when the others are projected out of it
-LARGEST_UNSEEN_SHARE = 1e-6  #: Of a gain in directions that nothing shows, up to which it is still identifiable
+#: Of a gain in directions that nothing shows, up to which it is still identifiable
+LARGEST_UNSEEN_SHARE = 1e-6
 SMALLEST_PIVOT = 1e-5  #: Of a Cholesky factor whose digits are not rounding errors
-LINK_MASS_KG = 5.0  #: Mass of each link where the URDF has no inertias, as a slender rod to the next joint
+#: Mass of each link where the URDF has no inertias, as a slender rod to the next joint
+LINK_MASS_KG = 5.0
 ROD_RADIUS_M = 0.05
 STEEL_KG_M3 = 7850.0
 DRY_FRICTION = 0.05
 VISCOUS_FRICTION = 0.10
 ROTOR = 0.03
-"""Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit;
-typical of geared arms (paper, Table 3)."""
-LARGEST_EFFORT = 1e6  #: [Nm or N]; some exporters write 0, others 1e9 for an effort that is not known
+"""Shares of a joint's torque limit: dry friction, viscous friction at its speed limit,
+rotor at its acceleration limit; typical of geared arms (paper, Table 3).
+"""
+#: [Nm or N]; some exporters write 0, others 1e9 for an effort that is not known
+LARGEST_EFFORT = 1e6
 NOISE_SHARE = 0.006
-"""Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
-current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
+"""Standard deviation of a row's residual, as a share of the motor's current at its torque limit:
+some 4 % of the rms current of a lively plan, which is what a good fit leaves
+(docs/evidence/estimators.md).
+"""
 LAG_ONE = 0.67  #: Correlation of the residual from row to row, as measured on real recordings
 RATE_HZ = 1000.0  #: Sampling rate that the rows are predicted for
 TORQUE_RESERVE = 3.0  #: Torque limit over the largest rigid-body torque, where the URDF gives none
@@ -72,13 +79,14 @@ class Expectation:
     """Expected robot: nominal before a fit, estimated after it."""
 
     model: Model  #: the declared model
-    gains: FloatArray  #: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,)
-    #: Of the model's standard columns, shape (c,); an estimate of base parameters is placed at its leading columns,
-    #: with zeros elsewhere.
+    #: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,)
+    gains: FloatArray
+    #: Of the model's standard columns, shape (c,); an estimate of base parameters is placed at its
+    #: leading columns, with zeros elsewhere.
     parameters: FloatArray
     payloads: tuple[ExpectedPayload, ...]  #: the mountings
-    #: Standard deviation of one row of each motor in the unit of its current reference, with correlation
-    #: (``effective_noise``), shape (n,).
+    #: Standard deviation of one row of each motor in the unit of its current reference, with
+    #: correlation (``effective_noise``), shape (n,).
     noise_a: FloatArray
 
 
@@ -87,11 +95,15 @@ class Excitation:
     """Rows of a motion, for any payload."""
 
     motion: Motion  #: of the n joints at the centres of k rows
-    use: BoolArray  #: rows of each motor that count, shape (n, k); standstill does not (see ident/equations/rows.py)
+    #: rows of each motor that count, shape (n, k); standstill does not (see
+    #: ident/equations/rows.py)
+    use: BoolArray
 
 
 def recorded(model: Model, data: Dataset, conditioning: Conditioning) -> Excitation:
-    """Return the rows of a recorded run: its motion at their centres, and which of them the fit uses."""
+    """Return the rows of a recorded run:
+    its motion at their centres, and which of them the fit uses.
+    """
     filter_ = row_filter(data, conditioning)
     centres = filter_.centres(len(data.time_s))
     motion = Motion(
@@ -106,8 +118,9 @@ def recorded(model: Model, data: Dataset, conditioning: Conditioning) -> Excitat
 def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
     """Standard deviation of independent rows with as much information as these correlated ones.
 
-    Slow signals lose most: their mean over a stretch has (1 + ρ)/(1 − ρ) times the variance of independent rows
-    (first-order autoregression). Faster motion loses less, so this is on the safe side.
+    Slow signals lose most: their mean over a stretch has (1 + ρ)/(1 − ρ) times the variance of
+    independent rows (first-order autoregression). Faster motion loses less, so this is on the safe
+    side.
 
     Args:
         noise_a: standard deviation of one row.
@@ -132,7 +145,8 @@ def visible_base(model: Model, motion: Motion) -> BaseParameters:
 class Design:
     """The unknowns of an experiment, and the information that excitations give about them.
 
-    The unknowns are, in this order, base parameters, unknown parameters of each mounting, ln of the gains.
+    The unknowns are, in this order, base parameters, unknown parameters of each mounting, ln of the
+    gains.
     """
 
     expectation: Expectation  #: the expected robot
@@ -155,7 +169,8 @@ class Design:
         return self.others + len(self.expectation.gains)
 
     def whitened(self, excitation: Excitation) -> FloatArray:
-        """γ_i (T W)_i / σ_i of base columns and the ten of a payload, shape (n, b + 10, k); masked rows are zero.
+        """γ_i (T W)_i / σ_i of base columns and the ten of a payload, shape (n, b + 10, k);
+        masked rows are zero.
 
         Of a redundant drive more columns, for `information_of`.
         """
@@ -163,7 +178,8 @@ class Design:
         model = expected.model
         flange = np.arange(model.flange.start, model.flange.stop)
         chosen = np.concatenate((self.base.independent, flange)).astype(np.intp)
-        # What a payload adds to friction has columns here, and none in the runs without one (`columns`).
+        # What a payload adds to friction has columns here, and none in the runs without one
+        # (`columns`).
         columns = model.regressor(excitation.motion, loaded=True)[:, chosen]
         motors = np.tensordot(model.drive_train.to_motor, columns, axes=1)
         if model.is_redundant:
@@ -173,9 +189,11 @@ class Design:
         return np.asarray(motors)
 
     def _without_preload(self, excitation: Excitation, torque: FloatArray) -> FloatArray:
-        """Whitened columns of a redundant drive, its torques, and its gains, shape (n, 2 (b + 10) + n, k).
+        """Whitened columns of a redundant drive, its torques, and its gains, shape (n, 2 (b + 10)
+        + n, k).
 
-        The currents that are expected are those without preload: with it, gains become better known, not worse.
+        The currents that are expected are those without preload: with it, gains become better
+            known, not worse.
         """
         expected = self.expectation
         _, to_motors = expected.model.balance(excitation.motion)
@@ -189,7 +207,9 @@ class Design:
         return np.concatenate((columns, torque, of_gains), axis=1)
 
     def with_known_preload(self, whitened: FloatArray, use: BoolArray) -> FloatArray:
-        """``whitened`` of a redundant drive if its preload were known: an equation for each motor, (n, b + 10, k)."""
+        """``whitened`` of a redundant drive if its preload were known:
+        an equation for each motor, (n, b + 10, k).
+        """
         expected = self.expectation
         all_move = np.all(use, axis=0)
         torque = whitened[:, self.width : 2 * self.width] * all_move
@@ -208,8 +228,8 @@ class Design:
         Args:
             whitened: shape (n, b + 10, k).
             payloads: the mounted payload of each repetition.
-            blind: motor whose own gain column omits the known part of the payload's torque, so that only coupling with
-                the other axes identifies it.
+            blind: motor whose own gain column omits the known part of the payload's torque, so that
+                only coupling with the other axes identifies it.
         """
         if whitened.shape[1] > self.width:
             return self._information_without_preload(whitened, payloads, blind)
@@ -247,13 +267,19 @@ class Design:
             if blind is not None and payload is not None:
                 torque[blind] -= self.known(payload) @ torques[blind]
             gain_columns = gains * torque
-            out[unknowns, of_gains] -= np.einsum("nak,njk->aj", columns[:, source], gain_columns, optimize=True)
-            out[of_gains, of_gains] += np.einsum("nik,njk->ij", gain_columns, gain_columns, optimize=True)
+            out[unknowns, of_gains] -= np.einsum(
+                "nak,njk->aj", columns[:, source], gain_columns, optimize=True
+            )
+            out[of_gains, of_gains] += np.einsum(
+                "nik,njk->ij", gain_columns, gain_columns, optimize=True
+            )
         out[others:, :others] = out[:others, others:].T
         return out
 
     def expected(self, payload: int | None) -> FloatArray:
-        """Parameters for which the columns of ``whitened`` give the total torque, shape (b + 10,)."""
+        """Parameters for which the columns of ``whitened`` give the total torque,
+        shape (b + 10,).
+        """
         base = self.base.grouping @ self.expectation.parameters
         mounted = np.zeros(len(LINK_PARAMETERS))
         if payload is not None:
@@ -289,9 +315,11 @@ class Design:
         )
 
     def condition(self, information: FloatArray) -> float:
-        """Condition number of the observation matrix W, rows weighted by their noise; inf for a column without rows.
+        """Condition number of the observation matrix W, rows weighted by their noise;
+        inf for a column without rows.
 
-        What a payload adds to friction is left out: in bare or in loaded runs alone it is no separate unknown.
+        What a payload adds to friction is left out: in bare or in loaded runs alone it is no
+            separate unknown.
         """
         payload_friction = self.expectation.model.loaded_friction_columns
         is_payload_friction = np.isin(self.base.independent, payload_friction)
@@ -304,7 +332,9 @@ class Design:
         return float("inf")
 
     def std_percent(self, information: FloatArray) -> FloatArray:
-        """Predicted standard deviation of each gain, shape (n,) [% of it]; inf where it is not identifiable."""
+        """Predicted standard deviation of each gain, shape (n,) [% of it];
+        inf where it is not identifiable.
+        """
         scaled, scale = self._scaled(information)
         factor = self._factor_of_gains(scaled)
         if factor is None:
@@ -316,7 +346,8 @@ class Design:
     def rank(self, information: FloatArray) -> int:
         """How many of the n independent directions of ln g are known to UNSEEN_PERCENT.
 
-        They are the eigenvectors of its covariance, of unit length: their errors are independent of each other.
+        They are the eigenvectors of its covariance, of unit length: their errors are independent of
+            each other.
         """
         scaled, scale = self._scaled(information)
         factor = self._factor_of_gains(scaled)
@@ -335,7 +366,9 @@ class Design:
         return information / np.outer(scale, scale), scale[self.others :]
 
     def _factor_of_gains(self, scaled: FloatArray) -> FloatArray | None:
-        """Cholesky factor of the information about the gains alone; None where rounding would decide."""
+        """Cholesky factor of the information about the gains alone;
+        None where rounding would decide.
+        """
         try:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
@@ -346,7 +379,9 @@ class Design:
         return np.asarray(factor[gains, gains])
 
     def _gains_alone(self, scaled: FloatArray) -> FloatArray:
-        """Information about the gains alone, shape (n, n); other unknowns that are not identifiable drop out."""
+        """Information about the gains alone, shape (n, n);
+        other unknowns that are not identifiable drop out.
+        """
         others = slice(None, self.others)
         gains = slice(self.others, None)
         values, vectors = np.linalg.eigh(scaled[others, others])
@@ -356,7 +391,9 @@ class Design:
         return np.asarray(scaled[gains, gains] - explained)
 
     def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
-        """Predict with unknowns that are not identifiable: they drop out, and gains that depend on them are inf."""
+        """Predict with unknowns that are not identifiable:
+        they drop out, and gains that depend on them are inf.
+        """
         values, directions = np.linalg.eigh(self._gains_alone(scaled))
         squares = directions**2
         is_seen = values > UNSEEN
@@ -369,7 +406,8 @@ class Design:
 def rows_between_rests(conditioning: Conditioning) -> tuple[float, float]:
     """Return the time between two rows of a fit, and how long after a rest rows begin to count [s].
 
-    A row counts when its filter window is so far from a standstill that enough of its weight is outside.
+    A row counts when its filter window is so far from a standstill that enough of its weight is
+    outside.
     """
     filter_ = decimator(RATE_HZ, conditioning.decimation_cutoff_hz)
     weights = np.abs(filter_.taps)
@@ -387,7 +425,8 @@ def nominal_expectation(
     limits: JointLimits,
     fast_motion: Motion,
 ) -> tuple[Expectation, bool]:
-    """Return the robot that is expected before a fit, and whether the URDF contains the masses of its links.
+    """Return the robot that is expected before a fit,
+    and whether the URDF contains the masses of its links.
 
     Args:
         model: the declared model.
@@ -414,7 +453,9 @@ def nominal_expectation(
 
 
 def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
-    """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them; else rods."""
+    """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them;
+    else rods.
+    """
     if urdf is not None:
         bodies = read_urdf(urdf).bodies
         if any(body.mass_kg > 0.0 for body in bodies):
@@ -442,10 +483,11 @@ def side_of_cube(mass_kg: float) -> float:
 
 
 def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
-    """Return a steel cube of the weighed mass, one side away from where it is mounted; known parameters stay.
+    """Return a steel cube of the weighed mass, one side away from where it is mounted;
+    known parameters stay.
 
-    It is off the axis of the joint that carries it, as the technician is asked to mount it: on the axis, gravity would
-    have no lever.
+    It is off the axis of the joint that carries it, as the technician is asked to mount it: on the
+    axis, gravity would have no lever.
     """
     mass = payload.known.get("m", LINK_MASS_KG)
     side = side_of_cube(mass)
@@ -463,7 +505,9 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
 
 
 def declared_efforts(model: Model, urdf: str | None) -> FloatArray:
-    """Return the effort limit of each axis in the URDF [Nm or N], shape (n,); inf where it is not known."""
+    """Return the effort limit of each axis in the URDF [Nm or N], shape (n,);
+    inf where it is not known.
+    """
     if urdf is None:
         return np.full(model.robot.axis_count, np.inf)
     declared = read_urdf(urdf).effort_limit[list(model.robot.axis_joints)]
@@ -471,8 +515,11 @@ def declared_efforts(model: Model, urdf: str | None) -> FloatArray:
     return np.where(is_known, declared, np.inf)
 
 
-def nominal_torque_limits(model: Model, urdf: str | None, links: FloatArray, fast_motion: Motion) -> FloatArray:
-    """Return the URDF's effort limits [Nm or N], else TORQUE_RESERVE times the rigid-body torque, shape (n,).
+def nominal_torque_limits(
+    model: Model, urdf: str | None, links: FloatArray, fast_motion: Motion
+) -> FloatArray:
+    """Return the URDF's effort limits [Nm or N], else TORQUE_RESERVE times the rigid-body torque,
+    shape (n,).
 
     Args:
         model, urdf: the declared model and the text of the URDF.
@@ -495,7 +542,9 @@ def nominal_parameters(
     velocity_limit: FloatArray,
     acceleration_limit: FloatArray,
 ) -> FloatArray:
-    """Return standard parameters of links, shape (n, 10), and of drives with these limits of the joints, shape (c,)."""
+    """Return standard parameters of links, shape (n, 10),
+    and of drives with these limits of the joints, shape (c,).
+    """
     parameters = np.zeros(len(model.columns))
     parameters[model.link_columns] = links
     parameters[model.rotor_columns] = ROTOR * torque_limit / acceleration_limit

@@ -1,15 +1,17 @@
-"""Verdicts on the gains of a planned or recorded experiment: how well each is identifiable, through what, and why not.
+"""Verdicts on the gains of a planned or recorded experiment:
+how well each is identifiable, through what, and why not.
 
 A gain is identifiable in three ways, and each is judged by the deviation that it would give alone:
 
 - gravity: the known payload's static torque in the motor's rows, independent of all unknowns there;
 - inertia: the rest of the known payload's torque in the motor's rows;
-- coupling: parameters that its rows share with those of other axes, whose gains are known by their own means.
+- coupling: parameters that its rows share with those of other axes, whose gains are known by their
+  own means.
 
-Motors of a redundant drive can work against each other, and this internal preload is taken out of every row
-(ident/equations/currents.py). The same rows are judged once more as if it were known: a gain that they would show then
-is hidden by preload, and one that they would not show either needs other moves. While the pose hardly changes, an
-unknown preload can pass for a change of the gains.
+Motors of a redundant drive can work against each other, and this internal preload is taken out of
+every row (ident/equations/currents.py). The same rows are judged once more as if it were known: a
+gain that they would show then is hidden by preload, and one that they would not show either needs
+other moves. While the pose hardly changes, an unknown preload can pass for a change of the gains.
 """
 
 from __future__ import annotations
@@ -26,12 +28,16 @@ from ident.model.robot import Motion
 from ident.planning.excitation import UNSEEN_PERCENT, Design, Excitation
 from ident.plausible import format_at_limit
 
-GOOD_PERCENT = 1.0  #: Largest standard deviation of a good gain: drives are sold with gains known to some percent
-SHARE_OF_BEST = 3.0  #: A source counts when it alone gives at most so many times the deviation of the best one
+#: Largest standard deviation of a good gain: drives are sold with gains known to some percent
+GOOD_PERCENT = 1.0
+#: A source counts when it alone gives at most so many times the deviation of the best one
+SHARE_OF_BEST = 3.0
 SHARE_OF_KNOWN = 2.0
-"""Preload hides a weak gain whose deviation is more than so many times that with known preload: three quarters of its
-variance come from taking the preload out."""
-SMALLEST_GRAVITY = 1e-12  #: Square of gravity's torque on an axis, as a share of that of all torque; less is rounding
+"""Preload hides a weak gain whose deviation is more than so many times that with known preload:
+three quarters of its variance come from taking the preload out.
+"""
+#: Square of gravity's torque on an axis, as a share of that of all torque; less is rounding
+SMALLEST_GRAVITY = 1e-12
 
 
 class GainSource(Enum):
@@ -59,7 +65,9 @@ class Hidden(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtraMoves:
-    """Moves that could be added to an experiment, made once without load and once with each payload."""
+    """Moves that could be added to an experiment,
+    made once without load and once with each payload.
+    """
 
     words: str  #: description, to follow "add": ``fast moves of J1 with the arm stretched``
     seconds: float  #: their duration, once
@@ -80,13 +88,17 @@ class GainVerdict:
     """Verdict on one gain."""
 
     axis: int  #: index from 0
-    std_percent: float  #: predicted standard deviation [% of the gain]; inf where it is not identifiable
-    #: The same if internal preload were known; None of a drive without redundant motors, which has none [%].
+    #: predicted standard deviation [% of the gain]; inf where it is not identifiable
+    std_percent: float
+    #: The same if internal preload were known; None of a drive without redundant motors, which has
+    #: none [%].
     known_preload_percent: float | None
-    alone_percent: dict[GainSource, float]  #: standard deviation that each source would give alone [%]
+    #: standard deviation that each source would give alone [%]
+    alone_percent: dict[GainSource, float]
     gravity_acts: bool  #: whether gravity of any payload acts on this axis
     verdict: Visibility  #: good, weak or unseen
-    advice: Advice | None  #: for a gain that is not good; None where no extra moves were offered or none helps
+    #: for a gain that is not good; None where no extra moves were offered or none helps
+    advice: Advice | None
 
     @property
     def sources(self) -> tuple[GainSource, ...]:
@@ -116,7 +128,9 @@ class GainVerdict:
         return None
 
     def words(self, axis_name: str) -> str:
-        """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
+        """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %;
+        add 5 s of … (σ 1.9 %)``.
+        """
         text = f"{axis_name} is not identifiable"
         if self.sources and np.isfinite(self.std_percent):
             std_percent = format_at_limit(self.std_percent, GOOD_PERCENT, 2, "g")
@@ -126,7 +140,10 @@ class GainVerdict:
         if self.advice is None:
             return text
         improved_percent = format_at_limit(self.advice.std_percent, GOOD_PERCENT, 2, "g")
-        return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {improved_percent} %)"
+        return (
+            f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ "
+            f"{improved_percent} %)"
+        )
 
     def _through(self) -> str:
         """Sources for a sentence: ``only through gravity``."""
@@ -143,18 +160,23 @@ class GainVerdict:
 
 @dataclass(frozen=True, slots=True)
 class Identifiability:
-    """Verdicts on all gains of an experiment, and how many independent directions of them it determines."""
+    """Verdicts on all gains of an experiment, and how many independent directions of them it
+    determines.
+    """
 
     gains: tuple[GainVerdict, ...]  #: one an axis, in their order
     rank: int  #: directions of the n gains known to UNSEEN_PERCENT; see `Design.rank`
-    known_preload_rank: int | None  #: the same if internal preload were known; None where there can be none
+    #: the same if internal preload were known; None where there can be none
+    known_preload_rank: int | None
 
     def hidden(self, by: Hidden) -> tuple[int, ...]:
         """Axes whose gains are hidden for this reason."""
         return tuple(gain.axis for gain in self.gains if gain.hidden_by is by)
 
     def sentences(self, axis_names: Sequence[str]) -> tuple[str, ...]:
-        """Name the axes whose gains are hidden, by what, and what to do; empty where there are none."""
+        """Name the axes whose gains are hidden, by what, and what to do;
+        empty where there are none.
+        """
         known_rank = self.known_preload_rank
         sentences: list[str] = []
         by_preload = self.hidden(Hidden.PRELOAD)
@@ -162,11 +184,12 @@ class Identifiability:
             hidden_gains = [self.gains[axis] for axis in by_preload]
             worst = max(hidden_gains, key=lambda gain: gain.std_percent)
             sentences.append(
-                f"Internal preload obscures {_named(by_preload, axis_names)}: σ up to {worst.std_percent:.2g} %, "
-                f"{worst.known_preload_percent:.2g} % if it were known. These moves determine {self.rank} of "
-                f"{len(self.gains)} independent directions of the gains to {UNSEEN_PERCENT:g} %, with known preload "
-                f"{known_rank}. Shift and turn the platform farther: while its pose hardly changes, preload passes for "
-                "a change of the gains."
+                f"Internal preload obscures {_named(by_preload, axis_names)}: σ up to "
+                f"{worst.std_percent:.2g} %, {worst.known_preload_percent:.2g} % if it were known. "
+                f"These moves determine {self.rank} of {len(self.gains)} independent directions of "
+                f"the gains to {UNSEEN_PERCENT:g} %, with known preload {known_rank}. Shift and "
+                "turn the platform farther: while its pose hardly changes, preload passes for a "
+                "change of the gains."
             )
         by_motion = self.hidden(Hidden.MOTION)
         if by_motion:
@@ -174,8 +197,8 @@ class Identifiability:
             if known_rank is not None:
                 even_then = ", nor would they if internal preload were known"
             sentences.append(
-                f"These moves do not show {_named(by_motion, axis_names)}{even_then}"
-                ": move there faster and farther, in both directions."
+                f"These moves do not show {_named(by_motion, axis_names)}{even_then}: move there "
+                "faster and farther, in both directions."
             )
         return tuple(sentences)
 
@@ -189,16 +212,19 @@ def _named(axes: Sequence[int], axis_names: Sequence[str]) -> str:
 
 
 Runs = Sequence[tuple[Excitation, Sequence[int | None]]]
-"""Motions, each with the payload of every repetition: an index into ``Expectation.payloads``, or None."""
+"""Motions, each with the payload of every repetition:
+an index into ``Expectation.payloads``, or None.
+"""
 
 
 def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> Identifiability:
     """Judge every gain of a planned or recorded experiment.
 
     Args:
-        design: unknowns, expected parameters and gains, noise. After a fit: its gains, parameters and residuals.
-        runs: for a plan ``[(excitation, (None, 0))]``, its moves without and with the payload; for recorded runs one
-            pair each, ``(excitation, (None,))`` or ``(excitation, (payload,))``.
+        design: unknowns, expected parameters and gains, noise. After a fit: its gains, parameters
+            and residuals.
+        runs: for a plan ``[(excitation, (None, 0))]``, its moves without and with the payload; for
+            recorded runs one pair each, ``(excitation, (None,))`` or ``(excitation, (payload,))``.
         extras: moves that could be added; for each gain that is not good the best of them is named.
 
     Returns:
@@ -260,7 +286,9 @@ def _visibility(std_percent: float) -> Visibility:
 def _std_with_extras(
     design: Design, information: FloatArray, extras: Sequence[ExtraMoves]
 ) -> list[tuple[ExtraMoves, FloatArray]]:
-    """Deviations of all gains with each of some extra moves [%], made without load and with every payload."""
+    """Deviations of all gains with each of some extra moves [%],
+    made without load and with every payload.
+    """
     every_payload: tuple[int | None, ...] = (None, *range(len(design.expectation.payloads)))
     tried: list[tuple[ExtraMoves, FloatArray]] = []
     for extra in extras:
@@ -269,8 +297,12 @@ def _std_with_extras(
     return tried
 
 
-def _with_known_preload(design: Design, runs: Runs, whitened: Whitened) -> tuple[Sequence[float | None], int | None]:
-    """Deviations of the gains if internal preload were known [%], and the rank; None where there can be none."""
+def _with_known_preload(
+    design: Design, runs: Runs, whitened: Whitened
+) -> tuple[Sequence[float | None], int | None]:
+    """Deviations of the gains if internal preload were known [%], and the rank;
+    None where there can be none.
+    """
     if not design.expectation.model.is_redundant:
         return (None,) * len(design.expectation.gains), None
     known: list[tuple[FloatArray, Sequence[int | None]]] = []
@@ -280,7 +312,9 @@ def _with_known_preload(design: Design, runs: Runs, whitened: Whitened) -> tuple
     return design.std_percent(information).tolist(), design.rank(information)
 
 
-def _advice(axis: int, std_percent: float, tried: Sequence[tuple[ExtraMoves, FloatArray]]) -> Advice | None:
+def _advice(
+    axis: int, std_percent: float, tried: Sequence[tuple[ExtraMoves, FloatArray]]
+) -> Advice | None:
     """The extra moves that lower a deviation most; None where none does. Of equals, the first."""
     best_percent = std_percent
     best: ExtraMoves | None = None
@@ -352,7 +386,9 @@ def _square_sums(columns: FloatArray) -> FloatArray:
 
 
 def _percent_alone(others: FloatArray, known: FloatArray) -> tuple[float, float]:
-    """100 over the norm of each of two columns with the others projected out; inf where nothing is left."""
+    """100 over the norm of each of two columns with the others projected out;
+    inf where nothing is left.
+    """
     norms = np.linalg.norm(others, axis=0)
     is_nonzero = norms > 0.0
     used = others[:, is_nonzero] / norms[is_nonzero]

@@ -38,7 +38,9 @@ class JointLimits:
             object.__setattr__(self, name, as_array(f"limits.{name}", getattr(self, name)))
 
     def targets(self) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the largest targets of a plan, which keep a margin from the limits."""
+        """Return the least and the largest targets of a plan,
+        which keep a margin from the limits.
+        """
         margin = POSITION_MARGIN * (self.upper - self.lower)
         return self.lower + margin, self.upper - margin
 
@@ -56,4 +58,6 @@ class JointLimits:
         for name in ("velocity", "acceleration"):
             values = as_array(f"limits.{name}", getattr(self, name), (count,), "one per joint")
             if not np.all(values > 0.0):
-                raise ModelError(f"limits.{name}: found {values.tolist()}; expected numbers above zero")
+                raise ModelError(
+                    f"limits.{name}: found {values.tolist()}; expected numbers above zero"
+                )

@@ -1,8 +1,9 @@
 """Plan moves from limits alone: point to point, for the gains that are known worst (paper §2.3).
 
-Random moves fill the duration. Then they are exchanged one at a time, and what lowers the predicted standard deviation
-of the worst gain stays. The information of a plan is the sum over its moves (`ident.planning.excitation`), so that an
-exchange costs the columns of the two moves that it touches.
+Random moves fill the duration. Then they are exchanged one at a time, and what lowers the predicted
+standard deviation of the worst gain stays. The information of a plan is the sum over its moves
+(`ident.planning.excitation`), so that an exchange costs the columns of the two moves that it
+touches.
 
 Nothing here knows what is in the room: the ways between the targets are the caller's to check.
 """
@@ -34,8 +35,10 @@ from ident.planning.excitation import (
 from ident.planning.limits import JointLimits
 
 DWELL_S = 0.1  #: Rest at each target [s]: moves are told apart by it
-SLOWEST_SHARE = 0.3  #: Least speed of a random move, as a share of the fastest that its limits allow
-SHORTEST_SHARE = 0.3  #: Least way of a random move, as a share of that to a target anywhere: short moves are more moves
+#: Least speed of a random move, as a share of the fastest that its limits allow
+SLOWEST_SHARE = 0.3
+#: Least way of a random move, as a share of that to a target anywhere: short moves are more moves
+SHORTEST_SHARE = 0.3
 SHARPNESS = 8.0  #: Order of the norm of all deviations that a plan lowers, nearly the largest
 NEAR_SHARE = 0.15  #: Standard deviation of the step to a near target, as a share of the range
 FEWEST_MOVES = 10  #: σ of a fit is found by leaving out moves
@@ -49,14 +52,17 @@ PEAK_ACCELERATION = 10.0 / 3.0**0.5  #: Its largest acceleration, over way / dur
 
 @dataclass(frozen=True, slots=True)
 class PlannedMoves:
-    """Moves from rest to rest in which all joints start and end together, each with the least jerk."""
+    """Moves from rest to rest in which all joints start and end together,
+    each with the least jerk.
+    """
 
     target_rad: FloatArray  #: start, then the target of each move, shape (moves + 1, n)
     move_s: FloatArray  #: duration of each move, shape (moves,)
     dwell_s: float  #: rest at each target
-    #: Standard deviation of each gain [% of it] when the moves are made once without load and once with the payload, as
-    #: predicted from a nominal robot, shape (n,). A careful bound, and no forecast: a fit of simulated moves has a
-    #: third to a twelfth of it. It compares plans of one robot.
+    #: Standard deviation of each gain [% of it] when the moves are made once without load and once
+    #: with the payload, as predicted from a nominal robot, shape (n,). A careful bound, and no
+    #: forecast: a fit of simulated moves has a third to a twelfth of it. It compares plans of one
+    #: robot.
     predicted_std_percent: FloatArray
 
     @property
@@ -71,18 +77,28 @@ class PlannedMoves:
             rate_hz: sampling rate.
 
         Raises:
-            ModelError: the rate, a duration or the dwell is no finite number above zero, or the samples are more than
-                MOST_SAMPLES.
+            ModelError: the rate, a duration or the dwell is no finite number above zero, or the
+                samples are more than MOST_SAMPLES.
         """
-        rate_hz = require_number("rate_hz", rate_hz, above=0.0, remedy="give the rate of the controller, such as 500")
-        dwell_s = require_number("dwell_s", self.dwell_s, above=0.0, remedy="give a rest such as 0.1 s")
+        rate_hz = require_number(
+            "rate_hz", rate_hz, above=0.0, remedy="give the rate of the controller, such as 500"
+        )
+        dwell_s = require_number(
+            "dwell_s", self.dwell_s, above=0.0, remedy="give a rest such as 0.1 s"
+        )
         target_rad = as_array("target_rad", self.target_rad)
         move_s = as_array("move_s", self.move_s)
         if target_rad.ndim != 2 or move_s.shape != (len(target_rad) - 1,):
             found = f"target_rad of shape {target_rad.shape} and move_s of shape {move_s.shape}"
-            raise ModelError(f"found {found}; expected (moves + 1, n_axes) and (moves,); give each move its duration")
+            raise ModelError(
+                f"found {found}; expected (moves + 1, n_axes) and (moves,); give each "
+                "move its duration"
+            )
         if not np.all(move_s > 0.0):
-            raise ModelError(f"move_s has {move_s.min():g} s; expected durations above 0 s; take those of plan_moves")
+            raise ModelError(
+                f"move_s has {move_s.min():g} s; expected durations above 0 s; take "
+                "those of plan_moves"
+            )
         duration_s = float(move_s.sum() + dwell_s * len(move_s))
         samples = rate_hz * duration_s
         if samples > MOST_SAMPLES:
@@ -99,8 +115,13 @@ class PlannedMoves:
         return time_s, _least_jerk(self.target_rad[move], way_rad[move], own_s, share)
 
 
-def _least_jerk(start_rad: FloatArray, way_rad: FloatArray, move_s: FloatArray, share: FloatArray) -> Motion:
-    """q = q₀ + d (10 s³ − 15 s⁴ + 6 s⁵), s = t/T: Flash & Hogan, J. Neurosci. 5 (1985); shapes (k, n) and (k,)."""
+def _least_jerk(
+    start_rad: FloatArray, way_rad: FloatArray, move_s: FloatArray, share: FloatArray
+) -> Motion:
+    """q = q₀ + d (10 s³ − 15 s⁴ + 6 s⁵), s = t/T: Flash & Hogan, J.
+
+    Neurosci. 5 (1985); shapes (k, n) and (k,).
+    """
     s = share[:, None]
     duration_s = move_s[:, None]
     position = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
@@ -153,8 +174,12 @@ class _Search:
         by_acceleration = np.sqrt(PEAK_ACCELERATION * way_rad / self.limits.acceleration)
         return float(max(by_velocity.max(), by_acceleration.max()))
 
-    def information(self, start_rad: FloatArray, end_rad: FloatArray, move_s: float) -> FloatArray | None:
-        """Information of a move, without load and with the payload; None where a drive would not have the torque."""
+    def information(
+        self, start_rad: FloatArray, end_rad: FloatArray, move_s: float
+    ) -> FloatArray | None:
+        """Information of a move, without load and with the payload;
+        None where a drive would not have the torque.
+        """
         time_s = np.arange(0.5 * self.row_s, move_s, self.row_s)
         rows = len(time_s)
         if rows == 0:
@@ -182,8 +207,12 @@ class _Search:
         use = motor_moves[:, None] & is_moving
         return self.design.information(Excitation(motion, use), RUNS)
 
-    def random_target(self, rng: np.random.Generator, start_rad: FloatArray | None = None) -> FloatArray:
-        """A target within the limits, with a margin, on the way from the start to anywhere; None: anywhere."""
+    def random_target(
+        self, rng: np.random.Generator, start_rad: FloatArray | None = None
+    ) -> FloatArray:
+        """A target within the limits, with a margin, on the way from the start to anywhere; None:
+        anywhere.
+        """
         lower, upper = self.limits.targets()
         end_rad = rng.uniform(lower, upper)
         if start_rad is None:
@@ -217,17 +246,20 @@ def plan_moves(
     exchanges: int = 1000,
     conditioning: Conditioning | None = None,
 ) -> PlannedMoves:
-    """Choose moves that let the worst gain be known as well as the time allows, from limits and without a cell file.
+    """Choose moves that let the worst gain be known as well as the time allows,
+    from limits and without a cell file.
 
-    The moves are made twice: without load, and with the payload. Positions, velocities and accelerations keep the
-    limits all the way, targets with a margin; torques keep the efforts of the URDF, where it has any. Obstacles
-    and the arm itself are not known: look at the moves before a robot makes them.
+    The moves are made twice: without load, and with the payload. Positions, velocities and
+    accelerations keep the limits all the way, targets with a margin; torques keep the efforts of
+    the URDF, where it has any. Obstacles and the arm itself are not known: look at the moves before
+    a robot makes them.
 
     Args:
         model: the declared model of a serial robot.
         limits: of the joints.
         payload: that will be mounted, with its known mass.
-        nameplate: gains by the data sheet, shape (n,); their sizes decide how clearly a torque shows.
+        nameplate: gains by the data sheet, shape (n,); their sizes decide how clearly a torque
+            shows.
         urdf: text of the URDF with inertias and efforts; without it, links are rods of 5 kg.
         duration_s: of one run [s], dwells included.
         seed: the same seed gives the same moves.
@@ -235,29 +267,40 @@ def plan_moves(
         conditioning: the filters of the fit; the usual ones when None.
 
     Returns:
-        the moves, with the predicted standard deviation of each gain. It is a careful bound: it counts on a residual of
-        0.6 % of each motor's largest current that stays the same from row to row (correlation 0.67). Where the residual
-        is the noise of currents alone, the fit has a third to a twelfth of this σ.
+        the moves, with the predicted standard deviation of each gain. It is a careful bound: it
+        counts on a residual of 0.6 % of each motor's largest current that stays the same from row
+        to row (correlation 0.67). Where the residual is the noise of currents alone, the fit has a
+        third to a twelfth of this σ.
 
     Raises:
-        ModelError: an argument is of another type or shape, a limit is none, or the robot is a closed chain.
+        ModelError: an argument is of another type or shape, a limit is none, or the robot is a
+            closed chain.
         PlanUnfit: the duration has no room for enough moves, or some gain does not show in them.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
-    require_kind("limits", limits, JointLimits, "write JointLimits(lower, upper, velocity, acceleration)")
+    require_kind(
+        "limits", limits, JointLimits, "write JointLimits(lower, upper, velocity, acceleration)"
+    )
     require_kind("payload", payload, Payload, "write Payload(name, mounting, known)")
     if urdf is not None:
         require_kind("urdf", urdf, str, "give the text of the file: Path(...).read_text()")
     if conditioning is not None:
         require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
-    if model.robot.closures:
-        raise ModelError("the model is of a closed chain, whose reach is not known here; expected a serial robot")
+    if model.robot.is_constrained:
+        raise ModelError(
+            "the model is of a closed chain, or has joints that follow others: its reach is not "
+            "known here; expected a serial robot, each joint with a motor"
+        )
     count = model.robot.axis_count
     gains = as_array("nameplate", nameplate, (count,), "one per motor")
     if not gains.all():
-        raise ModelError(f"nameplate is {gains.tolist()}; expected no zero: such a motor moves nothing")
+        raise ModelError(
+            f"nameplate is {gains.tolist()}; expected no zero: such a motor moves nothing"
+        )
     limits.require_size(count)
-    duration_s = require_number("duration_s", duration_s, above=0.0, remedy="give the time of one run, such as 40")
+    duration_s = require_number(
+        "duration_s", duration_s, above=0.0, remedy="give the time of one run, such as 40"
+    )
     if duration_s > LONGEST_RUN_S:
         expected = f"at most {LONGEST_RUN_S:g} s for one run; plan several runs, with a seed each"
         raise ModelError(f"duration_s is {duration_s:g} s; expected {expected}")
@@ -287,7 +330,12 @@ def plan_moves(
 
 
 def _search_of(
-    model: Model, limits: JointLimits, payload: Payload, gains: FloatArray, urdf: str | None, conditioning: Conditioning
+    model: Model,
+    limits: JointLimits,
+    payload: Payload,
+    gains: FloatArray,
+    urdf: str | None,
+    conditioning: Conditioning,
 ) -> _Search:
     """What moves of a nominal robot are judged by."""
     fast_motion = _fast_motion(limits)
@@ -301,7 +349,9 @@ def _search_of(
 
 
 def _fast_motion(limits: JointLimits) -> Motion:
-    """Random states as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
+    """Random states as fast as the limits allow:
+    which parameters there are does not depend on a plan's seed.
+    """
     rng = np.random.default_rng(0)
     shape = (960, len(limits.lower))
     position = rng.uniform(limits.lower, limits.upper, shape)
@@ -310,7 +360,9 @@ def _fast_motion(limits: JointLimits) -> Motion:
     return Motion(position, velocity, acceleration)
 
 
-def _move(search: _Search, start_rad: FloatArray, end_rad: FloatArray, share: float) -> tuple[float, FloatArray] | None:
+def _move(
+    search: _Search, start_rad: FloatArray, end_rad: FloatArray, share: float
+) -> tuple[float, FloatArray] | None:
     """Duration and information of a move; None where it cannot be made."""
     move_s = search.fastest_s(start_rad, end_rad) / share
     information = search.information(start_rad, end_rad, move_s)
@@ -331,7 +383,8 @@ def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) 
         start = targets[-1]
         target = search.random_target(rng, start)
         share = float(rng.uniform(SLOWEST_SHARE, 1.0))
-        # Slow limits make moves of hours: one that has no room ends the filling before its rows are built.
+        # Slow limits make moves of hours: one that has no room ends the filling before its rows are
+        # built.
         if search.fastest_s(start, target) / share > duration_s:
             break
         move = _move(search, start, target, share)
@@ -355,7 +408,9 @@ def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) 
     return _Draft(tuple(targets), tuple(shares), tuple(moves_s), tuple(found))
 
 
-def _improved(search: _Search, draft: _Draft, rng: np.random.Generator, duration_s: float, exchanges: int) -> _Draft:
+def _improved(
+    search: _Search, draft: _Draft, rng: np.random.Generator, duration_s: float, exchanges: int
+) -> _Draft:
     """Exchange targets and speeds one at a time, and keep what lowers the deviations."""
     best = draft
     least_cost = search.cost(np.sum(best.information, axis=0))
@@ -370,8 +425,12 @@ def _improved(search: _Search, draft: _Draft, rng: np.random.Generator, duration
     return best
 
 
-def _exchanged(search: _Search, draft: _Draft, rng: np.random.Generator, duration_s: float) -> _Draft | None:
-    """The same moves with another target, a near one or another speed; None where a move cannot be made."""
+def _exchanged(
+    search: _Search, draft: _Draft, rng: np.random.Generator, duration_s: float
+) -> _Draft | None:
+    """The same moves with another target, a near one or another speed;
+    None where a move cannot be made.
+    """
     changed = int(rng.integers(len(draft.target_rad)))
     kind = _Exchange(int(rng.integers(len(_Exchange))))
     targets = list(draft.target_rad)

@@ -1,8 +1,9 @@
-"""How far each gain is from the σ that it shall reach, how long that takes, and why the worst one takes longest.
+"""How far each gain is from the σ that it shall reach, how long that takes,
+and why the worst one takes longest.
 
-σ of independent moves falls with the root of their number, so at the rate so far σ(t) = σ √(T/t) after T seconds. The
-target σ* is reached at t = T (σ/σ*)², and T (σ/σ*)² − T are left. Moves that are planned for the worst gain
-(`recorded_information`) are faster than that.
+σ of independent moves falls with the root of their number, so at the rate so far σ(t) = σ √(T/t)
+after T seconds. The target σ* is reached at t = T (σ/σ*)², and T (σ/σ*)² − T are left. Moves that
+are planned for the worst gain (`recorded_information`) are faster than that.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from ident.planning.excitation import Design
 from ident.planning.gain_verdict import GainSource, GainVerdict, Hidden, Runs, Visibility
 
 NOISY = 2.0
-"""Times the planned noise from which on the noise counts as the cause: four times the planned recording then."""
+"""Times the planned noise from which on the noise counts as the cause:
+four times the planned recording then.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +29,8 @@ class TimeToTarget:
     """Distance of all gains from their targets."""
 
     ratio: FloatArray  #: σ over target of each gain, shape (m,); inf for one that nothing shows yet
-    left_s: FloatArray  #: of recording until each is at its target, shape (m,) [s]; inf where no rate is known yet
+    #: of recording until each is at its target, shape (m,) [s]; inf where no rate is known yet
+    left_s: FloatArray
 
     @property
     def is_reached(self) -> bool:
@@ -44,12 +48,17 @@ class TimeToTarget:
         return float(np.max(self.left_s))
 
 
-def time_to_target(std_percent: FloatArray, target_percent: FloatArray, recorded_s: float) -> TimeToTarget:
-    """Say how long a recording must go on until σ of each gain is at its target, at the rate so far.
+def time_to_target(
+    std_percent: FloatArray, target_percent: FloatArray, recorded_s: float
+) -> TimeToTarget:
+    """Say how long a recording must go on until σ of each gain is at its target,
+    at the rate so far.
 
     Args:
-        std_percent: σ of each gain so far [% of it], shape (m,); inf for one that nothing shows yet.
-        target_percent: σ that it shall reach [%], shape (m,), above zero; inf for a gain that does not matter.
+        std_percent: σ of each gain so far [% of it], shape (m,); inf for one that nothing shows
+            yet.
+        target_percent: σ that it shall reach [%], shape (m,), above zero; inf for a gain that does
+            not matter.
         recorded_s: recorded so far [s].
 
     Raises:
@@ -58,11 +67,18 @@ def time_to_target(std_percent: FloatArray, target_percent: FloatArray, recorded
     std = np.asarray(std_percent, dtype=np.float64)
     target = np.asarray(target_percent, dtype=np.float64)
     if std.shape != target.shape:
-        raise ModelError(f"target_percent has shape {target.shape}; expected {std.shape}, one per gain")
+        raise ModelError(
+            f"target_percent has shape {target.shape}; expected {std.shape}, one per gain"
+        )
     if not np.all(target > 0.0):
-        raise ModelError(f"target_percent is {target.tolist()}; expected σ above 0 % for every gain")
+        raise ModelError(
+            f"target_percent is {target.tolist()}; expected σ above 0 % for every gain"
+        )
     if not np.all(std >= 0.0):
-        raise ModelError(f"std_percent is {std.tolist()}; expected σ of every gain, inf for one that is not known")
+        raise ModelError(
+            f"std_percent is {std.tolist()}; expected σ of every gain, inf for one that is not "
+            "known"
+        )
     ratio = np.zeros(std.shape)
     matters = np.isfinite(target)
     ratio[matters] = std[matters] / target[matters]

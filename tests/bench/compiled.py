@@ -1,7 +1,9 @@
-"""The same job as a compiled program: Pinocchio's regressor and LAPACK's QR in C++, with every optimisation.
+"""The same job as a compiled program: Pinocchio's regressor and LAPACK's QR in C++,
+with every optimisation.
 
-The headers of Pinocchio are those of the package `pin`; Eigen and OpenBLAS come as packages too, into a folder of their
-own, so that no library of the system counts. Without a compiler there is no program, and the bench says so.
+The headers of Pinocchio are those of the package `pin`; Eigen and OpenBLAS come as packages too,
+into a folder of their own, so that no library of the system counts. Without a compiler there is no
+program, and the bench says so.
 """
 
 from __future__ import annotations
@@ -51,7 +53,14 @@ def compiled(folder: Path) -> Path:
     command = [compiler, *OPTIONS]
     for path in headers:
         command += ["-isystem", str(path)]
-    command += [str(SOURCE), "-o", str(program), f"-L{blas}", "-lscipy_openblas", f"-Wl,-rpath,{blas.resolve()}"]
+    command += [
+        str(SOURCE),
+        "-o",
+        str(program),
+        f"-L{blas}",
+        "-lscipy_openblas",
+        f"-Wl,-rpath,{blas.resolve()}",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise NotCompiled(f"{compiler} refuses: {done.stderr[-2000:]}")
@@ -64,7 +73,17 @@ def _libraries(folder: Path) -> Path:
     wanted = " ".join(LIBRARIES)
     if not installed.exists() or installed.read_text() != wanted:
         shutil.rmtree(folder, ignore_errors=True)
-        install = [sys.executable, "-m", "pip", "install", "-qq", "--no-deps", "--target", str(folder), *LIBRARIES]
+        install = [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "-qq",
+            "--no-deps",
+            "--target",
+            str(folder),
+            *LIBRARIES,
+        ]
         subprocess.run(install, check=True)
         installed.write_text(wanted)
     return folder

@@ -1,4 +1,5 @@
-"""What the compiled program reads: measurements without a format, and the joints of the robot as text.
+"""What the compiled program reads: measurements without a format,
+and the joints of the robot as text.
 
 python -m tests.bench.compiled_inputs DATA.npz ROBOT.urdf MEASUREMENTS JOINTS     writes them
 """

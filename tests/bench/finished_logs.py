@@ -1,4 +1,5 @@
-"""Two finished logs of 60 s at 1 kHz, without load and with the weighed payload, from the simulated cell.
+"""Two finished logs of 60 s at 1 kHz, without load and with the weighed payload,
+from the simulated cell.
 
 Recorded over the real driver path once, and kept: a log has its final name only when it is whole.
 

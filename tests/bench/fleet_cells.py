@@ -1,9 +1,10 @@
-"""Logs of many simulated cells, no two of them alike: gains, friction, links and the weighed mass are each cell's own.
+"""Logs of many simulated cells, no two of them alike:
+gains, friction, links and the weighed mass are each cell's own.
 
     python -m tests.bench.fleet_cells FOLDER CELLS     makes what is missing
 
-Motion and currents are the simulated cell's without a bus (tests/studies/direct_cell.py), the logs are written by the
-recorder's own writer. FOLDER/<cell>/{bare,loaded,held-out}.mcap.
+Motion and currents are the simulated cell's without a bus (tests/studies/direct_cell.py), the logs
+are written by the recorder's own writer. FOLDER/<cell>/{bare,loaded,held-out}.mcap.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ class FleetCell:
         return f"cell-{self.number:03d}"
 
 
-def plans_of(sets: int, exchanges: int, duration_s: float = DURATION_S) -> tuple[tuple[Plan, ...], ...]:
+def plans_of(
+    sets: int, exchanges: int, duration_s: float = DURATION_S
+) -> tuple[tuple[Plan, ...], ...]:
     """Plans for the three runs of a cell, some sets of them.
 
     Args:
@@ -78,10 +81,13 @@ def plans_of(sets: int, exchanges: int, duration_s: float = DURATION_S) -> tuple
     cell = load_cell(CELL)
 
     def one(seed: int) -> Plan:
-        return plan(cell, seed=seed, duration_s=duration_s, exchanges=exchanges, largest_condition=1e6)
+        return plan(
+            cell, seed=seed, duration_s=duration_s, exchanges=exchanges, largest_condition=1e6
+        )
 
     return tuple(
-        (one(FIRST_SEED + 3 * s), one(FIRST_SEED + 3 * s + 1), one(FIRST_SEED + 3 * s + 2)) for s in range(sets)
+        (one(FIRST_SEED + 3 * s), one(FIRST_SEED + 3 * s + 1), one(FIRST_SEED + 3 * s + 2))
+        for s in range(sets)
     )
 
 
@@ -103,7 +109,10 @@ def make_cell(made: FleetCell) -> str:
         log = part / f"{name}.mcap"
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)
-        payload = Payload("disc", "flange-a", {"m": mass_kg}) if loaded else None
+        if loaded:
+            payload = Payload("disc", "flange-a", {"m": mass_kg})
+        else:
+            payload = None
         spec = spec_of(truth, "disc" if loaded else None, number)
         steps = spec.substeps * made.period_us // spec.sync_period_us
         spec = replace(spec, sync_period_us=made.period_us, substeps=steps)
@@ -116,7 +125,13 @@ def make_cell(made: FleetCell) -> str:
 def _own_file(text: str, made: FleetCell, mass_kg: float) -> str:
     """The demonstration's cell file with a name, serial numbers and a payload of its own."""
     text = re.sub(r"^name: demo$", f"name: {made.name}", text, flags=re.MULTILINE)
-    text = re.sub(rf"^  period_us: {PERIOD_US}$", f"  period_us: {made.period_us}", text, flags=re.MULTILINE)
+    text = re.sub(
+        r"^  period_us: "
+        rf"{PERIOD_US}$",
+        f"  period_us: {made.period_us}",
+        text,
+        flags=re.MULTILINE,
+    )
     text = re.sub(r"serial: 100(\d)", rf"serial: {10 + made.number}0\1", text)
     return re.sub(r"mass_kg: 4\.59$", f"mass_kg: {mass_kg}", text, flags=re.MULTILINE)
 
@@ -131,27 +146,40 @@ def _of_mass(body: Body, mass_kg: float) -> Body:
 def write_log(path: Path, raw: RawRun, cell: Cell, files: dict[str, bytes], start_ns: int) -> None:
     """Write a run to a log as a recorder does."""
     answers = (
-        AxisReadback(axis.name, float(unit), drive={"serial": None if axis.identity is None else axis.identity.serial})
+        AxisReadback(
+            axis.name,
+            float(unit),
+            drive={"serial": None if axis.identity is None else axis.identity.serial},
+        )
         for axis, unit in zip(cell.axes, raw.ampere_per_unit, strict=True)
     )
     readback = Readback(tuple(answers))
     if cell.sync is None:
         raise ValueError(f"cell {cell.name}: no sync period")
     period_ns = cell.sync.period_us * 1000
-    run = RunInfo(f"{cell.name}-{raw.name}", 1e9 / period_ns, raw.payload, "bench", "bench 1", start_ns, 0)
+    run = RunInfo(
+        f"{cell.name}-{raw.name}", 1e9 / period_ns, raw.payload, "bench", "bench 1", start_ns, 0
+    )
     scale = scaling(cell, readback)
     bits = np.array(
-        [0 if axis.profile is None or axis.profile.saturation_bit is None else 1 << axis.profile.saturation_bit
+        [0 if axis.profile is None or axis.profile.saturation_bit is None else 1 << axis.profile.saturation_bit  # noqa: E501
          for axis in cell.axes]
     )  # fmt: skip
     status = (ENABLED | raw.limited * bits).tolist()
-    positions, currents = raw.position_counts.tolist(), raw.current_raw.tolist()
+    positions = raw.position_counts.tolist()
+    currents = raw.current_raw.tolist()
     changes = np.flatnonzero(np.diff(raw.move, prepend=raw.move[0] - 1)).tolist()
-    with LogWriter(path, LogContent.of(cell, run, files, readback), scale.joint_position_of, lambda: 0) as log:
-        for cycle, (position, current, word) in enumerate(zip(positions, currents, status, strict=True)):
+    with LogWriter(
+        path, LogContent.of(cell, run, files, readback), scale.joint_position_of, lambda: 0
+    ) as log:
+        for cycle, (position, current, word) in enumerate(
+            zip(positions, currents, status, strict=True)
+        ):
             time_ns = start_ns + cycle * period_ns
             if cycle in changes:
-                log.event(CellEvent(time_ns, None, EventKind.MOVE_START, int(raw.move[cycle]), "move"))
+                log.event(
+                    CellEvent(time_ns, None, EventKind.MOVE_START, int(raw.move[cycle]), "move")
+                )
             log.write(Sample(cycle, time_ns, tuple(position), tuple(current), tuple(word)))
         log.conclude(True)
 

@@ -1,7 +1,8 @@
-"""Processor time of one look at a fit that grows: six axes at 1 kHz, a look after each move of five seconds.
+"""Processor time of one look at a fit that grows:
+six axes at 1 kHz, a look after each move of five seconds.
 
 python -m tests.bench.growing        prints the table of docs/evidence/speed.md; exit code 1 above a tenth of a move
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -66,7 +67,10 @@ def main() -> int:
             if run.move is not None:
                 part = replace(part, move=run.move[:samples])
             begun_s = time.process_time()
-            fit = fit.with_run(run) if number == MOVES else fit.with_run_so_far(part)
+            if number == MOVES:
+                fit = fit.with_run(run)
+            else:
+                fit = fit.with_run_so_far(part)
             folded_s = time.process_time()
             found = fit.gains()
             ended_s = time.process_time()
@@ -84,7 +88,8 @@ def main() -> int:
         "|---|---|",
         f"| fold in a move of {MOVE_S:g} s | {_ms(folding)} |",
         f"| quick gains ± σ | {_ms(estimating)} |",
-        f"| `ml` from the same triangles, {fit.move_count} clusters | {1000.0 * likelihood_s:.0f} |",
+        f"| `ml` from the same triangles, {fit.move_count} clusters | "
+        f"{1000.0 * likelihood_s:.0f} |",
         f"| all {RUNS} runs of {MOVES * MOVE_S:g} s reduced again, `ml` | {1000.0 * whole_s:.0f} |",
     ]
     sys.stdout.write("\n".join(lines) + "\n")

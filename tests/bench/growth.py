@@ -24,7 +24,9 @@ FloatArray = NDArray[np.float64]
 
 
 class _Measured:
-    """Measurements as they stream in, and the processor time that making them took, which is not the job's."""
+    """Measurements as they stream in, and the processor time that making them took,
+    which is not the job's.
+    """
 
     def __init__(self, robot: Robot, samples: int) -> None:
         self._pieces = measurements(robot, samples)

@@ -1,9 +1,10 @@
 """A log into arrays, by chunk and message by message; and an hour of it in bounded memory.
 
-Three ways over one log of 60 s at 1 kHz and six axes: ours, which takes a chunk of samples as one array with every
-checksum checked; the messages of the `mcap` package, each unpacked as the fixed struct that it is, checksums checked
-too; and the messages decoded by their schema, as a program does that knows nothing of our layout (`mcap-ros2-support`,
-on a tenth of the log). An hour is passed through a process of its own, whose memory is what it says at its end.
+Three ways over one log of 60 s at 1 kHz and six axes: ours, which takes a chunk of samples as one
+array with every checksum checked; the messages of the `mcap` package, each unpacked as the fixed
+struct that it is, checksums checked too; and the messages decoded by their schema, as a program
+does that knows nothing of our layout (`mcap-ros2-support`, on a tenth of the log). An hour is
+passed through a process of its own, whose memory is what it says at its end.
 """
 
 from __future__ import annotations
@@ -31,8 +32,10 @@ from daq.log.writer import LogWriter
 from drivers.messages import Sample
 from tests.daq.logs import START_NS, content, joints
 
-AXES, RATE_HZ = 6, 1000
-MINUTE_S, HOUR_S = 60, 3600
+AXES = 6
+RATE_HZ = 1000
+MINUTE_S = 60
+HOUR_S = 3600
 REPEATS = 5
 PROMISED_RATIO = 8.0
 
@@ -44,12 +47,22 @@ def write_log(path: Path, seconds: int) -> Path:
         for second in range(seconds):
             time_s = second + np.arange(RATE_HZ)[:, None] / RATE_HZ
             phase = time_s * np.arange(1, AXES + 1) * 0.3
-            position = np.rint(5e4 * np.sin(phase) + 2.0 * chance.standard_normal(phase.shape)).astype(int).tolist()
-            current = np.rint(500.0 * np.cos(phase) + 8.0 * chance.standard_normal(phase.shape)).astype(int).tolist()
+            position = (
+                np.rint(5e4 * np.sin(phase) + 2.0 * chance.standard_normal(phase.shape))
+                .astype(int)
+                .tolist()
+            )
+            current = (
+                np.rint(500.0 * np.cos(phase) + 8.0 * chance.standard_normal(phase.shape))
+                .astype(int)
+                .tolist()
+            )
             for k in range(RATE_HZ):
                 cycle = second * RATE_HZ + k
                 stamp_ns = START_NS + cycle * 1_000_000
-                log.write(Sample(cycle, stamp_ns, tuple(position[k]), tuple(current[k]), (0x1237,) * AXES))
+                log.write(
+                    Sample(cycle, stamp_ns, tuple(position[k]), tuple(current[k]), (0x1237,) * AXES)
+                )
         log.conclude(valid=True)
     return path
 
@@ -63,7 +76,9 @@ def by_message(path: Path) -> int:
     """Every message, unpacked as a struct, into arrays; number of samples."""
     layout = sample_struct(AXES)
     with path.open("rb") as stream:
-        messages = make_reader(stream, validate_crcs=True).iter_messages(topics=[SAMPLES_TOPIC], log_time_order=False)
+        messages = make_reader(stream, validate_crcs=True).iter_messages(
+            topics=[SAMPLES_TOPIC], log_time_order=False
+        )
         rows = [layout.unpack(message.data) for _, _, message in messages]
     return len(np.array([row[1:] for row in rows], dtype=np.int64))
 
@@ -83,7 +98,8 @@ def by_schema(path: Path, messages_wanted: int) -> int:
 def hour(path: Path) -> dict[str, float]:
     """Pass a log through, keeping nothing but sums; in a process of its own."""
     begun = time.process_time()
-    total, count = np.zeros(AXES, dtype=np.int64), 0
+    total = np.zeros(AXES, dtype=np.int64)
+    count = 0
     for block in LogReader(path):
         total += block.position_counts.sum(axis=0)
         count += len(block.cycle)
@@ -91,7 +107,9 @@ def hour(path: Path) -> dict[str, float]:
 
 
 def _peak_mb() -> float:
-    """Peak memory of this program alone [MB]: in `getrusage` Linux counts what a parent held before it started us."""
+    """Peak memory of this program alone [MB]:
+    in `getrusage` Linux counts what a parent held before it started us.
+    """
     status = Path("/proc/self/status")
     if status.exists():
         return float(re.findall(r"VmHWM:\s+(\d+) kB", status.read_text())[0]) / 1024.0
@@ -139,22 +157,29 @@ def measure(folder: Path, hour_s: int = HOUR_S) -> dict[str, Any]:
 
 def summary_text(found: dict[str, Any]) -> str:
     """The figures of `measure`, for a person."""
-    minute, long = found["passed_through"]["minute"], found["passed_through"]["hour"]
+    minute = found["passed_through"]["minute"]
+    long = found["passed_through"]["hour"]
     return (
         f"60 s at 1 kHz, {AXES} axes, {found['minute_mb']:.1f} MB, processor time:\n"
         f"  by chunk into arrays        {1e3 * found['by_chunk_s']:8.0f} ms\n"
-        f"  message by message, struct  {1e3 * found['by_message_s']:8.0f} ms, {found['ratio']:.1f} times\n"
-        f"  message by message, schema  {1e3 * found['by_schema_s']:8.0f} ms, {found['ratio_by_schema']:.1f} times\n"
-        f"a log of {found['hour_s']} s, {found['hour_mb']:.0f} MB, passed through: {long['samples']:.0f} samples, "
+        f"  message by message, struct  {1e3 * found['by_message_s']:8.0f} ms, "
+        f"{found['ratio']:.1f} times\n"
+        f"  message by message, schema  {1e3 * found['by_schema_s']:8.0f} ms, "
+        f"{found['ratio_by_schema']:.1f} times\n"
+        f"a log of {found['hour_s']} s, {found['hour_mb']:.0f} MB, passed through: "
+        f"{long['samples']:.0f} samples, "
         f"{long['seconds']:.1f} s\n"
-        f"  most memory of the process  {long['peak_mb']:8.0f} MB, {minute['peak_mb']:.0f} MB for the minute"
+        f"  most memory of the process  {long['peak_mb']:8.0f} MB, {minute['peak_mb']:.0f} MB for "
+        "the minute"
     )
 
 
 def main() -> int:
     """Print the figures; 1 when the ratio is below what is promised."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pass-through", type=Path, help="a log to read block by block, as the child process does")
+    parser.add_argument(
+        "--pass-through", type=Path, help="a log to read block by block, as the child process does"
+    )
     parser.add_argument("--hour", type=int, default=HOUR_S, help="seconds of the long log")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
     arguments = parser.parse_args()

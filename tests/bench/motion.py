@@ -1,4 +1,6 @@
-"""A motion that can be evaluated anywhere: benchmarks of millions of samples hold no more than the piece at hand."""
+"""A motion that can be evaluated anywhere:
+benchmarks of millions of samples hold no more than the piece at hand.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ class Sinusoids:
     def motion(self, time_s: FloatArray) -> Motion:
         """Position, velocity and acceleration at these instants, exact."""
         phase = self.frequency_rad_s[:, :, None] * time_s + self.phase_rad[:, :, None]
-        sine, cosine = np.sin(phase), np.cos(phase)
+        sine = np.sin(phase)
+        cosine = np.cos(phase)
         rate = self.amplitude_rad * self.frequency_rad_s
         return Motion(
             np.einsum("jh,jhk->kj", self.amplitude_rad, sine),
@@ -45,5 +48,7 @@ def sinusoids(joints: int, seed: int) -> Sinusoids:
     rng = np.random.default_rng(seed)
     shape = (joints, 5)
     return Sinusoids(
-        rng.uniform(0.2, 0.6, shape), 2.0 * np.pi * rng.uniform(0.05, 0.6, shape), rng.uniform(0.0, 2.0 * np.pi, shape)
+        rng.uniform(0.2, 0.6, shape),
+        2.0 * np.pi * rng.uniform(0.05, 0.6, shape),
+        rng.uniform(0.0, 2.0 * np.pi, shape),
     )

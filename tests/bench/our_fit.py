@@ -18,7 +18,13 @@ from scipy.linalg import lapack
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
 from tests.bench.memory import peak_mb
-from tests.bench.torque_fit import PIECE_SAMPLES, fill_rows, fit_torques, joint_columns, standard_rows
+from tests.bench.torque_fit import (
+    PIECE_SAMPLES,
+    fill_rows,
+    fit_torques,
+    joint_columns,
+    standard_rows,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -26,11 +32,16 @@ FloatArray = NDArray[np.float64]
 def _pieces(data: dict[str, FloatArray]) -> Iterator[tuple[Motion, FloatArray]]:
     for first in range(0, data["q"].shape[1], PIECE_SAMPLES):
         part = slice(first, first + PIECE_SAMPLES)
-        yield Motion(data["q"][:, part].T, data["v"][:, part].T, data["a"][:, part].T), data["torque"][:, part]
+        yield (
+            Motion(data["q"][:, part].T, data["v"][:, part].T, data["a"][:, part].T),
+            data["torque"][:, part],
+        )
 
 
 def _bare_qr_s(columns: tuple[FloatArray, ...]) -> float:
-    """Processor time of LAPACK's own QR of the columns of each joint, already in its layout; copies do not count."""
+    """Processor time of LAPACK's own QR of the columns of each joint, already in its layout;
+    copies do not count.
+    """
     spent_s = 0.0
     for own in columns:
         rows = own.T.copy(order="F")

@@ -1,9 +1,11 @@
-"""The same job as a loop over Pinocchio's regressor in Python, and LAPACK's QR of each joint's own columns.
+"""The same job as a loop over Pinocchio's regressor in Python,
+and LAPACK's QR of each joint's own columns.
 
     python -m tests.bench.pinocchio_fit DATA.npz ROBOT.urdf REPEATS     prints one JSON object
 
-It does what a careful engineer would: pieces that stay in the cache, a joint's row without the links that do not move
-it, triangles instead of a matrix of all samples. `pinocchio_fit.cpp` is the same in C++.
+It does what a careful engineer would: pieces that stay in the cache, a joint's row without the
+links that do not move it, triangles instead of a matrix of all samples. `pinocchio_fit.cpp` is the
+same in C++.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ def regressors(model: pinocchio.Model, data: dict[str, FloatArray], samples: sli
     room = model.createData()
     states = (data[name][:, samples].T for name in ("q", "v", "a"))
     each = zip(*(np.ascontiguousarray(state) for state in states), strict=True)
-    return np.array([pinocchio.computeJointTorqueRegressor(model, room, *state).copy() for state in each])
+    return np.array(
+        [pinocchio.computeJointTorqueRegressor(model, room, *state).copy() for state in each]
+    )
 
 
 def link_columns(model: pinocchio.Model) -> list[IntArray]:
@@ -85,7 +89,8 @@ def solved(triangles: list[FloatArray], behind: list[IntArray]) -> tuple[int, fl
         spread[:, -1] = own[:, -1]
         rows.append(spread)
     whole = np.concatenate(rows)
-    standard, torque = whole[:, :-1], whole[:, -1]
+    standard = whole[:, :-1]
+    torque = whole[:, -1]
     norm = np.linalg.norm(standard, axis=0)
     # A column that is zero but for rounding errors must not be scaled up to one that counts.
     shown = norm > DEPENDENT * norm.max()

@@ -1,9 +1,10 @@
-"""Processor time and memory of `drivegain residual` on four runs of 40 s and a held-out one, 1 kHz, six axes.
+"""Processor time and memory of `drivegain residual` on four runs of 40 s and a held-out one, 1 kHz,
+six axes.
 
     python -m tests.bench.residual FOLDER [REPEATS]     simulates what is missing in FOLDER first
 
-The cells have no, one or three undeclared effects. They move without a bus (tests/studies/direct_cell.py); the logs are
-written by the recorder's own writer.
+The cells have no, one or three undeclared effects. They move without a bus
+(tests/studies/direct_cell.py); the logs are written by the recorder's own writer.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Usage:
 
 def make_logs(folder: Path, case: EffectCase) -> tuple[Path, ...]:
     """Simulate the runs of a case that are missing, and name their logs."""
-    cell, files = load_cell(CELL), bundle(CELL)
+    cell = load_cell(CELL)
+    files = bundle(CELL)
     (folder / case.name).mkdir(parents=True, exist_ok=True)
     logs = []
     for number, (name, payload, letter) in enumerate(RUNS):
@@ -58,17 +60,27 @@ def make_logs(folder: Path, case: EffectCase) -> tuple[Path, ...]:
         if log.exists():
             continue
         log.with_name(log.name + ".part").unlink(missing_ok=True)
-        mounted = None if payload is None else declared_payload(payload)
-        raw = simulate_run(cell, case.spec("measurement", payload, number), load_plan(planned, cell), name, mounted)
+        if payload is None:
+            mounted = None
+        else:
+            mounted = declared_payload(payload)
+        raw = simulate_run(
+            cell, case.spec("measurement", payload, number), load_plan(planned, cell), name, mounted
+        )
         write_log(log, raw, cell, files, START_NS + number * 60_000_000_000)
     return tuple(logs)
 
 
 def search(logs: tuple[Path, ...]) -> Usage:
-    """Search all logs but the last, which is held out, by the command, with one thread for linear algebra."""
-    used, held_out = map(str, logs[:-1]), str(logs[-1])
+    """Search all logs but the last, which is held out, by the command,
+    with one thread for linear algebra.
+    """
+    used = map(str, logs[:-1])
+    held_out = str(logs[-1])
     command = [sys.executable, "-m", "daq", "residual", *used, "--holdout", held_out, "--json"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"OMP_NUM_THREADS": "1"}) as child:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, env=os.environ | {"OMP_NUM_THREADS": "1"}
+    ) as child:
         _, status, usage = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
@@ -83,7 +95,10 @@ def main(folder: str, repeats: str = "1") -> None:
         logs = make_logs(Path(folder), case)
         usages = [search(logs) for _ in range(int(repeats))]
         best = min(usages, key=lambda usage: usage.seconds)
-        print_line(f"| {len(case.effects)} | {best.seconds:.1f} | {max(usage.peak_mb for usage in usages):.0f} |")
+        print_line(
+            f"| {len(case.effects)} | {best.seconds:.1f} | "
+            f"{max(usage.peak_mb for usage in usages):.0f} |"
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Processor time to start: the help of every verb, and `scan`, `info` and `history` on a small cell and log."""
+"""Processor time to start: the help of every verb, and `scan`,
+`info` and `history` on a small cell and log.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,11 @@ def start_up(out: Path, log: Path, repeats: int, environment: dict[str, str]) ->
     shutil.copytree("configs", folder, ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*"))
     cell = str(folder / "cells" / CELL.name)
     commands = {f"{verb.name} --help": [verb.name, "--help"] for verb in VERBS}
-    commands |= {"scan": ["scan", cell, "--wait", "0.05"], "info": ["info", str(log)], "history": ["history", cell]}
+    commands |= {
+        "scan": ["scan", cell, "--wait", "0.05"],
+        "info": ["info", str(log)],
+        "history": ["history", cell],
+    }
     return {
         name: statistics.median(_seconds(command, environment) for _ in range(repeats))
         for name, command in commands.items()
@@ -37,7 +43,11 @@ def start_up(out: Path, log: Path, repeats: int, environment: dict[str, str]) ->
 
 
 def _seconds(command: list[str], environment: dict[str, str]) -> float:
-    silent: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
+    silent: dict[str, Any] = {
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+        "env": environment,
+    }
     with subprocess.Popen([sys.executable, "-m", "daq", *command], **silent) as child:
         _, status, usage = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)

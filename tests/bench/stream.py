@@ -1,14 +1,17 @@
-"""`make bench-stream`: what the stream loses of six axes on SocketCAN, and what a frame costs, beside candump.
+"""`make bench-stream`: what the stream loses of six axes on SocketCAN, and what a frame costs,
+beside candump.
 
-Writes out/bench-stream.json and asserts nothing but that every frame is accounted for: sent = received + counted lost.
-The frames come from a process of their own (tests/bench/stream_sender.py) at the rate asked for, and go through the
-real SyncStream into a log and a feed, as `record` does it; the highest rate without a loss is looked for downwards from
-1 kHz, with a busy Python thread beside it. Then drivegain, candump (can-utils) and a plain listener receive the same
-frames, one after the other and alone, and drivegain's capture process is stopped for 30, 100 and 300 ms. What a frame
-costs is measured from outside, by stream_cost.py, which prints the table for docs/evidence/stream.md.
+Writes out/bench-stream.json and asserts nothing but that every frame is accounted for: sent =
+received + counted lost. The frames come from a process of their own (tests/bench/stream_sender.py)
+at the rate asked for, and go through the real SyncStream into a log and a feed, as `record` does
+it; the highest rate without a loss is looked for downwards from 1 kHz, with a busy Python thread
+beside it. Then drivegain, candump (can-utils) and a plain listener receive the same frames, one
+after the other and alone, and drivegain's capture process is stopped for 30, 100 and 300 ms. What a
+frame costs is measured from outside, by stream_cost.py, which prints the table for
+docs/evidence/stream.md.
 
     python -m tests.bench.stream --hear candump --cycles 5000     one listener at the compared rate, and nothing else
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -87,15 +90,20 @@ def main() -> int:
     """Downwards to the first rate without a loss, then more frames than can be taken."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0, help="of each run")
-    parser.add_argument("--hear", choices=("drivegain", *LISTENERS), help=f"this one alone, at {COMPARED_HZ} Hz")
+    parser.add_argument(
+        "--hear", choices=("drivegain", *LISTENERS), help=f"this one alone, at {COMPARED_HZ} Hz"
+    )
     parser.add_argument("--cycles", type=int, default=COMPARED_HZ, help="with --hear")
     arguments = parser.parse_args()
-    # The wire is a queue of the kernel here (vcan), and a thousand frames in it are a seventh of a second.
+    # The wire is a queue of the kernel here (vcan), and a thousand frames in it are a seventh of a
+    # second.
     with suppress(OSError):
         WIRE_QUEUE.write_text("10000\n")
     if arguments.hear:
         heard = hear(arguments.hear, 1_000_000 // COMPARED_HZ, arguments.cycles)
-        return 0 if arguments.hear == "nothing" or heard["lost"] == 0 else 1
+        if arguments.hear == "nothing" or heard["lost"] == 0:
+            return 0
+        return 1
     runs = []
     for rate_hz in RATES_HZ:
         runs.append(one_run(1_000_000 // rate_hz, round(rate_hz * arguments.seconds), busy))
@@ -120,11 +128,15 @@ def main() -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=2) + "\n")
     _print_line(f"written: {path}")
-    return 0 if all(run["identity_holds"] for run in (*runs, quiet, flood, stopped)) else 1
+    if all(run["identity_holds"] for run in (*runs, quiet, flood, stopped)):
+        return 0
+    return 1
 
 
 def compare(seconds: float) -> dict[str, int | None]:
-    """Highest rate without a loss of each listener alone [Hz]; None for one that loses at every rate."""
+    """Highest rate without a loss of each listener alone [Hz];
+    None for one that loses at every rate.
+    """
     rates = dict[str, int | None]()
     for name in ("drivegain", *LISTENERS):
         if name == "nothing" or (name == "candump" and shutil.which(name) is None):
@@ -141,7 +153,9 @@ def compare(seconds: float) -> dict[str, int | None]:
 
 def hear(name: str, period_us: int, cycles: int) -> dict[str, Any]:
     """So many cycles to one of the listeners, or to none."""
-    return one_run(period_us, cycles, nothing) if name == "drivegain" else listen(LISTENERS[name], period_us, cycles)
+    if name == "drivegain":
+        return one_run(period_us, cycles, nothing)
+    return listen(LISTENERS[name], period_us, cycles)
 
 
 def listen(command: tuple[str, ...], period_us: int, cycles: int) -> dict[str, Any]:
@@ -153,7 +167,9 @@ def listen(command: tuple[str, ...], period_us: int, cycles: int) -> dict[str, A
             time.sleep(1.0)
             process.terminate()
         out.seek(0)
-        received, sent, sent_hz = sum(1 for _ in out), int(sent_text), cycles / float(sending_s)
+        received = sum(1 for _ in out)
+        sent = int(sent_text)
+        sent_hz = cycles / float(sending_s)
     return {"lost": sent - received, "rate_held": sent_hz > 0.99 * 1e6 / period_us}
 
 
@@ -166,7 +182,9 @@ def _stop_for(pid: int, stops_s: Sequence[float]) -> None:
         os.kill(pid, signal.SIGCONT)
 
 
-def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float] = ()) -> dict[str, Any]:
+def one_run(
+    period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float] = ()
+) -> dict[str, Any]:
     """So many cycles through the stream; a period of 0 sends them as fast as the sender can.
 
     The capture process is stopped meanwhile for the given times.
@@ -177,7 +195,8 @@ def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float
         ends.append(open_socketcan(INTERFACE))
         return ends[0]
 
-    stamps, waits = np.zeros(cycles + 1, dtype=np.int64), np.zeros(cycles + 1, dtype=np.int64)
+    stamps = np.zeros(cycles + 1, dtype=np.int64)
+    waits = np.zeros(cycles + 1, dtype=np.int64)
     count = wrong = 0
 
     class Sender(Producer):
@@ -186,7 +205,9 @@ def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float
             stamps[count], waits[count] = monotonic_ns, time.monotonic_ns() - monotonic_ns
             count += 1
 
-    pacing = FollowedSync(1000 * (period_us or 1000), Sender("the sender", period_us), timeout_s=PATIENCE_S)
+    pacing = FollowedSync(
+        1000 * (period_us or 1000), Sender("the sender", period_us), timeout_s=PATIENCE_S
+    )
     # No node beats here: 0 is no supervision of heartbeats.
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -194,23 +215,26 @@ def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float
         _kept(Path(folder) / "run.mcap", 1e6 / (period_us or 1000)) as (kept, room),
         _sender(period_us, cycles) as sender,
     ):
-        stream, check_every = (
-            SyncStream(network, pacing, kept.event),
-            max(1, round(SPACE_CHECK_S * 1e6 / (period_us or 1000))),
-        )
+        stream = SyncStream(network, pacing, kept.event)
+        check_every = max(1, round(SPACE_CHECK_S * 1e6 / (period_us or 1000)))
         capture_before = _processor_s(ends[0].capture_pid)
-        begun_s, main_before, all_before = time.monotonic(), time.thread_time(), time.process_time()
+        begun_s = time.monotonic()
+        main_before = time.thread_time()
+        all_before = time.process_time()
         with beside() as turns:
             begin = sender.stdin
             if begin is not None:
                 begin.write("go\n")
                 begin.flush()
-            stopping = threading.Thread(target=_stop_for, args=(ends[0].capture_pid, stops_s), name="stop")
+            stopping = threading.Thread(
+                target=_stop_for, args=(ends[0].capture_pid, stops_s), name="stop"
+            )
             stopping.start()
             sample = stream.advance()
             regular = stream.statistics
             while sample.position_counts[0] != LAST:
-                # The position is the number of the cycle: an answer in another cycle's sample would show.
+                # The position is the number of the cycle: an answer in another cycle's sample would
+                # show.
                 wrong += sample.missing == 0 and len(set(sample.position_counts)) != 1
                 kept.sample(sample)
                 if count % check_every == 0:
@@ -219,13 +243,15 @@ def one_run(period_us: int, cycles: int, beside: Beside, stops_s: Sequence[float
                 sample = stream.advance()
             stopping.join()
         seconds = time.monotonic() - begun_s
-        main_s, all_s = time.thread_time() - main_before, time.process_time() - all_before
+        main_s = time.thread_time() - main_before
+        all_s = time.process_time() - all_before
         capture_s = _processor_s(ends[0].capture_pid) - capture_before
-        reported, losses = stream.statistics, ends[0].losses
+        reported = stream.statistics
+        losses = ends[0].losses
         sent_text, sending_s = sender.communicate()[0].split()
-    sent, received = (
-        int(sent_text),
-        reported.cycles + reported.frames + reported.late + reported.duplicate + reported.foreign,
+    sent = int(sent_text)
+    received = (
+        reported.cycles + reported.frames + reported.late + reported.duplicate + reported.foreign
     )
     lost = sum(losses)
     steps_us = np.diff(stamps[: max(count - 1, 0)]) * 1e-3
@@ -265,16 +291,34 @@ def _kept(path: Path, rate_hz: float) -> Iterator[tuple[Kept, DiskRoom]]:
     content = demo_content(CHECKOUT)
     cell = load_cell(DEMO)
     scale = scaling(cell, content.readback)
-    with LogWriter(path, content, scale.joint_position_of, time.monotonic_ns) as log, Feed(DEMO) as feed:
-        feed.begin(replace(_facts(cell, scale, content.run, path, 0), rate_hz=rate_hz), lambda: log.statistics)
-        yield Kept(log, feed, lambda _moves: None, RecordedMotion(len(cell.axes))), DiskRoom(path, free_bytes)
+    with (
+        LogWriter(path, content, scale.joint_position_of, time.monotonic_ns) as log,
+        Feed(DEMO) as feed,
+    ):
+        feed.begin(
+            replace(_facts(cell, scale, content.run, path, 0), rate_hz=rate_hz),
+            lambda: log.statistics,
+        )
+        yield (
+            Kept(log, feed, lambda _moves: None, RecordedMotion(len(cell.axes))),
+            DiskRoom(path, free_bytes),
+        )
         log.conclude(valid=False, reason="a benchmark")
 
 
 @contextmanager
 def _sender(period_us: int, cycles: int) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "tests.bench.stream_sender", INTERFACE, str(period_us), str(cycles)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "tests.bench.stream_sender",
+        INTERFACE,
+        str(period_us),
+        str(cycles),
+    ]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         try:
             if process.stdout is None or process.stdout.readline() != "ready\n":
                 raise RuntimeError(f"no sender: {' '.join(command)}")
@@ -291,8 +335,11 @@ def nothing() -> Iterator[list[int]]:
 
 @contextmanager
 def busy() -> Iterator[list[int]]:
-    """A thread of this process that never waits; it holds the interpreter for its 5 ms whenever it can."""
-    turns, stop = [0], threading.Event()
+    """A thread of this process that never waits;
+    it holds the interpreter for its 5 ms whenever it can.
+    """
+    turns = [0]
+    stop = threading.Event()
 
     def work() -> None:
         while not stop.is_set():
@@ -309,7 +356,9 @@ def busy() -> Iterator[list[int]]:
 
 
 def _processor_s(process: int) -> float:
-    """Return the processor time of a process [s], to the nanosecond; /proc counts ticks, which a guest misses."""
+    """Return the processor time of a process [s], to the nanosecond;
+    /proc counts ticks, which a guest misses.
+    """
     return time.clock_gettime(~process << 3 | CPUCLOCK_SCHED)
 
 

@@ -2,10 +2,10 @@
 
     python -m tests.bench.stream_cost        prints the table of docs/evidence/stream.md, after tests.bench.stream
 
-A guest counts processor time by its ticks, and what wakes up with the ticks escapes them. So the time is that of the
-whole guest as its host counts it: a long run less a short one, which cost the same to start, and of that the part
-beyond the same frames without a listener.
-"""
+A guest counts processor time by its ticks, and what wakes up with the ticks escapes them. So the
+time is that of the whole guest as its host counts it: a long run less a short one, which cost the
+same to start, and of that the part beyond the same frames without a listener.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from tests.bench.stream import COMPARED_HZ
 from tests.bench.stream_sender import FRAMES_A_CYCLE, NODES
 from tests.vcan.run import OUT
 
-SHORT_S, LONG_S = 8, 40
-ASKED_RATIO, ASKED_HZ = 3, 250
+SHORT_S = 8
+LONG_S = 40
+ASKED_RATIO = 3
+ASKED_HZ = 250
 
 
 def cost_us(name: str) -> float:
@@ -42,20 +44,28 @@ def main() -> int:
     """Measure, add it to the results of the bench, and print the table."""
     path = Path(os.environ.get(OUT, "out")) / "bench-stream.json"
     bench = json.loads(path.read_text(encoding="utf-8"))
-    rates, stopped = bench["compared_hz_without_loss"], bench["capture_stopped_for_30_100_300_ms"]
+    rates = bench["compared_hz_without_loss"]
+    stopped = bench["capture_stopped_for_30_100_300_ms"]
     alone = cost_us("nothing")
     costs = {name: cost_us(name) - alone for name in rates}
-    path.write_text(json.dumps(bench | {"processor_us_a_frame": costs, "sender_us_a_frame": alone}, indent=2) + "\n")
+    path.write_text(
+        json.dumps(bench | {"processor_us_a_frame": costs, "sender_us_a_frame": alone}, indent=2)
+        + "\n"
+    )
     lines = [
-        f"| listener | processor time a frame | of candump's (asked: ≤ {ASKED_RATIO}) "
-        f"| highest rate × {NODES} axes without loss (asked: ≥ {ASKED_HZ} Hz) |",
+        f"| listener | processor time a frame | of candump's (asked: ≤ {ASKED_RATIO}) | highest "
+        f"rate × {NODES} axes without loss (asked: ≥ {ASKED_HZ} Hz) |",
         "|---|---|---|---|",
     ]
     for name, cost in costs.items():
-        ratio = f"{cost / costs['candump']:.1f}" if "candump" in costs else "–"
+        if "candump" in costs:
+            ratio = f"{cost / costs['candump']:.1f}"
+        else:
+            ratio = "–"
         lines.append(f"| {name} | {cost:.0f} µs | {ratio} | {rates[name] or 'none'} Hz |")
     lines.append(
-        f"\nCapture stopped for 30, 100, 300 ms: {stopped['lost']} of {stopped['sent']} frames lost, "
+        f"\nCapture stopped for 30, 100, 300 ms: {stopped['lost']} of {stopped['sent']} "
+        "frames lost, "
         f"{stopped['missing_answers']} answers missing"
     )
     sys.stdout.write("\n".join(lines) + "\n")

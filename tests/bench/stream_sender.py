@@ -1,8 +1,9 @@
-"""Six amplifiers' frames on SocketCAN: `python -m tests.bench.stream_sender INTERFACE PERIOD_US CYCLES`.
+"""Six amplifiers' frames on SocketCAN:
+`python -m tests.bench.stream_sender INTERFACE PERIOD_US CYCLES`.
 
-Writes `ready`, waits for a line, then sends SYNC and one TPDO of each node every period (0: as fast as it can), on an
-absolute schedule that leaves nothing out; after a pause one more such cycle, whose positions are LAST. Writes how many
-frames it sent, and in how many seconds the periodic ones.
+Writes `ready`, waits for a line, then sends SYNC and one TPDO of each node every period (0: as fast
+as it can), on an absolute schedule that leaves nothing out; after a pause one more such cycle,
+whose positions are LAST. Writes how many frames it sent, and in how many seconds the periodic ones.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ def main(interface: str, period_us: int, cycles: int) -> None:
     sys.stdout.flush()
     sys.stdin.readline()
     if period_us:
-        # Wires and drives do not wait: on one processor a busy thread would else set the rate of the bus.
+        # Wires and drives do not wait: on one processor a busy thread would else set the rate of
+        # the bus.
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(2))
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:

@@ -1,7 +1,7 @@
 """Measurements of an arm whose every parameter is known, in pieces of any number.
 
 python -m tests.bench.synthetic ROBOT.urdf SAMPLES DATA.npz     writes them for programs that want them whole
-"""
+"""  # noqa: E501
 
 from __future__ import annotations
 

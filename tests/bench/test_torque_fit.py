@@ -71,7 +71,9 @@ def test_the_loop_over_pinocchio_finds_the_same(tmp_path: Path) -> None:
     robot = robot_from_urdf(TX40_URDF.read_text())
     fit = fit_torques(robot, measurements(robot, 6000))
     data = dict(np.load(written(tmp_path)))
-    parameters, residual_norm_nm = pinocchio_fit.fit(pinocchio.buildModelFromUrdf(str(TX40_URDF)), data)
+    parameters, residual_norm_nm = pinocchio_fit.fit(
+        pinocchio.buildModelFromUrdf(str(TX40_URDF)), data
+    )
     assert parameters == len(fit.values)
     assert residual_norm_nm == pytest.approx(fit.residual_norm, rel=1e-9)
 
@@ -101,11 +103,15 @@ def test_agrees_with_dense_least_squares() -> None:
     assert len(fit.values) == 58
     torque = np.concatenate([measured for _, measured in pieces], axis=1)
     parts = ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
-    whole = Motion(*(np.concatenate([getattr(motion, part) for motion, _ in pieces]) for part in parts))
+    whole = Motion(
+        *(np.concatenate([getattr(motion, part) for motion, _ in pieces]) for part in parts)
+    )
     rows = standard_rows(robot, 6000)
     fill_rows(robot, whole, rows)
     dense = np.moveaxis(rows, 1, 2).reshape(-1, rows.shape[1])
     best = dense @ np.linalg.lstsq(dense, torque.ravel())[0]
     assert np.max(np.abs(fit.predict(rows).ravel() - best)) < 1e-8 * np.max(np.abs(best))
-    assert fit.residual_norm == pytest.approx(float(np.linalg.norm(torque.ravel() - best)), rel=1e-10)
+    assert fit.residual_norm == pytest.approx(
+        float(np.linalg.norm(torque.ravel() - best)), rel=1e-10
+    )
     assert fit.residual_norm / np.sqrt(torque.size) == pytest.approx(NOISE_NM, rel=0.03)

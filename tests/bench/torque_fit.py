@@ -1,5 +1,7 @@
-"""The job that is timed: rows of the standard parameters, base parameters, ordinary least squares; from measured
-joint torques, sample by sample, as the classical tools do it. `fit_torques` never holds more than a piece of rows."""
+"""The job that is timed: rows of the standard parameters, base parameters, ordinary least squares;
+from measured joint torques, sample by sample, as the classical tools do it. `fit_torques` never
+holds more than a piece of rows.
+"""
 
 from __future__ import annotations
 
@@ -41,16 +43,24 @@ class TorqueFit:
 
     def predict(self, standard: FloatArray) -> FloatArray:
         """Joint torques of rows of the standard parameters, shape (n, c, k) → (n, k)."""
-        return np.asarray(np.einsum("jck,c->jk", standard[:, list(self.base.independent)], self.values))
+        return np.asarray(
+            np.einsum("jck,c->jk", standard[:, list(self.base.independent)], self.values)
+        )
 
 
 def names(joints: int) -> tuple[str, ...]:
     """Names of the standard parameters, joint by joint."""
-    return tuple(f"{name}{number + 1}" for number in range(joints) for name in LINK_PARAMETERS + DRIVE_PARAMETERS)
+    return tuple(
+        f"{name}{number + 1}"
+        for number in range(joints)
+        for name in LINK_PARAMETERS + DRIVE_PARAMETERS
+    )
 
 
 def standard_rows(robot: Robot, samples: int) -> FloatArray:
-    """Room for the rows of so many samples, shape (n, 14 n, k): the offsets' ones, and zeros that stay zeros."""
+    """Room for the rows of so many samples, shape (n, 14 n, k):
+    the offsets' ones, and zeros that stay zeros.
+    """
     count = robot.joint_count
     room = np.zeros((count, WIDTH * count, samples))
     for joint in range(count):
@@ -58,15 +68,21 @@ def standard_rows(robot: Robot, samples: int) -> FloatArray:
     return room
 
 
-def fill_rows(robot: Robot, motion: Motion, out: FloatArray, wanted: BoolArray | None = None) -> None:
-    """Write the rows of a piece of motion into ``standard_rows`` of its length; ``wanted`` as in `fill_rigid`."""
+def fill_rows(
+    robot: Robot, motion: Motion, out: FloatArray, wanted: BoolArray | None = None
+) -> None:
+    """Write the rows of a piece of motion into ``standard_rows`` of its length;
+    ``wanted`` as in `fill_rigid`.
+    """
     samples, count = motion.position_rad.shape
     position, velocity, acceleration = (
         np.ascontiguousarray(states.T)
         for states in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
     )
     by_link = out.reshape(count, count, WIDTH, samples)
-    fill_rigid(robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)], wanted)
+    fill_rigid(
+        robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)], wanted
+    )
     for joint in range(count):
         own = by_link[joint, joint, len(LINK_PARAMETERS) :]
         own[0], own[1] = acceleration[joint], velocity[joint]
@@ -76,33 +92,40 @@ def fill_rows(robot: Robot, motion: Motion, out: FloatArray, wanted: BoolArray |
 def structure(robot: Robot) -> BaseParameters:
     """The regrouping that holds in every motion of a robot: that of a random one.
 
-    Columns that depend on others whatever the motion need not be computed sample by sample. The tolerance is close to
-    the rounding errors: a column too many costs time, one too few would cost a parameter.
+    Columns that depend on others whatever the motion need not be computed sample by sample. The
+    tolerance is close to the rounding errors: a column too many costs time, one too few would cost
+    a parameter.
     """
     count = robot.joint_count
     rng = np.random.default_rng(0)
     motion = Motion(*(rng.uniform(-np.pi, np.pi, (4 * WIDTH, count)) for _ in range(3)))
     rows = standard_rows(robot, 4 * WIDTH)
     fill_rows(robot, motion, rows)
-    return base_parameters(qr_update(None, np.concatenate(list(rows), axis=1)), names(count), tolerance=1e-11)
+    return base_parameters(
+        qr_update(None, np.concatenate(list(rows), axis=1)), names(count), tolerance=1e-11
+    )
 
 
 def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> TorqueFit:
     """Identify from motions and the joint torques [Nm] measured in them, shape (n, k)."""
-    count, general = robot.joint_count, structure(robot)
+    count = robot.joint_count
+    general = structure(robot)
     needed = _needed(robot, general)
     place = np.cumsum(needed).reshape(needed.shape) - 1  # of each column among the needed ones
     held = _held(robot, needed)
     triangles: list[FloatArray | None] = [None] * count
-    room, own = standard_rows(robot, 0), np.zeros((WIDTH * count + 1, 0))
+    room = standard_rows(robot, 0)
+    own = np.zeros((WIDTH * count + 1, 0))
     for motion, torque in pieces:
         samples = torque.shape[1]
         if room.shape[2] != samples:
-            room, own = standard_rows(robot, samples), np.zeros((WIDTH * count + 1, samples))
+            room = standard_rows(robot, samples)
+            own = np.zeros((WIDTH * count + 1, samples))
         fill_rows(robot, motion, room, needed[:, : len(LINK_PARAMETERS)])
         for joint, columns in enumerate(held):
             rows = own[: len(columns) + 1]
-            np.take(room[joint], columns, axis=0, out=rows[:-1], mode="clip")  # "raise" would go through a copy
+            # "raise" would go through a copy
+            np.take(room[joint], columns, axis=0, out=rows[:-1], mode="clip")
             rows[-1] = torque[joint]
             triangles[joint] = qr_update(triangles[joint], rows)
     last = len(general.independent)
@@ -124,16 +147,23 @@ def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> To
 def joint_columns(
     robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]], *, all_standard: bool = False
 ) -> tuple[FloatArray, ...]:
-    """What `fit_torques` reduces, held whole: for each joint its columns and its torque, shape (c_j + 1, k).
+    """What `fit_torques` reduces, held whole:
+    for each joint its columns and its torque, shape (c_j + 1, k).
 
     `all_standard` takes the columns too that others reproduce in every motion.
     """
-    needed = np.ones((robot.joint_count, WIDTH), dtype=np.bool_) if all_standard else _needed(robot, structure(robot))
-    held, parts = _held(robot, needed), []
+    if all_standard:
+        needed = np.ones((robot.joint_count, WIDTH), dtype=np.bool_)
+    else:
+        needed = _needed(robot, structure(robot))
+    held = _held(robot, needed)
+    parts = []
     for motion, torque in pieces:
         room = standard_rows(robot, torque.shape[1])
         fill_rows(robot, motion, room, needed[:, : len(LINK_PARAMETERS)])
-        parts.append([np.vstack((room[joint, columns], torque[joint])) for joint, columns in enumerate(held)])
+        parts.append(
+            [np.vstack((room[joint, columns], torque[joint])) for joint, columns in enumerate(held)]
+        )
     return tuple(np.concatenate(own, axis=1) for own in zip(*parts, strict=True))
 
 
@@ -145,10 +175,15 @@ def _needed(robot: Robot, general: BaseParameters) -> BoolArray:
 
 
 def _held(robot: Robot, needed: BoolArray) -> tuple[IntArray, ...]:
-    """The needed columns that a joint's torque depends on: of the links behind it, and of its own drive."""
-    drive, links = np.arange(WIDTH) >= len(LINK_PARAMETERS), np.arange(robot.joint_count)
+    """The needed columns that a joint's torque depends on:
+    of the links behind it, and of its own drive.
+    """
+    drive = np.arange(WIDTH) >= len(LINK_PARAMETERS)
+    links = np.arange(robot.joint_count)
     return tuple(
-        np.flatnonzero(needed & (np.isin(links, moved)[:, None] & ~drive | (links == joint)[:, None] & drive))
+        np.flatnonzero(
+            needed & (np.isin(links, moved)[:, None] & ~drive | (links == joint)[:, None] & drive)
+        )
         for joint, moved in enumerate(moved_links(robot))
     )
 
@@ -156,8 +191,8 @@ def _held(robot: Robot, needed: BoolArray) -> tuple[IntArray, ...]:
 def qr_merge(parts: Iterable[tuple[FloatArray, Sequence[int]]], width: int) -> FloatArray:
     """R of several sets of rows, each known by its own triangle over a subset of the columns.
 
-    A joint's torque depends on the links behind it and on its own drive alone: its triangle is that narrow, and only
-    here the joints meet.
+    A joint's torque depends on the links behind it and on its own drive alone: its triangle is that
+    narrow, and only here the joints meet.
 
     Args:
         parts: triangle of shape (c_i, c_i), and which of the ``width`` columns these c_i are.
@@ -175,7 +210,9 @@ def qr_merge(parts: Iterable[tuple[FloatArray, Sequence[int]]], width: int) -> F
 
 
 def moved_links(robot: Robot) -> tuple[tuple[int, ...], ...]:
-    """For each joint the links behind it, ascending, its own first: in other columns its row is zero."""
+    """For each joint the links behind it, ascending, its own first:
+    in other columns its row is zero.
+    """
     behind: list[list[int]] = [[] for _ in robot.joints]
     for link in range(robot.joint_count):
         joint = link

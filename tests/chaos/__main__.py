@@ -1,10 +1,10 @@
 """Play rounds of random faults: ``python -m tests.chaos --seed 1 --minutes 10``.
 
-It plays on vcan0 where there is one (``python -m tests.vcan.run python -m tests.chaos``), else over a hub of drivegain
-on 127.0.0.1, without the acts that need the kernel's CAN. A round is repeated by its seed and number:
-``--seed 1 --round 17``. Log, frames and words of a round with violations are kept in the folder that
-DRIVEGAIN_VCAN_OUT names. With ``--results FILE`` every round leaves a row, and a run that was broken off goes on behind
-its last one.
+It plays on vcan0 where there is one (``python -m tests.vcan.run python -m tests.chaos``), else over
+a hub of drivegain on 127.0.0.1, without the acts that need the kernel's CAN. A round is repeated by
+its seed and number: ``--seed 1 --round 17``. Log, frames and words of a round with violations are
+kept in the folder that DRIVEGAIN_VCAN_OUT names. With ``--results FILE`` every round leaves a row,
+and a run that was broken off goes on behind its last one.
 """
 
 from __future__ import annotations
@@ -44,10 +44,16 @@ def say(line: str) -> None:
 def describe(number: int, outcome: Round, seconds: float) -> str:
     """One line about a round."""
     faults = "; ".join(map(str, outcome.faults))
-    verdict = "ok" if not outcome.violations else f"{len(outcome.violations)} VIOLATIONS"
+    if not outcome.violations:
+        verdict = "ok"
+    else:
+        verdict = f"{len(outcome.violations)} VIOLATIONS"
     if outcome.unrestored:
         faults += f"; settings of {outcome.unrestored} not restored"
-    return f"{number:4d}  {verdict}  exit {outcome.code}, {outcome.compared} values, {seconds:.0f} s: {faults}"
+    return (
+        f"{number:4d}  {verdict}  exit {outcome.code}, {outcome.compared} values, {seconds:.0f} s: "
+        f"{faults}"
+    )
 
 
 def arguments() -> argparse.Namespace:
@@ -55,9 +61,15 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(1 << 16))
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--round", type=int, help="play this round alone, and show what the recorder says")
-    parser.add_argument("--hub", action="store_true", help="play over a hub even where there is vcan0")
-    parser.add_argument("--results", type=Path, help="CSV file with a row for each round; a run goes on behind it")
+    parser.add_argument(
+        "--round", type=int, help="play this round alone, and show what the recorder says"
+    )
+    parser.add_argument(
+        "--hub", action="store_true", help="play over a hub even where there is vcan0"
+    )
+    parser.add_argument(
+        "--results", type=Path, help="CSV file with a row for each round; a run goes on behind it"
+    )
     return parser.parse_args()
 
 
@@ -65,7 +77,8 @@ def main() -> int:
     """Play until the time is over; 1 if anything was violated."""
     wanted = arguments()
     clock.begin_again("tests.chaos")
-    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))  # the round's processes end, too
+    # The round's processes end, too
+    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     stepped = clock.StepClock() if clock.available() else None
     done = read_rows(wanted.results, wanted.seed)
     played_s = sum(one.seconds for one in done)
@@ -81,7 +94,10 @@ def main() -> int:
         if not on_kernel:
             bus = stack.enter_context(hub_running())
         kinds = possible_kinds(bus, stepped is not None)
-        say(f"chaos: seed {wanted.seed} on {bus.address}, {len(kinds)} of {len(KINDS)} kinds of faults")
+        say(
+            f"chaos: seed {wanted.seed} on {bus.address}, {len(kinds)} of {len(KINDS)} kinds "
+            "of faults"
+        )
         first = len(done)
         last = None
         if wanted.round is not None:
@@ -94,7 +110,9 @@ def main() -> int:
             begun_s = time.monotonic()
             place = folder / str(number)
             place.mkdir()
-            outcome = play(faults, place, bus, simulation.read_text(encoding="utf-8"), plan, stepped)
+            outcome = play(
+                faults, place, bus, simulation.read_text(encoding="utf-8"), plan, stepped
+            )
             seconds = time.monotonic() - begun_s
             say(describe(number, outcome, seconds))
             if wanted.round is not None or outcome.violations:
@@ -102,7 +120,11 @@ def main() -> int:
             for line in outcome.violations:
                 say(f"      {line}")
             if outcome.violations and os.environ.get(OUT):
-                shutil.copytree(place, Path(os.environ[OUT], "chaos", f"{wanted.seed}-{number}"), dirs_exist_ok=True)
+                shutil.copytree(
+                    place,
+                    Path(os.environ[OUT], "chaos", f"{wanted.seed}-{number}"),
+                    dirs_exist_ok=True,
+                )
             row = Row.of(wanted.seed, number, bus.port is None, outcome, seconds)
             done.append(row)
             if wanted.results is not None and wanted.round is None:
@@ -126,18 +148,27 @@ def summary(seed: int, done: list[Row]) -> Iterator[str]:
     kinds = Counter(name for row in done for name in row.faults)
     codes = Counter(row.code for row in done)
     values = sum(row.values for row in done)
-    yield f"\nseed {seed}: {len(done)} rounds, {kinds.total()} faults of {len(kinds)} kinds, {values} values compared"
+    yield (
+        f"\nseed {seed}: {len(done)} rounds, {kinds.total()} faults of {len(kinds)} kinds, "
+        f"{values} values compared"
+    )
     neighbours = sum(row.neighbours for row in done)
     yield f"{neighbours} of them of the cycle before or after, in logs that are refused for that"
     writes = sum(row.writes for row in done)
     loads = [row.load for row in done]
     if done:
-        yield f"{writes} writes and checks of the audit log; load of the machine {min(loads)} to {max(loads)}"
+        yield (
+            f"{writes} writes and checks of the audit log; load of the machine {min(loads)} to "
+            f"{max(loads)}"
+        )
     for kind, count in sorted(kinds.items()):
         yield f"{count:4d}  {kind}"
     yield "exit codes: " + ", ".join(f"{code} ({count})" for code, count in sorted(codes.items()))
     latest = max((row.latest_s for row in done if row.stops), default=0.0)
-    yield f"stops after faults in motion: {sum(row.stops for row in done)}; latest, beside its bound: {latest:+.3f} s"
+    yield (
+        f"stops after faults in motion: {sum(row.stops for row in done)}; latest, beside its "
+        f"bound: {latest:+.3f} s"
+    )
     violated = [row.number for row in done if row.violations]
     for number in violated:
         yield f"violated: make chaos SEED={seed} ROUND={number}"

@@ -1,7 +1,8 @@
-"""A wall clock that is stepped for one process alone, at any moment, without touching the machine's.
+"""A wall clock that is stepped for one process alone, at any moment,
+without touching the machine's.
 
-The C library's clock is replaced through LD_PRELOAD (clock.c), so what the interpreter reads is stepped, too. It needs
-a C compiler; without one the acts on the clock are left out.
+The C library's clock is replaced through LD_PRELOAD (clock.c), so what the interpreter reads is
+stepped, too. It needs a C compiler; without one the acts on the clock are left out.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ def available() -> bool:
 
 
 def begin_again(module: str) -> None:
-    """Start this program anew on the replaced clock; return where that is done already, or impossible."""
+    """Start this program anew on the replaced clock;
+    return where that is done already, or impossible.
+    """
     compiler = shutil.which("cc")
     if available() or compiler is None:
         return

@@ -53,7 +53,9 @@ class End(ABC):
         self._socket.close()
 
     def hear(self, seconds: float) -> list[Heard]:
-        """Return the frames that wait, or the first that come within a time; an interface that is down has none."""
+        """Return the frames that wait, or the first that come within a time;
+        an interface that is down has none.
+        """
         if not select.select((self._socket,), (), (), seconds)[0]:
             return []
         with suppress(OSError):
@@ -119,7 +121,10 @@ class HubEnd(End):
         return [(one.identifier, one.data) for one in frames]
 
     def send(self, identifier: int, data: bytes = b"") -> None:
-        name = f"{identifier & ~EXTENDED:08X}" if identifier & EXTENDED else f"{identifier:03X}"
+        if identifier & EXTENDED:
+            name = f"{identifier & ~EXTENDED:08X}"
+        else:
+            name = f"{identifier:03X}"
         words = f"< send {name} {len(data):X} {data.hex(' ')} >"
         self._socket.sendall(words.encode("ascii"))
 
@@ -133,15 +138,20 @@ class ChaosBus:
     @property
     def address(self) -> str:
         """For the listener."""
-        return INTERFACE if self.port is None else f"{HUB_HOST}:{self.port}"
+        if self.port is None:
+            return INTERFACE
+        return f"{HUB_HOST}:{self.port}"
 
     @property
     def settings(self) -> str:
         """Lines of the cell file."""
         if self.port is None:
-            return f"bus:\n  interface: socketcan\n  channel: {INTERFACE}\n  bitrate_bit_s: 1000000\n"
+            return (
+                f"bus:\n  interface: socketcan\n  channel: {INTERFACE}\n  bitrate_bit_s: 1000000\n"
+            )
         return (
-            f"bus:\n  interface: socketcand\n  channel: {HUB_CHANNEL}\n  host: {HUB_HOST}\n  port: {self.port}\n"
+            f"bus:\n  interface: socketcand\n  channel: {HUB_CHANNEL}\n  host: {HUB_HOST}\n  port: "
+            f"{self.port}\n"
             "  bitrate_bit_s: 1000000\n"
         )
 
@@ -152,12 +162,16 @@ class ChaosBus:
 
     @property
     def same_sync_ns(self) -> int:
-        """Largest difference between the times of a sample and of its SYNC [ns]; a hub stamps what it has received."""
+        """Largest difference between the times of a sample and of its SYNC [ns];
+        a hub stamps what it has received.
+        """
         return SAME_SYNC_NS if self.port is None else 9_500_000
 
     @property
     def in_order(self) -> bool:
-        """Whether samples and SYNCs are paired by their order: a hub loses none, but a busy host stamps late."""
+        """Whether samples and SYNCs are paired by their order:
+        a hub loses none, but a busy host stamps late.
+        """
         return self.port is not None
 
     @property
@@ -167,7 +181,9 @@ class ChaosBus:
 
     def end(self, wanted: Sequence[tuple[int, int]] = ()) -> End:
         """Open an end that hears base data frames of these identifiers and masks."""
-        return KernelEnd(wanted) if self.port is None else HubEnd(self.address, wanted)
+        if self.port is None:
+            return KernelEnd(wanted)
+        return HubEnd(self.address, wanted)
 
 
 def flood(bus: ChaosBus, identifier: int = 0x7F0) -> int:

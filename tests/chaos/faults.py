@@ -1,4 +1,5 @@
-"""The faults of each round, drawn from a seed: kind, moment and size; nothing here touches a bus or a process.
+"""The faults of each round, drawn from a seed: kind, moment and size;
+nothing here touches a bus or a process.
 
 Nothing of the product is imported either: the judgement builds on this module.
 """
@@ -85,7 +86,15 @@ class Inside(Enum):
     LOSES_POWER = "loses-power"
 
 
-ONCE = frozenset({Inside.EMERGENCY, Inside.FOLLOWING_ERROR, Inside.FALLS_BACK, Inside.REBOOTS, Inside.LOSES_POWER})
+ONCE = frozenset(
+    {
+        Inside.EMERGENCY,
+        Inside.FOLLOWING_ERROR,
+        Inside.FALLS_BACK,
+        Inside.REBOOTS,
+        Inside.LOSES_POWER,
+    }
+)
 KINDS: tuple[Act | Inside, ...] = (*Act, *Inside)
 KERNEL_ONLY = frozenset(
     {
@@ -98,7 +107,9 @@ KERNEL_ONLY = frozenset(
         Act.LINK_DOWN,
     }
 )
-"""Acts that need the kernel's CAN: a hub has no interface, no error frames, and no capture process reads it."""
+"""Acts that need the kernel's CAN: a hub has no interface, no error frames,
+and no capture process reads it.
+"""
 NEEDS_CLOCK = frozenset({Act.CLOCK_STEP, Act.CLOCK_WRONG})
 FROM_START = frozenset({Act.SDO_ABORT, Act.NO_PERMISSION})
 """Acts that are there from the start of the recorder on."""
@@ -134,9 +145,12 @@ SETUP_OBJECTS = (
     (0x6081, 0),
     (0x6083, 0),
 )
-"""Objects that the set-up of a drive reads or writes (CiA 301, CiA 402); an SDO abort meets one of them."""
+"""Objects that the set-up of a drive reads or writes (CiA 301, CiA 402);
+an SDO abort meets one of them.
+"""
 WHOLE_CELL = frozenset({Inside.SECOND_MASTER})
-IN_MOTION = 0.75  #: Share of the faults whose moment counts from the first set-point; the others' from the start
+#: Share of the faults whose moment counts from the first set-point; the others' from the start
+IN_MOTION = 0.75
 MOTION_S, RUN_S = 3.5, 8.0  #: Latest moments
 SHORT_S, LONG_S, HANG_S = (0.03, 0.3), (0.5, 4.0), 5.0  #: How long acts last
 CYCLES = range(20, 230)  #: SYNCs from power-on to a fault of the cell
@@ -148,9 +162,11 @@ class Fault:
     """One fault."""
 
     kind: Act | Inside  #: an act from outside, or a fault that the cell makes by itself
-    in_motion: bool  #: whether `at_s` counts from the first set-point, not from the start of the recorder
+    #: whether `at_s` counts from the first set-point, not from the start of the recorder
+    in_motion: bool
     at_s: float  #: moment of an act [s]
-    for_s: float  #: how long a process is stopped, the interface down, a flood or a full disk lasts [s]
+    #: how long a process is stopped, the interface down, a flood or a full disk lasts [s]
+    for_s: float
     node: int  #: node id that it concerns
     times: int  #: number of frames
     gap_s: float  #: time between two of them [s]
@@ -161,7 +177,9 @@ class Fault:
     @property
     def name(self) -> str:
         """For the table of faults."""
-        return self.kind.value if isinstance(self.kind, Act) else f"cell: {self.kind.value}"
+        if isinstance(self.kind, Act):
+            return self.kind.value
+        return f"cell: {self.kind.value}"
 
     def __str__(self) -> str:
         if self.kind in FROM_START:
@@ -169,7 +187,10 @@ class Fault:
         if self.kind in AFTERWARDS:
             return self.name
         if isinstance(self.kind, Act):
-            since = "the first set-point" if self.in_motion else "its start"
+            if self.in_motion:
+                since = "the first set-point"
+            else:
+                since = "its start"
             return f"{self.name}, {self.at_s:.3f} s after {since}"
         return f"{self.name}, node {self.node}, SYNC {self.at_cycle}, {self.cycles or 'all'} cycles"
 
@@ -186,9 +207,18 @@ class Fault:
     def entry(self) -> str:
         """The line of a simulation file for a fault of the cell."""
         words = [f"fault: {self.kind.value}", f"at_cycle: {self.at_cycle}"]
-        words += [] if self.kind in WHOLE_CELL else [f"axis: J{self.node}"]
-        words += [] if self.cycles is None else [f"cycles: {self.cycles}"]
-        words += [f"emcy_code: {self.value:#x}"] if self.kind is Inside.EMERGENCY else []
+        if self.kind in WHOLE_CELL:
+            words += []
+        else:
+            words += [f"axis: J{self.node}"]
+        if self.cycles is None:
+            words += []
+        else:
+            words += [f"cycles: {self.cycles}"]
+        if self.kind is Inside.EMERGENCY:
+            words += [f"emcy_code: {self.value:#x}"]
+        else:
+            words += []
         return f"  - {{{', '.join(words)}}}\n"
 
 
@@ -220,7 +250,10 @@ def _draw(random: Random, kind: Act | Inside) -> Fault:
     duration_s = SHORT_S
     if kind in (Act.FLOOD, Act.DISK_FULL, Act.SCREEN_STOPPED):
         duration_s = LONG_S
-    cycles = None if kind in ONCE else (1 if short else random.randrange(2, 60))
+    if kind in ONCE:
+        cycles = None
+    else:
+        cycles = 1 if short else random.randrange(2, 60)
     return Fault(
         kind,
         in_motion,

@@ -1,15 +1,18 @@
-"""The judgement of a round, by what a listener, the files and the exit codes show: nothing of the product is imported.
+"""The judgement of a round, by what a listener, the files and the exit codes show:
+nothing of the product is imported.
 
-The listener must have heard the bus: one that heard nothing shows no violation. Eight things must hold whatever the
-faults were: (a) no value is in the log that was not on the bus, (b) every loss is counted, (c) the axes stop within
-their bound, (d) settings are restored, and the bus can be used again, (e) the exit code is one that the faults, or a
-stall on the bus, explain, without a traceback, (f) nothing moves without permission, (g) the controller's file is
-whole: all gains are those of one write, and nothing else has changed, (h) the chain of the audit log is unbroken, and
+The listener must have heard the bus: one that heard nothing shows no violation. Eight things must
+hold whatever the faults were: (a) no value is in the log that was not on the bus, (b) every loss is
+counted, (c) the axes stop within their bound, (d) settings are restored, and the bus can be used
+again, (e) the exit code is one that the faults, or a stall on the bus, explain, without a
+traceback, (f) nothing moves without permission, (g) the controller's file is whole: all gains are
+those of one write, and nothing else has changed, (h) the chain of the audit log is unbroken, and
 what was removed from it is reported.
 
-Frames are decoded by the identifiers and layouts of CiA 301 and of the drives' data sheet, logs by the `mcap` package,
-the chain by hashlib. Bounds and exit codes are those that the documentation states (docs/reference/faults.md,
-docs/reference/exit-codes.md), written down here again: a number that changes in the product alone is a violation.
+Frames are decoded by the identifiers and layouts of CiA 301 and of the drives' data sheet, logs by
+the `mcap` package, the chain by hashlib. Bounds and exit codes are those that the documentation
+states (docs/reference/faults.md, docs/reference/exit-codes.md), written down here again: a number
+that changes in the product alone is a violation.
 """
 
 from __future__ import annotations
@@ -31,11 +34,15 @@ from tests.vcan.log_reader import read_recorded
 RPDO1 = 0x200
 NEW_SETPOINT = 0x10  #: Bit of the controlword, which is behind the target in RPDO1
 TARGET_BYTES = 4
-CYCLE_S, GUARD_S, LATENESS_S = 0.02, 0.5, 1.0
+CYCLE_S = 0.02
+GUARD_S = 0.5
+LATENESS_S = 1.0
 LIMIT_S = 0.5  #: An active limit ends a run after so long
 SPACE_CHECK_S = 0.1  #: Time between two looks at the free space of the disk
 ALLOWANCE_S = 0.4
-"""For a guest whose host gives its time to others; the latest of some 50 measured stops came 0.17 s after its bound."""
+"""For a guest whose host gives its time to others;
+the latest of some 50 measured stops came 0.17 s after its bound.
+"""
 
 
 class ExitCode(IntEnum):
@@ -67,7 +74,8 @@ class Stop:
         return enough and fault.for_s >= self.least_s and fault.times >= self.least_times
 
 
-PROMPT, UNANSWERED_S = Stop(2 * CYCLE_S), 4 * CYCLE_S
+PROMPT = Stop(2 * CYCLE_S)
+UNANSWERED_S = 4 * CYCLE_S
 STOPS: dict[Act | Inside, Stop] = {
     Act.RECORDER_KILL: Stop(GUARD_S),
     Act.RECORDER_HANG: Stop(GUARD_S),
@@ -80,8 +88,9 @@ STOPS: dict[Act | Inside, Stop] = {
     Act.CELL_PAUSE: Stop(UNANSWERED_S, least_s=0.15, lasts=True),
     Act.CELL_HANG: Stop(UNANSWERED_S, lasts=True),
     Act.CELL_INT: PROMPT,
-    # The kernel does not distinguish the SYNC of another program on this machine from the recorder's own: the
-    # recorder notices when there are four or five too many (`drivers.stream.sync.SURPLUS`).
+    # The kernel does not distinguish the SYNC of another program on this machine from the
+    # recorder's own: the recorder notices when there are four or five too many
+    # (`drivers.stream.sync.SURPLUS`).
     Act.SYNC: Stop(7 * CYCLE_S, least_times=6),
     Act.NMT: PROMPT,
     Act.HEARTBEAT: PROMPT,
@@ -184,9 +193,11 @@ STOPS_RUN = (set(STOPS) - OWN_ENDS) | {
     Inside.SDO_MASTER,
 }
 """Faults of a device or of the bus, after which a recording may end as a device fault."""
-LATE_CYCLES, SILENT_CYCLES = 1.5, 3
-"""Cycles without a SYNC on the bus, or without an answer of an axis, that explain unfit data and a device fault: a busy
-host stalls recorder and cell. The listener shows it, not the recorder's words."""
+LATE_CYCLES = 1.5
+SILENT_CYCLES = 3
+"""Cycles without a SYNC on the bus, or without an answer of an axis, that explain unfit data and a
+device fault: a busy host stalls recorder and cell. The listener shows it, not the recorder's words.
+"""
 UNSTOPPED_CODES = {int(ExitCode.OK), int(ExitCode.DATA_UNFIT)}
 """Exit codes of a recording that came to its end: wrong after a fault that must stop it."""
 UNREAD = {Act.SCREEN_CLOSED, Act.TERMINAL_CLOSED}
@@ -194,8 +205,9 @@ UNREAD = {Act.SCREEN_CLOSED, Act.TERMINAL_CLOSED}
 WRITE_CODES = {int(ExitCode.OK), int(ExitCode.CALIBRATION_REFUSED)}
 """Exit codes of a write whose clock is wrong: the ages of what it reads may refuse it."""
 UNRESTORED = {Act.RECORDER_KILL, Act.RECORDER_INT_TWICE, Act.NMT, Inside.REBOOTS}
-"""Faults after which a drive may have other settings, and no message reports it: the recorder is gone or gave up, or
-the drive was reset."""
+"""Faults after which a drive may have other settings, and no message reports it:
+the recorder is gone or gave up, or the drive was reset.
+"""
 UNREACHABLE = {
     Inside.SILENT,
     Act.TWIN_SDO,
@@ -210,11 +222,15 @@ UNREACHABLE = {
     Act.RECORDER_TERM,
     Act.SDO_ABORT,
 }
-"""Faults after which a drive may have other settings if a message names it: it or the bus did not answer for a time."""
+"""Faults after which a drive may have other settings if a message names it:
+it or the bus did not answer for a time.
+"""
 NOT_RESTORED = re.compile(r"settings (?:of .{1,200}? )?not restored.*?switch these drives off")
 MAY_BE_SILENT = {Inside.SILENT, Act.NMT, Act.CELL_KILL, Act.CELL_INT, Act.LINK_DOWN}
 FOREIGN_MASTERS = {Inside.SECOND_MASTER, Inside.SDO_MASTER}
-"""Faults of the cell that may last on after the recorder's end: a scan that finds them refuses, and says so."""
+"""Faults of the cell that may last on after the recorder's end:
+a scan that finds them refuses, and says so.
+"""
 FOREIGN = "that we did not send"
 GONE = {Act.CELL_KILL, Act.CELL_INT, Act.LINK_DOWN}
 """Faults after which there may be no cell any more."""
@@ -223,7 +239,8 @@ GAIN = re.compile(r"^(\s*gain:\s*)(\S+)", re.MULTILINE)
 DIGEST = re.compile(r',"sha256":"([0-9a-f]{64})"')
 CHAIN_KEYS = ("previous", "sha256")
 FIRST = "0" * 64  #: Digest before the first entry of an audit log
-ENABLED, POWERED = 0x27, (0x27, 0x07, 0x23)  #: Statuswords under the mask 6Fh: OPERATION ENABLED, all with power
+#: Statuswords under the mask 6Fh: OPERATION ENABLED, all with power
+ENABLED, POWERED = 0x27, (0x27, 0x07, 0x23)
 STATUSWORD_MASK = 0x6F
 
 
@@ -244,7 +261,8 @@ class FilesSeen:
 
     controller: str  #: text of the controller's file
     audit: str  #: text of the audit log, empty where it is absent
-    torn: bool = False  #: whether a writer was killed, which may leave an unfinished line at the end
+    #: whether a writer was killed, which may leave an unfinished line at the end
+    torn: bool = False
 
 
 @dataclass
@@ -252,7 +270,8 @@ class Round:
     """What happened in a round."""
 
     faults: Sequence[Fault]  #: that were drawn
-    struck: list[tuple[Fault, int]] = field(default_factory=list)  #: acts and when they were made [ns since 1970]
+    #: acts and when they were made [ns since 1970]
+    struck: list[tuple[Fault, int]] = field(default_factory=list)
     twins: set[bytes] = field(default_factory=set)  #: data of the frames of a second node
     moved_ns: int = 0  #: time of the first set-point, 0 without one
     ended_ns: int = 1 << 63  #: time of the recorder's end
@@ -262,26 +281,40 @@ class Round:
     cell: bool = True  #: whether the cell outlived the recorder
     cell_said: str = ""  #: words of the cell
     enabled: list[int] = field(default_factory=list)  #: nodes that are enabled after the guard time
-    powered: list[int] = field(default_factory=list)  #: nodes that have power after the time of their stop
+    #: nodes that have power after the time of their stop
+    powered: list[int] = field(default_factory=list)
     unrestored: list[int] = field(default_factory=list)  #: nodes with other settings than before
     silent: list[int] = field(default_factory=list)  #: nodes that do not answer
     permitted: bool = True  #: whether the recorder was allowed to move the axes
     began_ns: int = 0  #: time at which the recorder began
-    clock_steps_ns: tuple[int, ...] = (0,)  #: by how much its wall clock may have been off at its start
-    written: list[Written] = field(default_factory=list)  #: writes of gains around the recording, in their order
-    files: list[FilesSeen] = field(default_factory=list)  #: controller's file and audit log, after each of them
+    #: by how much its wall clock may have been off at its start
+    clock_steps_ns: tuple[int, ...] = (0,)
+    #: writes of gains around the recording, in their order
+    written: list[Written] = field(default_factory=list)
+    #: controller's file and audit log, after each of them
+    files: list[FilesSeen] = field(default_factory=list)
     #: Exit code and words of `drivegain scan` afterwards, None where there is no cell any more.
     scanned: tuple[int | None, str] | None = None
     compared: int = 0  #: values that were compared with the bus
-    neighbours: int = 0  #: of these, of the cycle before or after, in a log that is refused for that
-    late_s: dict[str, float] = field(default_factory=dict)  #: time from a fault to the stop, less its bound, by name
+    #: of these, of the cycle before or after, in a log that is refused for that
+    neighbours: int = 0
+    #: time from a fault to the stop, less its bound, by name
+    late_s: dict[str, float] = field(default_factory=dict)
     violations: list[str] = field(default_factory=list)  #: of what must hold
 
     @property
     def moments(self) -> list[tuple[Fault, int]]:
         """The faults that came before the end of the recorder, and when [ns since 1970]."""
-        syncs = [one.time_ns for one in self.frames if one.identifier == SYNC and one.time_ns < self.ended_ns]
-        inside = [fault for fault in self.faults if isinstance(fault.kind, Inside) and fault.at_cycle < len(syncs)]
+        syncs = [
+            one.time_ns
+            for one in self.frames
+            if one.identifier == SYNC and one.time_ns < self.ended_ns
+        ]
+        inside = [
+            fault
+            for fault in self.faults
+            if isinstance(fault.kind, Inside) and fault.at_cycle < len(syncs)
+        ]
         return [*self.struck, *((fault, syncs[fault.at_cycle]) for fault in inside)]
 
     @property
@@ -301,11 +334,14 @@ class Round:
         return [
             (fault, at_ns)
             for fault, at_ns in self.moments
-            if 0 < self.moved_ns < at_ns < end_ns and (stop := STOPS.get(fault.kind)) is not None and stop.due(fault)
+            if 0 < self.moved_ns < at_ns < end_ns
+            and (stop := STOPS.get(fault.kind)) is not None
+            and stop.due(fault)
         ]
 
 
-# -- the judgement -----------------------------------------------------------------------------------------------------
+# -- the judgement
+# -----------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def judge(
@@ -338,18 +374,30 @@ def judge(
 
 
 def judge_listener(outcome: Round) -> None:
-    """Add a listener that cannot have heard the bus: what it would show seems to hold then, (c) and (f) above all."""
+    """Add a listener that cannot have heard the bus:
+    what it would show seems to hold then, (c) and (f) above all.
+    """
     if not outcome.frames:
         outcome.violations.append("(listener) the listener heard nothing")
-    elif outcome.moved_ns and not any(is_setpoint(one.identifier, one.data) for one in outcome.frames):
-        outcome.violations.append("(listener) the listener heard nothing of the set-points, and the axes got some")
+    elif outcome.moved_ns and not any(
+        is_setpoint(one.identifier, one.data) for one in outcome.frames
+    ):
+        outcome.violations.append(
+            "(listener) the listener heard nothing of the set-points, and the axes got some"
+        )
     elif outcome.moved_ns and not any(is_answer(one) for one in outcome.frames):
-        outcome.violations.append("(listener) the listener heard nothing of the axes, and they got set-points")
+        outcome.violations.append(
+            "(listener) the listener heard nothing of the axes, and they got set-points"
+        )
 
 
 def is_setpoint(identifier: int, data: bytes) -> bool:
     """Whether a frame is a new set-point for an axis."""
-    return identifier & ~0x7F == RPDO1 and len(data) > TARGET_BYTES and data[TARGET_BYTES] & NEW_SETPOINT != 0
+    return (
+        identifier & ~0x7F == RPDO1
+        and len(data) > TARGET_BYTES
+        and data[TARGET_BYTES] & NEW_SETPOINT != 0
+    )
 
 
 def is_answer(frame: Frame) -> bool:
@@ -374,7 +422,8 @@ def allowed_codes(outcome: Round) -> set[int]:
 
 
 def longest_stall_cycles(outcome: Round) -> float:
-    """Longest time without a SYNC, or without an answer of an axis, from the first set-point to the end of power.
+    """Longest time without a SYNC, or without an answer of an axis,
+    from the first set-point to the end of power.
 
     Returns:
         The time in cycles; 0 without motion.
@@ -401,23 +450,35 @@ def longest_stall_cycles(outcome: Round) -> float:
 
 def judge_end(outcome: Round) -> None:
     """Add what is wrong with the state of the cell."""
-    say, kinds = outcome.violations.append, outcome.kinds
+    say = outcome.violations.append
+    kinds = outcome.kinds
     if not outcome.cell and not kinds & GONE:
         say(f"the simulated cell ended by itself: {outcome.cell_said}")
     if outcome.enabled or outcome.powered:
-        say(f"(c) after its end nodes {outcome.enabled} are enabled, nodes {outcome.powered} have power")
+        say(
+            f"(c) after its end nodes {outcome.enabled} are enabled, nodes {outcome.powered} "
+            "have power"
+        )
     if outcome.unrestored and not kinds & (UNRESTORED | UNREAD):
         named = " ".join(NOT_RESTORED.findall(" ".join(outcome.said.split())))
         unnamed = [node for node in outcome.unrestored if not re.search(rf"\bJ{node}\b", named)]
         if unnamed:
-            say(f"(d) nodes {unnamed} have other settings than before, and no message reports it: {outcome.said}")
+            say(
+                f"(d) nodes {unnamed} have other settings than before, and no message reports it: "
+                f"{outcome.said}"
+            )
         elif not kinds & UNREACHABLE:
             say(f"(d) nodes {outcome.unrestored} were left with other settings: {outcome.said}")
     if outcome.silent and not kinds & MAY_BE_SILENT:
         say(f"(d) nodes {outcome.silent} do not answer any more")
-    if outcome.scanned is not None and outcome.scanned[0] != ExitCode.OK and not kinds & MAY_BE_SILENT:
+    if (
+        outcome.scanned is not None
+        and outcome.scanned[0] != ExitCode.OK
+        and not kinds & MAY_BE_SILENT
+    ):
         scan_code, scan_said = outcome.scanned
-        # A fault of the cell counts cycles, and none passes between the recorder's end and the scan.
+        # A fault of the cell counts cycles, and none passes between the recorder's end and the
+        # scan.
         refused_master = scan_code == ExitCode.DEVICE_FAULT and FOREIGN in scan_said
         if not (refused_master and kinds & FOREIGN_MASTERS):
             say(f"(d) scan ended with {scan_code} afterwards: {scan_said}")
@@ -425,7 +486,8 @@ def judge_end(outcome: Round) -> None:
 
 def judge_code(outcome: Round) -> None:
     """Add what is wrong with the exit code and the words."""
-    say, kinds = outcome.violations.append, outcome.kinds
+    say = outcome.violations.append
+    kinds = outcome.kinds
     allowed = allowed_codes(outcome)
     came_to_its_end = outcome.code in UNSTOPPED_CODES and outcome.stopping
     if outcome.code not in allowed and not came_to_its_end:
@@ -437,17 +499,26 @@ def judge_code(outcome: Round) -> None:
         words = " ".join(outcome.said.split())
         for fault in aborts:
             if f"node {fault.node})" not in words or "expect" not in words:
-                say(f"(e) no message names node {fault.node}, whose SDO abort ended the run: {outcome.said}")
+                say(
+                    f"(e) no message names node {fault.node}, whose SDO abort ended the run: "
+                    f"{outcome.said}"
+                )
     if came_to_its_end:
         faults = ", ".join(fault.name for fault, _ in outcome.stopping)
         say(f"(e) exit code {outcome.code} after {faults} in motion: {outcome.said}")
     scanned = "" if outcome.scanned is None else outcome.scanned[1]
-    for name, words in (("record", outcome.said), ("scan", scanned), ("the cell", outcome.cell_said)):
+    for name, words in (
+        ("record", outcome.said),
+        ("scan", scanned),
+        ("the cell", outcome.cell_said),
+    ):
         if "Traceback" in words:
             say(f"(e) {name} shows a traceback: {words}")
 
 
-def judge_log(outcome: Round, log: Path, same_sync_ns: int = SAME_SYNC_NS, in_order: bool = False) -> None:
+def judge_log(
+    outcome: Round, log: Path, same_sync_ns: int = SAME_SYNC_NS, in_order: bool = False
+) -> None:
     """Add what is wrong with the log, whole or unfinished."""
     path = next((one for one in (log, log.with_name(f"{log.name}.part")) if one.exists()), None)
     if path is None or path.stat().st_size == 0:
@@ -477,10 +548,15 @@ def judge_log(outcome: Round, log: Path, same_sync_ns: int = SAME_SYNC_NS, in_or
 
 
 def judge_permission(outcome: Round) -> None:
-    """Add axes that moved, or were enabled, before the recorder began, or at all without permission."""
+    """Add axes that moved, or were enabled, before the recorder began,
+    or at all without permission.
+    """
     if outcome.kinds & {Act.SETPOINT, Act.TWIN, Act.SDO_MASTER}:
         return  # another master's frames are on the bus
-    until_ns = outcome.began_ns if outcome.permitted else outcome.ended_ns
+    if outcome.permitted:
+        until_ns = outcome.began_ns
+    else:
+        until_ns = outcome.ended_ns
     for one in outcome.frames:
         if one.time_ns >= until_ns:
             break
@@ -503,13 +579,16 @@ def judge_controller(outcome: Round, before: str, gains: Sequence[Sequence[float
     Args:
         outcome: of the round.
         before: the file as it was first.
-        gains: the gains that a file may have, all of them of one entry; those of `before` are allowed, too.
+        gains: the gains that a file may have, all of them of one entry; those of `before` are
+            allowed, too.
     """
     frame = GAIN.sub(r"\1", before)
     allowed = [_gains(before), *(tuple(one) for one in gains)]
     for seen in outcome.files:
         if GAIN.sub(r"\1", seen.controller) != frame:
-            outcome.violations.append("(g) the controller's file has changed beside its gains, or is not whole")
+            outcome.violations.append(
+                "(g) the controller's file has changed beside its gains, or is not whole"
+            )
         elif not any(_are_close(_gains(seen.controller), one) for one in allowed):
             outcome.violations.append(
                 f"(g) the controller's file has gains of no single write: {_gains(seen.controller)}"
@@ -530,14 +609,16 @@ def _are_close(found: Sequence[float], expected: Sequence[float]) -> bool:
     """Whether gains are equal to the digits that are written."""
     if len(found) != len(expected):
         return False
-    return all(abs(one - other) <= 2e-4 * abs(other) for one, other in zip(found, expected, strict=True))
+    return all(
+        abs(one - other) <= 2e-4 * abs(other) for one, other in zip(found, expected, strict=True)
+    )
 
 
 def broken_chain(text: str, torn: bool = False) -> str:
     """Return what is wrong with the chain of an audit log; empty if it is unbroken.
 
-    Every line is JSON with the SHA-256 of itself without that digest, and with the digest of the line before. A writer
-    that was killed may leave an unfinished line.
+    Every line is JSON with the SHA-256 of itself without that digest, and with the digest of the
+    line before. A writer that was killed may leave an unfinished line.
     """
     previous = FIRST
     for number, line in enumerate(text.splitlines(), 1):
@@ -555,7 +636,10 @@ def broken_chain(text: str, torn: bool = False) -> str:
         if entry["previous"] != previous:
             return f"line {number} does not follow the one before"
         digests = DIGEST.findall(line)
-        content = line.replace(f',"sha256":"{digests[-1]}"', "") if digests else line
+        if digests:
+            content = line.replace(f',"sha256":"{digests[-1]}"', "")
+        else:
+            content = line
         if hashlib.sha256(content.encode()).hexdigest() != entry["sha256"]:
             return f"line {number} was changed"
         previous = entry["sha256"]
@@ -563,7 +647,9 @@ def broken_chain(text: str, torn: bool = False) -> str:
 
 
 def judge_audit(outcome: Round) -> None:
-    """Add breaks of the chain that no act explains, and removals that `history --verify` does not report."""
+    """Add breaks of the chain that no act explains,
+    and removals that `history --verify` does not report.
+    """
     removed = outcome.kinds & {Act.AUDIT_DELETED, Act.AUDIT_CUT}
     for seen in outcome.files:
         problem = broken_chain(seen.audit, seen.torn)
@@ -572,8 +658,13 @@ def judge_audit(outcome: Round) -> None:
             break
     for one in outcome.written:
         if one.verb == "history" and bool(removed) is not (one.code == ExitCode.DATA_UNFIT):
-            expected = "entries were removed" if removed else "no entry was removed"
-            outcome.violations.append(f"(h) history --verify ended with {one.code}, and {expected}: {one.said}")
+            if removed:
+                expected = "entries were removed"
+            else:
+                expected = "no entry was removed"
+            outcome.violations.append(
+                f"(h) history --verify ended with {one.code}, and {expected}: {one.said}"
+            )
 
 
 def judge_writes(outcome: Round) -> None:
@@ -583,12 +674,16 @@ def judge_writes(outcome: Round) -> None:
             outcome.violations.append(f"(e) {one.verb} shows a traceback: {one.said}")
         if one.verb != "apply":
             continue
-        allowed = {int(ExitCode.OK)} if one.right_clock else set(WRITE_CODES)
+        if one.right_clock:
+            allowed = {int(ExitCode.OK)}
+        else:
+            allowed = set(WRITE_CODES)
         if one.killed:
             allowed.add(-signal.SIGKILL)
         if one.code not in allowed:
             outcome.violations.append(
-                f"(e) {one.verb} ended with {one.code}, expected one of {sorted(allowed)}: {one.said}"
+                f"(e) {one.verb} ended with {one.code}, expected one of {sorted(allowed)}: "
+                f"{one.said}"
             )
 
 
@@ -606,10 +701,19 @@ def judge_stop(outcome: Round) -> None:
         and FEEDBACK.unpack(one.data)[2] & STATUSWORD_MASK == ENABLED
     ]
     for fault, at_ns in outcome.stopping:
-        stop, last_s = STOPS[fault.kind], (max(enabled, default=0) - at_ns) * 1e-9
+        stop = STOPS[fault.kind]
+        last_s = (max(enabled, default=0) - at_ns) * 1e-9
         bound_s = stop.bound_s + (fault.for_s if stop.lasts else 0.0)
-        held_up_s = sum(HOLDS_UP_S.get(kind, 0.0) for kind in outcome.kinds - {fault.kind} if isinstance(kind, Act))
+        held_up_s = sum(
+            HOLDS_UP_S.get(kind, 0.0)
+            for kind in outcome.kinds - {fault.kind}
+            if isinstance(kind, Act)
+        )
         if last_s > 0.0:
-            outcome.late_s[fault.name] = max(last_s - bound_s - held_up_s, outcome.late_s.get(fault.name, -1e9))
+            outcome.late_s[fault.name] = max(
+                last_s - bound_s - held_up_s, outcome.late_s.get(fault.name, -1e9)
+            )
         if last_s > bound_s + held_up_s + ALLOWANCE_S:
-            outcome.violations.append(f"(c) {fault.name}: an axis is enabled {last_s:.2f} s after it")
+            outcome.violations.append(
+                f"(c) {fault.name}: an axis is enabled {last_s:.2f} s after it"
+            )

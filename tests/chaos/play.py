@@ -1,4 +1,6 @@
-"""One round: a cell, a recorder, faults at their moments, and what is left of it; judge.py judges that."""
+"""One round: a cell, a recorder, faults at their moments, and what is left of it;
+judge.py judges that.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,18 @@ from tests.vcan.listener import heard, listening
 from tests.vcan.run import INTERFACE
 
 PERIOD_US = 20_000
-HEARTBEAT, LOWEST_RECORDER, HIGHEST_ID = 0x700, 112, 127
+HEARTBEAT = 0x700
+LOWEST_RECORDER = 112
+HIGHEST_ID = 127
 LSS_REQUEST = 0x7E5  # CiA 305: switch state global, to configuration
 DISK_MB = 80  #: More than a recording wants free before it moves (`daq.workflow.safeguards`)
 ERROR_PASSIVE = (0x2000_0004, bytes((0, 0x30, 0, 0, 0, 0, 0, 0)))  # linux/can/error.h
 BUS_OFF = (0x2000_0040, bytes(8))
 START_S, RUN_S = 60.0, 90.0  #: A round is broken off after so long
 CLAIM_S, CLAIMS = 0.1, 20  #: Heartbeats of a device that takes the recorder's id
-ON_SCREEN_OR_CLOCK = frozenset({Act.SCREEN_STOPPED, Act.SCREEN_CLOSED, Act.TERMINAL_CLOSED, Act.CLOCK_STEP})
+ON_SCREEN_OR_CLOCK = frozenset(
+    {Act.SCREEN_STOPPED, Act.SCREEN_CLOSED, Act.TERMINAL_CLOSED, Act.CLOCK_STEP}
+)
 
 Action = tuple[float, Callable[[], object]]
 """An act and its moment [s]."""
@@ -66,7 +72,12 @@ class Stage:
 
 
 def play(
-    faults: Sequence[Fault], folder: Path, bus: ChaosBus, simulation: str, plan: Path, clock: StepClock | None
+    faults: Sequence[Fault],
+    folder: Path,
+    bus: ChaosBus,
+    simulation: str,
+    plan: Path,
+    clock: StepClock | None,
 ) -> Round:
     """Play one round in an empty folder, and judge it."""
     outcome = Round(faults)
@@ -82,7 +93,17 @@ def play(
     office.write_first()
     shared = Shared()
     aborts = [(fault.node, *fault.aborted) for fault in faults if fault.kind is Act.SDO_ABORT]
-    arguments = ["record", str(cell_file), str(plan), "--out", str(log), "--operator", "chaos", "--speed", "0.2"]
+    arguments = [
+        "record",
+        str(cell_file),
+        str(plan),
+        "--out",
+        str(log),
+        "--operator",
+        "chaos",
+        "--speed",
+        "0.2",
+    ]
     outcome.permitted = Act.NO_PERMISSION not in kinds
     if outcome.permitted:
         arguments.append("--enable-motion")
@@ -99,7 +120,9 @@ def play(
         screen = screen_of(faults, words)
         shared.aborting = True
         outcome.began_ns = time.time_ns()
-        recorder = Verb.start(words, lambda: main(arguments), None if screen is None else screen.inside, clock)
+        recorder = Verb.start(
+            words, lambda: main(arguments), None if screen is None else screen.inside, clock
+        )
         stack.callback(recorder.end)
         with bus.end(((RPDO1, 0x780), (HEARTBEAT, 0x780))) as end:
             _strike(outcome, Stage(bus, recorder, cell, log.parent, screen, clock, end))
@@ -108,7 +131,8 @@ def play(
             screen.close()
         if clock is not None:
             clock.step(0)
-        outcome.code, outcome.said = recorder.code, plain(recorder.said)
+        outcome.code = recorder.code
+        outcome.said = plain(recorder.said)
         outcome.cell = cell.running
         if outcome.cell:
             _look(outcome, objects, before)
@@ -117,10 +141,20 @@ def play(
             outcome.scanned = (scan.end(), scan.said)
         cell.end(signal.SIGINT)
     office.write_again()
-    outcome.frames, outcome.cell_said = heard(folder / "frames"), cell.said
-    steps_ns = [fault.clock_step_s * 1_000_000_000 for fault in faults if fault.kind is Act.CLOCK_STEP]
+    outcome.frames = heard(folder / "frames")
+    outcome.cell_said = cell.said
+    steps_ns = [
+        fault.clock_step_s * 1_000_000_000 for fault in faults if fault.kind is Act.CLOCK_STEP
+    ]
     outcome.clock_steps_ns = (0, *steps_ns)
-    judge(outcome, folder / log.name, office.before, WRITTEN_GAINS, bus.same_sync_ns, in_order=bus.in_order)
+    judge(
+        outcome,
+        folder / log.name,
+        office.before,
+        WRITTEN_GAINS,
+        bus.same_sync_ns,
+        in_order=bus.in_order,
+    )
     return outcome
 
 
@@ -128,7 +162,9 @@ def play(
 def _disk(place: Path, kept: Path) -> Iterator[None]:
     """Mount a small disk for the log; the logs are copied from it in the end."""
     place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "chaos", str(place)], check=True)
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "chaos", str(place)], check=True
+    )
     try:
         yield
     finally:
@@ -151,7 +187,8 @@ def _until(done: Callable[[], bool], seconds: float) -> bool:
     return there
 
 
-# -- the faults --------------------------------------------------------------------------------------------------------
+# -- the faults
+# --------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def _strike(outcome: Round, stage: Stage) -> None:
@@ -171,12 +208,15 @@ def _strike(outcome: Round, stage: Stage) -> None:
             if identifier >= HEARTBEAT + LOWEST_RECORDER:
                 stage.recorder_id = identifier - HEARTBEAT
             elif not outcome.moved_ns and is_setpoint(identifier, data):
-                outcome.moved_ns, moved_s = time.time_ns(), time.monotonic()
+                outcome.moved_ns = time.time_ns()
+                moved_s = time.monotonic()
         now_s = time.monotonic()
         for fault in [one for one in waiting if now_s >= _moment_s(one, begun_s, moved_s)]:
             waiting.remove(fault)
             outcome.struck.append((fault, time.time_ns()))
-            later += [(now_s + after_s, action) for after_s, action in _actions(fault, outcome, stage)]
+            later += [
+                (now_s + after_s, action) for after_s, action in _actions(fault, outcome, stage)
+            ]
         for due in sorted((one for one in later if one[0] <= now_s), key=lambda one: one[0]):
             later.remove(due)
             with suppress(OSError):  # the process has ended, the interface is down
@@ -205,7 +245,11 @@ def _actions(fault: Fault, outcome: Round, stage: Stage) -> Iterator[Action]:
     if name.startswith(("RECORDER", "CAPTURE", "CELL")):
         who, _, what = name.partition("_")
         recorder = stage.recorder
-        pids = {"RECORDER": [recorder.pid], "CAPTURE": recorder.children(), "CELL": [stage.cell.pid]}[who]
+        pids = {
+            "RECORDER": [recorder.pid],
+            "CAPTURE": recorder.children(),
+            "CELL": [stage.cell.pid],
+        }[who]
         for pid in pids:
             yield from _signals(pid, what, fault.for_s)
     elif fault.kind is Act.FLOOD:
@@ -213,7 +257,10 @@ def _actions(fault: Fault, outcome: Round, stage: Stage) -> Iterator[Action]:
         yield fault.for_s, flooding.end
     elif fault.kind is Act.LINK_DOWN:
         for after_s, how in ((0.0, "down"), (fault.for_s, "up")):
-            yield after_s, partial(subprocess.run, ["ip", "link", "set", INTERFACE, how], check=True)
+            yield (
+                after_s,
+                partial(subprocess.run, ["ip", "link", "set", INTERFACE, how], check=True),
+            )
     elif fault.kind is Act.DISK_FULL:
         yield 0.0, partial(_fill, stage.disk)
         yield fault.for_s, (stage.disk / "filler").unlink
@@ -234,7 +281,8 @@ def _actions(fault: Fault, outcome: Round, stage: Stage) -> Iterator[Action]:
 
 
 def _screen_or_clock(fault: Fault, stage: Stage) -> Iterator[Action]:
-    screen, clock = stage.screen, stage.clock
+    screen = stage.screen
+    clock = stage.clock
     if fault.kind is Act.SCREEN_STOPPED and screen is not None:
         yield 0.0, screen.stop
         yield fault.for_s, screen.go_on
@@ -260,8 +308,11 @@ def _signals(pid: int, what: str, for_s: float) -> Iterator[Action]:
 
 def _foreign(fault: Fault, recorder_id: int, random: Random) -> tuple[int, bytes]:
     """Return a frame of another device; each call draws its data anew."""
-    node, word = fault.node, random.choice((0x0627, 0x0250, 0x0618))
-    feedback = FEEDBACK.pack(random.randrange(-(1 << 20), 1 << 20), random.randrange(-2000, 2000), word)
+    node = fault.node
+    word = random.choice((0x0627, 0x0250, 0x0618))
+    feedback = FEEDBACK.pack(
+        random.randrange(-(1 << 20), 1 << 20), random.randrange(-2000, 2000), word
+    )
     frames = {
         Act.SYNC: (SYNC, b""),
         Act.NMT: (0x000, bytes((fault.value & 0xFF, node))),
@@ -280,11 +331,14 @@ def _foreign(fault: Fault, recorder_id: int, random: Random) -> tuple[int, bytes
     return frames[Act(fault.kind)]
 
 
-# -- what is left ------------------------------------------------------------------------------------------------------
+# -- what is left
+# ------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def _look(outcome: Round, objects: Objects, before: dict[int, tuple[int | None, ...]]) -> None:
-    """Read states and settings of the axes when nothing disturbs them any more; recorder and faults have ended."""
+    """Read states and settings of the axes when nothing disturbs them any more;
+    recorder and faults have ended.
+    """
     time.sleep(GUARD_S + ALLOWANCE_S)
     outcome.enabled = [node for node in NODES if _state(outcome, objects, node) == ENABLED]
     for _ in range(10):

@@ -1,7 +1,8 @@
 """Processes of a round, and the cell's objects by SDO, without any code of `drivers`.
 
-A verb runs in a fork of this process, which has imported it: that saves four seconds of start-up a process, in a guest
-whose one processor all processes share. From there on it is a process like any other.
+A verb runs in a fork of this process, which has imported it: that saves four seconds of start-up a
+process, in a guest whose one processor all processes share. From there on it is a process like any
+other.
 """
 
 from __future__ import annotations
@@ -35,11 +36,14 @@ from tests.chaos.ends import ChaosBus
 from tests.vcan.listener import HUB_CHANNEL
 from tests.vcan.run import INTERFACE
 
-SOCKETCAN, SOCKETCAND = "socketcan", "socketcand"
+SOCKETCAN = "socketcan"
+SOCKETCAND = "socketcand"
 READY = "ready"
 BUS_LOST = 5  #: Exit code of a cell whose bus is gone
 ABORT = 0x08000022  #: "because of the present device state"
-SDO_REQUEST, SDO_ANSWER, SYNC = 0x600, 0x580, 0x080
+SDO_REQUEST = 0x600
+SDO_ANSWER = 0x580
+SYNC = 0x080
 ANSWER_S = 1.0
 POLL_S = 0.01
 USED = (
@@ -106,14 +110,22 @@ def hub_running() -> Iterator[ChaosBus]:
         os.waitpid(pid, 0)
 
 
-def serve_cell(truth: Path, bus: ChaosBus, aborts: Collection[tuple[int, int, int]], shared: Shared) -> int:
-    """Run the simulated cell until SIGINT; `aborts` has node, index and sub-index of what is refused by SDO."""
+def serve_cell(
+    truth: Path, bus: ChaosBus, aborts: Collection[tuple[int, int, int]], shared: Shared
+) -> int:
+    """Run the simulated cell until SIGINT;
+    `aborts` has node, index and sub-index of what is refused by SDO.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     address = BusAddress(SOCKETCAN, INTERFACE)
     if bus.port is not None:
         address = BusAddress(SOCKETCAND, HUB_CHANNEL, port=bus.port)
     try:
-        with suppress(KeyboardInterrupt), open_bus(address, answering=True) as end, bus_errors(address):
+        with (
+            suppress(KeyboardInterrupt),
+            open_bus(address, answering=True) as end,
+            bus_errors(address),
+        ):
             cell = SimulatedCell(load_simulation(truth), end)
             for node, index, subindex in aborts:
                 _refuse(cell.nodes[node - 1], (index, subindex), shared)
@@ -134,7 +146,12 @@ def _refuse(node: Node, key: tuple[int, int], shared: Shared) -> None:
 
 
 def _refused(
-    sound: Callable[..., object], key: tuple[int, int], shared: Shared, index: int, subindex: int, *data: bytes
+    sound: Callable[..., object],
+    key: tuple[int, int],
+    shared: Shared,
+    index: int,
+    subindex: int,
+    *data: bytes,
 ) -> object:
     if shared.aborting and (index, subindex) == key:
         raise SdoAbort(ABORT)
@@ -151,7 +168,11 @@ class Verb:
 
     @classmethod
     def start(
-        cls, words: Path, job: Callable[[], int], screen: int | None = None, clock: StepClock | None = None
+        cls,
+        words: Path,
+        job: Callable[[], int],
+        screen: int | None = None,
+        clock: StepClock | None = None,
     ) -> Verb:
         """Fork.
 
@@ -171,7 +192,10 @@ class Verb:
                 _begin(words, screen)
                 code = job()
             except SystemExit as leaving:
-                code = leaving.code if isinstance(leaving.code, int) else 1
+                if isinstance(leaving.code, int):
+                    code = leaving.code
+                else:
+                    code = 1
             except Exception:
                 traceback.print_exc()
                 raise
@@ -193,7 +217,9 @@ class Verb:
     @property
     def said(self) -> str:
         """What it said until now."""
-        return self.words.read_text(encoding="utf-8", errors="replace") if self.words.exists() else ""
+        if self.words.exists():
+            return self.words.read_text(encoding="utf-8", errors="replace")
+        return ""
 
     def children(self) -> list[int]:
         """Process ids of its capture processes."""
@@ -221,7 +247,9 @@ class Verb:
 
 
 def _begin(words: Path, screen: int | None) -> None:
-    """Make a fork a process group or, at a terminal, a session; what it says goes to its screen or file."""
+    """Make a fork a process group or, at a terminal, a session;
+    what it says goes to its screen or file.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # chaos itself handles it
     if screen is None:
         os.setpgid(0, 0)
@@ -237,7 +265,9 @@ def _begin(words: Path, screen: int | None) -> None:
 
 
 class Objects:
-    """Object dictionaries of the nodes, read over a socket of its own; objects of at most four bytes."""
+    """Object dictionaries of the nodes, read over a socket of its own;
+    objects of at most four bytes.
+    """
 
     def __init__(self, bus: ChaosBus) -> None:
         self._end = bus.end(((SDO_ANSWER, 0x780),))
@@ -259,11 +289,15 @@ class Objects:
         while (left_s := deadline_s - time.monotonic()) > 0:
             for identifier, data in self._end.hear(left_s):
                 if identifier == SDO_ANSWER + node and data[1:4] == key:
-                    return None if data[0] == 0x80 else int.from_bytes(data[4:8], "little")
+                    if data[0] == 0x80:
+                        return None
+                    return int.from_bytes(data[4:8], "little")
         raise TimeoutError(f"node {node} does not answer to {index:04X}h:{subindex}")
 
     def settings(self, node: int) -> tuple[int | None, ...]:
-        """Settings that a recording changes and must restore: parameters of the PDOs, 1016h, 1017h, 6007h, 6060h."""
+        """Settings that a recording changes and must restore:
+        parameters of the PDOs, 1016h, 1017h, 6007h, 6060h.
+        """
         keys = [(0x1016, 1), (0x1017, 0), (0x6007, 0), (0x6060, 0)]
         for number in range(2):
             for base in (0x1400, 0x1800):

@@ -1,4 +1,6 @@
-"""Rows of a run of chaos, one a round, in a CSV file: a run that was broken off goes on behind its last row."""
+"""Rows of a run of chaos, one a round, in a CSV file:
+a run that was broken off goes on behind its last row.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What a recorder prints to: a file, a pipe with a reader, or a terminal; readers stop, or go away."""
+"""What a recorder prints to: a file, a pipe with a reader, or a terminal;
+readers stop, or go away.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from pathlib import Path
 
 from tests.chaos.faults import Act, Fault
 
-ROWS, COLUMNS = 50, 250
+ROWS = 50
+COLUMNS = 250
 FILLER = b"\0"
 ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\0|\r")
 READER_S = 5.0
@@ -38,7 +41,9 @@ class Screen:
         if terminal:
             fcntl.ioctl(self.inside, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
         with words.open("wb") as file:
-            self._reader = subprocess.Popen(["cat"], stdin=outside, stdout=file, stderr=subprocess.DEVNULL)
+            self._reader = subprocess.Popen(
+                ["cat"], stdin=outside, stdout=file, stderr=subprocess.DEVNULL
+            )
         os.close(outside)
 
     def stop(self) -> None:
@@ -61,7 +66,11 @@ class Screen:
 
     def _reader_state(self) -> str:
         with suppress(OSError):
-            return Path(f"/proc/{self._reader.pid}/stat").read_text(encoding="ascii").rpartition(") ")[2][:1]
+            return (
+                Path(f"/proc/{self._reader.pid}/stat")
+                .read_text(encoding="ascii")
+                .rpartition(") ")[2][:1]
+            )
         return "X"
 
     def go_on(self) -> None:

@@ -1,4 +1,6 @@
-"""The drawing of the faults and the judgement of a round, on outcomes that are made up; this part needs no CAN."""
+"""The drawing of the faults and the judgement of a round, on outcomes that are made up;
+this part needs no CAN.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +14,45 @@ from tests.chaos.judge import ALLOWANCE_S, STOPS, Round, judge_code, judge_end, 
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1
 from tests.vcan.listener import Frame
 
-MOVED_NS, STRUCK_NS, CYCLE_NS = 1_000_000_000, 2_000_000_000, 20_000_000
-ENABLED, DISABLED = 0x0627, 0x0250
+MOVED_NS = 1_000_000_000
+STRUCK_NS = 2_000_000_000
+CYCLE_NS = 20_000_000
+ENABLED = 0x0627
+DISABLED = 0x0250
 
 
-def fault(kind: Act | Inside, for_s: float = 0.2, cycles: int | None = 40, times: int = 10) -> Fault:
+def fault(
+    kind: Act | Inside, for_s: float = 0.2, cycles: int | None = 40, times: int = 10
+) -> Fault:
     """A fault in motion; one of the cell begins when an act would strike."""
     at_cycle = (STRUCK_NS - MOVED_NS) // CYCLE_NS
-    return Fault(kind, True, 1.0, for_s, node=3, times=times, gap_s=0.0, value=1, at_cycle=at_cycle, cycles=cycles)
+    return Fault(
+        kind,
+        True,
+        1.0,
+        for_s,
+        node=3,
+        times=times,
+        gap_s=0.0,
+        value=1,
+        at_cycle=at_cycle,
+        cycles=cycles,
+    )
 
 
 def outcome(made: Fault, enabled_s: float, code: int = 5) -> Round:
-    """A round in which axis 5 answers that it is enabled for so long after a fault, and then that it is not."""
+    """A round in which axis 5 answers that it is enabled for so long after a fault,
+    and then that it is not.
+    """
     end_ns = STRUCK_NS + round(enabled_s * 1e9)
     frames = []
     for time_ns in range(MOVED_NS, STRUCK_NS + 8_000_000_000, CYCLE_NS):
         frames.append(Frame(time_ns, SYNC, b""))
-        frames.append(Frame(time_ns, TPDO1 + 5, FEEDBACK.pack(7, 0, ENABLED if time_ns <= end_ns else DISABLED)))
+        frames.append(
+            Frame(
+                time_ns, TPDO1 + 5, FEEDBACK.pack(7, 0, ENABLED if time_ns <= end_ns else DISABLED)
+            )
+        )
     struck = [(made, STRUCK_NS)] if isinstance(made.kind, Act) else []
     return Round((made,), struck=struck, moved_ns=MOVED_NS - 1, frames=frames, code=code)
 
@@ -61,7 +85,9 @@ def test_a_recording_that_came_to_its_end_after_a_fault_that_must_stop_it_is_fou
     judged = outcome(fault(kind), 0.01, code)
     judge_end(judged)
     judge_code(judged)
-    assert [line[:27] for line in judged.violations] == [f"(e) exit code {code} after {judged.faults[0].name}"[:27]]
+    assert [line[:27] for line in judged.violations] == [
+        f"(e) exit code {code} after {judged.faults[0].name}"[:27]
+    ]
     before = outcome(fault(kind), 0.01, code)
     before.moved_ns = STRUCK_NS + 1
     judge_end(before)
@@ -88,7 +114,9 @@ def test_a_stop_is_demanded_where_the_fault_lasts_long_enough(made: Fault, deman
 
 
 @pytest.mark.parametrize(("other", "excused"), [(Act.CAPTURE_HANG, True), (Act.NOISE, False)])
-def test_a_stopped_process_delays_the_stop_of_another_fault_but_not_its_own(other: Act, excused: bool) -> None:
+def test_a_stopped_process_delays_the_stop_of_another_fault_but_not_its_own(
+    other: Act, excused: bool
+) -> None:
     late_s = STOPS[Act.EMCY].bound_s + ALLOWANCE_S + 0.5
     judged = outcome(fault(Act.EMCY), late_s)
     judged.struck.append((fault(other), STRUCK_NS))
@@ -121,7 +149,10 @@ def test_the_answers_of_a_second_node_are_not_the_axis() -> None:
 
 
 LEFT = "settings of J1 (node 1) not restored; switch these drives off"
-GAVE_UP = "settings not restored (asked a second time): J1: TPDO1, 1016h; J2: 1017h; switch these drives off"
+GAVE_UP = (
+    "settings not restored (asked a second time): J1: TPDO1, 1016h; J2: 1017h; switch these "
+    "drives off"
+)
 
 
 def changed(kind: Act | Inside = Act.EMCY, **fields: object) -> Callable[[], Round]:
@@ -151,7 +182,10 @@ def changed(kind: Act | Inside = Act.EMCY, **fields: object) -> Callable[[], Rou
         (changed(unrestored=[1], said=LEFT), "(d) nodes [1] were left"),
         (changed(Act.LINK_DOWN, unrestored=[1], said=LEFT), ""),
         (changed(Inside.SILENT, unrestored=[1, 2], said=GAVE_UP), ""),
-        (changed(Act.LINK_DOWN, unrestored=[1, 3], said=GAVE_UP), "(d) nodes [3] have other settings"),
+        (
+            changed(Act.LINK_DOWN, unrestored=[1, 3], said=GAVE_UP),
+            "(d) nodes [3] have other settings",
+        ),
         (changed(Act.DISK_FULL, code=1), ""),
         (changed(silent=[1]), "(d) nodes [1] do not answer"),
         (changed(scanned=(5, "no")), "(d) scan ended with 5"),

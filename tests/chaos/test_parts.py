@@ -1,4 +1,6 @@
-"""The parts of a round that do not need a bus: clock, screens, results, and the listener's end on a hub."""
+"""The parts of a round that do not need a bus:
+clock, screens, results, and the listener's end on a hub.
+"""
 
 from __future__ import annotations
 
@@ -40,14 +42,18 @@ def until(true: Callable[[], bool], seconds: float = PATIENCE_S) -> bool:
 
 def act(kind: Act | Inside, value: int = 0) -> Fault:
     """A fault of a kind."""
-    return Fault(kind, True, 1.0, 0.2, node=3, times=1, gap_s=0.0, value=value, at_cycle=0, cycles=1)
+    return Fault(
+        kind, True, 1.0, 0.2, node=3, times=1, gap_s=0.0, value=value, at_cycle=0, cycles=1
+    )
 
 
 @pytest.mark.skipif(not Path("/usr/bin/cc").exists(), reason="no C compiler")
 def test_a_clock_is_stepped_while_a_process_runs_and_for_it_alone(tmp_path: Path) -> None:
     source = ROOT / "tests" / "chaos" / "clock.c"
     library = tmp_path / "clock.so"
-    subprocess.run(["cc", "-shared", "-fPIC", "-fno-builtin", "-o", str(library), str(source)], check=True)
+    subprocess.run(
+        ["cc", "-shared", "-fPIC", "-fno-builtin", "-o", str(library), str(source)], check=True
+    )
     code = (
         "import os, time\n"
         "from datetime import UTC, datetime\n"
@@ -63,14 +69,20 @@ def test_a_clock_is_stepped_while_a_process_runs_and_for_it_alone(tmp_path: Path
         "    same = abs(datetime.now(UTC).timestamp() - time.time()) < 60\n"
         "    print(round((time.time() - real_s) / 86400), same, flush=True)\n"
         "    clock.step(3 * 86400)\n"
-        "    print(round((time.time_ns() * 1e-9 - real_s) / 86400), time.monotonic() - begun_s < 60, flush=True)\n"
+        "    print(round((time.time_ns() * 1e-9 - real_s) / 86400), time.monotonic() - begun_s < "
+        "60, flush=True)\n"
         "    os._exit(0)\n"
         "os.wait()\n"
         "print(round((time.time() - real_s) / 86400))\n"
     )
     environment = {**os.environ, "LD_PRELOAD": str(library), BUILT: str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (done.stdout, done.stderr) == ("-730 True\n3 True\n0\n", "")
 
@@ -80,7 +92,9 @@ def test_a_stopped_reader_leaves_no_room_in_a_pipe_and_loses_nothing(tmp_path: P
     screen = Screen(words, terminal=False)
     os.write(screen.inside, b"before ")
     screen.stop()
-    writing = Verb.start(tmp_path / "unused", lambda: 0 if os.write(1, b"after") else 1, screen.inside)
+    writing = Verb.start(
+        tmp_path / "unused", lambda: 0 if os.write(1, b"after") else 1, screen.inside
+    )
     assert not writing.wait(0.3)
     screen.go_on()
     assert writing.wait(PATIENCE_S)
@@ -88,7 +102,9 @@ def test_a_stopped_reader_leaves_no_room_in_a_pipe_and_loses_nothing(tmp_path: P
     assert plain(words.read_text(encoding="utf-8")) == "before after"
 
 
-@pytest.mark.parametrize(("terminal", "code"), [(False, 32), (True, -1)], ids=["broken pipe", "hang-up"])
+@pytest.mark.parametrize(
+    ("terminal", "code"), [(False, 32), (True, -1)], ids=["broken pipe", "hang-up"]
+)
 def test_a_reader_that_goes_away_breaks_a_pipe_and_hangs_up_a_terminal(
     tmp_path: Path, terminal: bool, code: int
 ) -> None:
@@ -137,7 +153,11 @@ def test_an_independent_listener_hears_a_hub(tmp_path: Path) -> None:
             assert second.is_extended_id
             assert until(lambda: (tmp_path / "frames").stat().st_size >= 3 * 21)
     found = heard(tmp_path / "frames")
-    assert [(one.identifier, one.data) for one in found] == [(0x080, b""), (0x182, bytes(range(8))), (0x701, b"\x05")]
+    assert [(one.identifier, one.data) for one in found] == [
+        (0x080, b""),
+        (0x182, bytes(range(8))),
+        (0x701, b"\x05"),
+    ]
     assert all(abs(one.time_ns * 1e-9 - time.time()) < 60 for one in found)
 
 
@@ -151,7 +171,9 @@ def test_frames_of_a_hub_may_come_in_pieces() -> None:
 
 
 def test_objects_are_read_over_a_hub_behind_answers_to_others() -> None:
-    """An earlier answer to the recorder, for the same object, is not the answer to this question."""
+    """An earlier answer to the recorder, for the same object,
+    is not the answer to this question.
+    """
     with Hub((HUB_CHANNEL,)) as hub:
         bus = ChaosBus(hub.address().port)
         objects = Objects(bus)
@@ -198,7 +220,9 @@ def test_an_sdo_abort_meets_one_object_while_it_is_in_force(tmp_path: Path) -> N
     truth = write_simulation(tmp_path, 20_000)
     shared = Shared()
     with hub_running() as bus:
-        cell = Verb.start(tmp_path / "cell.txt", lambda: serve_cell(truth, bus, ((2, 0x6041, 0),), shared))
+        cell = Verb.start(
+            tmp_path / "cell.txt", lambda: serve_cell(truth, bus, ((2, 0x6041, 0),), shared)
+        )
         assert until(lambda: READY in cell.said)
         objects = Objects(bus)
         assert objects.read(2, 0x6041, 0) is not None

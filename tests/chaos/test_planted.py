@@ -1,4 +1,6 @@
-"""A violation planted for each of the things that must hold is reported; the judge shares no code with the product."""
+"""A violation planted for each of the things that must hold is reported;
+the judge shares no code with the product.
+"""
 
 from __future__ import annotations
 
@@ -16,34 +18,57 @@ from mcap.writer import Writer
 
 from drivers.simulation.faults import FaultKind
 from tests.chaos.faults import NODES, Act, Fault, Inside
-from tests.chaos.judge import ENABLED, FIRST, FilesSeen, Round, Written, allowed_codes, broken_chain, judge
+from tests.chaos.judge import (
+    ENABLED,
+    FIRST,
+    FilesSeen,
+    Round,
+    Written,
+    allowed_codes,
+    broken_chain,
+    judge,
+)
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1
 from tests.vcan.listener import Frame
 from tests.vcan.log_reader import RUN, SAMPLES_TOPIC, STATISTICS
 
 ROOT = Path(__file__).parents[2]
-AXES, PERIOD_NS = len(NODES), 20_000_000
+AXES = len(NODES)
+PERIOD_NS = 20_000_000
 BEGAN_NS = 1_700_000_000_000_000_000
 FIRST_SYNC_NS = BEGAN_NS + 500_000_000
-CYCLES, MOVED, STRUCK, STOPPED, AFTER = 60, 10, 50, 51, 80
-"""Cycles: of the log, of the first set-point, of the fault, of the first answer without power, and on the bus after."""
+CYCLES = 60
+MOVED = 10
+STRUCK = 50
+STOPPED = 51
+AFTER = 80
+"""Cycles: of the log, of the first set-point, of the fault, of the first answer without power,
+and on the bus after.
+"""
 SWITCHED_OFF = 0x0250
 SETPOINT = struct.pack("<iH", 1234, 0x1F)
 HEAD = "controller: demo\ndrives:\n"
 GAINS = ((33.9, 32.4, 24.2, -9.21, 16.3, 6.79), (34.578, 33.048, 24.684, -9.3942, 16.626, 6.9258))
 NAMEPLATE = (32.96, 32.96, 25.65, -11.52, 18.48, 7.68)
 SAID = "error: J3 (node 3): EMCY 2310h; expected none"
-KILLED = Fault(Act.EMCY, True, 0.8, 0.2, node=3, times=1, gap_s=0.0, value=0x2310, at_cycle=0, cycles=None)
+KILLED = Fault(
+    Act.EMCY, True, 0.8, 0.2, node=3, times=1, gap_s=0.0, value=0x2310, at_cycle=0, cycles=None
+)
 
 
 def controller(gains: tuple[float, ...]) -> str:
     """A controller's file."""
-    drives = "".join(f"  J{node}:\n    gain: {gain}  # Nm per A\n" for node, gain in zip(NODES, gains, strict=True))
+    drives = "".join(
+        f"  J{node}:\n    gain: {gain}  # Nm per A\n"
+        for node, gain in zip(NODES, gains, strict=True)
+    )
     return HEAD + drives
 
 
 def entry(number: int, previous: str) -> tuple[str, str]:
-    """A line of an audit log and its digest, as docs/reference/audit-and-history.md describes them."""
+    """A line of an audit log and its digest, as docs/reference/audit-and-history.md describes
+    them.
+    """
     content = {
         "action": "applied",
         "at": "2026-01-01T00:00:00+00:00",
@@ -53,7 +78,9 @@ def entry(number: int, previous: str) -> tuple[str, str]:
         "subject": "controller.yaml",
         "who": "chaos",
     }
-    digest = hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    digest = hashlib.sha256(
+        json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
     return json.dumps({**content, "sha256": digest}, sort_keys=True, separators=(",", ":")), digest
 
 
@@ -98,7 +125,9 @@ class Sample:
 
 @dataclass
 class Scene:
-    """A round before it is judged, in which nothing is wrong: an EMCY in motion, a stop, and a whole log."""
+    """A round before it is judged, in which nothing is wrong:
+    an EMCY in motion, a stop, and a whole log.
+    """
 
     outcome: Round
     samples: list[Sample] = field(default_factory=list)
@@ -117,7 +146,9 @@ class Scene:
             channel = writer.register_channel(SAMPLES_TOPIC, "cdr", schema)
             for one in self.samples:
                 writer.add_message(channel, one.time_ns, one.encode(), one.time_ns)
-            writer.add_metadata(STATISTICS, {"valid": json.dumps(self.verdict), "reason": self.reason})
+            writer.add_metadata(
+                STATISTICS, {"valid": json.dumps(self.verdict), "reason": self.reason}
+            )
             writer.finish()
         judge(self.outcome, log, controller(NAMEPLATE), GAINS, in_order=self.in_order)
         return self.outcome.violations
@@ -139,7 +170,9 @@ def scene() -> Scene:
         if cycle == MOVED:
             frames += [Frame(time_ns + 1, 0x200 + node, SETPOINT) for node in NODES]
         for node in NODES:
-            frames.append(Frame(time_ns + 100_000 * node, TPDO1 + node, FEEDBACK.pack(*value(cycle, node))))
+            frames.append(
+                Frame(time_ns + 100_000 * node, TPDO1 + node, FEEDBACK.pack(*value(cycle, node)))
+            )
         if cycle < CYCLES:
             samples.append(Sample(cycle, time_ns, [value(cycle, node) for node in NODES]))
     at = [frame.time_ns for frame in frames if frame.identifier == SYNC]
@@ -173,7 +206,8 @@ def test_nothing_is_wrong_with_a_sound_round(tmp_path: Path, in_order: bool) -> 
     assert made.outcome.compared == CYCLES * AXES
 
 
-# -- the plants --------------------------------------------------------------------------------------------------------
+# -- the plants
+# --------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def remove_a_sample(made: Scene) -> None:
@@ -197,7 +231,11 @@ def alter_a_sample(made: Scene) -> None:
 
 
 def leave_a_loss_uncounted(made: Scene) -> None:
-    place = next(n for n, frame in enumerate(made.outcome.frames) if frame.identifier == TPDO1 + 2 and n > 300)
+    place = next(
+        n
+        for n, frame in enumerate(made.outcome.frames)
+        if frame.identifier == TPDO1 + 2 and n > 300
+    )
     del made.outcome.frames[place]
 
 
@@ -319,11 +357,15 @@ def change_the_second_line(made: Scene, change: Callable[[dict[str, object]], ob
 
 
 def leave_out_the_link(made: Scene) -> None:
-    change_the_second_line(made, lambda entry: {key: one for key, one in entry.items() if key != "previous"})
+    change_the_second_line(
+        made, lambda entry: {key: one for key, one in entry.items() if key != "previous"}
+    )
 
 
 def leave_out_the_digest(made: Scene) -> None:
-    change_the_second_line(made, lambda entry: {key: one for key, one in entry.items() if key != "sha256"})
+    change_the_second_line(
+        made, lambda entry: {key: one for key, one in entry.items() if key != "sha256"}
+    )
 
 
 def write_a_list_as_an_entry(made: Scene) -> None:
@@ -381,11 +423,17 @@ PLANTS: list[tuple[Callable[[Scene], None], str]] = [
 
 
 def test_late_stamps_of_a_hub_are_no_violation(tmp_path: Path) -> None:
-    """The hub's thread stood still for three cycles: SYNCs and answers kept their order, with equal stamps."""
+    """The hub's thread stood still for three cycles:
+    SYNCs and answers kept their order, with equal stamps.
+    """
     made = scene()
     made.in_order = True
     frames = made.outcome.frames
-    begin = next(place for place, frame in enumerate(frames) if frame.time_ns > FIRST_SYNC_NS + 20 * PERIOD_NS)
+    begin = next(
+        place
+        for place, frame in enumerate(frames)
+        if frame.time_ns > FIRST_SYNC_NS + 20 * PERIOD_NS
+    )
     late_ns = FIRST_SYNC_NS + 23 * PERIOD_NS
     for place in range(begin, len(frames)):
         if frames[place].time_ns < late_ns:
@@ -438,7 +486,16 @@ def test_a_stall_that_the_listener_heard_explains_a_code(cycles: int, explained:
 
 
 def test_a_violation_is_planted_for_each_of_the_things_that_must_hold() -> None:
-    assert {letter for _, letter in PLANTS} == {"(listener)", "(a, b)", "(c)", "(d)", "(e)", "(f)", "(g)", "(h)"}
+    assert {letter for _, letter in PLANTS} == {
+        "(listener)",
+        "(a, b)",
+        "(c)",
+        "(d)",
+        "(e)",
+        "(f)",
+        "(g)",
+        "(h)",
+    }
 
 
 def test_the_unfinished_line_of_a_killed_writer_breaks_no_chain() -> None:
@@ -451,10 +508,13 @@ def test_the_unfinished_line_of_a_killed_writer_breaks_no_chain() -> None:
 def test_the_judge_imports_nothing_of_the_product() -> None:
     code = (
         "import sys, tests.chaos.judge, tests.vcan.listener\n"
-        "found = {name.partition('.')[0] for name in sys.modules} & {'daq', 'drivers', 'ident', 'can', 'canopen'}\n"
+        "found = {name.partition('.')[0] for name in sys.modules} & {'daq', 'drivers', 'ident', "
+        "'can', 'canopen'}\n"
         "sys.exit(', '.join(sorted(found)) or 0)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 

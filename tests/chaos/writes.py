@@ -1,4 +1,6 @@
-"""Writes of gains around a recording: a cell with its controller's file and audit log, and acts against both."""
+"""Writes of gains around a recording: a cell with its controller's file and audit log,
+and acts against both.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +34,17 @@ class Office:
         self._controller = cell.with_name("controller.yaml")
         self._torn = False
         self._count = 0
-        self.before = self._controller.read_text(encoding="utf-8")  #: controller's file before any write
+        #: controller's file before any write
+        self.before = self._controller.read_text(encoding="utf-8")
 
     def write_first(self) -> None:
         """Write gains for the first time."""
         self._apply(0)
 
     def write_again(self) -> None:
-        """Make the acts between two jobs, write other gains (twice if disturbed), and verify the log."""
+        """Make the acts between two jobs, write other gains (twice if disturbed),
+        and verify the log.
+        """
         disturbed = False
         wrong_s = 0
         killed_s = None
@@ -71,7 +76,9 @@ class Office:
         arguments = ["apply", str(self._cell), str(self._calibrations[number]), "--yes"]
         self._run("apply", arguments, wrong_s, killed_s)
 
-    def _run(self, verb: str, arguments: Sequence[str], wrong_s: int = 0, killed_s: float | None = None) -> None:
+    def _run(
+        self, verb: str, arguments: Sequence[str], wrong_s: int = 0, killed_s: float | None = None
+    ) -> None:
         self._count += 1
         words = self._cell.with_name(f"{self._count}-{verb}.txt")
         if self._clock is not None:
@@ -88,6 +95,9 @@ class Office:
         self._outcome.written.append(
             Written(verb, code, running.said, right_clock=wrong_s == 0, killed=killed_s is not None)
         )
-        audit = self._audit.read_text(encoding="utf-8") if self._audit.exists() else ""
+        if self._audit.exists():
+            audit = self._audit.read_text(encoding="utf-8")
+        else:
+            audit = ""
         controller = self._controller.read_text(encoding="utf-8", errors="replace")
         self._outcome.files.append(FilesSeen(controller, audit, torn=self._torn))

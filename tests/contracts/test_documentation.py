@@ -26,13 +26,16 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def test_pages_named_in_code_and_messages_exist() -> None:
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
-        "\n"
-    )
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split("\n")
     places = [name for name in listed if re.search(r"\.(py|md|yaml|toml|svg)$|^Makefile$", name)]
     named = 0
     for place in places:
-        text = (ROOT / place).read_text(encoding="utf-8") if (ROOT / place).exists() else ""
+        if (ROOT / place).exists():
+            text = (ROOT / place).read_text(encoding="utf-8")
+        else:
+            text = ""
         for found in re.findall(r"\bdocs/[\w./-]+", text):
             page = found.rstrip(".")
             # A decision may be named by its number alone.
@@ -48,7 +51,9 @@ def test_files_named_in_the_documentation_exist() -> None:
         text = page.read_text(encoding="utf-8")
         for name in re.findall(r"`((?:daq|ident|drivers|tests|configs)/[\w./-]+)`", text):
             # NAME is for the reader to fill in.
-            assert "NAME" in name or (ROOT / name).exists(), f"{page.relative_to(ROOT)} names {name}"
+            assert "NAME" in name or (ROOT / name).exists(), (
+                f"{page.relative_to(ROOT)} names {name}"
+            )
             named += 1
     assert named > 20
 
@@ -64,7 +69,9 @@ def test_the_first_commands_of_a_page_come_after_the_path_that_they_need() -> No
 
 def test_every_page_is_in_the_navigation() -> None:
     toctrees = "\n".join(
-        block for page in PAGES for block in re.findall(r"```\{toctree\}(.*?)```", page.read_text(), re.DOTALL)
+        block
+        for page in PAGES
+        for block in re.findall(r"```\{toctree\}(.*?)```", page.read_text(), re.DOTALL)
     )
     reached = {line.strip().rpartition("/")[2] for line in toctrees.splitlines()}
     for page in PAGES:
@@ -94,22 +101,28 @@ def drawings() -> ModuleType:
 
 @pytest.mark.parametrize("name", ["five-bar", "orthoglide", "dualv"])
 def test_drawn_mechanisms_are_those_of_the_cells(drawings: Any, name: str) -> None:
-    shown, robot = drawings.mechanism(name), robot_of(load_cell(ROOT / "configs" / "cells" / f"{name}.yaml"))
+    shown = drawings.mechanism(name)
+    robot = robot_of(load_cell(ROOT / "configs" / "cells" / f"{name}.yaml"))
     assert len(shown.motors) == robot.axis_count
     assert len(shown.passive) == len(robot.passive_joints)
     assert len(shown.closures) == len(robot.closures)
     # Loops close in the drawing, and the platform is drawn on the link that carries the payload.
     assert all(np.allclose(first, second, atol=1e-9) for first, second in shown.closures)
     body = np.array(shown.bodies[shown.carrier])
-    assert (shown.platform > body.min(axis=0) - 1e-9).all() and (shown.platform < body.max(axis=0) + 1e-9).all()
+    assert (shown.platform > body.min(axis=0) - 1e-9).all() and (
+        shown.platform < body.max(axis=0) + 1e-9
+    ).all()
 
 
 def test_the_picture_of_the_mechanisms_is_up_to_date(drawings: Any) -> None:
-    drawn, kept = drawings.mechanisms(), (ROOT / "docs" / "pictures" / "mechanisms.svg").read_text(encoding="utf-8")
+    drawn = drawings.mechanisms()
+    kept = (ROOT / "docs" / "pictures" / "mechanisms.svg").read_text(encoding="utf-8")
     number = r"-?\d+\.\d"
     assert re.sub(number, "#", drawn) == re.sub(number, "#", kept), "run `make screenshots`"
     # The last digit of a coordinate is the processor's.
-    found, expected = (np.array(re.findall(number, text), dtype=np.float64) for text in (drawn, kept))
+    found, expected = (
+        np.array(re.findall(number, text), dtype=np.float64) for text in (drawn, kept)
+    )
     np.testing.assert_allclose(found, expected, atol=0.11)
 
 
@@ -125,17 +138,23 @@ CHAINS = {
 def test_what_is_identifiable_on_a_closed_chain_is_as_documented(row: str) -> None:
     name, shown = CHAINS[row]
     cell = load_cell(ROOT / "configs" / "cells" / f"{name}.yaml")
-    model, draw = model_of(cell), np.random.default_rng(1)
+    model = model_of(cell)
+    draw = np.random.default_rng(1)
     robot, (lower, upper) = model.robot, np.array([axis.limits.position for axis in cell.axes]).T
     found = reach(robot, model.assembly, 0.6 * draw.uniform(lower, upper, (400, len(lower))))
     position = found.position_rad[found.closed][:, list(robot.axis_joints)]
     speed, acceleration = draw.standard_normal((2, *position.shape))
-    columns = np.concatenate(list(model.regressor(Motion(position, speed, 8.0 * acceleration))), axis=1).T
+    columns = np.concatenate(
+        list(model.regressor(Motion(position, speed, 8.0 * acceleration))), axis=1
+    ).T
     base = base_parameters(triangle_of(columns.T), tuple(column.name for column in model.columns))
     counts = (
-        f"{robot.joint_count}, {robot.axis_count}, {model.assembly.mobility} | {columns.shape[1]} → {len(base.names)}"
+        f"{robot.joint_count}, {robot.axis_count}, {model.assembly.mobility} | {columns.shape[1]} "
+        f"→ {len(base.names)}"
     )
-    assert f"| {row} | {counts} |" in (ROOT / "docs" / "explanation" / "method.md").read_text(encoding="utf-8")
+    assert (f"| {row} | {counts} |") in (ROOT / "docs" / "explanation" / "method.md").read_text(
+        encoding="utf-8"
+    )
     payload = np.linalg.norm(columns[:, model.flange], axis=0)
     names = (column.name.rstrip("0123456789") for column in model.columns[model.flange])
     seen = [name for name, size in zip(names, payload, strict=True) if size > 1e-9 * payload.max()]

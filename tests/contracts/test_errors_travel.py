@@ -1,4 +1,6 @@
-"""Every error of the three packages travels whole from one process to another: a process pool hangs otherwise."""
+"""Every error of the three packages travels whole from one process to another:
+a process pool hangs otherwise.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,11 @@ def _kinds() -> tuple[type[Exception], ...]:
     for package in (daq, drivers, ident):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(module.name)
-    return tuple(sorted({kind for root in ROOTS for kind in _below(root)}, key=lambda kind: kind.__qualname__))
+    return tuple(
+        sorted(
+            {kind for root in ROOTS for kind in _below(root)}, key=lambda kind: kind.__qualname__
+        )
+    )
 
 
 def _below(kind: type[Any]) -> Iterator[type[Exception]]:
@@ -55,7 +61,9 @@ def _below(kind: type[Any]) -> Iterator[type[Exception]]:
 def _made(kind: type[Exception]) -> Exception:
     if kind.__init__ is Exception.__init__:
         return kind("some text")
-    given = [p for p in inspect.signature(kind).parameters.values() if p.kind is not p.VAR_POSITIONAL]
+    given = [
+        p for p in inspect.signature(kind).parameters.values() if p.kind is not p.VAR_POSITIONAL
+    ]
     by_name = {p.name: EVIDENCE[p.annotation] for p in given if p.kind is p.KEYWORD_ONLY}
     return kind(*[EVIDENCE[p.annotation] for p in given if p.kind is not p.KEYWORD_ONLY], **by_name)
 
@@ -70,7 +78,9 @@ def test_the_three_trees_are_there() -> None:
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__qualname__)
 @pytest.mark.parametrize("protocol", [2, pickle.HIGHEST_PROTOCOL])
-def test_an_error_arrives_with_its_message_its_evidence_and_its_notes(kind: type[Exception], protocol: int) -> None:
+def test_an_error_arrives_with_its_message_its_evidence_and_its_notes(
+    kind: type[Exception], protocol: int
+) -> None:
     sent = _made(kind)
     sent.add_note("while stopping: node 3 did not answer")
     for arrived in (pickle.loads(pickle.dumps(sent, protocol)), copy.copy(sent)):

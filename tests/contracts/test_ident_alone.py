@@ -1,4 +1,6 @@
-"""`ident` needs numpy and scipy only: it imports, fits the documented example and searches it with all else refused."""
+"""`ident` needs numpy and scipy only: it imports, fits the documented example and searches it with
+all else refused.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ data = ident.differentiate(run, found.model.drive_train, found.conditioning)
 print(ident.predict_current(calibration, found.model, data).shape)
 for name in ident.__all__:
     getattr(ident, name)
-"""
+"""  # noqa: E501
 
 
 def _run(checkout: Path, code: str, also: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:

@@ -31,9 +31,11 @@ FOREIGN_TO_IDENT = (
 
 
 def _lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
-    # -c with the folder first on the path: an editable installation must not be examined instead of the copy.
+    # -c with the folder first on the path: an editable installation must not be examined instead of
+    # the copy.
     code = (
-        "import sys; sys.path.insert(0, ''); from importlinter.cli import lint_imports_command; lint_imports_command()"
+        "import sys; sys.path.insert(0, ''); from importlinter.cli import lint_imports_command; "
+        "lint_imports_command()"
     )
     return subprocess.run(
         [sys.executable, "-c", code, "--no-cache"],
@@ -54,29 +56,101 @@ BROKEN = [
     ("ident/data/run.py", "import can", "ident is not allowed to import can"),
     ("ident/data/run.py", "import pinocchio", "ident is not allowed to import pinocchio"),
     ("ident/data/run.py", "import drivers.messages", "ident is not allowed to import drivers"),
-    ("ident/model/base.py", "import ident.estimators.estimate", "ident.model is not allowed to import ident.est"),
-    ("ident/effects/effect.py", "import ident.discovery.search", "ident.effects is not allowed to import ident.dis"),
-    ("ident/drift/change.py", "import ident.model.model", "ident.drift is not allowed to import ident.model"),
-    ("drivers/canopen/bus.py", "import drivers.stream.stream", "drivers.canopen is not allowed to import drivers.st"),
-    ("drivers/profiles/profile.py", "import drivers.canopen.sdo", "drivers.profiles is not allowed to import drivers"),
-    ("drivers/stream/watch.py", "import drivers.motion.execute", "drivers.stream is not allowed to import drivers.mo"),
+    (
+        "ident/model/base.py",
+        "import ident.estimators.estimate",
+        "ident.model is not allowed to import ident.est",
+    ),
+    (
+        "ident/effects/effect.py",
+        "import ident.discovery.search",
+        "ident.effects is not allowed to import ident.dis",
+    ),
+    (
+        "ident/drift/change.py",
+        "import ident.model.model",
+        "ident.drift is not allowed to import ident.model",
+    ),
+    (
+        "drivers/canopen/bus.py",
+        "import drivers.stream.stream",
+        "drivers.canopen is not allowed to import drivers.st",
+    ),
+    (
+        "drivers/profiles/profile.py",
+        "import drivers.canopen.sdo",
+        "drivers.profiles is not allowed to import drivers",
+    ),
+    (
+        "drivers/stream/watch.py",
+        "import drivers.motion.execute",
+        "drivers.stream is not allowed to import drivers.mo",
+    ),
     ("drivers/messages.py", "import daq.errors", "drivers is not allowed to import daq"),
     ("drivers/messages.py", "import mcap.writer", "drivers is not allowed to import mcap"),
-    ("drivers/profiles/profile.py", "import pinocchio", "drivers.profiles is not allowed to import pinocchio"),
+    (
+        "drivers/profiles/profile.py",
+        "import pinocchio",
+        "drivers.profiles is not allowed to import pinocchio",
+    ),
     ("daq/errors.py", "import canopen", "daq is not allowed to import canopen"),
-    ("daq/jobs/units.py", "import daq.console.live", "daq.jobs is not allowed to import daq.console"),
-    ("daq/workflow/fit.py", "import daq.simulation.simulation_file", "daq.workflow is not allowed to import daq.sim"),
-    ("daq/workflow/nameplates.py", "import daq.report.text", "daq.workflow is not allowed to import daq.report"),
-    ("daq/workflow/nameplates.py", "import daq.ledger.fold", "daq.workflow is not allowed to import daq.ledger"),
-    ("daq/ledger/fold.py", "import daq.writeback.request", "daq.ledger is not allowed to import daq.writeback"),
-    ("daq/report/text.py", "import daq.jobs.session", "daq.report is not allowed to import daq.jobs"),
-    ("daq/log/reader.py", "import drivers.simulation.spec", "daq.log is not allowed to import drivers.simulation"),
-    ("daq/log/reader.py", "import daq.workflow.fit", "daq.log is not allowed to import daq.workflow"),
+    (
+        "daq/jobs/units.py",
+        "import daq.console.live",
+        "daq.jobs is not allowed to import daq.console",
+    ),
+    (
+        "daq/workflow/fit.py",
+        "import daq.simulation.simulation_file",
+        "daq.workflow is not allowed to import daq.sim",
+    ),
+    (
+        "daq/workflow/nameplates.py",
+        "import daq.report.text",
+        "daq.workflow is not allowed to import daq.report",
+    ),
+    (
+        "daq/workflow/nameplates.py",
+        "import daq.ledger.fold",
+        "daq.workflow is not allowed to import daq.ledger",
+    ),
+    (
+        "daq/ledger/fold.py",
+        "import daq.writeback.request",
+        "daq.ledger is not allowed to import daq.writeback",
+    ),
+    (
+        "daq/report/text.py",
+        "import daq.jobs.session",
+        "daq.report is not allowed to import daq.jobs",
+    ),
+    (
+        "daq/log/reader.py",
+        "import drivers.simulation.spec",
+        "daq.log is not allowed to import drivers.simulation",
+    ),
+    (
+        "daq/log/reader.py",
+        "import daq.workflow.fit",
+        "daq.log is not allowed to import daq.workflow",
+    ),
     ("daq/files.py", "import daq.config.cell", "daq.files is not allowed to import daq.config"),
-    ("daq/config/drive.py", "import daq.log.metadata", "daq.config is not allowed to import daq.log"),
+    (
+        "daq/config/drive.py",
+        "import daq.log.metadata",
+        "daq.config is not allowed to import daq.log",
+    ),
     # Also through a module that no contract names.
-    ("drivers/errors.py", "import drivers.simulation.spec", "daq.writeback is not allowed to import drivers.sim"),
-    ("daq/console/live.py", "import drivers.canopen.bus", "daq.console is not allowed to import drivers.canopen.bus"),
+    (
+        "drivers/errors.py",
+        "import drivers.simulation.spec",
+        "daq.writeback is not allowed to import drivers.sim",
+    ),
+    (
+        "daq/console/live.py",
+        "import drivers.canopen.bus",
+        "daq.console is not allowed to import drivers.canopen.bus",
+    ),
 ]
 """File, line that breaks a contract, and what is reported."""
 CIRCLE = ("ident/estimators/estimate.py", "ident.estimators.identify")
@@ -88,7 +162,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The packages copied, and all their contracts broken at once."""
     folder = tmp_path_factory.mktemp("broken")
     for package in PACKAGES:
-        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
     shutil.copyfile(ROOT / "pyproject.toml", folder / "pyproject.toml")
     begin = "from __future__ import annotations\n"
     for file, line, _ in BROKEN:
@@ -104,9 +180,12 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.parametrize(("file", "line", "says"), BROKEN)
-def test_a_contract_broken_on_purpose_is_reported(report: str, file: str, line: str, says: str) -> None:
+def test_a_contract_broken_on_purpose_is_reported(
+    report: str, file: str, line: str, says: str
+) -> None:
     """By its import: that of another line would not do."""
-    module, imported = file.removesuffix(".py").replace("/", "."), line.removeprefix("import ")
+    module = file.removesuffix(".py").replace("/", ".")
+    imported = line.removeprefix("import ")
     package = imported.partition(".")[0]
     if package not in PACKAGES:  # of a foreign one the package alone is named
         imported = package
@@ -135,7 +214,9 @@ def test_the_science_brings_no_bus_no_log_and_no_screen() -> None:
         "for name in names: importlib.import_module(name)\n"
         "print(len(names), *sorted({name.partition('.')[0] for name in sys.modules}))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     count, *loaded = done.stdout.split()
     assert int(count) > 5
     assert "numpy" in loaded
@@ -143,7 +224,9 @@ def test_the_science_brings_no_bus_no_log_and_no_screen() -> None:
 
 
 def test_the_helper_of_the_front_doors_imports_the_standard_library_alone() -> None:
-    """It is beside the packages, where no contract sees it; whatever it imports, all three would."""
+    """It is beside the packages, where no contract sees it;
+    whatever it imports, all three would.
+    """
     imported = set[str]()
     for node in ast.walk(ast.parse((ROOT / "lazy_names.py").read_text())):
         if isinstance(node, ast.Import):

@@ -1,4 +1,6 @@
-"""One write: `apply` and `rollback` of `daq.writeback.target` alone tell the ledger of a write to a controller."""
+"""One write: `apply` and `rollback` of `daq.writeback.target` alone tell the ledger of a write to a
+controller.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,20 @@ WRITERS = {
     # Steps of a write to a controller.
     "record_write": ("daq.ledger.ledger", {TARGET}),
     # Calibrations: those that are written, and those that a job proposes or a person enters.
-    "enter_calibration": ("daq.ledger.ledger", {TARGET, "daq/cli/history.py", "daq/jobs/stages.py"}),
-    # Steps of a job, which write to no controller. The verdict of new moves goes through `audit_entry` of the report.
+    "enter_calibration": (
+        "daq.ledger.ledger",
+        {TARGET, "daq/cli/history.py", "daq/jobs/stages.py"},
+    ),
+    # Steps of a job, which write to no controller. The verdict of new moves goes through
+    # `audit_entry` of the report.
     "record_session": ("daq.ledger.ledger", {"daq/jobs/decision.py", "daq/jobs/reporting.py"}),
     "acknowledge": ("daq.ledger.ledger", {"daq/cli/history.py"}),
     "migrate": ("daq.ledger.ledger", {"daq/cli/history.py"}),
     "rename_cell": ("daq.ledger.ledger", {"daq/cli/history.py"}),
 }
-"""Each function that writes to the ledger, by name: its module, and the files that may import it."""
+"""Each function that writes to the ledger, by name:
+its module, and the files that may import it.
+"""
 DOORS = ("apply", "rollback")
 """The functions of `TARGET` that may lead to a writer."""
 
@@ -54,7 +62,10 @@ def _offences(file: str, source: str) -> list[str]:
     found = []
     modules = {module for module, _ in WRITERS.values()}
     for one in _imports(file, source):
-        whole = one.module if one.name is None else f"{one.module}.{one.name}"
+        if one.name is None:
+            whole = one.module
+        else:
+            whole = f"{one.module}.{one.name}"
         if whole in modules:  # by which every writer could be called
             found.append(f"{file} imports {whole}")
         elif one.name in WRITERS:
@@ -70,7 +81,9 @@ def _sources() -> dict[str, str]:
 
 
 def test_only_the_named_files_write_to_the_ledger() -> None:
-    offences = [offence for file, source in _sources().items() for offence in _offences(file, source)]
+    offences = [
+        offence for file, source in _sources().items() for offence in _offences(file, source)
+    ]
     assert offences == []
 
 

@@ -1,4 +1,6 @@
-"""What is in public signatures of `ident` can be imported from it, and `help()` shows signatures that can be read."""
+"""What is in public signatures of `ident` can be imported from it,
+and `help()` shows signatures that can be read.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ OPAQUE = {
     "TreeMotion": "of a closed chain, between methods of the model",
     "Uncorrected": "of an evidence, for corrections of the description",
 }
-"""Containers that one function returns inside its result and another one takes, with what they are."""
+"""Containers that one function returns inside its result and another one takes,
+with what they are.
+"""
 LONGEST_SIGNATURE = 1000  #: Characters; `Calibration` has 25 fields with defaults
 
 
@@ -60,7 +64,10 @@ def _annotated(thing: Any) -> Iterator[Callable[..., Any]]:
     yield thing
     if inspect.isclass(thing):
         for name, value in vars(thing).items():
-            function = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
+            if isinstance(value, property):
+                function = value.fget
+            else:
+                function = getattr(value, "__func__", value)
             if not name.startswith("_") and inspect.isfunction(function):
                 yield function
 

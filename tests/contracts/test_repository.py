@@ -17,7 +17,10 @@ LOCK = (ROOT / "requirements.lock").read_text()
 def test_the_lock_has_hashes_and_no_address() -> None:
     assert not re.search(r"[a-z]+://|@ |--(?:extra-)?index-url|--find-links", LOCK)
     pinned = re.findall(
-        r"^([a-zA-Z0-9_.-]+)==\S+(?: ;[^\\\n]*)? \\\n    --hash=sha256:[0-9a-f]{64}", LOCK, re.MULTILINE
+        r"^([a-zA-Z0-9_.-]+)==\S+(?: ;[^\\\n]*)? \\\n    "
+        r"--hash=sha256:[0-9a-f]{64}",
+        LOCK,
+        re.MULTILINE,
     )
     named = re.findall(r"^[a-zA-Z0-9].*$", LOCK, re.MULTILINE)
     assert len(pinned) == len(named) > 20
@@ -44,7 +47,9 @@ def test_the_decisions_are_numbered_once() -> None:
 
 
 @pytest.mark.parametrize("name", [verb.name for verb in VERBS])
-def test_every_verb_shows_an_example_of_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_shows_an_example_of_itself(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([name, "--help"]) == 0
     assert f"Example: drivegain {name}" in " ".join(capsys.readouterr().out.split())
 
@@ -63,10 +68,17 @@ def test_every_make_target_that_the_documents_name_exists() -> None:
 
 
 def test_every_command_of_the_readme_is_one(capsys: pytest.CaptureFixture[str]) -> None:
-    commands = re.findall(r"^drivegain ([a-z]+)(.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    commands = re.findall(
+        r"^drivegain "
+        r"([a-z]+)(.*)$",
+        (ROOT / "README.md").read_text(),
+        re.MULTILINE,
+    )
     assert len(commands) >= 5
     for verb, rest in commands:
-        assert verb in {one.name for one in VERBS}, f"README names the verb {verb}, which is not there"
+        assert verb in {one.name for one in VERBS}, (
+            f"README names the verb {verb}, which is not there"
+        )
         assert main([verb, "--help"]) == 0
         shown = capsys.readouterr().out
         for option in re.findall(r"--[a-z-]+", rest):

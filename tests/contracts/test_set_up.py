@@ -21,7 +21,7 @@ Collecting can==4.5 (from -r requirements.lock (line 9))
   Using cached can-4.5-py3-none-any.whl (300 kB)
 Processing /opt/wheels/cmeel_qhull-8.0.2.1-1-py3-none-manylinux_2_28_x86_64.whl (from -r requirements.lock (line 12))
 Requirement already satisfied: pip==25.0 in ./lib (from -r requirements.lock (line 14)) (25.0)
-"""
+"""  # noqa: E501
 
 
 @pytest.fixture
@@ -39,9 +39,13 @@ def test_it_is_said_how_many_packages_of_how_many(set_up: dict[str, Any]) -> Non
     assert progress.words(2) == "unpacked 2 of 3 packages"
 
 
-def test_the_lock_is_counted_with_what_other_machines_need(set_up: dict[str, Any], checkout: Path) -> None:
+def test_the_lock_is_counted_with_what_other_machines_need(
+    set_up: dict[str, Any], checkout: Path
+) -> None:
     lock = (checkout / "requirements.lock").read_text()
-    assert set_up["packages_in"](lock) == sum(not line.startswith((" ", "#")) for line in lock.splitlines())
+    assert set_up["packages_in"](lock) == sum(
+        not line.startswith((" ", "#")) for line in lock.splitlines()
+    )
 
 
 def test_what_pip_complains_of_is_shown(checkout: Path, tmp_path: Path) -> None:
@@ -81,18 +85,28 @@ def makefile(checkout: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def set_up_with(folder: Path, *arguments: str, environment: str | None = None) -> subprocess.CompletedProcess[str]:
+def set_up_with(
+    folder: Path, *arguments: str, environment: str | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run `make setup`; environment is the PYTHON of the environment variables."""
-    variables = {name: value for name, value in os.environ.items() if name not in {"PYTHON", "MAKEFLAGS", "MAKELEVEL"}}
+    variables = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in {"PYTHON", "MAKEFLAGS", "MAKELEVEL"}
+    }
     if environment is not None:
         variables["PYTHON"] = environment
     command = ["make", "setup", *arguments]
-    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, cwd=folder, env=variables, capture_output=True, text=True, check=False
+    )
 
 
 def interpreter_of(environment: Path) -> str:
     """Return which interpreter an environment was made by."""
-    said = subprocess.run([environment / "bin" / "python", "-c", "which"], capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [environment / "bin" / "python", "-c", "which"], capture_output=True, text=True, check=True
+    )
     return said.stdout.strip()
 
 

@@ -1,4 +1,6 @@
-"""A file or folder of the user's with the name of a package is named by the first import that fails."""
+"""A file or folder of the user's with the name of a package is named by the first import that
+fails.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,12 @@ def _run(checkout: Path, folder: Path, code: str) -> subprocess.CompletedProcess
     """Run code in a folder, which comes first on the path as it does beside a script."""
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     return subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
 
 
@@ -33,14 +40,18 @@ def _shadow(folder: Path, name: str, content: str) -> Path:
     return file.parent if file.name == "__init__.py" else file
 
 
-@pytest.mark.parametrize("name", ["drivers.py", "drivers/__init__.py", "ident.py", "ident/__init__.py"])
+@pytest.mark.parametrize(
+    "name", ["drivers.py", "drivers/__init__.py", "ident.py", "ident/__init__.py"]
+)
 def test_it_is_named_with_its_place(checkout: Path, tmp_path: Path, name: str) -> None:
     place = _shadow(tmp_path, name, "X = 1\n")
     failed = _run(checkout, tmp_path, USE["daq"])
     assert failed.returncode == 1
     *_, last = failed.stderr.splitlines()
     package = place.name.removesuffix(".py")
-    assert last.startswith(f"ImportError: {package!r}: found {place}, which Python imports in the place of drivegain's")
+    assert last.startswith(
+        f"ImportError: {package!r}: found {place}, which Python imports in the place of drivegain's"
+    )
     assert f"expected {checkout / package}; rename {place.name!r}" in last
 
 

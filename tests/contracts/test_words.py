@@ -19,13 +19,19 @@ from tests.words import BASELINE, DOCSTRING, PHRASES, ROOT, Source, count, worki
         ("# a gate\n# is closed", {"closed gate": 1}),
         ("undo = plan_the_way_back()", {"way back": 1}),
         ("it stands in the file", {"stand, stands, stood, standing": 1}),
-        ("standstill standard_rows standalone stand-alone: the joint stands still; understand, outstanding", {}),
+        (
+            "standstill standard_rows standalone stand-alone: the joint stands still; understand, "
+            "outstanding",
+            {},
+        ),
         ("import drivers.stranger", {"stranger": 1}),
         ("Deed.APPLIED, the_doer", {"deed, doer": 2}),
         ("retold, gates are checked, the bus is closed, garbage collection", {}),
     ],
 )
-def test_phrases_are_counted_in_identifiers_and_over_lines(text: str, found: dict[str, int]) -> None:
+def test_phrases_are_counted_in_identifiers_and_over_lines(
+    text: str, found: dict[str, int]
+) -> None:
     source = Source.of("daq/x.txt", text)
     counted = {phrase.name: len(list(phrase.found_in(source))) for phrase in PHRASES}
     assert {name: number for name, number in counted.items() if number} == found
@@ -33,7 +39,8 @@ def test_phrases_are_counted_in_identifiers_and_over_lines(text: str, found: dic
 
 def test_docstrings_are_found_by_their_first_word() -> None:
     text = (
-        '"""Of a module."""\ndef f():\n    """What it does."""\ndef g():\n    """Office hours."""\n    return "What"\n'
+        '"""Of a module."""\ndef f():\n    """What it does."""\ndef g():\n    """Office '
+        'hours."""\n    return "What"\n'
     )
     assert list(Source.of("daq/x.py", text).odd_docstrings()) == ["Of a module.", "What it does."]
 
@@ -58,9 +65,16 @@ def test_the_working_tree_is_read() -> None:
 
 
 def test_every_identifier_of_the_glossary_is_in_the_code() -> None:
-    files = (file for folder in ("daq", "ident", "drivers") for file in (ROOT / folder).rglob("*.py"))
-    code = {name for file in files for name in re.findall(r"\w+", file.read_text())} | {"daq", "drivers"}
-    rows = re.findall(r"^\|.*\| (`.*`) \|$", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    files = (
+        file for folder in ("daq", "ident", "drivers") for file in (ROOT / folder).rglob("*.py")
+    )
+    code = {name for file in files for name in re.findall(r"\w+", file.read_text())} | {
+        "daq",
+        "drivers",
+    }
+    rows = re.findall(
+        r"^\|.*\| (`.*`) \|$", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE
+    )
     named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
     assert len(named) > 100
     assert sorted(name for name in named if not set(name.split(".")) <= code) == []

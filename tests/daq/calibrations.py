@@ -1,4 +1,6 @@
-"""Calibrations for tests: one that every gate lets through, and hypothesis strategies for any other."""
+"""Calibrations for tests: one that every gate lets through,
+and hypothesis strategies for any other.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,15 @@ def demo_calibration() -> Calibration:
         ),
         parameters=(Parameter("ZZ1R", 1.25, 0.01, "kg m²"), Parameter("off3", 0.0, 0.02, "Nm")),
         effects=(
-            AcceptedEffect("load-friction", "J3", {"power": 1.0}, (Parameter("c", 0.12, 0.002, "1"),), 6.1, 3.4, ()),
+            AcceptedEffect(
+                "load-friction",
+                "J3",
+                {"power": 1.0},
+                (Parameter("c", 0.12, 0.002, "1"),),
+                6.1,
+                3.4,
+                (),
+            ),
         ),
         relative_error_percent=RelativeError((3.1, 2.8, 3.4, 4.0, 5.5, 4.9), 3.2),
         holdout_error_percent=RelativeError((3.2, 2.9, 3.5, 4.1, 5.6, 5.0), 3.3),
@@ -55,8 +65,11 @@ def demo_calibration() -> Calibration:
 
 
 def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Path:
-    """A calibration that every gate of the demo cell lets through, its gains times a factor; its file."""
-    declared, now = load_cell(cell_file), datetime.now(UTC)
+    """A calibration that every gate of the demo cell lets through, its gains times a factor;
+    its file.
+    """
+    declared = load_cell(cell_file)
+    now = datetime.now(UTC)
     calibration = recorded(demo_calibration(), now - timedelta(hours=1))
     calibration = replace(
         calibration,
@@ -73,7 +86,9 @@ def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Pat
 def demo_recording(entered_kg: float | None = None, at: datetime = RECORDED) -> Recording:
     """Recording of the demo cell's drives, without losses, some samples saturated."""
     serials = tuple(range(1001, 1007))
-    return Recording(at.timestamp(), entered_kg, serials, (0.0, 0.1, 0.0, 0.0, 1.9, 0.0), 0, (0,) * 6, None)
+    return Recording(
+        at.timestamp(), entered_kg, serials, (0.0, 0.1, 0.0, 0.0, 1.9, 0.0), 0, (0,) * 6, None
+    )
 
 
 def recorded(calibration: Calibration, at: datetime) -> Calibration:
@@ -87,7 +102,9 @@ def with_recordings(calibration: Calibration, **changes: object) -> Calibration:
     return replace(
         calibration,
         sources=tuple(
-            source if recording is None else replace(source, recording=replace(recording, **changes))  # type: ignore[arg-type]
+            source
+            if recording is None
+            else replace(source, recording=replace(recording, **changes))  # type: ignore[arg-type]
             for source, recording in reported
         ),
     )
@@ -97,7 +114,9 @@ def of_first_axes(calibration: Calibration, count: int) -> Calibration:
     """The same of so many axes."""
 
     def first(error: RelativeError | None) -> RelativeError | None:
-        return None if error is None else replace(error, axes=error.axes[:count])
+        if error is None:
+            return None
+        return replace(error, axes=error.axes[:count])
 
     error = calibration.relative_error_percent
     cut = replace(
@@ -108,7 +127,10 @@ def of_first_axes(calibration: Calibration, count: int) -> Calibration:
         nameplate_holdout_error_percent=first(calibration.nameplate_holdout_error_percent),
     )
     return with_recordings(
-        cut, serials=tuple(range(1001, 1001 + count)), saturated_percent=(0.0,) * count, missing=(0,) * count
+        cut,
+        serials=tuple(range(1001, 1001 + count)),
+        saturated_percent=(0.0,) * count,
+        missing=(0,) * count,
     )
 
 
@@ -152,7 +174,9 @@ calibrations = st.builds(
     Calibration,
     cell=_texts,
     method=st.sampled_from(("ls", "wls", "tls", "ml")),
-    gains=st.lists(st.builds(Gain, _texts, _numbers, _deviations, _texts, _numbers), max_size=4).map(tuple),
+    gains=st.lists(
+        st.builds(Gain, _texts, _numbers, _deviations, _texts, _numbers), max_size=4
+    ).map(tuple),
     parameters=st.lists(_parameters, max_size=4).map(tuple),
     effects=st.lists(_effects, max_size=2).map(tuple),
     covariance_factor=st.none() | st.lists(_numbers, max_size=3).map(lambda row: (tuple(row),)),

@@ -39,7 +39,9 @@ REAL = GainObject(index=0x2003, subindex=2, type=ParameterKind.F32, factor=1.0)
 
 
 def demo_cell(folder: Path, *objects: GainObject) -> Cell:
-    """The demo cell with its records in a folder, and the gains in these objects, or in 2003h:01 of all drives."""
+    """The demo cell with its records in a folder, and the gains in these objects,
+    or in 2003h:01 of all drives.
+    """
     cell = load_cell(CONFIGS / "cells" / "demo.yaml")
     return replace(
         cell,
@@ -62,7 +64,10 @@ def simulated(
 ) -> Iterator[SimulatedCell]:
     """The demo cell, its drives with entered gains and faults."""
     spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
-    axes = tuple(replace(axis, entered_gain_nm_per_a=gain) for axis, gain in zip(spec.axes, entered, strict=True))
+    axes = tuple(
+        replace(axis, entered_gain_nm_per_a=gain)
+        for axis, gain in zip(spec.axes, entered, strict=True)
+    )
     bus: can.BusABC = open_bus(address)
     try:
         with SimulatedCell(replace(spec, axes=axes, faults=faults), bus) as cell:
@@ -71,7 +76,9 @@ def simulated(
         bus.shutdown()
 
 
-def network_of(cell: Cell, address: BusAddress, mapping: Mapping = Mapping.STORED) -> CanopenNetwork:
+def network_of(
+    cell: Cell, address: BusAddress, mapping: Mapping = Mapping.STORED
+) -> CanopenNetwork:
     """To be entered; with short waits, and drives of which it is known that they save so."""
     return CanopenNetwork(
         address,
@@ -90,7 +97,9 @@ def with_mapping(axis: Axis, mapping: Mapping) -> Axis:
 
 def entered_gain(node: Node, gain_object: GainObject = WHOLE) -> float:
     """Gain in a drive now [Nm/A]."""
-    word = int.from_bytes(node.read(gain_object.parameter.index, gain_object.parameter.subindex), "little")
+    word = int.from_bytes(
+        node.read(gain_object.parameter.index, gain_object.parameter.subindex), "little"
+    )
     return gain_object.parameter.value(word) / gain_object.factor
 
 

@@ -1,9 +1,11 @@
-"""A child process whose changing system calls are counted, and one of which fails or is its end (Linux, ptrace(2)).
+"""A child process whose changing system calls are counted,
+and one of which fails or is its end (Linux, ptrace(2)).
 
-A changing call is one that changes what is on a disk: a file opened for writing, written, flushed, renamed, linked,
-removed, its rights or its length changed, a folder made. The call that fails is not made: the kernel gets the number of
-no call, and the process gets the error. So every library of the process is reached, not Python's alone, and nothing is
-needed beside this module: neither strace nor a compiler.
+A changing call is one that changes what is on a disk: a file opened for writing, written, flushed,
+renamed, linked, removed, its rights or its length changed, a folder made. The call that fails is
+not made: the kernel gets the number of no call, and the process gets the error. So every library of
+the process is reached, not Python's alone, and nothing is needed beside this module: neither strace
+nor a compiler.
 """
 
 from __future__ import annotations
@@ -21,15 +23,26 @@ from pathlib import Path
 
 from tests.daq.killing import NOT_PERMITTED, ask_ptrace, be_traced
 
-_SYSCALL, _GETREGS, _SETREGS, _SETOPTIONS = 24, 12, 13, 0x4200
-_TRACESYSGOOD, _EXITKILL = 0x1, 0x100000
+_SYSCALL = 24
+_GETREGS = 12
+_SETREGS = 13
+_SETOPTIONS = 0x4200
+_TRACESYSGOOD = 0x1
+_EXITKILL = 0x100000
 _SYSCALL_STOP = signal.SIGTRAP | 0x80
 _NO_CALL = 2**64 - 1
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 _AT_CWD = -100
 
 # Registers in the order of `struct user_regs_struct` (x86-64).
-_R10, _R8, _RAX, _RDX, _RSI, _RDI, _ORIG_RAX, _COUNT = 7, 9, 10, 12, 13, 14, 15, 27
+_R10 = 7
+_R8 = 9
+_RAX = 10
+_RDX = 12
+_RSI = 13
+_RDI = 14
+_ORIG_RAX = 15
+_COUNT = 27
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +104,10 @@ CALLS = {
     199: CallKind("setxattr", file=_RDI),  # fremovexattr
     280: CallKind("utimens", path=_RSI, folder=_RDI),
 }
-"""Changing calls by their number on x86-64. A close(2) may report that an earlier write failed (NFS, quotas)."""
+"""Changing calls by their number on x86-64.
+
+A close(2) may report that an earlier write failed (NFS, quotas).
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +129,8 @@ class Fault:
 
     Attributes:
         number: of the call, from 0.
-        error: number of the error that the call gives; None kills the process (SIGKILL) before the call is made.
+        error: number of the error that the call gives; None kills the process (SIGKILL) before the
+            call is made.
         is_lasting: every later changing call gives the error too.
     """
 
@@ -138,17 +155,23 @@ class Traced:
 def why_not_here() -> str:
     """Say why no call can be made to fail on this machine; empty where it can."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        return f"the numbers and registers of system calls are those of Linux on x86-64, not of {platform.machine()}"
+        return (
+            "the numbers and registers of system calls are those of Linux on x86-64, not of "
+            f"{platform.machine()}"
+        )
     if traced(lambda: 0, lambda _: True).code == NOT_PERMITTED:
         return "ptrace is not permitted here: no system call can be made to fail"
     return ""
 
 
-def traced(work: Callable[[], int], is_counted: Callable[[Path], bool], fault: Fault | None = None) -> Traced:
+def traced(
+    work: Callable[[], int], is_counted: Callable[[Path], bool], fault: Fault | None = None
+) -> Traced:
     """Do some work in a child, with a fault at one of its changing calls.
 
     Args:
-        work: returns the exit code. Calls of the threads and processes that it starts are left alone.
+        work: returns the exit code. Calls of the threads and processes that it starts are left
+            alone.
         is_counted: of the path that a call changes; other calls are not counted and never fail.
         fault: None for none.
     """
@@ -190,7 +213,9 @@ class _Tracer:
             _, status = os.waitpid(self.child, 0)
             if not os.WIFSTOPPED(status):
                 self.is_ended = True
-                return os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
+                if os.WIFEXITED(status):
+                    return os.WEXITSTATUS(status)
+                return None
             passed_on = os.WSTOPSIG(status)
             if passed_on == _SYSCALL_STOP:
                 passed_on = 0
@@ -224,7 +249,11 @@ class _Tracer:
         number = len(self.calls)
         self.calls.append(call)
         fault = self.fault
-        if fault is None or number < fault.number or (number > fault.number and not fault.is_lasting):
+        if (
+            fault is None
+            or number < fault.number
+            or (number > fault.number and not fault.is_lasting)
+        ):
             return
         if fault.error is None:
             os.kill(self.child, signal.SIGKILL)
@@ -262,7 +291,9 @@ class _Tracer:
             descriptor = ctypes.c_int(registers[kind.folder]).value
             if descriptor != _AT_CWD:
                 folder = process / "fd" / str(descriptor)
-        return path if path.is_absolute() else (_link(folder) or Path("/")) / path
+        if path.is_absolute():
+            return path
+        return (_link(folder) or Path("/")) / path
 
 
 def _is_for_writing(info: Path) -> bool:

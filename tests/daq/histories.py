@@ -42,7 +42,8 @@ def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibr
     )
     at = BEGIN + timedelta(weeks=week)
     logs = tuple(
-        replace(one, sha256=hashlib.sha256(f"{one.name} of week {week}".encode()).hexdigest()) for one in demo.sources
+        replace(one, sha256=hashlib.sha256(f"{one.name} of week {week}".encode()).hexdigest())
+        for one in demo.sources
     )
     return recorded(replace(demo, gains=gains, sources=logs, created=at.isoformat()), at)
 
@@ -88,7 +89,8 @@ def write(
     who: str = "anna",
     before: str = "0" * 64,
 ) -> AuditEntry:
-    """Enter a write to a controller as `apply` does, or as `rollback` does where it is of no calibration.
+    """Enter a write to a controller as `apply` does,
+    or as `rollback` does where it is of no calibration.
 
     Args:
         ledger: that gets the entries.
@@ -102,16 +104,22 @@ def write(
     Returns:
         the entry that ends the write.
     """
-    begun, ended = AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK
+    begun = AuditAction.ROLLBACK_BEGUN
+    ended = AuditAction.ROLLED_BACK
     details: dict[str, object] = {"sha256_before": before, "sha256_after": after}
     if digest is not None:
-        begun, ended = AuditAction.APPLY_BEGUN, AuditAction.APPLIED
+        begun = AuditAction.APPLY_BEGUN
+        ended = AuditAction.APPLIED
         details["calibration"] = {"sha256": digest, "cell": ledger.cell.name}
     first = append(ledger.audit, begun, at=at, who=who, subject=target, details=details)
-    return append(ledger.audit, ended, at=at, who=who, subject=target, details={"begun": first.number})
+    return append(
+        ledger.audit, ended, at=at, who=who, subject=target, details={"begun": first.number}
+    )
 
 
-def fill(ledger: Ledger, weeks: int, true: Callable[[int], tuple[float, ...]], seed: int = 3) -> tuple[str, ...]:
+def fill(
+    ledger: Ledger, weeks: int, true: Callable[[int], tuple[float, ...]], seed: int = 3
+) -> tuple[str, ...]:
     """Enter calibrations with their noise.
 
     Args:

@@ -11,8 +11,11 @@ from typing import NoReturn
 
 import pytest
 
-_TRACEME, _SYSCALL, _SETOPTIONS = 0, 24, 0x4200
-_TRACESYSGOOD, _EXITKILL = 0x1, 0x100000
+_TRACEME = 0
+_SYSCALL = 24
+_SETOPTIONS = 0x4200
+_TRACESYSGOOD = 0x1
+_EXITKILL = 0x100000
 _SYSCALL_STOP = signal.SIGTRAP | 0x80
 _FAILED = 70
 NOT_PERMITTED = 77  #: Exit code of a child that may not be traced
@@ -23,7 +26,9 @@ _ptrace.restype = ctypes.c_long
 
 
 def in_a_child(work: Callable[[], int]) -> int:
-    """Do some work in a process of its own, which ends with the code that it returns; return its process id."""
+    """Do some work in a process of its own, which ends with the code that it returns;
+    return its process id.
+    """
     with warnings.catch_warnings():
         # Of threads of the test runner, which the child never meets.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -38,11 +43,14 @@ def in_a_child(work: Callable[[], int]) -> int:
 
 
 def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> bool:
-    """Do some work in a child and kill it (SIGKILL) as it asks for a system call, which is not made any more.
+    """Do some work in a child and kill it (SIGKILL) as it asks for a system call,
+    which is not made any more.
 
     Args:
-        here: of the call's number, from 1; where it returns true the child is killed. The child waits for the answer.
-        work: with nothing left to import or to prepare; its calls and the child's own end are counted.
+        here: of the call's number, from 1; where it returns true the child is killed. The child
+            waits for the answer.
+        work: with nothing left to import or to prepare; its calls and the child's own end are
+            counted.
 
     Returns:
         whether it was killed; False where it was killed nowhere and came to its end.
@@ -53,7 +61,8 @@ def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> b
     _, status = os.waitpid(child, 0)
     if os.WIFEXITED(status) and os.WEXITSTATUS(status) == NOT_PERMITTED:
         reason = "ptrace is not permitted here: no process can be killed at a chosen system call"
-        # In CI a skip goes unread, so this test must not be skipped: it alone shows that no kill leaves half a file.
+        # In CI a skip goes unread, so this test must not be skipped: it alone shows that no kill
+        # leaves half a file.
         if os.environ.get("CI"):
             pytest.fail(reason)
         pytest.skip(reason)
@@ -78,7 +87,9 @@ def killed_where(here: Callable[[int], object], work: Callable[[], object]) -> b
 
 
 def be_traced(work: Callable[[], object]) -> NoReturn:
-    """Do some work in a child that was just forked, once its parent traces it; an integer is its exit code."""
+    """Do some work in a child that was just forked, once its parent traces it;
+    an integer is its exit code.
+    """
     code = _FAILED
     try:
         if _ptrace(_TRACEME, 0, None, None) != 0:

@@ -17,7 +17,9 @@ START_NS = 1_700_000_000_123_456_789
 DISC = Payload("disc", "flange-a", {"m": 4.59})
 
 
-def content(axes: int, payload: Payload | None = None, files: dict[str, bytes] | None = None) -> LogContent:
+def content(
+    axes: int, payload: Payload | None = None, files: dict[str, bytes] | None = None
+) -> LogContent:
     """The start of a log of so many axes: 1 kHz, 2 mA a unit."""
     names = tuple(f"J{i + 1}" for i in range(axes))
     run = RunInfo("run-1", 1000.0, payload, "Ada", "test 1", START_NS, 55)
@@ -69,7 +71,9 @@ def write(
 
 
 def damaged(data: bytes, kind: str, at: int, rng: random.Random, junk_bytes: int) -> bytes:
-    """A file with a bit flipped ("flip"), its end lost ("cut") or some bytes replaced ("junk"), from an offset on."""
+    """A file with a bit flipped ("flip"), its end lost ("cut") or some bytes replaced ("junk"),
+    from an offset on.
+    """
     hurt = bytearray(data)
     if kind == "flip":
         hurt[at] ^= 1 << rng.randrange(8)

@@ -1,4 +1,6 @@
-"""Calibrations of robots with known bodies, rotors and friction, for models that have to give the same torques."""
+"""Calibrations of robots with known bodies, rotors and friction,
+for models that have to give the same torques.
+"""
 
 from __future__ import annotations
 
@@ -65,13 +67,18 @@ def robot_of(name: str) -> CalibratedRobot:
         data = Path(os.environ.get("DRIVEGAIN_DATA", CHECKOUT.parent / "shared/data"))
         path = data / "ur10/ur10-cell.yaml"
         if not path.exists():
-            pytest.skip(f"no description of the UR10 at {path}; DRIVEGAIN_DATA names the folder that holds ur10/")
+            pytest.skip(
+                f"no description of the UR10 at {path}; DRIVEGAIN_DATA names the folder "
+                "that holds ur10/"
+            )
     return calibrated_robot(path)
 
 
 def apart(found: FloatArray, expected: FloatArray) -> float:
     """‖found − expected‖/‖expected‖ of the worst axis."""
-    return float((np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)).max())
+    return float(
+        (np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)).max()
+    )
 
 
 def calibrated_robot(cell_file: Path, seed: int = 4, coupling: float = 0.2) -> CalibratedRobot:
@@ -80,7 +87,8 @@ def calibrated_robot(cell_file: Path, seed: int = 4, coupling: float = 0.2) -> C
     Args:
         cell_file: of the cell.
         seed: of bodies, rotors and friction.
-        coupling: Iam and fvm of motors that turn with several joints, as a share of the least Ia and fv.
+        coupling: Iam and fvm of motors that turn with several joints, as a share of the least Ia
+            and fv.
     """
     cell = load_cell(cell_file)
     model = model_of(cell)
@@ -90,7 +98,8 @@ def calibrated_robot(cell_file: Path, seed: int = 4, coupling: float = 0.2) -> C
     names = tuple(column.name for column in model.columns)
     base = base_parameters(np.asarray(np.linalg.qr(columns, mode="r")), names)
     gains = tuple(
-        Gain(axis.name, 1.03 * axis.nameplate_gain, 0.01, axis.gain_unit, axis.nameplate_gain) for axis in cell.axes
+        Gain(axis.name, 1.03 * axis.nameplate_gain, 0.01, axis.gain_unit, axis.nameplate_gain)
+        for axis in cell.axes
     )
     parameters = tuple(
         Parameter(name, float(value), 0.01 * abs(float(value)) + 1e-3, "kg m²")

@@ -1,4 +1,6 @@
-"""Messages of the libraries on the command line: verbs and options in the place of functions and arguments."""
+"""Messages of the libraries on the command line:
+verbs and options in the place of functions and arguments.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,11 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_name_of_the_table_is_in_a_message(name: str) -> None:
-    code = "".join(file.read_text() for folder in ("ident", "drivers") for file in (ROOT / folder).rglob("*.py"))
+    code = "".join(
+        file.read_text()
+        for folder in ("ident", "drivers")
+        for file in (ROOT / folder).rglob("*.py")
+    )
     assert name in code
 
 
@@ -41,14 +47,20 @@ def test_estimators_that_disagree_name_method_and_residual() -> None:
 
 
 def test_a_misplaced_node_names_the_scan() -> None:
-    assert "; `drivegain scan` shows the nodes of each bus" in ErrorParts.of(NodeMisplaced(3, "can0", "can1")).error
+    assert ("; `drivegain scan` shows the nodes of each bus") in ErrorParts.of(
+        NodeMisplaced(3, "can0", "can1")
+    ).error
 
 
 def test_mixed_parameters_name_the_rollback() -> None:
-    assert "`drivegain rollback CELL --drives`" in ErrorParts.of(ParametersMixed(("J1",), ("J2: silent",))).do
+    assert ("`drivegain rollback CELL --drives`") in ErrorParts.of(
+        ParametersMixed(("J1",), ("J2: silent",))
+    ).do
 
 
-def test_a_payload_that_is_not_seen_is_looked_for_in_every_run_before_a_heavier_one_is_advised() -> None:
+def test_a_payload_that_is_not_seen_is_looked_for_in_every_run_before_a_heavier_one_is_advised() -> (  # noqa: E501
+    None
+):
     """A body that was mounted in the run without load hides it as well as a light one does."""
     remedy = ErrorParts.of(PayloadUnseen((40.0, 60.0), ("bare", "loaded"))).do
     assert remedy.index("what was mounted in each run") < remedy.index("a heavier payload")

@@ -16,13 +16,22 @@ import pytest
 from daq.errors import OutputFailed, OwnerNotKept
 from daq.files import replace_file
 
-ACCESS, DEFAULT = "system.posix_acl_access", "system.posix_acl_default"
-READ, WRITE = 4, 2
-_OWNER, _USER, _GROUP, _MASK, _OTHERS, _NO_ONE = 0x01, 0x02, 0x04, 0x10, 0x20, 0xFFFFFFFF
+ACCESS = "system.posix_acl_access"
+DEFAULT = "system.posix_acl_default"
+READ = 4
+WRITE = 2
+_OWNER = 0x01
+_USER = 0x02
+_GROUP = 0x04
+_MASK = 0x10
+_OTHERS = 0x20
+_NO_ONE = 0xFFFFFFFF
 
 
 def _access_list(user: int) -> bytes:
-    """As Linux keeps it (version 2): the owner and one more user may read and write, no one else."""
+    """As Linux keeps it (version 2): the owner and one more user may read and write,
+    no one else.
+    """
     entries = (
         (_OWNER, READ | WRITE, _NO_ONE),
         (_USER, READ | WRITE, user),
@@ -54,7 +63,9 @@ def file(tmp_path: Path) -> Path:
 
 
 def _rights(path: Path) -> dict[str, bytes | int]:
-    attributes: dict[str, bytes | int] = {name: os.getxattr(path, name) for name in os.listxattr(path)}
+    attributes: dict[str, bytes | int] = {
+        name: os.getxattr(path, name) for name in os.listxattr(path)
+    }
     return attributes | {"mode": stat.S_IMODE(path.stat().st_mode)}
 
 
@@ -80,7 +91,8 @@ def _refusing(prefix: str, number: int) -> object:
 
 def _with_capability(monkeypatch: pytest.MonkeyPatch, file: Path, name: str) -> None:
     """The file has an attribute more, named first, that no test may set."""
-    listed, got = os.listxattr, os.getxattr
+    listed = os.listxattr
+    got = os.getxattr
 
     def listxattr(path: object) -> list[str]:
         return [name, *listed(path)] if path == file else listed(path)  # type: ignore[arg-type]
@@ -115,7 +127,9 @@ def test_an_access_list_that_cannot_be_kept_stops_the_write(
     assert [path.name for path in file.parent.iterdir()] == ["demo.yaml"]
 
 
-def test_a_file_system_without_attributes_has_none_to_keep(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_attributes_has_none_to_keep(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(os, "setxattr", _refusing("", errno.ENOTSUP))
     replace_file(file, b"new")
     assert file.read_bytes() == b"new"

@@ -19,4 +19,6 @@ def test_a_digest_is_that_of_the_content(tmp_path: Path) -> None:
 
 def test_what_is_no_regular_file_has_none_and_no_one_waits(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    assert [sha256_of(path) for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero"))] == [None] * 3
+    assert [sha256_of(path) for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero"))] == [
+        None
+    ] * 3

@@ -6,11 +6,23 @@ import importlib
 import inspect
 import pkgutil
 
+import pytest
+
 import daq
 import drivers
 import ident
-from daq.errors import CalibrationRefused, DaqError, OutputFailed, OwnerNotKept, SchemaMismatch, UsageError, exit_code
+from daq.errors import (
+    CalibrationRefused,
+    DaqError,
+    OutputFailed,
+    OwnerNotKept,
+    SchemaMismatch,
+    UsageError,
+    exit_code,
+    first_few,
+)
 from daq.log.feed import FeedUnfit
+from daq.workflow.urdf_shapes import ShapeUnreadable
 from drivers.canopen.sdo import TransferUnboundedError
 from drivers.errors import DriverError, SetupRefused
 from drivers.simulation.spec import SdoAbort
@@ -29,10 +41,18 @@ def _exceptions() -> set[type[BaseException]]:
 def test_every_exception_class_has_an_exit_code() -> None:
     kinds = _exceptions()
     assert {SetupRefused, RankDeficient, SchemaMismatch} <= kinds
-    # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus, FeedUnfit is said on the
-    # console's page, TransferUnboundedError becomes an ObjectAccessError, OwnerNotKept is an OSError that becomes an
-    # OutputFailed: they end no command.
-    inner = {DaqError, SdoAbort, FeedUnfit, TransferUnboundedError, OwnerNotKept}
+    # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus,
+    # FeedUnfit is said on the console's page, TransferUnboundedError becomes an ObjectAccessError,
+    # OwnerNotKept is an OSError that becomes an OutputFailed, ShapeUnreadable is listed in a model:
+    # they end no command.
+    inner = {
+        DaqError,
+        SdoAbort,
+        FeedUnfit,
+        TransferUnboundedError,
+        OwnerNotKept,
+        ShapeUnreadable,
+    }
     unmapped = {kind.__qualname__ for kind in kinds - inner if exit_code(kind) is None}
     assert not unmapped
 
@@ -43,13 +63,25 @@ def test_foreign_exceptions_have_none() -> None:
 
 
 def test_codes_are_those_of_the_command_line_contract() -> None:
-    kinds = (UsageError, CalibrationRefused, IdentificationError, DriverError, SchemaMismatch, OutputFailed)
+    kinds = (
+        UsageError,
+        CalibrationRefused,
+        IdentificationError,
+        DriverError,
+        SchemaMismatch,
+        OutputFailed,
+    )
     assert [exit_code(kind) for kind in kinds] == [2, 3, 4, 5, 6, 1]
 
 
 def test_an_error_carries_its_evidence() -> None:
     error = UsageError("here", found="this", expected="that", remedy="do so")
-    assert (error.subject, error.found, error.expected, error.remedy) == ("here", "this", "that", "do so")
+    assert (error.subject, error.found, error.expected, error.remedy) == (
+        "here",
+        "this",
+        "that",
+        "do so",
+    )
     assert str(error) == "here: found this; expected that; do so"
 
 
@@ -57,3 +89,19 @@ def test_a_message_does_not_repeat_a_damaged_file() -> None:
     error = UsageError("here", found="x" * 10**6, expected="that", remedy="do so")
     assert len(str(error)) < 5000
     assert "996000 more characters" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("count", "shown"),
+    [
+        (0, ""),
+        (1, "a"),
+        (3, "a, b, c"),
+        (4, "a, b, c, and 1 more (see below)"),
+        (6, "a, b, c, and 3 more (see below)"),
+    ],
+)
+def test_the_first_of_many_texts_are_shown_with_the_number_of_the_others(
+    count: int, shown: str
+) -> None:
+    assert first_few("abcdef"[:count], 3, separator=", ", note=" (see below)") == shown

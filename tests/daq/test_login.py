@@ -12,7 +12,9 @@ from daq.environment import login
 
 
 @pytest.mark.parametrize("variable", ["LOGNAME", "USER", "LNAME", "USERNAME"])
-def test_a_name_of_one_s_own_choice_is_not_an_exception(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
+def test_a_name_of_one_s_own_choice_is_not_an_exception(
+    monkeypatch: pytest.MonkeyPatch, variable: str
+) -> None:
     monkeypatch.setenv(variable, "carol")
     assert login() == pwd.getpwuid(os.getuid()).pw_name
     assert applier("Ada").names == ("Ada", login())

@@ -1,10 +1,12 @@
-"""Make `tests/data/previous_version`: cell, log, calibrations, audit and history as an earlier version wrote them.
+"""Make `tests/data/previous_version`: cell, log, calibrations,
+audit and history as an earlier version wrote them.
 
     git worktree add --detach ../previous ad5bfbc
     cd ../previous && PYTHONPATH=$PWD python .../tests/data/make_previous_version.py OUT
 
-`tests/pipeline/test_previous_version.py` opens these files with the present version. Run this with the version whose
-files are wanted, never with the present one: its modules are looked up by the names that they had there.
+`tests/pipeline/test_previous_version.py` opens these files with the present version. Run this with
+the version whose files are wanted, never with the present one: its modules are looked up by the
+names that they had there.
 """
 
 from __future__ import annotations
@@ -21,7 +23,10 @@ DURATION_S = 12.0
 VALIDATION_MOVES = 3
 """Of the log that is kept: it must be small."""
 CONFIGS = Path("configs")
-POLICY = "policy: {apply: {max_age_days: null, max_error_percent: 60.0, max_axis_error_percent: 100.0}}\n"
+POLICY = (
+    "policy: {apply: {max_age_days: null, max_error_percent: 60.0, max_axis_error_percent: "
+    "100.0}}\n"
+)
 CELL = "press.yaml"
 
 
@@ -51,7 +56,9 @@ def make_cell_files(out: Path) -> None:
 
 
 def simulate_logs(out: Path, logs: Path, moves: int | None = None) -> None:
-    """Write bare.mcap, loaded.mcap and unused.mcap into `logs`, each with so many moves or all of them."""
+    """Write bare.mcap, loaded.mcap and unused.mcap into `logs`,
+    each with so many moves or all of them.
+    """
     fleet: Any = importlib.import_module("tests.bench.fleet_cells")
     fleet.CELL = out / "cells" / CELL
     spec_of = fleet.spec_of
@@ -61,7 +68,9 @@ def simulate_logs(out: Path, logs: Path, moves: int | None = None) -> None:
     fleet.Payload = lambda name, mounting, _known: importlib.import_module("ident.payload").Payload(
         name, mounting, {"m": 4.59}
     )
-    plans = tuple(replace(plan, moves=plan.moves[:moves]) for plan in fleet.plans_of(1, 300, DURATION_S)[0])
+    plans = tuple(
+        replace(plan, moves=plan.moves[:moves]) for plan in fleet.plans_of(1, 300, DURATION_S)[0]
+    )
     made = logs / fleet.make_cell(fleet.FleetCell(logs, 0, plans))
     for log in made.iterdir():
         log.rename(logs / log.name)
@@ -70,19 +79,43 @@ def simulate_logs(out: Path, logs: Path, moves: int | None = None) -> None:
 def main(out: Path) -> int:
     """Make all of it."""
     make_cell_files(out)
-    long, short = out / "long", out / "short"
+    long = out / "long"
+    short = out / "short"
     simulate_logs(out, long)
     simulate_logs(out, short, VALIDATION_MOVES)
     (short / "unused.mcap").rename(out / "held-out.mcap")
     runs = ("long/bare.mcap", "long/loaded.mcap")
     for method in ("ml", "wls", "tls"):
-        drivegain(out, "fit", *runs, "--holdout", "long/unused.mcap", "--method", method, "--out", f"{method}.yaml")
+        drivegain(
+            out,
+            "fit",
+            *runs,
+            "--holdout",
+            "long/unused.mcap",
+            "--method",
+            method,
+            "--out",
+            f"{method}.yaml",
+        )
     cell = f"cells/{CELL}"
     for calibration, who in (("wls.yaml", "Ada"), ("ml.yaml", "Bert")):
-        drivegain(out, "apply", calibration, "--cell", cell, "--yes", "--by", who, "--payload-mass", "disc=4.59")
+        drivegain(
+            out,
+            "apply",
+            calibration,
+            "--cell",
+            cell,
+            "--yes",
+            "--by",
+            who,
+            "--payload-mass",
+            "disc=4.59",
+        )
     drivegain(out, "rollback", "--cell", cell, "--by", "Cleo")
     drivegain(out, "history", cell, "--add", "tls.yaml")
-    drivegain(out, "history", cell, "--acknowledge", "J4", "--by", "Dora", "--why", "gearbox exchanged")
+    drivegain(
+        out, "history", cell, "--acknowledge", "J4", "--by", "Dora", "--why", "gearbox exchanged"
+    )
     drivegain(out, "history", cell, "--verify")
     for folder in (long, short):
         shutil.rmtree(folder)

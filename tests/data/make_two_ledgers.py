@@ -1,10 +1,11 @@
-"""Make `tests/data/two_ledgers`: audit log and SQLite history of a cell, as the version wrote them that had both.
+"""Make `tests/data/two_ledgers`: audit log and SQLite history of a cell,
+as the version wrote them that had both.
 
     git worktree add --detach ../previous 4b099fc
     cd ../previous && PYTHONPATH=$PWD python .../tests/data/make_two_ledgers.py FOLDER
 
-`tests/daq/ledger/test_migration.py` migrates these files. Run this with that version, never with the present one.
-FOLDER is new; its path is in the audit log.
+`tests/daq/ledger/test_migration.py` migrates these files. Run this with that version, never with
+the present one. FOLDER is new; its path is in the audit log.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ def run(*arguments: object) -> None:
 
 
 def main(folder: Path) -> int:
-    """Apply two calibrations, roll the second one back, enter a third one, and acknowledge a change."""
+    """Apply two calibrations, roll the second one back, enter a third one,
+    and acknowledge a change.
+    """
     shutil.copytree("configs", folder, ignore=shutil.ignore_patterns("*.jsonl", "*.sqlite*"))
     cell = folder / "cells" / "demo.yaml"
     first, second, third = (calibration_for(cell, factor) for factor in (1.0, 1.02, 1.01))

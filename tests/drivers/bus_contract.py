@@ -1,4 +1,6 @@
-"""Requirements on every bus, whatever its interface; subclass it with a fixture ``ends`` of three open ends."""
+"""Requirements on every bus, whatever its interface;
+subclass it with a fixture ``ends`` of three open ends.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +25,29 @@ frames = st.builds(
 
 def same(one: can.Message | None, other: can.Message) -> bool:
     """Equal in all that is on the wire."""
-    return one is not None and one.equals(other, timestamp_delta=None, check_channel=False, check_direction=False)
+    return one is not None and one.equals(
+        other, timestamp_delta=None, check_channel=False, check_direction=False
+    )
 
 
 class BusContract:
     """The tests; a subclass has the fixture."""
 
-    # The ends stay open over all examples, and every interface runs the same examples: both are meant.
+    # The ends stay open over all examples, and every interface runs the same examples: both are
+    # meant.
     @settings(
         max_examples=30,
         deadline=None,
         database=None,
-        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.differing_executors],
+        suppress_health_check=[
+            HealthCheck.function_scoped_fixture,
+            HealthCheck.differing_executors,
+        ],
     )
     @given(burst=st.lists(frames, min_size=1, max_size=20))
-    def test_every_other_end_gets_every_frame_in_order(self, ends: Ends, burst: list[can.Message]) -> None:
+    def test_every_other_end_gets_every_frame_in_order(
+        self, ends: Ends, burst: list[can.Message]
+    ) -> None:
         sender, *others = ends
         send_burst(sender, burst)
         for end in others:
@@ -59,13 +69,16 @@ class BusContract:
     def test_a_long_burst_loses_nothing(self, ends: Ends) -> None:
         sender, *others = ends
         burst = [
-            can.Message(arbitration_id=n & 0x7FF, is_extended_id=False, data=n.to_bytes(8, "big")) for n in range(3000)
+            can.Message(arbitration_id=n & 0x7FF, is_extended_id=False, data=n.to_bytes(8, "big"))
+            for n in range(3000)
         ]
         for start in range(0, 3000, 100):
             send_burst(sender, burst[start : start + 100])
         for end in others:
             received = [end.recv(WAIT_S) for _ in burst]
-            assert [bytes(frame.data) for frame in received if frame] == [bytes(frame.data) for frame in burst]
+            assert [bytes(frame.data) for frame in received if frame] == [
+                bytes(frame.data) for frame in burst
+            ]
 
     def test_shutdown_twice_is_harmless(self, ends: Ends) -> None:
         ends[2].shutdown()

@@ -1,8 +1,9 @@
-"""A drive of another stack on the scripted bus: `canopen.LocalNode` with the objects of a maker's data sheet.
+"""A drive of another stack on the scripted bus:
+`canopen.LocalNode` with the objects of a maker's data sheet.
 
-The object dictionary, its access rights and the SDO server are canopen's. Only the sheet says which objects and PDOs
-there are. RPDOs are applied object by object in the order of their mapping, and a controlword acts at once, with the
-target that the drive has at that moment.
+The object dictionary, its access rights and the SDO server are canopen's. Only the sheet says which
+objects and PDOs there are. RPDOs are applied object by object in the order of their mapping, and a
+controlword acts at once, with the target that the drive has at that moment.
 """
 
 from __future__ import annotations
@@ -69,7 +70,12 @@ class ForeignNode(ScriptedNode):
         for base, first in ((0x1400, 0x200), (0x1800, 0x180)):
             for number in self.numbers(base):
                 self.store(base + number, 1, first + 0x100 * number + node_id)
-        for key, value in (((0x6075, 0), RATED_MA), ((0x1018, 1), 0x5A), ((0x1018, 2), 1), ((0x1018, 4), 7)):
+        for key, value in (
+            ((0x6075, 0), RATED_MA),
+            ((0x1018, 1), 0x5A),
+            ((0x1018, 2), 1),
+            ((0x1018, 4), 7),
+        ):
             if self.has(*key):
                 self.store(*key, value)
 
@@ -105,7 +111,11 @@ class ForeignNode(ScriptedNode):
         if self.fixed and writes and 0x1600 <= index & ~0x1FF <= 0x1A00 and index & 0x200:
             return struct.pack("<BHBL", 0x80, index, sub, _READ_ONLY)
         self._refresh()
-        if command >> 5 == 2 and self.has(index, sub) and not isinstance(self._variable(index, sub).default, str):
+        if (
+            command >> 5 == 2
+            and self.has(index, sub)
+            and not isinstance(self._variable(index, sub).default, str)
+        ):
             self.store(index, sub, self.value(index, sub))  # an object without a default is 0
         self._wire.answers.clear()
         self.local.sdo.on_request(0x600 + self.node_id, data, 0.0)
@@ -121,24 +131,32 @@ class ForeignNode(ScriptedNode):
 
     def control(self, word: int, cycle: int) -> None:
         super().control(word, cycle)
-        self.target = self.target - (1 << 32) if self.target >= 1 << 31 else self.target
+        if self.target >= 1 << 31:
+            self.target = self.target - (1 << 32)
 
     def on_sync(self, cycle: int, counted: bool = False) -> list[can.Message]:
         if self.nmt != 5:
             return []
         answers = []
         for number in self.numbers(0x1800):
-            cob, kind = self.value(0x1800 + number, 1), self.value(0x1800 + number, 2)
+            cob = self.value(0x1800 + number, 1)
+            kind = self.value(0x1800 + number, 2)
             if not cob >> 31 and kind == 1 and (mapped := self._mapped(0x1800, number)):
                 self._refresh()
                 data = b"".join(self.value(i, s).to_bytes(n, "little") for i, s, n in mapped)
-                answers.append(can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data))
+                answers.append(
+                    can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data)
+                )
         for number in self.numbers(0x1400):
             cob = self.value(0x1400 + number, 1)
             pdo = self._pending.pop(cob & 0x7FF, None)
             offset = 0
-            for index, sub, size in self._mapped(0x1400, number) if pdo is not None and not cob >> 31 else ():
-                self.store(index, sub, int.from_bytes((pdo or b"")[offset : offset + size], "little"))
+            for index, sub, size in (
+                self._mapped(0x1400, number) if pdo is not None and not cob >> 31 else ()
+            ):
+                self.store(
+                    index, sub, int.from_bytes((pdo or b"")[offset : offset + size], "little")
+                )
                 offset += size
                 self._written(index)
         self._move()
@@ -148,7 +166,9 @@ class ForeignNode(ScriptedNode):
 def foreign_cell(
     sheet: Path, profile: DriveProfile, axes: int = 2, profiles: Profiles = tuple, **how: Any
 ) -> tuple[CanopenNetwork, ScriptedBus]:
-    """A network of so many drives of one data sheet, not yet entered, and the bus that it will open."""
+    """A network of so many drives of one data sheet, not yet entered,
+    and the bus that it will open.
+    """
     if not sheet.is_file():
         pytest.skip(f"no data sheet at {sheet}: set DRIVEGAIN_DATA to the folder that holds eds/")
     clock = FakeClock()

@@ -14,11 +14,14 @@ Answer = Callable[[bytes, ScriptedBus], bytes | None]
 
 
 class Hostile(ScriptedNode):
-    """A node that answers some requests in a way of its own; an answer of None is that of a sound node."""
+    """A node that answers some requests in a way of its own;
+    an answer of None is that of a sound node.
+    """
 
     def __init__(self, node_id: int, bus: ScriptedBus, answer: Answer) -> None:
         super().__init__(node_id)
-        self._bus, self._own = bus, answer
+        self._bus = bus
+        self._own = answer
 
     def sdo(self, data: bytes) -> bytes | None:
         own = self._own(data, self._bus)
@@ -33,20 +36,28 @@ def endless(data: bytes, _: ScriptedBus) -> bytes | None:
     """Send a name of seven bytes after the other."""
     if data[0] >> 5 == 3:
         return bytes((data[0] & 0x10,)) + b"endless"
-    return bytes((0x40, *data[1:4])) + bytes(4) if about(data) == NAME else None
+    if about(data) == NAME:
+        return bytes((0x40, *data[1:4])) + bytes(4)
+    return None
 
 
 def huge(data: bytes, _: ScriptedBus) -> bytes | None:
     """Announce a name of 4 GB."""
-    return bytes((0x41, *data[1:4])) + b"\xff" * 4 if about(data) == NAME else None
+    if about(data) == NAME:
+        return bytes((0x41, *data[1:4])) + b"\xff" * 4
+    return None
 
 
 def one_byte(data: bytes, _: ScriptedBus) -> bytes | None:
-    return bytes((0x4F, *data[1:4])) + bytes(4) if about(data) == STATUSWORD else None
+    if about(data) == STATUSWORD:
+        return bytes((0x4F, *data[1:4])) + bytes(4)
+    return None
 
 
 def nonsense(data: bytes, _: ScriptedBus) -> bytes | None:
-    return bytes((0xE7, *data[1:4])) + b"\xff" * 4 if about(data) != 0x1000 else None
+    if about(data) != 0x1000:
+        return bytes((0xE7, *data[1:4])) + b"\xff" * 4
+    return None
 
 
 def flood(data: bytes, bus: ScriptedBus) -> bytes | None:
@@ -54,7 +65,9 @@ def flood(data: bytes, bus: ScriptedBus) -> bytes | None:
     if about(data) == 0x1000:
         return None
     for _ in range(200):
-        other = can.Message(arbitration_id=0x582, is_extended_id=False, data=bytes.fromhex("4399999900000000"))
+        other = can.Message(
+            arbitration_id=0x582, is_extended_id=False, data=bytes.fromhex("4399999900000000")
+        )
         bus.inject(other)
     return b""
 

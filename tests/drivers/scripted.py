@@ -1,7 +1,9 @@
-"""A bus with tiny CANopen nodes on it that live in the caller's thread and in a time of their own: no waiting, no luck.
+"""A bus with tiny CANopen nodes on it that live in the caller's thread and in a time of their own:
+no waiting, no luck.
 
-The nodes keep to what CiA 301 and 402 demand of a drive (mapping may change only while the PDO is not valid,
-transitions one at a time, set-points on the rising edge of bit 4) and deviate where a test sets it.
+The nodes keep to what CiA 301 and 402 demand of a drive (mapping may change only while the PDO is
+not valid, transitions one at a time, set-points on the rising edge of bit 4) and deviate where a
+test sets it.
 """
 
 from __future__ import annotations
@@ -17,7 +19,15 @@ from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import NO_LOSSES
 from drivers.move import AxisLimits, MotionPermission
-from drivers.profiles.profile import Amplitude, Axis, CurrentScale, DriveProfile, Identity, ObjectEntry, TapPoint
+from drivers.profiles.profile import (
+    Amplitude,
+    Axis,
+    CurrentScale,
+    DriveProfile,
+    Identity,
+    ObjectEntry,
+    TapPoint,
+)
 
 PERIOD_NS = 1_000_000
 ADDRESS = BusAddress("virtual", "scripted")
@@ -105,7 +115,10 @@ class ScriptedNode:
         }
         for base, cob in ((0x1400, 0x200), (0x1800, 0x180)):
             for number in range(4):
-                o[base + number, 1] = (cob + 0x100 * number + node_id | (0 if number < 2 else 1 << 31), 4)
+                o[base + number, 1] = (
+                    cob + 0x100 * number + node_id | (0 if number < 2 else 1 << 31),
+                    4,
+                )
                 o[base + number, 2] = (255, 1)
                 o[base + 0x200 + number, 0] = (1, 1)
                 for sub in range(1, 9):
@@ -166,7 +179,10 @@ class ScriptedNode:
                 self.store(*key, value)
 
     def _mapped(self, base: int, number: int) -> list[tuple[int, int, int]]:
-        words = [self.value(base + 0x200 + number, sub + 1) for sub in range(self.value(base + 0x200 + number, 0))]
+        words = [
+            self.value(base + 0x200 + number, sub + 1)
+            for sub in range(self.value(base + 0x200 + number, 0))
+        ]
         return [(w >> 16, w >> 8 & 0xFF, (w & 0xFF) // 8) for w in words]
 
     def receive_pdo(self, cob_id: int, data: bytes) -> None:
@@ -189,7 +205,9 @@ class ScriptedNode:
                     (self.value(i, s) & (1 << 8 * n) - 1).to_bytes(n, "little")
                     for i, s, n in self._mapped(0x1800, number)
                 )
-                answers.append(can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data))
+                answers.append(
+                    can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data)
+                )
         self._apply_pdos(cycle)
         self._move()
         return answers
@@ -202,7 +220,11 @@ class ScriptedNode:
                 continue
             offset = 0
             for index, sub, size in self._mapped(0x1400, number):
-                self.store(index, sub, int.from_bytes(pdo[offset : offset + size], "little", signed=index == 0x607A))
+                self.store(
+                    index,
+                    sub,
+                    int.from_bytes(pdo[offset : offset + size], "little", signed=index == 0x607A),
+                )
                 offset += size
             if number == 0:
                 self.control(self.value(0x6040, 0), cycle)
@@ -234,7 +256,11 @@ class ScriptedNode:
             self._rising_seen = 0
             return
         self._rising_seen += 1
-        if self.ignores_setpoint or (self.second_controlword and self._rising_seen < 2) or self.statusword & 0x1000:
+        if (
+            self.ignores_setpoint
+            or (self.second_controlword and self._rising_seen < 2)
+            or self.statusword & 0x1000
+        ):
             return
         self.statusword = (self.statusword | 0x1000) & ~0x0400
         self.target, self.moving = self.value(0x607A, 0), True
@@ -315,7 +341,11 @@ class ScriptedBus(can.BusABC):
             elif cob == 0x600 + node.node_id and node.nmt != 4:
                 reply = node.sdo(data)
                 if reply is not None:
-                    self._answer(can.Message(arbitration_id=0x580 + node.node_id, is_extended_id=False, data=reply))
+                    self._answer(
+                        can.Message(
+                            arbitration_id=0x580 + node.node_id, is_extended_id=False, data=reply
+                        )
+                    )
             elif 0x200 <= cob < 0x600 and cob & 0x7F == node.node_id:
                 node.receive_pdo(cob, data)
         self._beat()
@@ -326,7 +356,11 @@ class ScriptedBus(can.BusABC):
             if node.beats and period_ms and self.clock.now_ns >= node.next_beat_ns:
                 node.next_beat_ns = self.clock.now_ns + period_ms * 1_000_000
                 data = bytes((node.nmt,))
-                self._answer(can.Message(arbitration_id=0x700 + node.node_id, is_extended_id=False, data=data))
+                self._answer(
+                    can.Message(
+                        arbitration_id=0x700 + node.node_id, is_extended_id=False, data=data
+                    )
+                )
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if self.broken:
@@ -362,7 +396,9 @@ def cell(axes: int = 2) -> tuple[CanopenNetwork, ScriptedBus]:
 
 
 def lose_first_answer(bus: ScriptedBus, *, repeats: bool) -> None:
-    """Hold node 1's first SDO answer back; it comes before its second answer, and if so before every one after that."""
+    """Hold node 1's first SDO answer back; it comes before its second answer,
+    and if so before every one after that.
+    """
     held: list[can.Message] = []
     released = False
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from canopen.sdo.exceptions import SdoAbortedError
 
-from drivers.errors import DriverError, ObjectAccessError, all_notes, error_chain, stop_notes, text_of
+from drivers.errors import (
+    DriverError,
+    ObjectAccessError,
+    all_notes,
+    error_chain,
+    stop_notes,
+    text_of,
+)
 
 ABORT_READ_ONLY = 0x0601_0002
 
@@ -41,7 +48,11 @@ def test_the_notes_of_a_stop_are_found_behind_a_later_error() -> None:
     later = DriverError("the disk is full")
     cause = DriverError("node 2 is in fault")
     later.__context__ = cause
-    for note in ("while stopping: node 2 does not answer", "not confirmed without power: J2", "hint: look"):
+    for note in (
+        "while stopping: node 2 does not answer",
+        "not confirmed without power: J2",
+        "hint: look",
+    ):
         cause.add_note(note)
     later.add_note("not confirmed without power: J2")
     confirmed = ("not confirmed without power: J2", "while stopping: node 2 does not answer")

@@ -28,7 +28,10 @@ CUT_OFF: dict[str, tuple[FaultSpec, EventKind, Callable[[str, FaultSpec], Outcom
 """Faults that leave axes which do not answer."""
 COUNTED = {
     "error passive": FaultSpec(FaultKind.ERROR_PASSIVE, None, STRIKE),
-    **{f"one {kind.value} frame": at(kind, cycles=1) for kind in (FaultKind.LOST, FaultKind.LATE, FaultKind.DUPLICATE)},
+    **{
+        f"one {kind.value} frame": at(kind, cycles=1)
+        for kind in (FaultKind.LOST, FaultKind.LATE, FaultKind.DUPLICATE)
+    },
     "one short frame": at(FaultKind.SHORT_PDO, cycles=1),
     "another device sends SDO requests": at(FaultKind.SDO_MASTER, cycles=5),
 }
@@ -60,29 +63,56 @@ def ended(outcome: Outcome) -> tuple[str, str]:
     kept = outcome.restored_axes
     return (
         states,
-        "all" if outcome.restored else f"axes {', '.join(str(axis + 1) for axis in kept)}" if kept else "none",
+        "all"
+        if outcome.restored
+        else f"axes {', '.join(str(axis + 1) for axis in kept)}"
+        if kept
+        else "none",
     )
 
 
 def in_motion(named: Iterable[tuple[str, EventKind, Outcome]]) -> None:
     """The table of what ends a recording."""
-    head("fault", "error", "event, cycles after", "stop, cycles after", "states at the end", "settings back")
+    head(
+        "fault",
+        "error",
+        "event, cycles after",
+        "stop, cycles after",
+        "states at the end",
+        "settings back",
+    )
     for name, event, outcome in named:
         row(name, type(outcome.error).__name__, f"{event.value}, {after(outcome, event)}",
             after(outcome, EventKind.STOP), *ended(outcome))  # fmt: skip
 
 
-in_motion((name, p.event, run(f"table {name}", p.fault, toggle_bit=p.toggle_bit)) for name, p in STOPS.items())
-in_motion((name, event, ran(f"table {name}", fault)) for name, (fault, event, ran) in CUT_OFF.items())
+in_motion(
+    (name, p.event, run(f"table {name}", p.fault, toggle_bit=p.toggle_bit))
+    for name, p in STOPS.items()
+)
+in_motion(
+    (name, event, ran(f"table {name}", fault)) for name, (fault, event, ran) in CUT_OFF.items()
+)
 head("fault", "the run", "counted", "states at the end", "settings back")
 for name, fault in COUNTED.items():
     outcome = run(f"table {name}", fault)
     fields = ("missing", "late", "duplicate", "wrong_length")
-    counts = [f"{field} {count}" for field in fields if (count := getattr(outcome.statistics, field))]
+    counts = [
+        f"{field} {count}" for field in fields if (count := getattr(outcome.statistics, field))
+    ]
     events = sorted(
-        {event.kind.value for event in outcome.events if event.kind in (EventKind.BUS_PASSIVE, EventKind.BUS_BUSY)}
+        {
+            event.kind.value
+            for event in outcome.events
+            if event.kind in (EventKind.BUS_PASSIVE, EventKind.BUS_BUSY)
+        }
     )
-    row(name, "goes on" if outcome.error is None else "ENDS", ", ".join(counts + events), *ended(outcome))
+    row(
+        name,
+        "goes on" if outcome.error is None else "ENDS",
+        ", ".join(counts + events),
+        *ended(outcome),
+    )
 head("fault from the start", "error", "moved", "states at the end", "settings back")
 for kind in REFUSALS:
     outcome = run(f"table start {kind.value}", FaultSpec(kind, 1))

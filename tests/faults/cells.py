@@ -1,4 +1,6 @@
-"""The demo cell with one fault in it, driven over a virtual bus in lockstep: the reports, their time, and the end."""
+"""The demo cell with one fault in it, driven over a virtual bus in lockstep:
+the reports, their time, and the end.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ PERIOD_NS = 1_000_000
 ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
 TRAVEL_COUNTS = 150_000
 STRIKE = 120
-"""SYNCs since power-on: in the middle of the move, which begins at about 25 and takes more than 300."""
+"""SYNCs since power-on: in the middle of the move,
+which begins at about 25 and takes more than 300.
+"""
 
 
 Settings = tuple[tuple[tuple[bytes, ...], ...], ...]
@@ -48,7 +52,8 @@ class Outcome:
         events: in their order.
         statistics: of the stream; None when it never began.
         states: CiA 402 state of each axis at the end, read in the simulator.
-        settings: of each node its 1016h:01, 1017h, 6007h, 6060h and the parameters of its PDOs, before and after.
+        settings: of each node its 1016h:01, 1017h, 6007h, 6060h and the parameters of its PDOs,
+            before and after.
         ended_cycle: SYNCs since power-on at the end.
         unguarded: what the network says of amplifiers that cannot watch it.
     """
@@ -65,7 +70,8 @@ class Outcome:
     def powerless(self) -> bool:
         """Whether no axis has power."""
         return not any(
-            state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.SWITCHED_ON)
+            state
+            in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.SWITCHED_ON)
             for state in self.states
         )
 
@@ -77,7 +83,11 @@ class Outcome:
     @property
     def restored_axes(self) -> tuple[int, ...]:
         """Nodes that have the settings from before."""
-        return tuple(axis for axis, (one, other) in enumerate(zip(*self.settings, strict=True)) if one == other)
+        return tuple(
+            axis
+            for axis, (one, other) in enumerate(zip(*self.settings, strict=True))
+            if one == other
+        )
 
     def cycles_of(self, kind: EventKind, axis: int | None = None) -> list[int]:
         """Cycles, counted as `FaultSpec.at_cycle` is, of the events of a kind."""
@@ -93,7 +103,9 @@ def settings_of(cell: SimulatedCell) -> Settings:
     return tuple(
         (
             *(_pdo(node, base, number) for base in (0x1400, 0x1800) for number in range(4)),
-            tuple(_value(node, *key) for key in ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x6060, 0))),
+            tuple(
+                _value(node, *key) for key in ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x6060, 0))
+            ),
         )
         for node in cell.nodes
     )
@@ -121,8 +133,8 @@ def run(
 ) -> Outcome:
     """One move of all axes there and back in a cell with these faults.
 
-    The driver's clock runs with the plant's time beside the wall's: a silence lasts as long in samples on a fast
-    machine as on a slow one; and so does the amplifiers'.
+    The driver's clock runs with the plant's time beside the wall's: a silence lasts as long in
+    samples on a fast machine as on a slow one; and so does the amplifiers'.
 
     Args:
         name: of the virtual bus.
@@ -131,9 +143,12 @@ def run(
         afterwards: SYNCs of another device when the recorder is gone, to let the plant's time pass.
         toggle_bit: of the amplifiers and of their profile.
     """
-    address, outcome = BusAddress("virtual", f"faults {name}"), Outcome()
+    address = BusAddress("virtual", f"faults {name}")
+    outcome = Outcome()
     spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
-    spec = replace(spec, faults=faults, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in spec.axes))
+    spec = replace(
+        spec, faults=faults, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in spec.axes)
+    )
     axes = tuple(
         replace(axis, profile=replace(axis.profile, toggle_bit=toggle_bit))
         for axis in drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
@@ -147,7 +162,9 @@ def run(
                 address,
                 axes,
                 guard_ms=guard_ms,
-                bounds=Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05, nmt_s=1.0, mode_s=1.0, disable_s=1.0),
+                bounds=Bounds(
+                    answer_s=1.0, silence_s=0.3, listen_s=0.05, nmt_s=1.0, mode_s=1.0, disable_s=1.0
+                ),
                 policy=SdoPolicy(0.3, 3),
                 clock=lambda: time.monotonic_ns() + cell.cycles * PERIOD_NS,
             )
@@ -179,14 +196,20 @@ def _drive(network: CanopenNetwork, outcome: Outcome) -> None:
     with network:
         network.prepare()
         outcome.unguarded = network.unguarded()
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 1.0, clock=network.link.clock), outcome.events.append)
+        stream = SyncStream(
+            network, LockstepSync(PERIOD_NS, 1.0, clock=network.link.clock), outcome.events.append
+        )
         try:
             first = next(stream)
             network.check_feedback(first)
             start = first.position_counts
-            there = synchronised_move(start, tuple(count + TRAVEL_COUNTS for count in start), ROOM, dwell_cycles=10)
+            there = synchronised_move(
+                start, tuple(count + TRAVEL_COUNTS for count in start), ROOM, dwell_cycles=10
+            )
             back = synchronised_move(there.target_counts, start, ROOM, dwell_cycles=10)
-            with closing(execute(network, stream, (there, back), MotionPermission("the test", ROOM))) as samples:
+            with closing(
+                execute(network, stream, (there, back), MotionPermission("the test", ROOM))
+            ) as samples:
                 for _ in samples:
                     pass
         finally:

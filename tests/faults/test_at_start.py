@@ -1,4 +1,6 @@
-"""Every fault that is there before a recording: it is refused by name, and no axis ever has power."""
+"""Every fault that is there before a recording:
+it is refused by name, and no axis ever has power.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,16 @@ from drivers.simulation.faults import FaultKind, FaultSpec
 from tests.faults.cells import run
 
 REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {
-    FaultKind.SILENT: (NodeMissing, r"J2 \(node 2\) did not answer within 1 s \(answered: 1, 3, 4, 5, 6\)"),
-    FaultKind.OTHER_SERIAL: (SetupRefused, r"J2 \(node 2\): serial number 1018h:04 is 1003, .* expects 1002"),
+    FaultKind.SILENT: (
+        NodeMissing,
+        r"J2 \(node 2\) did not answer within 1 s \(answered: 1, 3, "
+        r"4, 5, 6\)",
+    ),
+    FaultKind.OTHER_SERIAL: (
+        SetupRefused,
+        r"J2 \(node 2\): serial number 1018h:04 is 1003, .* "
+        r"expects 1002",
+    ),
     FaultKind.REFUSES_NMT: (
         StateRefused,
         r"J2 \(node 2\): asked for NMT OPERATIONAL, its heartbeat still says PRE-OPERATIONAL",
@@ -27,13 +37,21 @@ REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {
         SetupRefused,
         r"J2 \(node 2\): TPDO1: writing 0x0 to 1A00h:00: aborted.*0x06010002",
     ),
-    FaultKind.SHIFTED: (SetupRefused, r"J2 \(node 2\): object 6064h(:00)? is -?\d+ by SDO and -?\d+ in its PDO"),
+    FaultKind.SHIFTED: (
+        SetupRefused,
+        r"J2 \(node 2\): object 6064h(:00)? is -?\d+ by SDO and "
+        r"-?\d+ in its PDO",
+    ),
     FaultKind.SECOND_MASTER: (BusBusy, r"a SYNC \(080h\) that we did not send"),
     FaultKind.SYNC_PRODUCER: (
         BusBusy,
         r"a SYNC \(080h\) that we did not send; .* no other master, .* SYNC producer",
     ),
-    FaultKind.SDO_MASTER: (BusBusy, r"an SDO request to J2 \(node 2\) \(602h\) that we did not send"),
+    FaultKind.SDO_MASTER: (
+        BusBusy,
+        r"an SDO request to J2 \(node 2\) \(602h\) that we "
+        r"did not send",
+    ),
 }
 
 
@@ -52,4 +70,6 @@ def test_a_fault_from_the_start_is_refused_by_name_before_anything_moves(kind: F
 def test_an_amplifier_without_consumer_heartbeat_is_recorded_and_said_so() -> None:
     outcome = run("no guard", FaultSpec(FaultKind.NO_GUARD, 1))
     assert outcome.error is None
-    assert outcome.unguarded == ("J2: no 1016h: it does NOT stop by itself when the recorder is killed",)
+    assert outcome.unguarded == (
+        "J2: no 1016h: it does NOT stop by itself when the recorder is killed",
+    )

@@ -11,7 +11,9 @@ from tests.drivers.scripted import ScriptedBus, cell
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_refused_nmt_command_is_reported_within_its_bound(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_nmt_command_is_reported_within_its_bound(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     network, bus = cell(2)
     commanded_ns: dict[bytes, int] = {}
     send = ScriptedBus.send
@@ -24,7 +26,11 @@ def test_a_refused_nmt_command_is_reported_within_its_bound(number: int, monkeyp
     monkeypatch.setattr(ScriptedBus, "send", noting)
     bus.nodes[number].obeys_nmt = False
     with network:
-        with pytest.raises(StateRefused, match=rf"J{number + 1} \(node {number + 1}\): asked for NMT OPERATIONAL"):
+        with pytest.raises(
+            StateRefused,
+            match=rf"J{number + 1} \(node {number + 1}\): asked for "
+            r"NMT OPERATIONAL",
+        ):
             network.prepare()
         waited_ns = bus.clock.now_ns - commanded_ns[bytes((NmtCommand.START, number + 1))]
         # The nodes before it are waited for first: sound ones confirm with their next heartbeat.

@@ -1,4 +1,6 @@
-"""The speed override of a first run: slower profiles for the amplifiers, in the log and in the report of a fit."""
+"""The speed override of a first run: slower profiles for the amplifiers,
+in the log and in the report of a fit.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +24,41 @@ from tests.daq.logs import content
 from tests.faults.cells import CONFIGS
 from tests.faults.test_scenario import PLAN
 
-PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION = 0x6081, 0x6083, 0x6084
+PROFILE_VELOCITY = 0x6081
+PROFILE_ACCELERATION = 0x6083
+PROFILE_DECELERATION = 0x6084
 
 
 def profiles(cell: SimulatedCell, index: int) -> list[int]:
-    """Last profile of the amplifiers; not the sixth, which rests where J5 and J6 turn against each other."""
+    """Last profile of the amplifiers; not the sixth,
+    which rests where J5 and J6 turn against each other.
+    """
     return [int.from_bytes(node.read(index, 0), "little") for node in cell.nodes[:5]]
 
 
 def recorded(folder: Path, speed: float) -> tuple[Path, list[list[int]]]:
     """A log, and the profile velocities, accelerations and decelerations of its last move."""
-    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", folder / "plan.yaml", folder / f"{speed}.mcap"
+    cell_file = CONFIGS / "cells" / "demo.yaml"
+    plan = folder / "plan.yaml"
+    out = folder / f"{speed}.mcap"
     plan.write_text(PLAN, encoding="utf-8")
     spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
     with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
-        arguments = ["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--speed", str(speed)]
+        arguments = [
+            "record",
+            str(cell_file),
+            str(plan),
+            "--out",
+            str(out),
+            "--enable-motion",
+            "--speed",
+            str(speed),
+        ]
         assert main([*arguments, "--operator", "test"]) == ExitCode.OK
-        reported = [profiles(cell, i) for i in (PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION)]
+        reported = [
+            profiles(cell, i)
+            for i in (PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION)
+        ]
     return out, reported
 
 
@@ -57,7 +77,9 @@ def test_a_first_run_is_slower_in_speed_and_ramps_and_its_log_says_so(
         load_run(whole)
         assert not caplog.messages
         load_run(slow)
-    assert [message for message in caplog.messages if "recorded at 50 % of the plan's speed" in message]
+    assert [
+        message for message in caplog.messages if "recorded at 50 % of the plan's speed" in message
+    ]
 
 
 @pytest.mark.parametrize("speed", ["0", "-0.5", "1.5", "nan", "fast"])

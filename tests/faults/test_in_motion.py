@@ -1,4 +1,6 @@
-"""Faults in the middle of a move: the name, the time to report it, and all axes without power at the end."""
+"""Faults in the middle of a move: the name, the time to report it,
+and all axes without power at the end.
+"""
 
 from __future__ import annotations
 
@@ -46,24 +48,54 @@ class Promise:
     toggle_bit: ToggleBit | None = None
 
 
-def at(kind: FaultKind, value: int = 0, cycles: int | None = None, axis: int | None = AXIS) -> FaultSpec:
+def at(
+    kind: FaultKind, value: int = 0, cycles: int | None = None, axis: int | None = AXIS
+) -> FaultSpec:
     return FaultSpec(kind, axis, STRIKE, cycles, value)
 
 
 STOPS = {
-    "emcy": Promise(at(FaultKind.EMERGENCY, 0x7305), DriveFault, "7305h incremental sensor 1 fault", EventKind.EMCY, 2),
-    "following-error": Promise(
-        at(FaultKind.FOLLOWING_ERROR), DriveFault, "8611h following error", EventKind.FOLLOWING_ERROR, 2
+    "emcy": Promise(
+        at(FaultKind.EMERGENCY, 0x7305),
+        DriveFault,
+        "7305h incremental sensor 1 fault",
+        EventKind.EMCY,
+        2,
     ),
-    "falls-back": Promise(at(FaultKind.FALLS_BACK), DriveFault, "8130h life guard error", EventKind.EMCY, 2),
+    "following-error": Promise(
+        at(FaultKind.FOLLOWING_ERROR),
+        DriveFault,
+        "8611h following error",
+        EventKind.FOLLOWING_ERROR,
+        2,
+    ),
+    "falls-back": Promise(
+        at(FaultKind.FALLS_BACK), DriveFault, "8130h life guard error", EventKind.EMCY, 2
+    ),
     "reboots": Promise(at(FaultKind.REBOOTS), DriveFault, "left OPERATIONAL", EventKind.NMT, 2),
     "loses-power": Promise(
-        at(FaultKind.LOSES_POWER), DriveFault, "left OPERATION ENABLED, is SWITCH ON DISABLED", EventKind.STATE, 2
+        at(FaultKind.LOSES_POWER),
+        DriveFault,
+        "left OPERATION ENABLED, is SWITCH ON DISABLED",
+        EventKind.STATE,
+        2,
     ),
-    "heartbeat": Promise(at(FaultKind.NO_HEARTBEAT), DriveFault, J3 + "no heart", EventKind.HEARTBEAT_LOST, 330),
-    "limit": Promise(at(FaultKind.LIMIT), DriveFault, J3 + "a limit has been active for 0.5 s", EventKind.LIMIT, 2),
-    "frozen": Promise(at(FaultKind.FROZEN), DriveFault, J3 + "move 0: .* do not change", EventKind.FROZEN, 60),
-    "stale": Promise(at(FaultKind.STALE), DriveFault, J3 + "move 0: .* do not change", EventKind.FROZEN, 60),
+    "heartbeat": Promise(
+        at(FaultKind.NO_HEARTBEAT), DriveFault, J3 + "no heart", EventKind.HEARTBEAT_LOST, 330
+    ),
+    "limit": Promise(
+        at(FaultKind.LIMIT),
+        DriveFault,
+        J3 + "a limit has been active for 0.5 s",
+        EventKind.LIMIT,
+        2,
+    ),
+    "frozen": Promise(
+        at(FaultKind.FROZEN), DriveFault, J3 + "move 0: .* do not change", EventKind.FROZEN, 60
+    ),
+    "stale": Promise(
+        at(FaultKind.STALE), DriveFault, J3 + "move 0: .* do not change", EventKind.FROZEN, 60
+    ),
     "stale, toggle bit": Promise(
         at(FaultKind.STALE),
         DriveFault,
@@ -81,15 +113,31 @@ STOPS = {
         toggle_bit=14,
     ),
     "sync-producer": Promise(
-        at(FaultKind.SYNC_PRODUCER), BusBusy, r"a SYNC \(080h\) that we did not send", EventKind.BUS_BUSY, 2
+        at(FaultKind.SYNC_PRODUCER),
+        BusBusy,
+        r"a SYNC \(080h\) that we "
+        r"did not send",
+        EventKind.BUS_BUSY,
+        2,
     ),
     "short-pdo": Promise(
-        at(FaultKind.SHORT_PDO), DriveFault, "PDO 183h has 7 bytes, its mapping has 8", EventKind.PDO_LENGTH, 2
+        at(FaultKind.SHORT_PDO),
+        DriveFault,
+        "PDO 183h has 7 bytes, its mapping has 8",
+        EventKind.PDO_LENGTH,
+        2,
     ),
-    "wrong-cob-id": Promise(at(FaultKind.WRONG_COB_ID), SampleLost, "no answer from J3", EventKind.SAMPLE_LOST, 2),
+    "wrong-cob-id": Promise(
+        at(FaultKind.WRONG_COB_ID), SampleLost, "no answer from J3", EventKind.SAMPLE_LOST, 2
+    ),
     "lost": Promise(at(FaultKind.LOST), SampleLost, "no answer from J3", EventKind.SAMPLE_LOST, 2),
     "second-master": Promise(
-        at(FaultKind.SECOND_MASTER, axis=None), BusBusy, r"a SYNC \(080h\) that we did not send", EventKind.BUS_BUSY, 2
+        at(FaultKind.SECOND_MASTER, axis=None),
+        BusBusy,
+        r"a SYNC \(080h\) that we "
+        r"did not send",
+        EventKind.BUS_BUSY,
+        2,
     ),
 }
 
@@ -122,7 +170,8 @@ def test_a_cell_that_falls_silent_is_reported_after_one_bound_not_after_one_a_no
     assert isinstance(outcome.error, SampleLost)
     assert "no axis answered within" in str(outcome.error)
     assert outcome.cycles_of(EventKind.SAMPLE_LOST, AXIS)[0] == STRIKE
-    assert outcome.ended_cycle - STRIKE <= 6  # each of them waits, but the first alone for a whole bound
+    # Each of them waits, but the first alone for a whole bound
+    assert outcome.ended_cycle - STRIKE <= 6
     notes = " ".join(outcome.error.__notes__)
     nodes = ", ".join(f"J{number} (node {number})" for number in range(1, 7))
     assert f"while stopping: {nodes} did not answer" in notes
@@ -135,7 +184,9 @@ def test_an_axis_that_falls_silent_stops_the_others_and_is_shouted() -> None:
     assert isinstance(outcome.error, SampleLost)
     others = [state for axis, state in enumerate(outcome.states) if axis != AXIS]
     assert set(others) == {PowerState.SWITCH_ON_DISABLED}
-    assert [event.axis for event in outcome.events if event.kind is EventKind.STOP_UNCONFIRMED] == [AXIS]
+    assert [event.axis for event in outcome.events if event.kind is EventKind.STOP_UNCONFIRMED] == [
+        AXIS
+    ]
     assert "J3 (node 3) did not answer" in " ".join(outcome.error.__notes__)
     assert outcome.restored_axes == tuple(axis for axis in range(6) if axis != AXIS)
 
@@ -147,7 +198,9 @@ def test_an_axis_that_is_cut_off_stops_by_itself_since_it_hears_no_recorder() ->
 
 
 def test_bus_off_is_reported_at_once_and_the_axes_stop_by_themselves() -> None:
-    outcome = run("bus off", at(FaultKind.BUS_OFF, axis=None), guard_ms=GUARD_MS, afterwards=2 * GUARD_MS)
+    outcome = run(
+        "bus off", at(FaultKind.BUS_OFF, axis=None), guard_ms=GUARD_MS, afterwards=2 * GUARD_MS
+    )
     assert isinstance(outcome.error, BusError)
     assert_matches("bus-off", outcome.error)
     assert outcome.cycles_of(EventKind.BUS_LOST)[0] - STRIKE <= 2
@@ -156,7 +209,8 @@ def test_bus_off_is_reported_at_once_and_the_axes_stop_by_themselves() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "field"), [(FaultKind.LOST, "missing"), (FaultKind.LATE, "late"), (FaultKind.DUPLICATE, "duplicate")]
+    ("kind", "field"),
+    [(FaultKind.LOST, "missing"), (FaultKind.LATE, "late"), (FaultKind.DUPLICATE, "duplicate")],
 )
 def test_a_single_bad_frame_is_counted_and_the_run_goes_on(kind: FaultKind, field: str) -> None:
     outcome: Outcome = run(f"one {field}", at(kind, cycles=1))

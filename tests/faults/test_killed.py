@@ -1,7 +1,8 @@
 """A recorder that ends without a word, as kill -9 ends it: the amplifiers stop by themselves.
 
-Most tests abandon a recorder in their own process; ``python -m tests.faults.test_killed`` kills a process of its own
-with SIGKILL, with a foreign node on every id from 1 to 127, or on those that are named.
+Most tests abandon a recorder in their own process; ``python -m tests.faults.test_killed`` kills a
+process of its own with SIGKILL, with a foreign node on every id from 1 to 127, or on those that are
+named.
 """
 
 from __future__ import annotations
@@ -54,14 +55,20 @@ CHANNEL, AXES = "can0", range(1, 7)
 
 @contextmanager
 def foreign_device(address: BusAddress, node_id: int) -> Iterator[None]:
-    """A plain device of another stack with a heartbeat of its own: `canopen.LocalNode` on the bus."""
+    """A plain device of another stack with a heartbeat of its own:
+    `canopen.LocalNode` on the bus.
+    """
     dictionary = ObjectDictionary()
     for index, kind in ((0x1000, UNSIGNED32), (0x1017, UNSIGNED16)):
         variable = ODVariable(f"object {index:04X}h", index)
         variable.data_type, variable.default = kind, 0
         dictionary.add_object(variable)
-    server = {"host": address.host, "port": address.port} if address.interface == "socketcand" else {}
-    with canopen.Network().connect(interface=address.interface, channel=address.channel, **server) as network:
+    server = (
+        {"host": address.host, "port": address.port} if address.interface == "socketcand" else {}
+    )
+    with canopen.Network().connect(
+        interface=address.interface, channel=address.channel, **server
+    ) as network:
         node = network.create_node(node_id, dictionary)
         node.nmt.state = "PRE-OPERATIONAL"
         node.sdo[0x1017].raw = HEARTBEAT_MS
@@ -71,7 +78,9 @@ def foreign_device(address: BusAddress, node_id: int) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Killed:
-    """End of axes whose recorder was killed while they moved; `refused` where it did not move them at all."""
+    """End of axes whose recorder was killed while they moved;
+    `refused` where it did not move them at all.
+    """
 
     refused: str
     states: frozenset[PowerState]
@@ -103,7 +112,9 @@ def moving(network: CanopenNetwork) -> Generator[Sample, None, None]:
 
 
 def demo_network(address: BusAddress) -> CanopenNetwork:
-    return CanopenNetwork(address, drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml")), guard_ms=GUARD_MS)
+    return CanopenNetwork(
+        address, drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml")), guard_ms=GUARD_MS
+    )
 
 
 def end_of(cell: SimulatedCell, start_rad: NDArray[np.float64], refused: str = "") -> Killed:
@@ -114,7 +125,9 @@ def end_of(cell: SimulatedCell, start_rad: NDArray[np.float64], refused: str = "
 
 
 def kill_recorder(name: str, *, guarded: bool = True, foreign_id: int | None = None) -> Killed:
-    """Abandon a recorder of this process in the middle of a move, and look on for longer than the amplifiers wait."""
+    """Abandon a recorder of this process in the middle of a move,
+    and look on for longer than the amplifiers wait.
+    """
     address = BusAddress("virtual", f"killed {name}")
     device = nullcontext() if foreign_id is None else foreign_device(address, foreign_id)
     with device, powered_cell(address, guarded=guarded) as cell:
@@ -146,18 +159,26 @@ def record_until_killed(port: int, samples: int, say: Callable[[str], object]) -
             return
         for number, sample in enumerate(moving(network)):
             if number == samples:
-                say(MOVING if all(word & 0x6F == 0x27 for word in sample.statusword) else "no axis is enabled")
+                say(
+                    MOVING
+                    if all(word & 0x6F == 0x27 for word in sample.statusword)
+                    else "no axis is enabled"
+                )
 
 
 def kill_process(foreign_id: int) -> Killed:
-    """Kill a recorder with SIGKILL, at another moment of its move for each id, beside a foreign node of this id."""
+    """Kill a recorder with SIGKILL, at another moment of its move for each id,
+    beside a foreign node of this id.
+    """
     (port_end, port_in), (said_end, said_in) = os.pipe(), os.pipe()
     # Forked while this process has one thread: bus, cell and device come afterwards.
     pid = os.fork()
     if pid == 0:
         try:
             port = int(os.read(port_end, 16))
-            record_until_killed(port, 100 + 3 * foreign_id, lambda text: os.write(said_in, text.encode()))
+            record_until_killed(
+                port, 100 + 3 * foreign_id, lambda text: os.write(said_in, text.encode())
+            )
         finally:
             os._exit(0)
     try:
@@ -167,7 +188,11 @@ def kill_process(foreign_id: int) -> Killed:
             cell = stack.enter_context(powered_cell(address))
             start_rad = cell.plant.motor_rad.copy()
             os.write(port_in, str(address.port).encode())
-            said = os.read(said_end, 4096).decode() if select.select((said_end,), (), (), READY_S)[0] else "no answer"
+            said = (
+                os.read(said_end, 4096).decode()
+                if select.select((said_end,), (), (), READY_S)[0]
+                else "no answer"
+            )
             if said == MOVING:
                 os.kill(pid, signal.SIGKILL)
             ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
@@ -183,9 +208,13 @@ def kill_process(foreign_id: int) -> Killed:
 
 @pytest.mark.parametrize("guarded", [True, False], ids=["1016h", "without"])
 def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool) -> None:
-    """Without 1016h the same axes go on to their target and keep their power: the guard is what stops them."""
+    """Without 1016h the same axes go on to their target and keep their power:
+    the guard is what stops them.
+    """
     end = kill_recorder(str(guarded), guarded=guarded)
-    assert end.states == {PowerState.SWITCH_ON_DISABLED if guarded else PowerState.OPERATION_ENABLED}
+    assert end.states == {
+        PowerState.SWITCH_ON_DISABLED if guarded else PowerState.OPERATION_ENABLED
+    }
     assert end.arrived != guarded
 
 
@@ -204,7 +233,10 @@ def test_no_foreign_device_takes_the_place_of_a_killed_recorder(node_id: int) ->
 @pytest.mark.processes
 def test_a_process_that_is_killed_leaves_no_axis_with_power() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tests.faults.test_killed", "3", "100"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "tests.faults.test_killed", "3", "100"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "1 refused, 1 killed while the axes moved: all stopped by themselves" in done.stdout
@@ -222,7 +254,9 @@ def main(ids: Sequence[int]) -> int:
         sys.stdout.write(f"{every_id} {'stopped' if good else 'MOVES ON'} {outcome.refused}\n")
         sys.stdout.flush()
     verdict = f"NOT as it must be: {moved_on}" if moved_on else "all stopped by themselves"
-    sys.stdout.write(f"{len(ids)} ids: {refused} refused, {stopped} killed while the axes moved: {verdict}\n")
+    sys.stdout.write(
+        f"{len(ids)} ids: {refused} refused, {stopped} killed while the axes moved: {verdict}\n"
+    )
     return int(bool(moved_on))
 
 

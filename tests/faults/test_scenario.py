@@ -1,4 +1,6 @@
-"""A scenario in the simulation file, through the command line: exit code, log, and what is left on the axes."""
+"""A scenario in the simulation file, through the command line:
+exit code, log, and what is left on the axes.
+"""
 
 from __future__ import annotations
 
@@ -42,24 +44,48 @@ def scenario(folder: Path, faults: str) -> Path:
     """A simulation file of the demo cell with these faults."""
     text = (CONFIGS / "simulation" / "clean.yaml").read_text(encoding="utf-8")
     path = folder / "scenario.yaml"
-    path.write_text(text.replace("urdf: ", f"urdf: {CONFIGS}/simulation/") + f"faults:\n{faults}", encoding="utf-8")
+    path.write_text(
+        text.replace("urdf: ", f"urdf: {CONFIGS}/simulation/") + f"faults:\n{faults}",
+        encoding="utf-8",
+    )
     return path
 
 
-def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_log(tmp_path: Path) -> None:
-    spec = load_simulation(scenario(tmp_path, "  - {fault: emergency, axis: J3, at_s: 0.2, emcy_code: 0x2310}\n"))
-    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_log(
+    tmp_path: Path,
+) -> None:
+    spec = load_simulation(
+        scenario(tmp_path, "  - {fault: emergency, axis: J3, at_s: 0.2, emcy_code: 0x2310}\n")
+    )
+    cell_file = CONFIGS / "cells" / "demo.yaml"
+    plan = tmp_path / "plan.yaml"
+    out = tmp_path / "a.mcap"
     plan.write_text(PLAN, encoding="utf-8")
     with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
-        code = main(["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--operator", "test"])
+        code = main(
+            [
+                "record",
+                str(cell_file),
+                str(plan),
+                "--out",
+                str(out),
+                "--enable-motion",
+                "--operator",
+                "test",
+            ]
+        )
         assert code == ExitCode.DEVICE_FAULT
         assert [node.drive.state for node in cell.nodes].count(PowerState.FAULT) <= 1
         assert not any(node.drive.powered for node in cell.nodes)
     assert not out.exists()
     saved = tmp_path / "saved.mcap"
     assert main(["salvage", str(tmp_path / "a.mcap.part"), "--out", str(saved)]) == ExitCode.OK
-    statistics = [event for event in read_log(saved).events if event.kind in (EventKind.EMCY, EventKind.STOP)]
-    assert [(event.kind, event.axis, event.code) for event in statistics[:1]] == [(EventKind.EMCY, 2, 0x2310)]
+    statistics = [
+        event for event in read_log(saved).events if event.kind in (EventKind.EMCY, EventKind.STOP)
+    ]
+    assert [(event.kind, event.axis, event.code) for event in statistics[:1]] == [
+        (EventKind.EMCY, 2, 0x2310)
+    ]
     assert EventKind.STOP in {event.kind for event in statistics}
 
 
@@ -90,18 +116,32 @@ def end_at_the_console() -> ProgramEnd:
 def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_consoles_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An SDO abort of the library is behind that error, and cannot be compared with other errors."""
+    """An SDO abort of the library is behind that error,
+    and cannot be compared with other errors.
+    """
     monkeypatch.setattr("daq.log.feed.Feed", WatchedFeed)
     spec = load_simulation(scenario(tmp_path, "  - {fault: refuses-mapping, axis: J2}\n"))
-    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    cell_file = CONFIGS / "cells" / "demo.yaml"
+    plan = tmp_path / "plan.yaml"
+    out = tmp_path / "a.mcap"
     plan.write_text(PLAN, encoding="utf-8")
     with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
-        command = ["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--json"]
+        command = [
+            "record",
+            str(cell_file),
+            str(plan),
+            "--out",
+            str(out),
+            "--enable-motion",
+            "--json",
+        ]
         assert main(command) == ExitCode.DEVICE_FAULT
         assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
     failure = json.loads(capsys.readouterr().err.splitlines()[-1])
     assert failure["kind"] == "SetupRefused"
-    assert failure["found"].startswith("J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted, Code 0x06010002")
+    assert failure["found"].startswith(
+        "J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted, Code 0x06010002"
+    )
     assert failure["expected"] == "a PDO that can be mapped for the recording"
     assert "switch the drive off and on" in failure["do"]
     told = f"{failure['found']}; expected {failure['expected']}; {failure['do']}"
@@ -109,7 +149,9 @@ def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_co
     assert not list(tmp_path.glob("*.mcap*"))
 
 
-def refuse(monkeypatch: pytest.MonkeyPatch, cell: SimulatedCell, action: str, index: int, sub: int) -> None:
+def refuse(
+    monkeypatch: pytest.MonkeyPatch, cell: SimulatedCell, action: str, index: int, sub: int
+) -> None:
     """Let J2 abort each reading or writing of an object."""
     server = cell.nodes[1]._sdo
     sound = getattr(server, action)
@@ -139,7 +181,9 @@ REFUSED_OBJECTS = [
     ("_read", 0x6061, 0, "profile position mode (1)"),
     ("_read", 0x6075, 0, "scale of the current"),
 ]
-"""Objects of each step of the set-up, and what the message says of them; tests/drivers has every object."""
+"""Objects of each step of the set-up, and what the message says of them;
+tests/drivers has every object.
+"""
 
 
 @pytest.mark.parametrize(
@@ -157,12 +201,22 @@ def test_an_abort_at_each_step_of_the_setup_is_exit_5_with_its_reason_and_consol
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("daq.log.feed.Feed", WatchedFeed)
-    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    cell_file = CONFIGS / "cells" / "demo.yaml"
+    plan = tmp_path / "plan.yaml"
+    out = tmp_path / "a.mcap"
     plan.write_text(PLAN, encoding="utf-8")
     spec = load_simulation(shipped_simulation("clean"))
     with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
         refuse(monkeypatch, cell, action, index, sub)
-        command = ["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--json"]
+        command = [
+            "record",
+            str(cell_file),
+            str(plan),
+            "--out",
+            str(out),
+            "--enable-motion",
+            "--json",
+        ]
         assert main(command) == ExitCode.DEVICE_FAULT
         assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
     failure = json.loads(capsys.readouterr().err.splitlines()[-1])
@@ -179,7 +233,13 @@ def test_an_abort_at_each_step_of_the_setup_is_exit_5_with_its_reason_and_consol
 def test_without_leave_nothing_is_sent_to_the_cell(tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
-    arguments = ["record", str(CONFIGS / "cells" / "demo.yaml"), str(plan), "--out", str(tmp_path / "a.mcap")]
+    arguments = [
+        "record",
+        str(CONFIGS / "cells" / "demo.yaml"),
+        str(plan),
+        "--out",
+        str(tmp_path / "a.mcap"),
+    ]
     assert main(arguments) == ExitCode.USAGE
 
 
@@ -216,7 +276,8 @@ def test_a_scenario_for_an_axis_that_the_cell_lacks_is_refused(tmp_path: Path) -
         load_simulation(scenario(tmp_path, "  - {fault: lost, axis: J7}\n"))
 
 
-# -- a scenario file of faults alone -----------------------------------------------------------------------------------
+# -- a scenario file of faults alone
+# -----------------------------------------------------------------------------------
 
 
 def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
@@ -233,9 +294,19 @@ def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
 
     monkeypatch.setattr("drivers.simulation.cell.SimulatedCell", Cell)
     faults = tmp_path / "faults.yaml"
-    faults.write_text("faults:\n  - {fault: limit, axis: J2, at_s: 1.5}\n  - {fault: silent}\n", encoding="utf-8")
+    faults.write_text(
+        "faults:\n  - {fault: limit, axis: J2, at_s: 1.5}\n  - {fault: silent}\n", encoding="utf-8"
+    )
     simulation = scenario(tmp_path, "  - {fault: lost, axis: 2, at_cycle: 7}\n")
-    arguments = ["simulate", str(simulation), "--interface", "virtual", "--channel", "scenario", "--faults"]
+    arguments = [
+        "simulate",
+        str(simulation),
+        "--interface",
+        "virtual",
+        "--channel",
+        "scenario",
+        "--faults",
+    ]
     assert main([*arguments, str(faults)]) == ExitCode.OK
     assert built[0].faults == (
         FaultSpec(FaultKind.LOST, 1, 7),
@@ -244,7 +315,9 @@ def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
     )
     assert "3 faults" in capsys.readouterr().out
     assert main([*arguments, "faults-example"]) == ExitCode.OK
-    assert built[1].faults == built[0].faults[:1] + load_scenario(shipped_simulation("faults-example"), 6, 1000)
+    assert built[1].faults == built[0].faults[:1] + load_scenario(
+        shipped_simulation("faults-example"), 6, 1000
+    )
 
 
 def test_the_example_names_every_kind_of_fault() -> None:
@@ -283,14 +356,23 @@ def test_a_wrong_scenario_file_is_refused_with_its_line(
         load_scenario(path, 6, 1000)
 
 
-def test_the_help_of_simulate_shows_how_to_give_a_scenario(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_of_simulate_shows_how_to_give_a_scenario(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["simulate", "--help"]) == ExitCode.OK
-    assert "drivegain simulate demo --payload disc --faults faults-example" in capsys.readouterr().out
+    assert (
+        "drivegain simulate demo --payload disc --faults faults-example"
+    ) in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     "times",
-    ["at_s: 1e308", "at_s: 1, for_s: 1e300", "at_cycle: 18446744073709551615", "at_s: 0, cycles: 1000000000001"],
+    [
+        "at_s: 1e308",
+        "at_s: 1, for_s: 1e300",
+        "at_cycle: 18446744073709551615",
+        "at_s: 0, cycles: 1000000000001",
+    ],
 )
 def test_a_time_that_no_cell_lives_to_see_is_reported(times: str, tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
@@ -300,7 +382,15 @@ def test_a_time_that_no_cell_lives_to_see_is_reported(times: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("kind", [FaultKind.BUS_OFF, FaultKind.ERROR_PASSIVE])
-def test_a_fault_that_the_hub_cannot_carry_is_reported_before_anything_moves(kind: FaultKind) -> None:
-    spec = replace(load_simulation(shipped_simulation("clean")), faults=(FaultSpec(kind, at_cycle=5),))
-    with Hub(("can0",)) as hub, open_bus(hub.address()) as bus, pytest.raises(SpecInvalid, match=kind.value):
+def test_a_fault_that_the_hub_cannot_carry_is_reported_before_anything_moves(
+    kind: FaultKind,
+) -> None:
+    spec = replace(
+        load_simulation(shipped_simulation("clean")), faults=(FaultSpec(kind, at_cycle=5),)
+    )
+    with (
+        Hub(("can0",)) as hub,
+        open_bus(hub.address()) as bus,
+        pytest.raises(SpecInvalid, match=kind.value),
+    ):
         SimulatedCell(spec, bus)

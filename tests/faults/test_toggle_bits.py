@@ -20,7 +20,9 @@ PERIOD_NS = 1_000_000
 BIT = 14
 
 
-def alarm_cycles(values: Sequence[int], update_period_us: int = 1000, missing: Sequence[int] = ()) -> list[int]:
+def alarm_cycles(
+    values: Sequence[int], update_period_us: int = 1000, missing: Sequence[int] = ()
+) -> list[int]:
     """Cycles in which the first of two axes is reported; the second has no such bit."""
     profile = replace(PROFILE, toggle_bit=BIT, update_period_us=update_period_us)
     bits = ToggleBits((Axis("J1", 1, profile, None), Axis("J2", 2, PROFILE, None)))
@@ -51,7 +53,9 @@ def test_an_amplifier_that_is_slower_than_sync_is_reported_after_two_of_its_peri
 @settings(deadline=None)
 @given(st.sets(st.integers(0, 199)))
 def test_a_lost_frame_proves_nothing(lost: set[int]) -> None:
-    """The values repeat the last ones then, and how often the bit has changed meanwhile is not known."""
+    """The values repeat the last ones then, and how often the bit has changed meanwhile is not
+    known.
+    """
     values: list[int] = []
     for cycle in range(200):
         values.append(values[-1] if cycle in lost and values else cycle % 2)
@@ -68,6 +72,8 @@ def test_only_a_bit_that_is_the_makers_own_can_be_a_toggle_bit_and_it_needs_a_so
     ):
         with pytest.raises(SchemaMismatch, match="toggle_bit"):
             drive_from_text(spoiled.encode(), "spoiled.yaml")
-    profile = drive_from_text(sourced.replace("tap:", "toggle_bit: 14\ntap:", 1).encode(), "good.yaml")
+    profile = drive_from_text(
+        sourced.replace("tap:", "toggle_bit: 14\ntap:", 1).encode(), "good.yaml"
+    )
     assert profile.toggle_bit == 14
     assert {fact.about for fact in profile.facts} >= {"toggle_bit", "save"}

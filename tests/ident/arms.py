@@ -22,12 +22,12 @@ def _chain(name: str, joints: tuple[tuple[str, str, str, str], ...]) -> Arm:
     for index, (kind, xyz, rpy, axis) in enumerate(joints):
         parent = "base" if index == 0 else f"link{index - 1}"
         text.append(
-            f'<joint name="q{index}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent link="{parent}"/>'
-            f'<child link="link{index}"/><axis xyz="{axis}"/>'
-            '<limit lower="-3" upper="3" velocity="3" effort="99"/></joint>'
-            f'<link name="link{index}"><inertial><origin xyz="0.0{index + 1} -0.02 0.1"/>'
-            f'<mass value="{4.0 - 0.4 * index}"/>'
-            '<inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" izz="0.02"/></inertial></link>'
+            f'<joint name="q{index}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent '
+            f'link="{parent}"/><child link="link{index}"/><axis xyz="{axis}"/><limit lower="-3" '
+            'upper="3" velocity="3" effort="99"/></joint><link '
+            f'name="link{index}"><inertial><origin xyz="0.0{index + 1} -0.02 0.1"/><mass '
+            f'value="{4.0 - 0.4 * index}"/><inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" '
+            'iyz="0.003" izz="0.02"/></inertial></link>'
         )
     return Arm(name, "".join([*text, "</robot>"]))
 

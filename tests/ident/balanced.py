@@ -20,12 +20,19 @@ from tests.ident.recordings import positions
 
 AXIS = 1
 RATE_HZ = 250.0
-FOOT_M, LEVER_M, TOWARDS_RAD, STIFFNESS_N_M, FREE_M = 0.69, 0.185, -1.45, 1e5, 0.405
+FOOT_M = 0.69
+LEVER_M = 0.185
+TOWARDS_RAD = -1.45
+STIFFNESS_N_M = 1e5
+FREE_M = 0.405
 GAINS = np.array([353.2, 344.5, 320.4, 196.1, 195.3, 137.6])
 NOISE_A = np.array([0.34, 0.78, 0.58, 0.2, 0.22, 0.25])
-FRICTION = np.array([[118, 152, 88, 14, 15, 7.5], [260, 310, 205, 38, 36, 19], [290, 340, 240, 52, 48, 27]]).T
+FRICTION = np.array(
+    [[118, 152, 88, 14, 15, 7.5], [260, 310, 205, 38, 36, 19], [290, 340, 240, 52, 48, 27]]
+).T
 CONDITIONING = Conditioning(standstill_rad_s=(0.02,) * 6)
-MASS_KG, CENTRE_M = 269.4, np.array([0.43, 0.11, -0.12])
+MASS_KG = 269.4
+CENTRE_M = np.array([0.43, 0.11, -0.12])
 REACH_RAD = np.array([2.0, 1.1, 2.2, 3.0, 2.0, 3.0])
 MIDDLE_RAD = np.array([0.0, -1.26, 0.3, 0.0, 0.0, 0.0])
 
@@ -34,7 +41,10 @@ def heavy_model() -> Model:
     """Six axes with the geometry and drive train of the shipped cell."""
     document = yaml.safe_load((CONFIGS / "cells/kr270.yaml").read_text(encoding="utf-8"))
     urdf = _urdf(CONFIGS / "robots/kr270.urdf")
-    return Model(robot_from_urdf(urdf), DriveTrain(np.array(document["drive_train"]["ratio"], dtype=np.float64)))
+    return Model(
+        robot_from_urdf(urdf),
+        DriveTrain(np.array(document["drive_train"]["ratio"], dtype=np.float64)),
+    )
 
 
 def _urdf(path: Path) -> str:
@@ -42,11 +52,15 @@ def _urdf(path: Path) -> str:
 
 
 def _balance(q: FloatArray, free_m: float) -> FloatArray:
-    """Slope of the energy k (s − s₀)²/2 of a spring from the foot to the end of the lever, by differences."""
+    """Slope of the energy k (s − s₀)²/2 of a spring from the foot to the end of the lever,
+    by differences.
+    """
 
     def energy(angle: FloatArray) -> FloatArray:
         lever = np.array([np.cos(angle - TOWARDS_RAD), np.sin(angle - TOWARDS_RAD)]) * LEVER_M
-        return np.asarray(0.5 * STIFFNESS_N_M * (np.hypot(lever[0] - FOOT_M, lever[1]) - free_m) ** 2)
+        return np.asarray(
+            0.5 * STIFFNESS_N_M * (np.hypot(lever[0] - FOOT_M, lever[1]) - free_m) ** 2
+        )
 
     return (energy(q + 1e-5) - energy(q - 1e-5)) / 2e-5
 
@@ -58,26 +72,36 @@ def heavy_runs(balanced: bool, free_m: float = FREE_M) -> tuple[Run, ...]:
         balanced: whether the second joint has a balancer.
         free_m: length of its spring without force.
     """
-    model, rng = heavy_model(), np.random.default_rng(1)
+    model = heavy_model()
+    rng = np.random.default_rng(1)
     links, _ = nominal_links(model.robot, _urdf(CONFIGS / "simulation/kr270-plant.urdf"))
     parameters = np.zeros(len(model.columns))
     own = parameters[: 14 * 6].reshape(6, 14)
     own[:, :10], own[:, 10:13] = links, FRICTION
-    inertia = np.diag([17.0, 14.0, 15.0]) + MASS_KG * (CENTRE_M @ CENTRE_M * np.eye(3) - np.outer(CENTRE_M, CENTRE_M))
+    inertia = np.diag([17.0, 14.0, 15.0]) + MASS_KG * (
+        CENTRE_M @ CENTRE_M * np.eye(3) - np.outer(CENTRE_M, CENTRE_M)
+    )
     body = np.concatenate((inertia[np.triu_indices(3)], MASS_KG * CENTRE_M, [MASS_KG]))
     runs = []
     for number in range(4):
-        payload = Payload("block", "a", {"m": MASS_KG}) if number % 2 else None
+        if number % 2:
+            payload = Payload("block", "a", {"m": MASS_KG})
+        else:
+            payload = None
         q = MIDDLE_RAD + positions(rng, 12.0, RATE_HZ, REACH_RAD)
         run = Run(f"run-{number}", np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), payload)
         data = differentiate(run, model.drive_train, CONDITIONING)
         total = parameters.copy()
         total[model.flange] += body if payload else 0.0
         torque = model.torques(data.motion(), total)[2]
-        torque[AXIS] += _balance(data.position_rad[:, AXIS], free_m) if balanced else 0.0
+        if balanced:
+            torque[AXIS] += _balance(data.position_rad[:, AXIS], free_m)
+        else:
+            torque[AXIS] += 0.0
         current = np.zeros_like(q)
         current[1:-1] = ((model.drive_train.to_motor @ torque) / GAINS[:, None]).T
-        noise, stays = rng.standard_normal(current.shape) * NOISE_A, np.exp(-1.0 / (RATE_HZ * 0.005))
+        noise = rng.standard_normal(current.shape) * NOISE_A
+        stays = np.exp(-1.0 / (RATE_HZ * 0.005))
         for k in range(1, len(noise)):
             noise[k] = stays * noise[k - 1] + np.sqrt(1.0 - stays**2) * noise[k]
         runs.append(Run(run.name, run.time_s, q, current + noise, payload))

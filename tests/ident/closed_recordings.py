@@ -1,4 +1,6 @@
-"""Recordings of closed chains that obey the declared model exactly: what an estimator must give back."""
+"""Recordings of closed chains that obey the declared model exactly:
+what an estimator must give back.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +41,12 @@ def _body(rng: np.random.Generator, mass: float) -> FloatArray:
     return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
 
 
-def axis_positions(mechanism: Mechanism, rng: np.random.Generator, seconds: float, share: float = 1.0) -> FloatArray:
-    """Positions of the motors that the closures allow, around the assembly pose, shape (k, m), in a share of all."""
+def axis_positions(
+    mechanism: Mechanism, rng: np.random.Generator, seconds: float, share: float = 1.0
+) -> FloatArray:
+    """Positions of the motors that the closures allow, around the assembly pose, shape (k, m),
+    in a share of all.
+    """
     robot = mechanism.robot
     home = mechanism.model.assembly.position_rad[list(robot.axis_joints)]
     if mechanism is not PLANAR:
@@ -51,8 +57,12 @@ def axis_positions(mechanism: Mechanism, rng: np.random.Generator, seconds: floa
     return np.asarray(motors + 2.0 * np.pi * np.round((home - motors[0]) / (2.0 * np.pi)))
 
 
-def preload_of(model: Model, to_motors: FloatArray, time_s: FloatArray, size_nm: float) -> FloatArray:
-    """Torques of the motors that work against each other, shape (k, m): zero of a robot that is not redundant."""
+def preload_of(
+    model: Model, to_motors: FloatArray, time_s: FloatArray, size_nm: float
+) -> FloatArray:
+    """Torques of the motors that work against each other, shape (k, m):
+    zero of a robot that is not redundant.
+    """
     samples, count, free = to_motors.shape
     out = np.zeros((samples, count))
     whole, _ = np.linalg.qr(to_motors, mode="complete")
@@ -74,8 +84,11 @@ def recorded(
     preload_nm: float = 0.3,
     share: float = 1.0,
 ) -> Made:
-    """A run without load and one with 2 kg on the platform, in a share of the workspace around its middle."""
-    model, rng = mechanism.model, np.random.default_rng(0)
+    """A run without load and one with 2 kg on the platform,
+    in a share of the workspace around its middle.
+    """
+    model = mechanism.model
+    rng = np.random.default_rng(0)
     standard = np.zeros(len(model.columns))
     for columns in model.link_columns:
         standard[columns] = _body(rng, rng.uniform(0.3, 1.5))
@@ -83,7 +96,8 @@ def recorded(
         standard[14 * joint + 10 : 14 * joint + 14] = 0.02, 0.3, 0.4, 0.05
     payload = _body(rng, 2.0)
     conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count)
-    rng, runs = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    runs = []
     for mounted in (None, MOUNTED):
         drawn = axis_positions(mechanism, rng, seconds, share)
         q = drawn[::AVERAGED]
@@ -94,7 +108,9 @@ def recorded(
         if mounted is not None:
             whole[model.flange] += payload
         torque = np.einsum("mck,c->km", model.regressor(data.motion()), whole)
-        torque = torque + preload_of(model, model.follow(data.motion()).to_motors, data.time_s, preload_nm)
+        torque = torque + preload_of(
+            model, model.follow(data.motion()).to_motors, data.time_s, preload_nm
+        )
         noise = noise_a * rng.standard_normal(drawn.shape)
         current = np.add.reduceat(noise, np.arange(0, len(noise), AVERAGED)) / AVERAGED
         current[1:-1] += torque / mechanism.gains

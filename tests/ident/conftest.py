@@ -9,7 +9,15 @@ from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather
 from ident.estimators.estimate import Identification
 from ident.estimators.identify import identify
-from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
+from tests.ident.recordings import (
+    CONDITIONING,
+    MOUNTED,
+    Truth,
+    gathered,
+    record,
+    three_axes_truth,
+    tx40_truth,
+)
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +72,14 @@ def small_runs(small_truth: Truth) -> tuple[Run, ...]:
     """Four runs of it, every other one loaded, at a relative error of about seven per cent."""
     rng = np.random.default_rng(3)
     return tuple(
-        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
+        record(
+            small_truth,
+            f"run{index}",
+            rng,
+            MOUNTED if index % 2 else None,
+            noise_a=0.3,
+            seconds=22.0,
+        )
         for index in range(4)
     )
 

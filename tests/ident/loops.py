@@ -1,4 +1,6 @@
-"""Recordings of a cell whose disturbance goes round its position loop: it moves the arm and returns in the current."""
+"""Recordings of a cell whose disturbance goes round its position loop:
+it moves the arm and returns in the current.
+"""
 
 from __future__ import annotations
 
@@ -30,29 +32,39 @@ def record_in_loop(
     disturbance_nm: float,
     seconds: float = 20.0,
 ) -> Run:
-    """One run: I δq̈ + 2 D ω I δq̇ + ω² I δq = −d moves every joint off its demand, and g v = τ(q + δq) + d.
+    """One run: I δq̈ + 2 D ω I δq̇ + ω² I δq = −d moves every joint off its demand,
+    and g v = τ(q + δq) + d.
 
-    The currents obey the declared model for the recorded motion, with the error d; but that motion has seen d. It is
-    made at 1 kHz, and each sample of the run is the mean of four.
+    The currents obey the declared model for the recorded motion, with the error d; but that motion
+    has seen d. It is made at 1 kHz, and each sample of the run is the mean of four.
     """
     asked = record(truth, name, rng, payload, seconds=seconds, averaged=1)
-    rate_hz, count = asked.rate_hz, len(truth.gains)
+    rate_hz = asked.rate_hz
+    count = len(truth.gains)
     memory = np.exp(-1.0 / (rate_hz * CORRELATION_S))
-    white = rng.standard_normal((len(asked.time_s), count)) * disturbance_nm * np.sqrt(1.0 - memory**2)
+    white = (
+        rng.standard_normal((len(asked.time_s), count)) * disturbance_nm * np.sqrt(1.0 - memory**2)
+    )
     disturbance = signal.lfilter([1.0], [1.0, -memory], white, axis=0)
     omega = 2.0 * np.pi * LOOP_HZ
     moved = signal.cont2discrete(
-        (np.array([-1.0 / INERTIA_KG_M2]), np.array([1.0, 2.0 * DAMPING * omega, omega**2])), 1.0 / rate_hz
+        (np.array([-1.0 / INERTIA_KG_M2]), np.array([1.0, 2.0 * DAMPING * omega, omega**2])),
+        1.0 / rate_hz,
     )
     off = signal.lfilter(moved[0].ravel(), moved[1], disturbance, axis=0)
     q = asked.position_rad + off
     data = differentiate(
-        replace(asked, position_rad=q), truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * rate_hz)
+        replace(asked, position_rad=q),
+        truth.model.drive_train,
+        Conditioning(position_cutoff_hz=0.3 * rate_hz),
     )
     parameters = truth.parameters.copy()
     if payload is not None:
         parameters[truth.model.flange] += [PAYLOAD_TRUTH[p] for p in LINK_PARAMETERS]
-    torque = np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters) + disturbance[1:-1].T
+    torque = (
+        np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters)
+        + disturbance[1:-1].T
+    )
     current = np.zeros_like(q)
     current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T
     samples = len(q) // AVERAGED * AVERAGED

@@ -1,4 +1,6 @@
-"""Closed chains of our own for the tests of the science: five-bar, redundant planar platform, three parallel legs."""
+"""Closed chains of our own for the tests of the science:
+five-bar, redundant planar platform, three parallel legs.
+"""
 
 from __future__ import annotations
 
@@ -64,15 +66,21 @@ class _Urdf:
         self.parts = [f'<robot name="{name}"><link name="base"/>']
         self.count = 0
 
-    def joint(self, name: str, kind: str, parent: str, xyz: str, axis: str, rpy: str = "0 0 0") -> str:
-        """Add a joint and the link behind it, which has the joint's name and a mass unlike any other; its name."""
+    def joint(
+        self, name: str, kind: str, parent: str, xyz: str, axis: str, rpy: str = "0 0 0"
+    ) -> str:
+        """Add a joint and the link behind it, which has the joint's name and a mass unlike any
+        other; its name.
+        """
         self.count += 1
-        mass, along = 0.4 + 0.17 * self.count, 0.03 + 0.01 * (self.count % 5)
+        mass = 0.4 + 0.17 * self.count
+        along = 0.03 + 0.01 * (self.count % 5)
         self.parts.append(
-            f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent link="{parent}"/>'
-            f'<child link="{name}"/><axis xyz="{axis}"/><limit lower="-3" upper="3" velocity="3" effort="99"/></joint>'
-            f'<link name="{name}"><inertial><origin xyz="{along} 0.01 -0.02"/><mass value="{mass}"/>'
-            '<inertia ixx="0.004" ixy="0.0003" ixz="-0.0002" iyy="0.006" iyz="0.0004" izz="0.005"/></inertial></link>'
+            f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent '
+            f'link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/><limit lower="-3" '
+            f'upper="3" velocity="3" effort="99"/></joint><link name="{name}"><inertial><origin '
+            f'xyz="{along} 0.01 -0.02"/><mass value="{mass}"/><inertia ixx="0.004" ixy="0.0003" '
+            'ixz="-0.0002" iyy="0.006" iyz="0.0004" izz="0.005"/></inertial></link>'
         )
         return name
 
@@ -89,7 +97,9 @@ class _Urdf:
         return "".join([*self.parts, "</robot>"])
 
 
-CRANK_M, ROD_M, BASE_M = 0.3, 0.4, 0.25
+CRANK_M = 0.3
+ROD_M = 0.4
+BASE_M = 0.25
 
 
 def _five_bar() -> Mechanism:
@@ -119,10 +129,13 @@ HALF_M = 0.1  #: Half the length of the platform: two legs hold each of its ends
 
 
 def leg_angles(pose: FloatArray, leg: int) -> tuple[FloatArray, FloatArray]:
-    """Both joint angles of a leg of the planar platform, each (k,), at poses (x, y, angle), shape (k, 3)."""
+    """Both joint angles of a leg of the planar platform, each (k,), at poses (x, y, angle),
+    shape (k, 3).
+    """
     x, y, side = LEGS[leg]
     end = -HALF_M if leg < 2 else HALF_M
-    dx, dy = pose[:, 0] + end * np.cos(pose[:, 2]) - x, pose[:, 1] + end * np.sin(pose[:, 2]) - y
+    dx = pose[:, 0] + end * np.cos(pose[:, 2]) - x
+    dy = pose[:, 1] + end * np.sin(pose[:, 2]) - y
     apart = np.hypot(dx, dy)
     first = np.arctan2(dy, dx) + side * np.arccos(0.5 * apart / LEG_M)
     elbow = np.arctan2(dy - LEG_M * np.sin(first), dx - LEG_M * np.cos(first)) - first
@@ -130,7 +143,8 @@ def leg_angles(pose: FloatArray, leg: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _planar() -> Mechanism:
-    urdf, home = _Urdf("planar"), np.zeros((1, 3))
+    urdf = _Urdf("planar")
+    home = np.zeros((1, 3))
     assembly: dict[str, float] = {}
     for leg, (x, y, _) in enumerate(LEGS):
         crank = urdf.joint(f"motor-{leg}", "revolute", "base", f"{x} {y} 0", "0 0 1")
@@ -147,7 +161,9 @@ def _planar() -> Mechanism:
         name="planar",
         urdf=urdf.text,
         motors=tuple(f"motor-{leg}" for leg in range(4)),
-        closures=tuple(LinkPair(f"corner {n}", f"corner-{n}", f"tip-{n}", ("x", "y")) for n in (1, 2, 3)),
+        closures=tuple(
+            LinkPair(f"corner {n}", f"corner-{n}", f"tip-{n}", ("x", "y")) for n in (1, 2, 3)
+        ),
         platform="platform",
         mobility=3,
         gains=np.array([2.0, -1.5, 1.8, 2.2]),
@@ -155,16 +171,28 @@ def _planar() -> Mechanism:
     )
 
 
-SLIDE_M, WIDTH_M = 0.31, 0.08
+SLIDE_M = 0.31
+WIDTH_M = 0.08
 
 
 def _three_legs() -> Mechanism:
     """A slide along each axis, and a parallelogram from it to a platform that only translates."""
     urdf = _Urdf("three-legs")
-    turns = ("0 0 0", "1.5707963267948966 0 1.5707963267948966", "-1.5707963267948966 -1.5707963267948966 0")
+    turns = (
+        "0 0 0",
+        "1.5707963267948966 0 1.5707963267948966",
+        "-1.5707963267948966 -1.5707963267948966 0",
+    )
     for leg, rpy in enumerate(turns):
         axes = np.roll(np.eye(3), leg, axis=1)[0]
-        slide = urdf.joint(f"slide-{leg}", "prismatic", "base", " ".join(map(str, -SLIDE_M * axes)), "1 0 0", rpy=rpy)
+        slide = urdf.joint(
+            f"slide-{leg}",
+            "prismatic",
+            "base",
+            " ".join(map(str, -SLIDE_M * axes)),
+            "1 0 0",
+            rpy=rpy,
+        )
         turn = urdf.joint(f"turn-{leg}", "revolute", slide, "0 0 0", "0 1 0")
         bar = urdf.joint(f"bar-{leg}", "revolute", turn, f"0 {0.5 * WIDTH_M} 0", "0 0 1")
         other = urdf.joint(f"other-bar-{leg}", "revolute", turn, f"0 {-0.5 * WIDTH_M} 0", "0 0 1")
@@ -174,13 +202,17 @@ def _three_legs() -> Mechanism:
         hand = urdf.joint(f"hand-{leg}", "revolute", coupler, f"0 {-0.5 * WIDTH_M} 0", "0 1 0")
         urdf.frame(f"centre-{leg}", hand, "0 0 0")
     rigid = ("x", "y", "z", "rx", "ry", "rz")
-    # The frames of the legs are turned against each other: a frame of leg 0 in the directions of leg n.
+    # The frames of the legs are turned against each other: a frame of leg 0 in the directions of
+    # leg n.
     for leg, rpy in ((1, turns[1]), (2, turns[2])):
         urdf.parts.append(
             f'<joint name="seat-{leg}" type="fixed"><origin rpy="{rpy}"/><parent link="hand-0"/>'
             f'<child link="seat-{leg}"/></joint><link name="seat-{leg}"/>'
         )
-    closures = [LinkPair(f"parallelogram {n}", f"coupler-end-{n}", f"bar-end-{n}", ("x", "y")) for n in range(3)]
+    closures = [
+        LinkPair(f"parallelogram {n}", f"coupler-end-{n}", f"bar-end-{n}", ("x", "y"))
+        for n in range(3)
+    ]
     closures += [LinkPair(f"platform {n}", f"seat-{n}", f"centre-{n}", rigid) for n in (1, 2)]
     return Mechanism(
         name="three-legs",
@@ -194,5 +226,7 @@ def _three_legs() -> Mechanism:
     )
 
 
-FIVE_BAR, PLANAR, THREE_LEGS = _five_bar(), _planar(), _three_legs()
+FIVE_BAR = _five_bar()
+PLANAR = _planar()
+THREE_LEGS = _three_legs()
 MECHANISMS = (FIVE_BAR, PLANAR, THREE_LEGS)

@@ -46,18 +46,26 @@ def small_recordings(
         bodies: what a run carries in place of what it says, shape (10,); zero for nothing.
         seconds, noise_a: of each run.
     """
-    rng, runs, carried = np.random.default_rng(seed), list[Run](), bodies or {}
+    rng = np.random.default_rng(seed)
+    runs = list[Run]()
+    carried = bodies or {}
     for index in range(count):
         parameters = truth.parameters.copy()
         if index in carried:
             parameters[truth.model.flange] += carried[index] - (BODY if index % 2 else 0.0)
         payload = MOUNTED if index % 2 else None
         planted = replace(truth, parameters=parameters)
-        runs.append(record(planted, f"r{index}", rng, payload, seconds=seconds, noise_a=noise_a, rate_hz=200.0))
+        runs.append(
+            record(
+                planted, f"r{index}", rng, payload, seconds=seconds, noise_a=noise_a, rate_hz=200.0
+            )
+        )
     return runs
 
 
-def with_currents(runs: Sequence[Run], factor: FloatArray | float, order: Sequence[int] = (0, 1, 2)) -> list[Run]:
+def with_currents(
+    runs: Sequence[Run], factor: FloatArray | float, order: Sequence[int] = (0, 1, 2)
+) -> list[Run]:
     """The same with each current multiplied, and the channels in another order."""
     return [replace(run, current_a=(run.current_a * factor)[:, list(order)]) for run in runs]
 

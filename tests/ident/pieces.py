@@ -14,7 +14,9 @@ SECONDS = 4.0
 NOISE = 0.04  #: Of the current, as a share of its root mean square; lag one of rows 0.67
 
 
-def noisy_pieces(truth: Truth, seed: int, count: int = 8, seconds: float = SECONDS) -> tuple[Run, ...]:
+def noisy_pieces(
+    truth: Truth, seed: int, count: int = 8, seconds: float = SECONDS
+) -> tuple[Run, ...]:
     """Runs in the order bare, loaded, loaded, bare, …, each with moves and noise of its own."""
     rng = np.random.default_rng(seed)
     pieces = []
@@ -35,5 +37,8 @@ def with_noise(run: Run, rng: np.random.Generator, share: float = NOISE) -> Run:
 def first_samples(run: Run, count: int) -> Run:
     """The run as it was after so many samples."""
     return replace(
-        run, time_s=run.time_s[:count], position_rad=run.position_rad[:count], current_a=run.current_a[:count]
+        run,
+        time_s=run.time_s[:count],
+        position_rad=run.position_rad[:count],
+        current_a=run.current_a[:count],
     )

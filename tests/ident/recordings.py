@@ -1,4 +1,6 @@
-"""Recordings that obey the declared model exactly, made by its own regressor: what an estimator must give back."""
+"""Recordings that obey the declared model exactly, made by its own regressor:
+what an estimator must give back.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,11 @@ RATIO = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
 RATIO[5, 4] = 32.0
 GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
 PAYLOAD_TRUTH = dict(
-    zip(LINK_PARAMETERS, (0.08, -0.012, 0.022, 0.082, 0.032, 0.052, -0.24, -0.25, 0.39, 4.59), strict=True)
+    zip(
+        LINK_PARAMETERS,
+        (0.08, -0.012, 0.022, 0.082, 0.032, 0.052, -0.24, -0.25, 0.39, 4.59),
+        strict=True,
+    )
 )
 MOUNTED = Payload("disc", "a", {"m": 4.59})
 CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 6)
@@ -68,8 +74,8 @@ def tx40_truth(seed: int = 0) -> Truth:
 def three_axes_truth() -> Truth:
     """An arm of three axes without coupling.
 
-    Its rotors are light: what is seen of Ia2 is regrouped with the inertia of the links, which elasticity and backlash
-    speak of, and would make them look smaller than they are.
+    Its rotors are light: what is seen of Ia2 is regrouped with the inertia of the links, which
+    elasticity and backlash speak of, and would make them look smaller than they are.
     """
     model = Model(robot_from_urdf(THREE_AXES.urdf), DriveTrain(np.diag([40.0, 50.0, -45.0])))
     friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (0.02, 1.6, 6.3))
@@ -79,8 +85,16 @@ def three_axes_truth() -> Truth:
 
 def gantry_truth() -> Truth:
     """Three linear axes with a wrist of two, the arm in an upright gravity."""
-    model = Model(robot_from_urdf(GANTRY.urdf), DriveTrain(np.diag([120.0, 120.0, 150.0, 40.0, 50.0])))
-    friction = ((8.0, 20.0, 15.0), (6.0, 15.0, 12.0), (3.0, 10.0, 9.0), (0.03, 1.0, 2.0), (0.02, 0.8, 1.5))
+    model = Model(
+        robot_from_urdf(GANTRY.urdf), DriveTrain(np.diag([120.0, 120.0, 150.0, 40.0, 50.0]))
+    )
+    friction = (
+        (8.0, 20.0, 15.0),
+        (6.0, 15.0, 12.0),
+        (3.0, 10.0, 9.0),
+        (0.03, 1.0, 2.0),
+        (0.02, 0.8, 1.5),
+    )
     parameters = _parameters(model, (15.0, 12.0, 8.0, 4.0, 2.0), friction, np.random.default_rng(3))
     offset_n = [20.0, -15.0, 10.0]
     parameters[[13, 27, 41]] = offset_n
@@ -114,18 +128,24 @@ def _parameters(
     return parameters
 
 
-def positions(rng: np.random.Generator, seconds: float, rate_hz: float, limits: FloatArray) -> FloatArray:
+def positions(
+    rng: np.random.Generator, seconds: float, rate_hz: float, limits: FloatArray
+) -> FloatArray:
     """Point-to-point moves with smooth ramps and no dwell, shape (k, n)."""
     count = round(seconds * rate_hz)
     knots = rng.uniform(-1.0, 1.0, (round(seconds / 1.1) + 2, len(limits))) * limits
     stairs = np.repeat(knots, round(1.1 * rate_hz), axis=0)[:count]
     window = np.hanning(round(0.9 * rate_hz))
     padded = np.concatenate(
-        (np.repeat(stairs[:1], len(window), axis=0), stairs, np.repeat(stairs[-1:], len(window), axis=0))
+        (
+            np.repeat(stairs[:1], len(window), axis=0),
+            stairs,
+            np.repeat(stairs[-1:], len(window), axis=0),
+        )
     )
-    return np.asarray(signal.fftconvolve(padded, (window / window.sum())[:, None], mode="same", axes=0))[
-        len(window) : len(window) + count
-    ]
+    return np.asarray(
+        signal.fftconvolve(padded, (window / window.sum())[:, None], mode="same", axes=0)
+    )[len(window) : len(window) + count]
 
 
 def record(
@@ -140,7 +160,8 @@ def record(
     averaged: int | None = None,
     bend: Callable[[FloatArray], FloatArray] = lambda q: q,
 ) -> Run:
-    """One run: the current is what the model needs for the (bent) motion, plus noise on the current alone.
+    """One run: the current is what the model needs for the (bent) motion,
+    plus noise on the current alone.
 
     Args:
         truth: the robot.
@@ -150,8 +171,9 @@ def record(
         seconds: duration.
         noise_a: σ of each sample that is drawn [A].
         rate_hz: of the samples that are drawn.
-        averaged: how many of them become one sample of the run; where None, 4 of 1 kHz, else 1. Fewer tell the filters
-            of a fit, which end at some 10 Hz, the same, and are worked on in a quarter of the time.
+        averaged: how many of them become one sample of the run; where None, 4 of 1 kHz, else 1.
+            Fewer tell the filters of a fit, which end at some 10 Hz, the same, and are worked on in
+            a quarter of the time.
         bend: the motion that is made, of the positions that are drawn.
     """
     drawn_hz = rate_hz
@@ -163,8 +185,11 @@ def record(
     q = drawn[::averaged]
     time = np.arange(len(q)) / rate_hz
     bare = Run(name, time, q, np.zeros_like(q))
-    # The recorded positions are band-limited far below this cut-off, so these derivatives are the motion's own.
-    data = differentiate(bare, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * rate_hz))
+    # The recorded positions are band-limited far below this cut-off, so these derivatives are the
+    # motion's own.
+    data = differentiate(
+        bare, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * rate_hz)
+    )
     columns = truth.model.regressor(data.motion())
     parameters = truth.parameters.copy()
     if payload is not None:
@@ -184,7 +209,8 @@ def gathered(truth: Truth, runs: tuple[Run, ...], holdout: tuple[Run, ...] = ())
 
 
 def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArray]) -> Evidence:
-    """Recordings in which the joints need more torque than the declared model says, fitted again without holding it.
+    """Recordings in which the joints need more torque than the declared model says,
+    fitted again without holding it.
 
     Args:
         clean: without hold-out runs.
@@ -192,13 +218,20 @@ def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArra
         torque_nm: of all joints along a run, shape (n, k).
     """
     rows = [decimate_rows(data, clean.conditioning, torque_nm(data)) for data in clean.datasets]
-    return with_current(clean, truth.model.drive_train.to_motor @ np.concatenate(rows, axis=1) / truth.gains[:, None])
+    return with_current(
+        clean,
+        truth.model.drive_train.to_motor @ np.concatenate(rows, axis=1) / truth.gains[:, None],
+    )
 
 
 def with_current(clean: Evidence, added_a: FloatArray) -> Evidence:
     """The same with more current on the decimated rows, shape (n, r), fitted again."""
-    training = replace(clean.rows_without_effects, current=clean.rows_without_effects.current + added_a)
-    return replace(clean, rows_without_effects=training, training=training, estimate=ml(training.system()))
+    training = replace(
+        clean.rows_without_effects, current=clean.rows_without_effects.current + added_a
+    )
+    return replace(
+        clean, rows_without_effects=training, training=training, estimate=ml(training.system())
+    )
 
 
 def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
@@ -208,7 +241,9 @@ def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
 
 def search_problem_of(evidence: Evidence, cache: ColumnCache | None = None) -> SearchProblem:
     """The residual of the runs of the fit."""
-    return prepare_search(evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache)
+    return prepare_search(
+        evidence.model, evidence.fit_runs, evidence.training, evidence.estimate, cache
+    )
 
 
 def whole(jacobian: Jacobian) -> FloatArray:
@@ -218,7 +253,8 @@ def whole(jacobian: Jacobian) -> FloatArray:
 
 def training_error(evidence: Evidence) -> RelativeError:
     """Error on the rows of the fit [%]."""
-    estimate, rows = evidence.estimate, evidence.training
+    estimate = evidence.estimate
+    rows = evidence.training
     return relative_error(rows.torque(estimate.gains), estimate.predicted_torque(rows), rows.use)
 
 
@@ -228,20 +264,26 @@ def calibrated(evidence: Evidence) -> Calibration:
     axes = tuple(f"J{number}" for number in range(1, len(estimate.gains) + 1))
     parameters = tuple(
         Parameter(column.name, float(value), float(std), column.unit)
-        for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+        for column, value, std in zip(
+            estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True
+        )
     )
     effects = []
     for placed in evidence.effects:
         names = {column.name for column in placed.columns}
         coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
         setting = {name: float(value) for name, value in placed.effect.settings.items()}
-        effects.append(AcceptedEffect(placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0))
+        effects.append(
+            AcceptedEffect(placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0)
+        )
     whole = a_calibration(estimate.gains, parameters, estimate.gains_std)
     references = []
     for one in mass_responses(evidence.identification.system, estimate):
         gain_per_kg = one.gain_per_kg.tolist()
         parameters_per_kg = one.parameters_per_kg.tolist()
-        references.append(PayloadMass.of(one.payload, one.mass_kg, gain_per_kg, whole.gains, parameters_per_kg))
+        references.append(
+            PayloadMass.of(one.payload, one.mass_kg, gain_per_kg, whole.gains, parameters_per_kg)
+        )
     return replace(
         whole,
         payload_mass=tuple(references),

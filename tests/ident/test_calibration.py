@@ -1,4 +1,6 @@
-"""From arrays to effects to a prediction with `import ident` alone: found effects are part of the calibration."""
+"""From arrays to effects to a prediction with `import ident` alone:
+found effects are part of the calibration.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from ident.equations.rows import decimate_rows
 from ident.prediction import placed_effect
 from tests.ident.recordings import Truth
 
-AXES, NAMEPLATE = ("J1", "J2", "J3"), (32.0, 34.0, -23.0)
+AXES = ("J1", "J2", "J3")
+NAMEPLATE = (32.0, 34.0, -23.0)
 DELAY_S = 0.008
 
 
@@ -38,7 +41,9 @@ def late(small_runs: tuple[ident.Run, ...]) -> tuple[ident.Run, ...]:
 
 
 @pytest.fixture(scope="module")
-def searched(small_truth: Truth, late: tuple[ident.Run, ...]) -> tuple[ident.Identification, tuple[ident.Step, ...]]:
+def searched(
+    small_truth: Truth, late: tuple[ident.Run, ...]
+) -> tuple[ident.Identification, tuple[ident.Step, ...]]:
     """First estimate, and the turns of the search."""
     found = ident.identify(small_truth.model, late[:3], Conditioning(), holdout=late[3:])
     families = ((TimeSkew(),), (Coupling(2, 1), Coupling(3, 1)))
@@ -70,7 +75,9 @@ def test_a_skew_found_on_all_axes_is_predicted(
     data = ident.differentiate(late[3], found.model.drive_train, found.conditioning)
 
     def left(of: ident.Calibration) -> float:
-        rest = np.where(data.moving, ident.predict_current(of, found.model, data) - data.current_a, 0.0)
+        rest = np.where(
+            data.moving, ident.predict_current(of, found.model, data) - data.current_a, 0.0
+        )
         return float(np.linalg.norm(decimate_rows(data, found.conditioning, rest.T)))
 
     without = ident.calibration_of(found, AXES, NAMEPLATE)
@@ -83,7 +90,9 @@ def test_errors_without_a_held_out_run_are_those_of_left_out_moves(
 ) -> None:
     found, steps = searched
     blind = tuple(replace(step, after=replace(step.after, holdout=None)) for step in steps)
-    (skew,) = ident.calibration_of(replace(found, holdout=None), AXES, NAMEPLATE, steps=blind).effects
+    (skew,) = ident.calibration_of(
+        replace(found, holdout=None), AXES, NAMEPLATE, steps=blind
+    ).effects
     assert steps[0].accepted is not None
     assert skew.error_before_percent == steps[0].accepted.error_before_percent
 
@@ -104,5 +113,7 @@ def test_only_an_effect_on_all_motors_is_on_all_axes(
     placed, _ = placed_effect(calibration.effects[0], calibration)
     assert placed in steps[-1].after.effects
     spring = replace(calibration.effects[0], name="spring")
-    with pytest.raises(ident.EffectRefused, match="'spring' acts on axis 'all axes'; there are J1, J2, J3"):
+    with pytest.raises(
+        ident.EffectRefused, match="'spring' acts on axis 'all axes'; there are J1, J2, J3"
+    ):
         placed_effect(spring, calibration)

@@ -1,4 +1,6 @@
-"""External torque: a push is found, quiet motion raises no alarm, and the band is as wide as the residual."""
+"""External torque: a push is found, quiet motion raises no alarm,
+and the band is as wide as the residual.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +11,22 @@ import pytest
 from scipy import signal, stats
 
 from ident.calibration import Calibration, Parameter
-from ident.contact import PREDICTED_SHARE, SCALE_MARGIN, alarm_level, external_torque, prediction_band
+from ident.contact import (
+    PREDICTED_SHARE,
+    SCALE_MARGIN,
+    alarm_level,
+    external_torque,
+    prediction_band,
+)
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from tests.ident.recordings import FloatArray, Truth, a_calibration, record
 from tests.ident.weighed import RATE_HZ, coloured
 
-PUSHED, START_S, END_S = 1, 12.0, 12.6
+PUSHED = 1
+START_S = 12.0
+END_S = 12.6
 CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 3)
 
 
@@ -24,7 +34,9 @@ CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 3)
 def calibration(small_truth: Truth) -> Calibration:
     """Exact: what is left is the noise alone."""
     columns = zip(small_truth.model.columns, small_truth.parameters, strict=True)
-    return a_calibration(small_truth.gains, tuple(Parameter(one.name, float(v), 0.0, one.unit) for one, v in columns))
+    return a_calibration(
+        small_truth.gains, tuple(Parameter(one.name, float(v), 0.0, one.unit) for one, v in columns)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +65,16 @@ def test_a_push_is_found_where_and_when_it_was(
     small_truth: Truth, calibration: Calibration, runs: tuple[Run, ...], learned_elsewhere: bool
 ) -> None:
     model = small_truth.model
-    band = prediction_band(calibration, model, runs[:2], CONDITIONING) if learned_elsewhere else None
+    if learned_elsewhere:
+        band = prediction_band(calibration, model, runs[:2], CONDITIONING)
+    else:
+        band = None
     quiet = external_torque(calibration, model, runs[2], CONDITIONING, band)
     assert quiet.contacts == ()
     torque_nm = -3.0 * float(np.median(quiet.threshold_nm[PUSHED]))
-    found = external_torque(calibration, model, _pushed(small_truth, runs[2], torque_nm), CONDITIONING, band)
+    found = external_torque(
+        calibration, model, _pushed(small_truth, runs[2], torque_nm), CONDITIONING, band
+    )
     (contact,) = found.contacts
     assert contact.axis == PUSHED
     assert contact.start_s == pytest.approx(START_S, abs=0.1)
@@ -82,14 +99,17 @@ def test_the_band_holds_its_share_and_follows_what_drives_the_residual(
 
 @pytest.mark.parametrize("kind", ["normal", "laplace"])
 def test_the_level_is_crossed_less_often_than_allowed(kind: str) -> None:
-    """Two minutes foretell five hours; and the level is no higher than three times what those hours hold."""
+    """Two minutes foretell five hours; and the level is no higher than three times what those hours
+    hold.
+    """
     rng = np.random.default_rng(4)
 
     def drawn(count: int) -> FloatArray:
         white = getattr(rng, kind)(size=count)
         return np.abs(signal.lfilter([1.0], [1.0, -0.67], white))
 
-    seen, later = drawn(6000), drawn(900_000)
+    seen = drawn(6000)
+    later = drawn(900_000)
     time_s: FloatArray = np.arange(len(seen)) * np.float64(0.02)
     level = alarm_level(seen, time_s, 0.1, 1.0, 120.0)
     assert level is not None
@@ -102,7 +122,9 @@ def test_the_level_is_crossed_less_often_than_allowed(kind: str) -> None:
 
 
 def test_a_heavy_tail_has_fewer_alarms_than_allowed_on_average() -> None:
-    """Student's t with five degrees of freedom, later 15 % larger; independent rows have an exact rate."""
+    """Student's t with five degrees of freedom, later 15 % larger;
+    independent rows have an exact rate.
+    """
     rng = np.random.default_rng(2001)
     seconds = 300.0
     rows_an_hour = 72_000

@@ -43,16 +43,26 @@ def test_every_error_has_one_root() -> None:
 
 
 def test_importing_it_brings_nothing_along() -> None:
-    words = "import sys, ident; print([m for m in ('numpy', 'scipy', 'ident.model') if m in sys.modules])"
+    words = (
+        "import sys, ident; print([m for m in ('numpy', 'scipy', 'ident.model') if m in "
+        "sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def test_from_arrays_to_gains_in_ten_lines(example: SimpleNamespace, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_arrays_to_gains_in_ten_lines(
+    example: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
     lines = [line[4:] for line in (ident.__doc__ or "").splitlines() if line.startswith("    ")]
     assert len(lines) <= 10
-    model = ident.Model(ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS)))
-    bare, loaded = (example.record(model, "x", payload, seed) for seed, payload in enumerate((None, example.DISC)))
+    model = ident.Model(
+        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    )
+    bare, loaded = (
+        example.record(model, "x", payload, seed)
+        for seed, payload in enumerate((None, example.DISC))
+    )
     given = {
         "np": np,
         "urdf_text": example.URDF,
@@ -68,9 +78,13 @@ def test_from_arrays_to_gains_in_ten_lines(example: SimpleNamespace, capsys: pyt
     assert capsys.readouterr().out.count("[") == 2
 
 
-def test_the_example_finds_the_gains(example: SimpleNamespace, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_finds_the_gains(
+    example: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
     found = example.main()
-    assert np.all(np.abs(found.estimate.gains - example.TRUE_GAINS_NM_A) < 4.0 * found.estimate.gains_std)
+    assert np.all(
+        np.abs(found.estimate.gains - example.TRUE_GAINS_NM_A) < 4.0 * found.estimate.gains_std
+    )
     assert capsys.readouterr().out.count("±") == 3
 
 
@@ -82,23 +96,31 @@ def test_the_calibration_predicts_a_run_that_the_fit_has_not_seen(example: Simpl
     predicted = ident.predict_current(calibration, found.model, data)
     rest = (predicted - data.current_a)[data.moving.all(axis=1)]
     assert predicted.shape == data.current_a.shape == (len(run.time_s) - 2, 3)
-    # The noise of the recording is 0.05 A; filtering the positions changes the direction of dry friction for a moment.
+    # The noise of the recording is 0.05 A; filtering the positions changes the direction of dry
+    # friction for a moment.
     assert np.all(np.sqrt(np.mean(rest**2, axis=0)) < 0.08)
     assert np.all(np.sqrt(np.mean(data.current_a**2, axis=0)) > 0.3)
 
 
 def test_a_calibration_needs_one_name_an_axis(example: SimpleNamespace) -> None:
-    with pytest.raises(ident.ModelError, match="2 axis names, 3 nameplate gains and 2 units for 3 identified"):
+    with pytest.raises(
+        ident.ModelError, match="2 axis names, 3 nameplate gains and 2 units for 3 identified"
+    ):
         ident.calibration_of(example.main(), ("J1", "J2"), example.NAMEPLATE_NM_A)
 
 
-def test_currents_are_predicted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_currents_are_predicted(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     runpy.run_path(str(EXAMPLES / "predict_current.py"), run_name="__main__")
     out = capsys.readouterr().out
     bare, loaded = (line for line in out.splitlines() if "largest currents" in line)
     # Raising the disc costs motor 2 at least its weight at a hand's breadth.
-    ampere = [float(line.split("currents ")[1].split(", ")[1].removesuffix(" A")) for line in (bare, loaded)]
+    ampere = [
+        float(line.split("currents ")[1].split(", ")[1].removesuffix(" A"))
+        for line in (bare, loaded)
+    ]
     assert ampere[1] > ampere[0] + 0.2
 
 
@@ -108,7 +130,11 @@ def _slow_motion(axes: int = 3, samples: int = 200) -> ident.Motion:
 
 
 def test_a_misspelt_parameter_of_a_payload_is_refused() -> None:
-    with pytest.raises(ident.ModelError, match=r"'disc'.* 'mass'; expected names among .*mz, m; write .*'m': 4.59"):
+    with pytest.raises(
+        ident.ModelError,
+        match=r"'disc'.* 'mass'; expected names among .*mz, m; "
+        r"write .*'m': 4.59",
+    ):
         ident.Payload("disc", mounting="flange", known={"mass": 4.59})
 
 
@@ -117,7 +143,9 @@ def test_a_payload_of_another_mass_is_not_predicted(example: SimpleNamespace) ->
     calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
     heavier = ident.Payload("disc", mounting="flange", known={"m": 6.0})
     with pytest.raises(ident.DataUnfit, match=r"weighs 6 kg; expected 4.59 kg as in the fit"):
-        ident.predict_current(calibration, found.model, ident.planned(_slow_motion(), 100.0, heavier))
+        ident.predict_current(
+            calibration, found.model, ident.planned(_slow_motion(), 100.0, heavier)
+        )
     same = ident.Payload("disc", mounting="flange", known={"m": 4.595})  # weighed again
     assert np.isfinite(
         ident.predict_current(calibration, found.model, ident.planned(_slow_motion(), 100.0, same))
@@ -128,12 +156,20 @@ def test_a_planned_motion_holds_numbers_of_one_shape() -> None:
     motion = _slow_motion()
     motion.velocity_rad_s[7, 1] = np.nan
     with pytest.raises(
-        ident.DataUnfit, match="velocity_rad_s holds 1 non-finite values, the first in sample 7, axis 2"
+        ident.DataUnfit,
+        match="velocity_rad_s holds 1 non-finite values, the first in sample 7, axis 2",
     ):
         ident.planned(motion, 100.0)
-    with pytest.raises(ident.DataUnfit, match=r"\(200, 3\), \(200, 3\) and \(3, 200\); expected \(n_samples, n_axes\)"):
+    with pytest.raises(
+        ident.DataUnfit,
+        match=r"\(200, 3\), \(200, 3\) and \(3, 200\); expected "
+        r"\(n_samples, n_axes\)",
+    ):
         motion = _slow_motion()
-        ident.planned(ident.Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2.T), 100.0)
+        ident.planned(
+            ident.Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2.T),
+            100.0,
+        )
 
 
 def test_lists_are_as_good_as_arrays(example: SimpleNamespace) -> None:
@@ -141,8 +177,16 @@ def test_lists_are_as_good_as_arrays(example: SimpleNamespace) -> None:
     calibration = ident.calibration_of(found, ["J1", "J2", "J3"], list(example.NAMEPLATE_NM_A))
     model = ident.Model(found.model.robot, ident.DriveTrain(np.diag(example.GEAR_RATIOS).tolist()))
     run = example.record(found.model, "lists", example.DISC, 3)
-    lists = ident.Run("lists", run.time_s.tolist(), run.position_rad.tolist(), run.current_a.tolist(), example.DISC)
-    data, same = (ident.differentiate(one, model.drive_train, found.conditioning) for one in (run, lists))
+    lists = ident.Run(
+        "lists",
+        run.time_s.tolist(),
+        run.position_rad.tolist(),
+        run.current_a.tolist(),
+        example.DISC,
+    )
+    data, same = (
+        ident.differentiate(one, model.drive_train, found.conditioning) for one in (run, lists)
+    )
     assert np.array_equal(data.velocity_rad_s, same.velocity_rad_s)
     assert np.array_equal(data.current_a, same.current_a)
     assert np.array_equal(
@@ -171,9 +215,16 @@ class Frame:
         return np.asarray(self._values, dtype=dtype)
 
 
-def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(example: SimpleNamespace) -> None:
-    model = ident.Model(ident.robot_from_urdf(example.URDF), ident.DriveTrain(Frame(np.diag(example.GEAR_RATIOS))))
-    runs = [example.record(model, "bare", None, 1), example.record(model, "loaded", example.DISC, 2)]
+def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(
+    example: SimpleNamespace,
+) -> None:
+    model = ident.Model(
+        ident.robot_from_urdf(example.URDF), ident.DriveTrain(Frame(np.diag(example.GEAR_RATIOS)))
+    )
+    runs = [
+        example.record(model, "bare", None, 1),
+        example.record(model, "loaded", example.DISC, 2),
+    ]
     frames = [
         ident.Run(
             run.name,
@@ -195,16 +246,22 @@ def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(examp
     axes = ("J1", "J2", "J3")
     calibration = ident.calibration_of(same, axes, nameplate)
     assert [gain.nameplate for gain in calibration.gains] == list(example.NAMEPLATE_NM_A)
-    assert ident.diagnose(same, axes, nameplate) == ident.diagnose(found, axes, list(example.NAMEPLATE_NM_A))
+    assert ident.diagnose(same, axes, nameplate) == ident.diagnose(
+        found, axes, list(example.NAMEPLATE_NM_A)
+    )
     motion = _slow_motion()
-    framed = ident.Motion(Frame(motion.position_rad), motion.velocity_rad_s.tolist(), motion.acceleration_rad_s2)
+    framed = ident.Motion(
+        Frame(motion.position_rad), motion.velocity_rad_s.tolist(), motion.acceleration_rad_s2
+    )
     assert np.array_equal(model.regressor(motion), model.regressor(framed))
     torque_nm = ident.measured_torque(calibration, model, Frame(runs[0].current_a))
     assert np.array_equal(torque_nm, ident.measured_torque(calibration, model, runs[0].current_a))
 
 
 def test_the_parameters_that_a_type_checker_sees_are_those_of_the_class() -> None:
-    """Constructors are written twice: for type checkers with whatever becomes an array, at run time by the fields."""
+    """Constructors are written twice: for type checkers with whatever becomes an array,
+    at run time by the fields.
+    """
     for kind in (ident.Run, ident.Motion, ident.DriveTrain):
         tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
         functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
@@ -219,9 +276,17 @@ def test_the_parameters_that_a_type_checker_sees_are_those_of_the_class() -> Non
 def test_filters_need_not_be_given(example: SimpleNamespace) -> None:
     found = example.main()
     assert found.conditioning == ident.Conditioning()  # 500 Hz
-    runs = [example.record(found.model, "bare", None, 1), example.record(found.model, "loaded", example.DISC, 2)]
+    runs = [
+        example.record(found.model, "bare", None, 1),
+        example.record(found.model, "loaded", example.DISC, 2),
+    ]
     slow = [
-        replace(run, time_s=run.time_s[::10], position_rad=run.position_rad[::10], current_a=run.current_a[::10])
+        replace(
+            run,
+            time_s=run.time_s[::10],
+            position_rad=run.position_rad[::10],
+            current_a=run.current_a[::10],
+        )
         for run in runs
     ]
     of_slow = ident.identify(found.model, iter(slow))
@@ -233,35 +298,56 @@ def test_filters_need_not_be_given(example: SimpleNamespace) -> None:
 
 def test_a_calibration_brings_its_filters(example: SimpleNamespace) -> None:
     model = example.main().model
-    runs = [example.record(model, "bare", None, 1), example.record(model, "loaded", example.DISC, 2)]
+    runs = [
+        example.record(model, "bare", None, 1),
+        example.record(model, "loaded", example.DISC, 2),
+    ]
     given = ident.Conditioning(30.0, decimation_cutoff_hz=15.0)
-    calibration = ident.calibration_of(ident.identify(model, runs, given), ("J1", "J2", "J3"), [1.0, 1.0, 1.0])
+    calibration = ident.calibration_of(
+        ident.identify(model, runs, given), ("J1", "J2", "J3"), [1.0, 1.0, 1.0]
+    )
     assert calibration.conditioning == given
     weighed = ident.weigh(calibration, model, runs[1:])
     assert weighed.mass_kg == ident.weigh(calibration, model, runs[1:], given).mass_kg
-    assert weighed.mass_kg != ident.weigh(calibration, model, runs[1:], ident.Conditioning()).mass_kg
+    assert (
+        weighed.mass_kg != ident.weigh(calibration, model, runs[1:], ident.Conditioning()).mass_kg
+    )
     quiet = ident.prediction_band(calibration, model, runs[1:])
     external = ident.external_torque(calibration, model, runs[1], band=quiet)
     same = ident.external_torque(calibration, model, runs[1], given, quiet)
     assert np.array_equal(external.torque_nm, same.torque_nm)
-    with pytest.raises(ident.ModelError, match=r"the filter of the calibration: found nothing; .*give `conditioning`"):
+    with pytest.raises(
+        ident.ModelError,
+        match=r"the filter of the calibration: found nothing; "
+        r".*give `conditioning`",
+    ):
         ident.weigh(replace(calibration, filter={}), model, runs[1:])
 
 
-def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(example: SimpleNamespace) -> None:
+def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(
+    example: SimpleNamespace,
+) -> None:
     found = example.main()
-    with pytest.raises(ident.ModelError, match=r"drive train has shape \(2, 2\), expected \(3, 3\)"):
+    with pytest.raises(
+        ident.ModelError,
+        match=r"drive train has shape \(2, 2\), "
+        r"expected \(3, 3\)",
+    ):
         ident.Model(found.model.robot, ident.DriveTrain(np.diag([100.0, 100.0])))
     run = example.record(found.model, "run", None, 3)
     turned = ident.Run("turned", run.time_s, run.position_rad.T, run.current_a)
     with pytest.raises(
-        ident.DataUnfit, match=r"position_rad has shape \(3, \d+\); expected \(\d+, 3\), one row .*transpose it\?"
+        ident.DataUnfit,
+        match=r"position_rad has shape \(3, \d+\); expected \(\d+, 3\), one row "
+        r".*transpose it\?",
     ):
         ident.identify(found.model, [turned], found.conditioning)
     with pytest.raises(ident.ModelError, match=r"fixed_gains has shape \(2,\); expected \(3,\)"):
         ident.identify(found.model, [run], found.conditioning, fixed_gains=np.ones(2))
     calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
     motion = _slow_motion()
-    across = ident.Motion(motion.position_rad.T, motion.velocity_rad_s.T, motion.acceleration_rad_s2.T)
+    across = ident.Motion(
+        motion.position_rad.T, motion.velocity_rad_s.T, motion.acceleration_rad_s2.T
+    )
     with pytest.raises(ident.ModelError, match=r"shapes \(3, 200\).*expected \(n_samples, 3\)"):
         ident.predict_torque(calibration, found.model, ident.planned(across, 100.0))

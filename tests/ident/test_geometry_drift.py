@@ -1,4 +1,6 @@
-"""A zero that is lost, a base that is moved, after the calibration: named by one run that the fit has not seen."""
+"""A zero that is lost, a base that is moved, after the calibration:
+named by one run that the fit has not seen.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,13 @@ NOISE_A = 0.05
 @cache
 def _new_run() -> Run:
     return record(
-        tx40_truth(), "new", np.random.default_rng(77), seconds=30.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A
+        tx40_truth(),
+        "new",
+        np.random.default_rng(77),
+        seconds=30.0,
+        rate_hz=500.0,
+        averaged=2,
+        noise_a=NOISE_A,
     )
 
 
@@ -44,7 +52,16 @@ def _new_run() -> Run:
 def _fitted_runs() -> tuple[Run, ...]:
     rng = np.random.default_rng(5)
     return tuple(
-        record(tx40_truth(), f"run {number}", rng, payload, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A)
+        record(
+            tx40_truth(),
+            f"run {number}",
+            rng,
+            payload,
+            seconds=15.0,
+            rate_hz=500.0,
+            averaged=2,
+            noise_a=NOISE_A,
+        )
         for number, payload in enumerate((None, MOUNTED))
     )
 
@@ -56,13 +73,18 @@ def _fitted() -> tuple[Evidence, Calibration]:
 
 
 def _drift(
-    run: Run, model: Model, known: Calibration | None = None, suspected: Collection[PlacedEffect] = ()
+    run: Run,
+    model: Model,
+    known: Calibration | None = None,
+    suspected: Collection[PlacedEffect] = (),
 ) -> GeometryDrift | None:
     evidence, calibration = _fitted()
     calibration = known or calibration
     data = differentiate(run, model.drive_train, evidence.conditioning)
     use, _ = row_masks(model, data, evidence.conditioning)
-    left = measured_torque(calibration, model, data.current_a) - predict_torque(calibration, model, data)
+    left = measured_torque(calibration, model, data.current_a) - predict_torque(
+        calibration, model, data
+    )
     left_nm = decimate_rows(data, evidence.conditioning, left.T)
     return geometry_drift(calibration, model, data, evidence.conditioning, left_nm, use, suspected)
 
@@ -87,7 +109,11 @@ def test_of_two_zeros_that_explain_the_error_the_one_that_explains_more_is_named
     """Both explain more than what the error is larger than in a fit that left much."""
     _, calibration = _fitted()
     errors = RelativeError((2.5,) * 6, 2.5)
-    found = _drift(_offset(_new_run(), 2, 3.0), tx40_truth().model, replace(calibration, relative_error_percent=errors))
+    found = _drift(
+        _offset(_new_run(), 2, 3.0),
+        tx40_truth().model,
+        replace(calibration, relative_error_percent=errors),
+    )
     assert found is not None
     assert found.placed == PlacedEffect(ZeroOffset(), 2)
 
@@ -95,7 +121,9 @@ def test_of_two_zeros_that_explain_the_error_the_one_that_explains_more_is_named
 def test_a_zero_that_is_suspected_needs_not_explain_most_of_the_error() -> None:
     rng = np.random.default_rng(3)
     run = _offset(_new_run(), 1, 2.0)
-    slow = np.repeat(rng.standard_normal((len(run.time_s) // 50 + 1, 6)), 50, axis=0)[: len(run.time_s)]
+    slow = np.repeat(rng.standard_normal((len(run.time_s) // 50 + 1, 6)), 50, axis=0)[
+        : len(run.time_s)
+    ]
     disturbed = replace(run, current_a=run.current_a + 0.03 * slow)
     model = tx40_truth().model
     assert _drift(disturbed, model) is None
@@ -117,11 +145,15 @@ def test_a_moved_base_is_named() -> None:
 
 
 def test_a_base_that_moved_after_gravity_was_corrected_is_named_with_its_size() -> None:
-    """What has changed is counted from the gravity of the calibration, not from the declared one."""
+    """What has changed is counted from the gravity of the calibration,
+    not from the declared one.
+    """
     truth = tx40_truth()
 
     def tilted(degrees: float) -> Model:
-        turned = rotation_by(np.array([0.0, np.radians(degrees), 0.0])) @ truth.model.robot.gravity_m_s2
+        turned = (
+            rotation_by(np.array([0.0, np.radians(degrees), 0.0])) @ truth.model.robot.gravity_m_s2
+        )
         return Model(replace(truth.model.robot, gravity_m_s2=turned), truth.model.drive_train)
 
     runs = _fitted_runs()
@@ -137,7 +169,8 @@ def test_a_base_that_moved_after_gravity_was_corrected_is_named_with_its_size() 
 
 
 def test_nothing_is_named_where_friction_or_a_gain_has_changed() -> None:
-    run, truth = _new_run(), tx40_truth()
+    run = _new_run()
+    truth = tx40_truth()
     assert _drift(run, truth.model) is None
     current = run.current_a.copy()
     current[:, 1] += 4.0 * np.sign(np.gradient(run.position_rad[:, 1])) / truth.gains[1]
@@ -152,7 +185,9 @@ def test_a_run_of_a_closed_chain_is_judged_as_well(run: int) -> None:
     calibration = calibration_of(identified, AXES[:2], FIVE_BAR.gains)
     data = differentiate(made.runs[run], made.model.drive_train, made.conditioning)
     use, _ = row_masks(made.model, data, made.conditioning)
-    left = measured_torque(calibration, made.model, data.current_a) - predict_torque(calibration, made.model, data)
+    left = measured_torque(calibration, made.model, data.current_a) - predict_torque(
+        calibration, made.model, data
+    )
     # An error that the fit did not leave is worth a look.
     left = left + 0.3 * np.sin(3.0 * data.position_rad)
     left_nm = decimate_rows(data, made.conditioning, left.T)

@@ -14,9 +14,14 @@ Numbers = st.floats(-1e6, 1e6, allow_nan=False)
 
 
 @given(
-    value=Numbers, limit=st.floats(1e-3, 1e5), digits=st.integers(0, 4), form=st.sampled_from(["f", "g", "+f", "+g"])
+    value=Numbers,
+    limit=st.floats(1e-3, 1e5),
+    digits=st.integers(0, 4),
+    form=st.sampled_from(["f", "g", "+f", "+g"]),
 )
-def test_a_number_shows_on_which_side_of_its_limit_it_is(value: float, limit: float, digits: int, form: str) -> None:
+def test_a_number_shows_on_which_side_of_its_limit_it_is(
+    value: float, limit: float, digits: int, form: str
+) -> None:
     shown = format_at_limit(value, limit, digits, form)
     assert (abs(float(shown)) > limit) == (abs(value) > limit)
     usual = f"{value:{form[:-1]}.{digits}{form[-1]}}"
@@ -25,7 +30,8 @@ def test_a_number_shows_on_which_side_of_its_limit_it_is(value: float, limit: fl
 
 
 @pytest.mark.parametrize(
-    ("value", "shown"), [(1.004, "1.004"), (0.996, "1.00"), (1.0, "1.00"), (1.00002, "1.00002"), (1.2, "1.20")]
+    ("value", "shown"),
+    [(1.004, "1.004"), (0.996, "1.00"), (1.0, "1.00"), (1.00002, "1.00002"), (1.2, "1.20")],
 )
 def test_a_number_has_no_more_digits_than_its_limit_needs(value: float, shown: str) -> None:
     assert format_at_limit(value, 1.0, 2) == shown

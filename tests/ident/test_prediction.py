@@ -1,4 +1,6 @@
-"""Prediction from a calibration alone: the same torque as the estimate's, and the currents that were recorded."""
+"""Prediction from a calibration alone: the same torque as the estimate's,
+and the currents that were recorded.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,28 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Model
-from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
-from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, a_calibration, calibrated
+from ident.prediction import (
+    measured_torque,
+    placed_effect,
+    predict_current,
+    predict_torque,
+    standard_parameters,
+)
+from tests.ident.recordings import (
+    CONDITIONING,
+    GAINS,
+    MOUNTED,
+    PAYLOAD_TRUTH,
+    Truth,
+    a_calibration,
+    calibrated,
+)
 
 
 def _largest_difference(identification: Evidence) -> float:
-    """Largest difference of the two predictions on the decimated rows, relative to the largest torque."""
+    """Largest difference of the two predictions on the decimated rows,
+    relative to the largest torque.
+    """
     calibration = calibrated(identification)
     expected = identification.estimate.predicted_torque(identification.training)
     rows = [
@@ -47,7 +65,9 @@ def _largest_difference(identification: Evidence) -> float:
 @pytest.fixture(scope="module")
 def identified(truth: Truth, noisy_runs: tuple[Run, ...]) -> Evidence:
     """One run without load and one with, by the classical identification."""
-    found = identify(truth.model, noisy_runs[:2], CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
+    found = identify(
+        truth.model, noisy_runs[:2], CONDITIONING, method=Method.WLS, fixed_gains=GAINS
+    )
     return gather(found, noisy_runs[:2])
 
 
@@ -73,14 +93,21 @@ def test_so_does_that_of_effects(identified: Evidence, effects: tuple[PlacedEffe
 
 
 def test_an_effect_has_no_torque_far_beyond_what_the_fit_has_seen(identified: Evidence) -> None:
-    """A power of the speed grows without end: at twice the speed, the fourth is sixteen times as large."""
+    """A power of the speed grows without end:
+    at twice the speed, the fourth is sixteen times as large.
+    """
     placed = PlacedEffect(NonlinearViscous(4.0), 1)
     after = with_effects(identified, (placed,))
     whole = calibrated(after)
     largest_nm = _largest_torque(after, placed)
     assert largest_nm is not None
-    rows = after.training.effects[:, 0] * after.estimate.parameters[own_unknowns(after.estimate, (placed,))]
-    assert largest_nm == pytest.approx(np.max(np.abs(rows), axis=1, where=after.training.use, initial=0.0), rel=1e-3)
+    rows = (
+        after.training.effects[:, 0]
+        * after.estimate.parameters[own_unknowns(after.estimate, (placed,))]
+    )
+    assert largest_nm == pytest.approx(
+        np.max(np.abs(rows), axis=1, where=after.training.use, initial=0.0), rel=1e-3
+    )
     bounded = replace(whole, effects=(replace(whole.effects[0], largest_torque=largest_nm),))
     data = identified.datasets[0]
     fast = replace(data, velocity_rad_s=2.0 * data.velocity_rad_s)
@@ -89,18 +116,28 @@ def test_an_effect_has_no_torque_far_beyond_what_the_fit_has_seen(identified: Ev
         free = predict_torque(whole, model, motion)
         limited = predict_torque(bounded, model, motion)
         assert np.allclose(free, limited) != is_limited
-    without = predict_torque(replace(whole, effects=(_without_torque(whole.effects[0]),)), model, fast)
-    assert np.max(np.abs(limited - without)) == pytest.approx(EXTRAPOLATED * max(largest_nm), rel=1e-6)
+    without = predict_torque(
+        replace(whole, effects=(_without_torque(whole.effects[0]),)), model, fast
+    )
+    assert np.max(np.abs(limited - without)) == pytest.approx(
+        EXTRAPOLATED * max(largest_nm), rel=1e-6
+    )
     assert _largest_torque(after, PlacedEffect(Lag(), 1)) is None
 
 
 def _without_torque(effect: AcceptedEffect) -> AcceptedEffect:
     """The same effect with coefficients of zero."""
-    return replace(effect, coefficients=tuple(replace(one, value=0.0) for one in effect.coefficients))
+    return replace(
+        effect, coefficients=tuple(replace(one, value=0.0) for one in effect.coefficients)
+    )
 
 
-def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    runs = tuple(replace(run, started_s=1.7e9 + 60.0 * number) for number, run in enumerate(noisy_runs[:2]))
+def test_what_fades_over_a_session_counts_from_its_first_run(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
+    runs = tuple(
+        replace(run, started_s=1.7e9 + 60.0 * number) for number, run in enumerate(noisy_runs[:2])
+    )
     found = identify(truth.model, runs, CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
     after = with_effects(gather(found, runs), (PlacedEffect(WarmUp(40.0, 1), 1),))
     assert _largest_difference(after) < 1e-9
@@ -108,14 +145,19 @@ def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy
 
 def test_a_motion_that_no_one_recorded_needs_the_same_current(identified: Evidence) -> None:
     after = with_effects(identified, (PlacedEffect(Spring(), 2), PlacedEffect(LoadFriction(0), 1)))
-    calibration, data = calibrated(after), after.datasets[1]
+    calibration = calibrated(after)
+    data = after.datasets[1]
     asked = planned(data.motion(), data.rate_hz, data.payload)
     expected = predict_current(calibration, after.model, data)
-    assert_allclose(predict_current(calibration, after.model, asked), expected, rtol=0.0, atol=1e-12)
+    assert_allclose(
+        predict_current(calibration, after.model, asked), expected, rtol=0.0, atol=1e-12
+    )
 
 
 def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Evidence) -> None:
-    """The fit built its columns with the estimate before the last, so the two agree only as the iteration does."""
+    """The fit built its columns with the estimate before the last,
+    so the two agree only as the iteration does.
+    """
     after = with_effects(identified, (PlacedEffect(LoadFriction(0), 1),))
     assert _largest_difference(after) < 1e-4
 
@@ -133,7 +175,8 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
     standard = rng.normal(size=len(truth.model.columns))
     base = identified.rows_without_effects.base
     named = tuple(
-        Parameter(name, float(value), 0.0, "") for name, value in zip(base.names, base.grouping @ standard, strict=True)
+        Parameter(name, float(value), 0.0, "")
+        for name, value in zip(base.names, base.grouping @ standard, strict=True)
     )
     columns = truth.model.regressor(motion.motion())
     expected = np.einsum("jck,c->kj", columns, standard)
@@ -157,40 +200,64 @@ def test_the_true_parameters_predict_the_recorded_current(
     identified: Evidence, truth: Truth, clean_runs: tuple[Run, ...]
 ) -> None:
     base = identified.rows_without_effects.base
-    values = (*base.grouping @ truth.parameters, *(value for name, value in PAYLOAD_TRUTH.items() if name != "m"))
+    values = (
+        *base.grouping @ truth.parameters,
+        *(value for name, value in PAYLOAD_TRUTH.items() if name != "m"),
+    )
     names = (*base.names, *(f"{name}:{MOUNTED.mounting}" for name in PAYLOAD_TRUTH if name != "m"))
-    parameters = tuple(Parameter(name, float(value), 0.0, "") for name, value in zip(names, values, strict=True))
+    parameters = tuple(
+        Parameter(name, float(value), 0.0, "") for name, value in zip(names, values, strict=True)
+    )
     calibration = a_calibration(GAINS, parameters)
     for run in clean_runs:
         data = differentiate(run, truth.model.drive_train, CONDITIONING)
-        _, use = row_masks(truth.model, data, CONDITIONING)  # at standstill dry friction is undetermined
+        # At standstill dry friction is undetermined
+        _, use = row_masks(truth.model, data, CONDITIONING)
         recorded = decimate_rows(data, CONDITIONING, data.current_a.T)[use]
-        predicted = decimate_rows(data, CONDITIONING, predict_current(calibration, truth.model, data).T)[use]
+        predicted = decimate_rows(
+            data, CONDITIONING, predict_current(calibration, truth.model, data).T
+        )[use]
         assert np.linalg.norm(predicted - recorded) < 2e-3 * np.linalg.norm(recorded)
-        torque = measured_torque(calibration, truth.model, predict_current(calibration, truth.model, data))
-        assert_allclose(torque, predict_torque(calibration, truth.model, data), rtol=1e-9, atol=1e-9)
+        torque = measured_torque(
+            calibration, truth.model, predict_current(calibration, truth.model, data)
+        )
+        assert_allclose(
+            torque, predict_torque(calibration, truth.model, data), rtol=1e-9, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize(
     ("payload", "words"),
     [
-        (Payload("disc", "upside down", {"m": 4.59}), "'upside down', of which the calibration knows nothing.*'a'"),
+        (
+            Payload("disc", "upside down", {"m": 4.59}),
+            "'upside down', of which the calibration knows nothing.*'a'",
+        ),
         (Payload("disc", "a", {"m": 4.59, "mx": -0.24}), "declares mx of mounting 'a'"),
     ],
 )
-def test_a_payload_that_the_calibration_does_not_know(identified: Evidence, payload: Payload, words: str) -> None:
+def test_a_payload_that_the_calibration_does_not_know(
+    identified: Evidence, payload: Payload, words: str
+) -> None:
     data = replace(identified.datasets[1], payload=payload)
     with pytest.raises(DataUnfit, match=words):
         predict_torque(calibrated(identified), identified.model, data)
 
 
-def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(identified: Evidence) -> None:
-    calibration, data = calibrated(identified), identified.datasets[1]
+def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(
+    identified: Evidence,
+) -> None:
+    calibration = calibrated(identified)
+    data = identified.datasets[1]
     full = dict.fromkeys(PAYLOAD_TRUTH, 0.0) | {"m": 1e-9}  # a speck
-    weightless = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", full)))
+    weightless = predict_torque(
+        calibration, identified.model, replace(data, payload=Payload("x", "x", full))
+    )
     bare = predict_torque(calibration, identified.model, replace(data, payload=None))
     assert weightless == pytest.approx(bare, abs=1e-6)
-    heavy = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", {**full, "m": 1.0})))
+    heavy = predict_torque(
+        calibration, identified.model, replace(data, payload=Payload("x", "x", {**full, "m": 1.0}))
+    )
     assert np.max(np.abs(heavy - bare)) > 5.0  # a kilogram at the flange of an arm of half a metre
 
 
@@ -202,15 +269,30 @@ STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
     [
         (AcceptedEffect("magic", "J3", {}, (), 1.0, 1.0), "no effect 'magic'; there are .*spring"),
         (AcceptedEffect("spring", "J9", {}, (STIFFNESS,), 1.0, 1.0), "'J9'; there are J1, J2"),
-        (AcceptedEffect("spring", "J3", {"rest": 1.0}, (STIFFNESS,), 1.0, 1.0), "settings rest; it has none"),
+        (
+            AcceptedEffect("spring", "J3", {}, (STIFFNESS,), 1.0, 1.0, package="springs 1.0"),
+            "found an effect of this name of drivegain, .*expected springs 1.0",
+        ),
+        (
+            AcceptedEffect("spring", "J3", {"rest": 1.0}, (STIFFNESS,), 1.0, 1.0),
+            "settings rest; it has none",
+        ),
         (AcceptedEffect("stribeck", "J3", {}, (), 1.0, 1.0), "settings none; it has speed_rad_s"),
         (AcceptedEffect("cogging", "J3", {"order": 2.5}, (), 1.0, 1.0), "whole"),
-        (AcceptedEffect("spring", "J3", {}, (), 1.0, 1.0), "coefficients none; it needs spring stiffness 3"),
+        (
+            AcceptedEffect("spring", "J3", {}, (), 1.0, 1.0),
+            "coefficients none; it needs spring stiffness 3",
+        ),
         (AcceptedEffect("spring", "J4", {}, (STIFFNESS,), 1.0, 1.0), "it needs spring stiffness 4"),
-        (AcceptedEffect("time-skew", "J3", {}, (STIFFNESS,), 1.0, 1.0), "'J3'; it acts on all axes"),
+        (
+            AcceptedEffect("time-skew", "J3", {}, (STIFFNESS,), 1.0, 1.0),
+            "'J3'; it acts on all axes",
+        ),
     ],
 )
-def test_an_effect_that_does_not_exist_is_refused(identified: Evidence, effect: AcceptedEffect, words: str) -> None:
+def test_an_effect_that_does_not_exist_is_refused(
+    identified: Evidence, effect: AcceptedEffect, words: str
+) -> None:
     with pytest.raises(EffectRefused, match=words):
         placed_effect(effect, calibrated(identified))
 
@@ -218,7 +300,11 @@ def test_an_effect_that_does_not_exist_is_refused(identified: Evidence, effect: 
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [
-        ("coupling", {"other_axis": 99, "sense": 1}, "other_axis = 99; it is the number of another of the 6 axes"),
+        (
+            "coupling",
+            {"other_axis": 99, "sense": 1},
+            "other_axis = 99; it is the number of another of the 6 axes",
+        ),
         ("coupling", {"other_axis": 3, "sense": 1}, "other_axis = 3"),
         ("coupling", {"other_axis": 0, "sense": 1}, "other_axis = 0"),
         ("coupling", {"other_axis": 2.5, "sense": 1}, "other_axis = 2.5"),
@@ -233,9 +319,21 @@ def test_an_effect_that_does_not_exist_is_refused(identified: Evidence, effect: 
         ("cogging", {"order": 1e9}, "order = 1e"),
         ("warm-up", {"time_constant_s": -20.0, "whole_session": 0}, "time_constant_s = -20"),
         ("warm-up", {"time_constant_s": 20.0, "whole_session": 7}, "whole_session = 7"),
-        ("smooth-velocity", {"lower": 1.0, "upper": 1.0, "signed": 0, "other_axis": 0}, "must not be empty"),
-        ("smooth-velocity", {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 2}, "no other axis"),
-        ("smooth-other-velocity", {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 0}, "other_axis = 0"),
+        (
+            "smooth-velocity",
+            {"lower": 1.0, "upper": 1.0, "signed": 0, "other_axis": 0},
+            "must not be empty",
+        ),
+        (
+            "smooth-velocity",
+            {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 2},
+            "no other axis",
+        ),
+        (
+            "smooth-other-velocity",
+            {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 0},
+            "other_axis = 0",
+        ),
     ],
 )
 def test_settings_that_no_effect_has_are_refused(
@@ -259,7 +357,9 @@ def test_an_effect_of_an_earlier_version_is_that_of_first_order(
     identified: Evidence, effect: Effect, coefficient: str
 ) -> None:
     axis = ALL_AXES if effect.side is GearSide.ALL_MOTORS else "J3"
-    earlier = AcceptedEffect(effect.name, axis, {}, (Parameter(coefficient, 2e-4, 1e-5, ""),), 1.0, 1.0)
+    earlier = AcceptedEffect(
+        effect.name, axis, {}, (Parameter(coefficient, 2e-4, 1e-5, ""),), 1.0, 1.0
+    )
     placed, values = placed_effect(earlier, calibrated(identified))
     assert (placed.effect, values.tolist()) == (effect, [2e-4])
 
@@ -274,19 +374,28 @@ def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -
 
 def _with_longer_links(model: Model, times: float) -> Model:
     """The same robot with all offsets between its joints longer."""
-    joints = [replace(joint, translation_m=times * joint.translation_m) for joint in model.robot.joints]
+    joints = [
+        replace(joint, translation_m=times * joint.translation_m) for joint in model.robot.joints
+    ]
     return Model(replace(model.robot, joints=tuple(joints)), model.drive_train)
 
 
 def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:
-    calibration, data = calibrated(identified), identified.datasets[0]
+    calibration = calibrated(identified)
+    data = identified.datasets[0]
     with pytest.raises(ModelError, match="5 gains, the model 6 joints"):
         predict_torque(replace(calibration, gains=calibration.gains[:5]), identified.model, data)
     other = _with_longer_links(identified.model, 1.2)
-    with pytest.raises(ModelError, match=r"which another geometry gathers; expected a calibration of the model's"):
+    with pytest.raises(
+        ModelError,
+        match=r"which another geometry gathers; expected a calibration "
+        r"of the model's",
+    ):
         predict_current(calibration, other, data)
     measured_again = _with_longer_links(identified.model, 1.002)
     predict_current(calibration, measured_again, data)
-    seventh = replace(calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, "")))
+    seventh = replace(
+        calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, ""))
+    )
     with pytest.raises(ModelError, match="'Izz7"):
         predict_torque(seventh, identified.model, data)

@@ -17,7 +17,16 @@ from ident.model.bodies import LINK_PARAMETERS, Payload, body_of
 from ident.model.robot import Motion, Place
 from ident.planning.excitation import Excitation
 from ident.planning.gain_verdict import ExtraMoves
-from ident.weighing import KNOWN, RowsToWeigh, Scale, WeighedBody, moves_that_help, rows_to_weigh, weigh, weigh_rows
+from ident.weighing import (
+    KNOWN,
+    RowsToWeigh,
+    Scale,
+    WeighedBody,
+    moves_that_help,
+    rows_to_weigh,
+    weigh,
+    weigh_rows,
+)
 from tests.ident.recordings import FloatArray, Truth
 from tests.ident.weighed import AXIS, WeighedCell, a_body, noisy_run, weighed_cell
 
@@ -46,14 +55,23 @@ def _without_effects(calibration: Calibration) -> Calibration:
 def _scores(cell: WeighedCell, found: WeighedBody) -> FloatArray:
     mass = cell.body[-1]
     centre, std = found.centre_m
-    return np.concatenate(([(found.mass_kg - mass) / found.mass_std_kg], (centre - cell.body[6:9] / mass) / std))
+    return np.concatenate(
+        ([(found.mass_kg - mass) / found.mass_std_kg], (centre - cell.body[6:9] / mass) / std)
+    )
 
 
-def test_errors_are_as_large_as_their_sigma(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
+def test_errors_are_as_large_as_their_sigma(
+    small_truth: Truth, cells: tuple[WeighedCell, ...]
+) -> None:
     """`make weigh-study` counts a hundred cells."""
     scores = np.array(
         [
-            _scores(cell, weigh(cell.calibration, small_truth.model, [cell.loaded], cell.conditioning, bare=bare))
+            _scores(
+                cell,
+                weigh(
+                    cell.calibration, small_truth.model, [cell.loaded], cell.conditioning, bare=bare
+                ),
+            )
             for cell in cells
             for bare in ([], [cell.bare])
         ]
@@ -75,9 +93,13 @@ def test_without_the_effects_sigma_is_wide_and_the_residual_large(
 def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
     cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh], beside: int
 ) -> None:
-    """A calibration whose only error is one direction: its share of σ is the shift that this error makes."""
+    """A calibration whose only error is one direction:
+    its share of σ is the shift that this error makes.
+    """
     calibration = _without_effects(cells[0].calibration)
-    values = np.array([one.value for one in calibration.gains] + [one.value for one in calibration.parameters])
+    values = np.array(
+        [one.value for one in calibration.gains] + [one.value for one in calibration.parameters]
+    )
     rng = np.random.default_rng(5)
     error = 1e-4 * rng.standard_normal(len(values)) * np.maximum(np.abs(values), 1e-2)
     root = tuple((float(value), *([0.0] * index)) for index, value in enumerate(error))
@@ -85,14 +107,21 @@ def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
     moved = _changed(calibration, values + error)
     shift = weigh_rows(moved, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
     share = np.diag(certain.covariance - certain.moves_covariance)
-    assert np.sqrt(np.abs(share)) == pytest.approx(np.abs(shift), rel=0.03, abs=0.03 * float(np.abs(shift).max()))
+    assert np.sqrt(np.abs(share)) == pytest.approx(
+        np.abs(shift), rel=0.03, abs=0.03 * float(np.abs(shift).max())
+    )
 
 
 @pytest.mark.parametrize("beside", [0, 1])
 def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_the_body(
-    small_truth: Truth, cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh], beside: int
+    small_truth: Truth,
+    cells: tuple[WeighedCell, ...],
+    rows: tuple[RowsToWeigh, RowsToWeigh],
+    beside: int,
 ) -> None:
-    """The share of σ is the shift of the body with a calibration that took another mass for known."""
+    """The share of σ is the shift of the body with a calibration that took another mass for
+    known.
+    """
     calibration = cells[0].calibration
     (reference,) = calibration.payload_mass
     factor = 1.002
@@ -100,14 +129,20 @@ def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_t
     heavier = weighed_cell(small_truth, 0, mass_factor=factor).calibration
     shift = weigh_rows(heavier, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
     tolerant = replace(calibration, payload_mass=(reference.weighed_to(tolerance_kg),))
-    earlier = replace(calibration, payload_mass=(replace(tolerant.payload_mass[0], parameters_per_kg=()),))
+    earlier = replace(
+        calibration, payload_mass=(replace(tolerant.payload_mass[0], parameters_per_kg=()),)
+    )
     exact = weigh_rows(calibration, rows[beside])
     for known in (tolerant, earlier):
         found = weigh_rows(known, rows[beside])
         added = found.covariance - exact.covariance
         assert found.reference_covariance == pytest.approx(added)
-        assert np.sqrt(np.diag(added)) == pytest.approx(np.abs(shift), rel=0.05, abs=0.02 * np.abs(shift).max())
-        assert found.mass_reference_std_kg == pytest.approx(tolerance_kg / reference.mass_kg * exact.mass_kg, rel=0.02)
+        assert np.sqrt(np.diag(added)) == pytest.approx(
+            np.abs(shift), rel=0.05, abs=0.02 * np.abs(shift).max()
+        )
+        assert found.mass_reference_std_kg == pytest.approx(
+            tolerance_kg / reference.mass_kg * exact.mass_kg, rel=0.02
+        )
     assert exact.mass_reference_std_kg == 0.0
 
 
@@ -139,10 +174,16 @@ def _changed(calibration: Calibration, values: FloatArray) -> Calibration:
 def test_a_common_error_of_the_gains_scales_the_body_and_leaves_its_centre(
     cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh]
 ) -> None:
-    """Without a covariance, σ of the gains is taken as such an error; the scatter of the moves is left alone."""
+    """Without a covariance, σ of the gains is taken as such an error;
+    the scatter of the moves is left alone.
+    """
     plain = _without_effects(cells[0].calibration)
-    scaled = replace(plain, gains=tuple(replace(gain, value=1.05 * gain.value) for gain in plain.gains))
-    uncertain = replace(plain, gains=tuple(replace(gain, std=0.02 * abs(gain.value)) for gain in plain.gains))
+    scaled = replace(
+        plain, gains=tuple(replace(gain, value=1.05 * gain.value) for gain in plain.gains)
+    )
+    uncertain = replace(
+        plain, gains=tuple(replace(gain, std=0.02 * abs(gain.value)) for gain in plain.gains)
+    )
     exact, heavier, found = (weigh_rows(one, rows[1]) for one in (plain, scaled, uncertain))
     assert heavier.mass_kg == pytest.approx(1.05 * exact.mass_kg, rel=1e-3)
     assert heavier.centre_m[0] == pytest.approx(exact.centre_m[0], abs=1e-5)
@@ -151,11 +192,15 @@ def test_a_common_error_of_the_gains_scales_the_body_and_leaves_its_centre(
     assert found.moves_covariance == pytest.approx(exact.moves_covariance)
 
 
-def test_what_the_logs_say_of_their_payload_is_ignored(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
+def test_what_the_logs_say_of_their_payload_is_ignored(
+    small_truth: Truth, cells: tuple[WeighedCell, ...]
+) -> None:
     cell = cells[1]
     calibration = _without_effects(cell.calibration)
     runs = cell.loaded, replace(cell.loaded, payload=Payload("other", "elsewhere", {"m": 99.0}))
-    first, second = (weigh(calibration, small_truth.model, [run], cell.conditioning) for run in runs)
+    first, second = (
+        weigh(calibration, small_truth.model, [run], cell.conditioning) for run in runs
+    )
     assert first.values.tolist() == second.values.tolist()
 
 
@@ -180,7 +225,8 @@ def test_a_swing_of_the_last_joint_shows_a_part_and_says_what_would_show_the_res
         motion = Motion(q, velocity, np.gradient(velocity, axis=0) * rate_hz)
         return ExtraMoves(words, 24.0, Excitation(motion, (np.abs(velocity) > 0.03).T))
 
-    everything, same = extra("all axes", cell.loaded), extra("more of the same", calm)
+    everything = extra("all axes", cell.loaded)
+    same = extra("more of the same", calm)
     helped = {one.name: one for one in moves_that_help(found, [same, everything])}
     assert helped["m"].words == "all axes"
     assert 2.0 * helped["m"].std < cell.body[-1]
@@ -203,7 +249,9 @@ def _recorded(truth: Truth, run: Run, body: FloatArray) -> Run:
     parameters[truth.model.flange] += body
     torque = truth.model.torques(motion, parameters)[2]
     noise = 0.02 * np.random.default_rng(2).standard_normal(torque.shape)
-    return replace(run, current_a=(truth.model.drive_train.to_motor @ torque / truth.gains[:, None] + noise).T)
+    return replace(
+        run, current_a=(truth.model.drive_train.to_motor @ torque / truth.gains[:, None] + noise).T
+    )
 
 
 def test_too_little_is_refused(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
@@ -222,7 +270,8 @@ def test_too_little_is_refused(small_truth: Truth, cells: tuple[WeighedCell, ...
 def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     """Values as of `body_of`; σ as of a finite difference along a single uncertain direction."""
     rng = np.random.default_rng(seed)
-    ten, step = a_body(rng), 1e-6 * rng.standard_normal(10)
+    ten = a_body(rng)
+    step = 1e-6 * rng.standard_normal(10)
     certain = np.zeros((10, 10))
     spread = np.outer(step, step)
     scale = Scale.__new__(Scale)
@@ -230,8 +279,11 @@ def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     found = WeighedBody(ten, certain, spread, True, 9, error, scale)
     (centre, centre_std), (inertia, inertia_std) = found.centre_m, found.inertia_kg_m2
     upper = np.triu_indices(3)
-    body, near = body_of(ten), body_of(ten + step)
-    frame = Place(0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.4, 0.1, 0.0]))
+    body = body_of(ten)
+    near = body_of(ten + step)
+    frame = Place(
+        0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.4, 0.1, 0.0])
+    )
     placed, placed_std = found.centre_in(frame)
     x, y, z = body.centre_m
     assert placed == pytest.approx([y - 0.1, 0.4 - x, z])  # a quarter turn about z
@@ -241,24 +293,33 @@ def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     assert centre == pytest.approx(body.centre_m)
     assert inertia == pytest.approx(body.inertia_kg_m2[upper], abs=1e-12)
     assert centre_std == pytest.approx(np.abs(near.centre_m - body.centre_m), rel=1e-2, abs=1e-9)
-    assert inertia_std == pytest.approx(np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)[upper], rel=1e-2, abs=1e-9)
+    assert inertia_std == pytest.approx(
+        np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)[upper], rel=1e-2, abs=1e-9
+    )
     lost = replace(found, values=np.where(np.arange(10) == 6, np.nan, ten))
     assert np.isnan(lost.centre_m[0]).tolist() == [True, False, False]
 
 
 def test_a_parameter_with_a_long_lever_is_identified_though_a_compact_body_has_less() -> None:
-    """Izz of 5 kg, 0.45 m from the joint, known to 2 %: twice σ is more than a steel cube of that mass has."""
+    """Izz of 5 kg, 0.45 m from the joint, known to 2 %:
+    twice σ is more than a steel cube of that mass has.
+    """
     ten = np.array([np.nan, np.nan, np.nan, np.nan, np.nan, 1.0, 2.2, 0.01, np.nan, 5.0])
 
     def identified(std_of_izz: float) -> list[str]:
         std = np.where(np.isnan(ten), np.nan, 0.01)
         std[5] = std_of_izz
         covariance = np.diag(std**2)
-        body = WeighedBody(ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale))
-        return [name for name, known in zip(LINK_PARAMETERS, body.identifiable, strict=True) if known]
+        body = WeighedBody(
+            ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale)
+        )
+        return [
+            name for name, known in zip(LINK_PARAMETERS, body.identifiable, strict=True) if known
+        ]
 
     assert 2.0 * 0.02 > 5.0 * (5.0 / 7850.0) ** (2.0 / 3.0)
-    assert identified(0.02) == ["Izz", "mx", "my", "m"]  # my is near zero, and known to less than the cube's
+    # `my` is near zero, and known to less than the cube's
+    assert identified(0.02) == ["Izz", "mx", "my", "m"]
     assert identified(0.2) == ["mx", "my", "m"]
 
 
@@ -272,7 +333,9 @@ def test_a_mass_is_identified_to_a_tenth_of_itself_and_nothing_is_small_beside_a
     std = np.full(10, 1e-4 * mass_kg)
     std[9] = share * mass_kg
     covariance = np.diag(std**2)
-    body = WeighedBody(ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale))
+    body = WeighedBody(
+        ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale)
+    )
     known = body.identifiable
     assert known[9] == (share <= KNOWN)
     least = body.size

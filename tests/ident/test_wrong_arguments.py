@@ -1,4 +1,6 @@
-"""Wrong arguments of a caller without a type checker: each is refused with what was found, expected, and what to do."""
+"""Wrong arguments of a caller without a type checker:
+each is refused with what was found, expected, and what to do.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,10 @@ DRIVE_TRAIN = ident.DriveTrain(np.diag([40.0, 50.0, -45.0]))
 def short(small_truth: Truth) -> tuple[ident.Run, ident.Run]:
     """A run without load and one with, long enough for a fit."""
     rng = np.random.default_rng(7)
-    one, two = (record(small_truth, name, rng, payload) for name, payload in (("bare", None), ("loaded", MOUNTED)))
+    one, two = (
+        record(small_truth, name, rng, payload)
+        for name, payload in (("bare", None), ("loaded", MOUNTED))
+    )
     return one, two
 
 
@@ -35,18 +40,50 @@ Change = Callable[[Any], Any]
 lax: Any = ident  #: As a notebook sees it
 
 OF_A_RUN: list[tuple[str, Change, str]] = [
-    ("time of two columns", lambda r: replace(r, time_s=r.time_s.reshape(-1, 2)), r"'bare': time_s .*\(n_samples,\)"),
-    ("a rate for the time", lambda r: replace(r, time_s=0.001), r"'bare': time_s has shape \(\); expected"),
-    ("a gap in time", lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)), "time_s holds 1 .* sample 4999;"),
+    (
+        "time of two columns",
+        lambda r: replace(r, time_s=r.time_s.reshape(-1, 2)),
+        r"'bare': time_s "
+        r".*\(n_samples,\)",
+    ),
+    (
+        "a rate for the time",
+        lambda r: replace(r, time_s=0.001),
+        r"'bare': time_s has shape "
+        r"\(\); expected",
+    ),
+    (
+        "a gap in time",
+        lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)),
+        "time_s holds 1 .* sample 4999;",
+    ),
     (
         "ragged time",
         lambda r: replace(r, time_s=[[0.0], [0.1, 0.2]]),
         "'bare': time_s is no array of numbers.*expected",
     ),
-    ("short time", lambda r: replace(r, time_s=r.time_s[:-9]), r"position_rad has shape \(\d+, 3\); expected.*one row"),
-    ("ragged positions", lambda r: replace(r, position_rad=[[0.0] * 3, [0.1]]), "'bare': position_rad is no array"),
-    ("words", lambda r: replace(r, current_a=[["one", "two", "three"]]), "'bare': current_a is no array of numbers"),
-    ("transposed", lambda r: replace(r, position_rad=r.position_rad.T), r"\(3, \d+\); expected .* transpose it\?"),
+    (
+        "short time",
+        lambda r: replace(r, time_s=r.time_s[:-9]),
+        r"position_rad has shape \(\d+, "
+        r"3\); expected.*one row",
+    ),
+    (
+        "ragged positions",
+        lambda r: replace(r, position_rad=[[0.0] * 3, [0.1]]),
+        "'bare': position_rad is no array",
+    ),
+    (
+        "words",
+        lambda r: replace(r, current_a=[["one", "two", "three"]]),
+        "'bare': current_a is no array of numbers",
+    ),
+    (
+        "transposed",
+        lambda r: replace(r, position_rad=r.position_rad.T),
+        r"\(3, \d+\); expected .* "
+        r"transpose it\?",
+    ),
     (
         "complex currents",
         lambda r: replace(r, current_a=r.current_a + 0.5j),
@@ -54,7 +91,9 @@ OF_A_RUN: list[tuple[str, Change, str]] = [
     ),
     (
         "masked positions",
-        lambda r: replace(r, position_rad=np.ma.masked_array(r.position_rad, r.time_s[:, None] * [1, 1, 1] > 9.0)),
+        lambda r: replace(
+            r, position_rad=np.ma.masked_array(r.position_rad, r.time_s[:, None] * [1, 1, 1] > 9.0)
+        ),
         r"position_rad is a masked array with \d+ masked values; expected numbers; fill them",
     ),
     (
@@ -73,13 +112,30 @@ OF_A_RUN: list[tuple[str, Change, str]] = [
         "'bare': temperature_c is of complex numbers",
     ),
     ("no position", lambda r: replace(r, position_rad=None), "'bare': position_rad .*expected"),
-    ("valid of samples", lambda r: replace(r, valid=np.ones(len(r.time_s))), r"'bare': valid has shape .* expected \("),
-    ("few moves", lambda r: replace(r, move=np.zeros(9)), r"'bare': move has shape \(9,\); expected \(\d+,\)"),
-    ("a mass for the payload", lambda r: replace(r, payload=4.0), "'bare' is of type float; expected Payload; write"),
+    (
+        "valid of samples",
+        lambda r: replace(r, valid=np.ones(len(r.time_s))),
+        r"'bare': valid has "
+        r"shape .* "
+        r"expected \(",
+    ),
+    (
+        "few moves",
+        lambda r: replace(r, move=np.zeros(9)),
+        r"'bare': move has shape \(9,\); "
+        r"expected \(\d+,\)",
+    ),
+    (
+        "a mass for the payload",
+        lambda r: replace(r, payload=4.0),
+        "'bare' is of type float; expected Payload; write",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("change", "words"), [case[1:] for case in OF_A_RUN], ids=[case[0] for case in OF_A_RUN])
+@pytest.mark.parametrize(
+    ("change", "words"), [case[1:] for case in OF_A_RUN], ids=[case[0] for case in OF_A_RUN]
+)
 def test_a_run_that_is_none_is_refused(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], change: Change, words: str
 ) -> None:
@@ -94,12 +150,17 @@ IN_OTHER_UNITS: list[tuple[str, FloatArray]] = [
 ]
 
 
-@pytest.mark.parametrize("factors", [case[1] for case in IN_OTHER_UNITS], ids=[case[0] for case in IN_OTHER_UNITS])
+@pytest.mark.parametrize(
+    "factors", [case[1] for case in IN_OTHER_UNITS], ids=[case[0] for case in IN_OTHER_UNITS]
+)
 def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], factors: FloatArray
 ) -> None:
     runs = [replace(run, position_rad=np.asarray(run.position_rad) * factors) for run in short]
-    words = r"found q\d turning by \d+\.?\d* rad in run '\w+'; expected a joint's angle in rad: are these degrees"
+    words = (
+        r"found q\d turning by \d+\.?\d* rad in run '\w+'; expected a joint's angle in rad: "
+        r"are these degrees"
+    )
     with pytest.raises(ident.IdentificationError, match=words):
         ident.identify(small_truth.model, runs)
 
@@ -107,7 +168,10 @@ def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
 def test_a_range_or_current_of_a_robot_is_not_taken_for_other_units(
     small_truth: Truth, short: tuple[ident.Run, ident.Run]
 ) -> None:
-    channels = [channels_of(small_truth.model, differentiate(run, small_truth.model.drive_train)) for run in short]
+    channels = [
+        channels_of(small_truth.model, differentiate(run, small_truth.model.drive_train))
+        for run in short
+    ]
     axes = ("J1", "J2", "J3")
     assert unlikely_units(channels, small_truth.model, axes) == ""
     in_milliamperes = [replace(one, limits=1000.0 * one.limits) for one in channels]
@@ -117,13 +181,42 @@ def test_a_range_or_current_of_a_robot_is_not_taken_for_other_units(
 Call = Callable[[Any, Any], Any]
 
 OF_A_CALL: list[tuple[str, Call, str]] = [
-    ("one run", lambda m, r: lax.identify(m, r[0], lax.Conditioning()), r"type Run; .* give a list: \[bare, load"),
-    ("one held out", lambda m, r: lax.identify(m, r, lax.Conditioning(), holdout=r[0]), "holdout .* give a list"),
-    ("no run", lambda m, _: lax.identify(m, [], lax.Conditioning()), "^no run was given; expected one without load"),
-    ("arrays", lambda m, r: lax.identify(m, [r[0].time_s], lax.Conditioning()), "type ndarray; expected Run; write"),
-    ("a cut-off", lambda m, r: lax.identify(m, r, 40.0), "type float; expected Conditioning; write Conditioning"),
-    ("one name", lambda m, r: lax.identify(m, [r[0], r[0]]), "'bare': found two runs of this name; expected another"),
-    ("held out, too", lambda m, r: lax.identify(m, r, holdout=[r[1]]), "'loaded': found two runs of this name"),
+    (
+        "one run",
+        lambda m, r: lax.identify(m, r[0], lax.Conditioning()),
+        r"type Run; .* give a "
+        r"list: \[bare, load",
+    ),
+    (
+        "one held out",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(), holdout=r[0]),
+        "holdout .* give a list",
+    ),
+    (
+        "no run",
+        lambda m, _: lax.identify(m, [], lax.Conditioning()),
+        "^no run was given; expected one without load",
+    ),
+    (
+        "arrays",
+        lambda m, r: lax.identify(m, [r[0].time_s], lax.Conditioning()),
+        "type ndarray; expected Run; write",
+    ),
+    (
+        "a cut-off",
+        lambda m, r: lax.identify(m, r, 40.0),
+        "type float; expected Conditioning; write Conditioning",
+    ),
+    (
+        "one name",
+        lambda m, r: lax.identify(m, [r[0], r[0]]),
+        "'bare': found two runs of this name; expected another",
+    ),
+    (
+        "held out, too",
+        lambda m, r: lax.identify(m, r, holdout=[r[1]]),
+        "'loaded': found two runs of this name",
+    ),
     (
         "milliseconds",
         lambda m, r: lax.identify(m, [replace(one, time_s=1000.0 * one.time_s) for one in r]),
@@ -134,12 +227,32 @@ OF_A_CALL: list[tuple[str, Call, str]] = [
         lambda *_: lax.robot_from_urdf(THREE_AXES.urdf, closures=[("loop", "a", "b", ("x",))]),
         r"an entry of closures is of type tuple; expected LinkPair; write LinkPair\(name, first",
     ),
-    ("no motion", lambda *_: lax.Motion(None, [[0.0]], [[0.0]]), "position_rad of the motion is None; expected an arr"),
-    ("no model", lambda m, r: lax.identify(m.robot, r, lax.Conditioning()), "type Robot; expected Model; write"),
-    ("cut-off", lambda m, r: lax.identify(m, r, lax.Conditioning(0.0)), "'bare': .*cut-off of 0 Hz; expected above"),
-    ("decimation", lambda m, r: lax.identify(m, r, lax.Conditioning(decimation_cutoff_hz=-1)), "of -1 Hz; expected"),
+    (
+        "no motion",
+        lambda *_: lax.Motion(None, [[0.0]], [[0.0]]),
+        "position_rad of the motion is None; expected an arr",
+    ),
+    (
+        "no model",
+        lambda m, r: lax.identify(m.robot, r, lax.Conditioning()),
+        "type Robot; expected Model; write",
+    ),
+    (
+        "cut-off",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(0.0)),
+        "'bare': .*cut-off of 0 Hz; expected above",
+    ),
+    (
+        "decimation",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(decimation_cutoff_hz=-1)),
+        "of -1 Hz; expected",
+    ),
     ("NaN", lambda m, r: lax.identify(m, r, lax.Conditioning(float("nan"))), "'bare': "),
-    ("method", lambda m, r: lax.identify(m, r, lax.Conditioning(), method="foo"), "'foo'; expected one of ls, wls"),
+    (
+        "method",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(), method="foo"),
+        "'foo'; expected one of ls, wls",
+    ),
     (
         "zero gain",
         lambda m, r: _fixed(m, r, [30.0, 0.0, 20.0]),
@@ -150,16 +263,63 @@ OF_A_CALL: list[tuple[str, Call, str]] = [
         lambda m, r: _fixed(m, r, [30.0, float("nan"), 20.0]),
         "fixed_gains holds 1 .* sample 1; give numbers",
     ),
-    ("a gain", lambda m, r: _fixed(m, r, 30.0), r"fixed_gains has shape \(\); expected \(3,\), one per motor"),
-    ("words", lambda m, r: _fixed(m, r, ["a", "b", "c"]), r"fixed_gains is no array of numbers.*expected \(3,\)"),
-    ("a mass", lambda *_: lax.Payload("disc", "flange", 4.0), "known is of type float; expected dict; write"),
-    ("text", lambda *_: lax.Payload("disc", "flange", {"m": "4"}), r"known\['m'\] is of type str; .* SI units"),
-    ("URDF", lambda *_: lax.Model(THREE_AXES.urdf, DRIVE_TRAIN), r"type str; expected Robot; .*robot_from_urdf\("),
-    ("ratios", lambda m, _: lax.Model(m.robot, np.diag([40.0] * 3)), r"ndarray; expected DriveTrain; .*np.diag\("),
-    ("vector", lambda *_: lax.DriveTrain([100, -50]), r"found shape \(2,\); write np.diag\(gear_ratios"),
-    ("ragged", lambda *_: lax.DriveTrain([[1.0], [1.0, 2.0]]), "the drive train is no array of numbers.*expected"),
-    ("file name", lambda *_: lax.robot_from_urdf("robot.urdf"), r"looks like a file name; .* pass Path\(...\).read_te"),
-    ("path", lambda *_: lax.robot_from_urdf(Path("robot.urdf")), "'robot.urdf'.* looks like a file name; expected"),
+    (
+        "a gain",
+        lambda m, r: _fixed(m, r, 30.0),
+        r"fixed_gains has shape \(\); expected \(3,\), one "
+        r"per motor",
+    ),
+    (
+        "words",
+        lambda m, r: _fixed(m, r, ["a", "b", "c"]),
+        r"fixed_gains is no array of "
+        r"numbers.*expected \(3,\)",
+    ),
+    (
+        "a mass",
+        lambda *_: lax.Payload("disc", "flange", 4.0),
+        "known is of type float; expected dict; write",
+    ),
+    (
+        "text",
+        lambda *_: lax.Payload("disc", "flange", {"m": "4"}),
+        r"known\['m'\] is of type str; "
+        r".* SI units",
+    ),
+    (
+        "URDF",
+        lambda *_: lax.Model(THREE_AXES.urdf, DRIVE_TRAIN),
+        r"type str; expected Robot; "
+        r".*robot_from_urdf\(",
+    ),
+    (
+        "ratios",
+        lambda m, _: lax.Model(m.robot, np.diag([40.0] * 3)),
+        r"ndarray; expected "
+        r"DriveTrain; .*np.diag\(",
+    ),
+    (
+        "vector",
+        lambda *_: lax.DriveTrain([100, -50]),
+        r"found shape \(2,\); write "
+        r"np.diag\(gear_ratios",
+    ),
+    (
+        "ragged",
+        lambda *_: lax.DriveTrain([[1.0], [1.0, 2.0]]),
+        "the drive train is no array of numbers.*expected",
+    ),
+    (
+        "file name",
+        lambda *_: lax.robot_from_urdf("robot.urdf"),
+        r"looks like a file name; .* pass "
+        r"Path\(...\).read_te",
+    ),
+    (
+        "path",
+        lambda *_: lax.robot_from_urdf(Path("robot.urdf")),
+        "'robot.urdf'.* looks like a file name; expected",
+    ),
     (
         "plan",
         lambda *_: lax.planned(lax.Motion([["a"]], [[0.0]], [[0.0]]), 9.0),
@@ -172,7 +332,9 @@ def _fixed(model: ident.Model, runs: list[ident.Run], gains: Any) -> ident.Ident
     return ident.identify(model, runs, ident.Conditioning(), fixed_gains=gains)
 
 
-@pytest.mark.parametrize(("call", "words"), [case[1:] for case in OF_A_CALL], ids=[case[0] for case in OF_A_CALL])
+@pytest.mark.parametrize(
+    ("call", "words"), [case[1:] for case in OF_A_CALL], ids=[case[0] for case in OF_A_CALL]
+)
 def test_an_argument_of_another_kind_is_refused(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], call: Call, words: str
 ) -> None:
@@ -182,12 +344,16 @@ def test_an_argument_of_another_kind_is_refused(
             call(small_truth.model, list(short))
 
 
-def test_runs_of_different_logs_may_have_one_name(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
+def test_runs_of_different_logs_may_have_one_name(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run]
+) -> None:
     """Sessions in folders of their own give their logs the same names."""
     bare, loaded = short
     of_logs = [replace(bare, digest="a" * 64), replace(loaded, name=bare.name, digest="b" * 64)]
     same = ident.identify(small_truth.model, of_logs)
-    assert np.array_equal(same.estimate.gains, ident.identify(small_truth.model, short).estimate.gains)
+    assert np.array_equal(
+        same.estimate.gains, ident.identify(small_truth.model, short).estimate.gains
+    )
 
 
 def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
@@ -196,13 +362,17 @@ def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident
         assert found.estimate.method is method
 
 
-def test_several_runs_are_named_one_by_one(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
+def test_several_runs_are_named_one_by_one(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run]
+) -> None:
     still = [replace(run, position_rad=run.position_rad * [1.0, 0.0, 1.0]) for run in short]
     with pytest.raises(ident.DataUnfit, match=r"^runs bare, loaded: axis q1: found q1 never moves"):
         ident.identify(small_truth.model, still, ident.Conditioning())
 
 
-def test_lists_and_arrays_of_objects_or_without_a_masked_value_are_as_good(short: tuple[ident.Run, ident.Run]) -> None:
+def test_lists_and_arrays_of_objects_or_without_a_masked_value_are_as_good(
+    short: tuple[ident.Run, ident.Run],
+) -> None:
     run = short[0]
     train = DRIVE_TRAIN
     expected = ident.differentiate(run, train)
@@ -266,8 +436,15 @@ def test_no_public_function_has_a_traceback_for_an_argument_of_another_type(
     arguments: dict[str, Any], function: str
 ) -> None:
     called = getattr(lax, function)
-    needed = [one.name for one in inspect.signature(called).parameters.values() if one.default is one.empty]
-    right = [arguments[name] for name in needed] if function != "gather" else [arguments["found"], arguments["runs"]]
+    needed = [
+        one.name
+        for one in inspect.signature(called).parameters.values()
+        if one.default is one.empty
+    ]
+    if function != "gather":
+        right = [arguments[name] for name in needed]
+    else:
+        right = [arguments["found"], arguments["runs"]]
     for place in range(len(right)):
         for value in WRONG_VALUES:
             if needed[place:] and needed[place] == "rate_hz" and isinstance(value, float):
@@ -282,11 +459,17 @@ def test_a_run_in_the_place_of_data_or_of_a_band_is_named(arguments: dict[str, A
     calibration = arguments["calibration"]
     model = arguments["model"]
     run = arguments["run"]
-    with pytest.raises(ident.ModelError, match="loaded of weigh is of type Run; expected Iterable; call weigh"):
+    with pytest.raises(
+        ident.ModelError, match="loaded of weigh is of type Run; expected Iterable; call weigh"
+    ):
         lax.weigh(calibration, model, run)
-    with pytest.raises(ident.ModelError, match="data of predict_torque is of type Run; expected Dataset"):
+    with pytest.raises(
+        ident.ModelError, match="data of predict_torque is of type Run; expected Dataset"
+    ):
         lax.predict_torque(calibration, model, run)
-    with pytest.raises(ident.ModelError, match="conditioning of external_torque is of type Run; expected Cond"):
+    with pytest.raises(
+        ident.ModelError, match="conditioning of external_torque is of type Run; expected Cond"
+    ):
         lax.external_torque(calibration, model, run, run)
 
 
@@ -295,12 +478,23 @@ def test_a_run_in_the_place_of_data_or_of_a_band_is_named(arguments: dict[str, A
     [
         ("abc", [1.0, 1.0, 1.0], "axes is the text 'abc'; expected a list of names"),
         ([1, 2, 3], [1.0, 1.0, 1.0], "an entry of axes is of type int; expected str"),
-        (["J1", "J1", "J2"], [1.0, 1.0, 1.0], "axes are J1, J1, J2; expected another name for each"),
-        (["J1", "J2", "J3"], [1.0, 0.0, 1.0], r"nameplate is \[1.0, 0.0, 1.0\]; expected .* none of them zero"),
+        (
+            ["J1", "J1", "J2"],
+            [1.0, 1.0, 1.0],
+            "axes are J1, J1, J2; expected another name for each",
+        ),
+        (
+            ["J1", "J2", "J3"],
+            [1.0, 0.0, 1.0],
+            r"nameplate is \[1.0, 0.0, 1.0\]; expected .* none "
+            r"of them zero",
+        ),
         (["J1", "J2", "J3"], [[1.0], [1.0], [1.0]], "nameplate is .*expected one gain per axis"),
     ],
 )
-def test_a_calibration_of_odd_axes_is_refused(arguments: dict[str, Any], axes: Any, nameplate: Any, words: str) -> None:
+def test_a_calibration_of_odd_axes_is_refused(
+    arguments: dict[str, Any], axes: Any, nameplate: Any, words: str
+) -> None:
     with pytest.raises(ident.ModelError, match=words):
         ident.calibration_of(arguments["found"], axes, nameplate)
 
@@ -309,7 +503,9 @@ def test_the_tolerance_of_a_payloads_mass_is_that_of_a_cell_file(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], arguments: dict[str, Any]
 ) -> None:
     declared = replace(MOUNTED, mass_tolerance_kg=0.02)
-    found = ident.identify(small_truth.model, [short[0], replace(short[1], payload=declared)], ident.Conditioning())
+    found = ident.identify(
+        small_truth.model, [short[0], replace(short[1], payload=declared)], ident.Conditioning()
+    )
     calibration = ident.calibration_of(found, arguments["axes"], arguments["nameplate"])
     # What `daq.calibration_of` does with `mass_tolerance_kg` of the cell file
     by_cell_file = [one.weighed_to(0.02) for one in arguments["calibration"].payload_mass]

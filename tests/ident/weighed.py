@@ -1,4 +1,6 @@
-"""Cells whose flange carries a body of known parameters, for the tests of weighing and its study: numpy alone."""
+"""Cells whose flange carries a body of known parameters, for the tests of weighing and its study:
+numpy alone.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from tests.ident.recordings import MOUNTED, PAYLOAD_TRUTH, FloatArray, Truth, ca
 RATE_HZ = 250.0
 AXIS = 1  #: Of the load friction, from 0
 COEFFICIENT = 0.12
-NOISE = 0.04  #: Of a row, as a share of the motor's rms current; lag one is 0.67, as on real recordings
+#: Of a row, as a share of the motor's rms current; lag one is 0.67, as on real recordings
+NOISE = 0.04
 CORRELATION_S = 0.05
 DISC = np.array([PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS])
 
@@ -37,8 +40,11 @@ class WeighedCell:
     body: FloatArray  #: its ten parameters
 
 
-def weighed_cell(truth: Truth, seed: int, *, seconds: float = 24.0, mass_factor: float = 1.0) -> WeighedCell:
-    """Calibrate a cell with load friction from four runs, then record it with a body that is drawn anew.
+def weighed_cell(
+    truth: Truth, seed: int, *, seconds: float = 24.0, mass_factor: float = 1.0
+) -> WeighedCell:
+    """Calibrate a cell with load friction from four runs,
+    then record it with a body that is drawn anew.
 
     Args:
         truth: of the robot.
@@ -68,23 +74,37 @@ def weighed_cell(truth: Truth, seed: int, *, seconds: float = 24.0, mass_factor:
 def a_body(rng: np.random.Generator) -> FloatArray:
     """One to six kilograms within a decimetre of the flange."""
     mass = rng.uniform(1.0, 6.0)
-    return Body(mass, rng.uniform(-0.1, 0.1, 3), mass * np.diag(rng.uniform(0.002, 0.004, 3))).parameters
+    return Body(
+        mass, rng.uniform(-0.1, 0.1, 3), mass * np.diag(rng.uniform(0.002, 0.004, 3))
+    ).parameters
 
 
-def noisy_run(truth: Truth, name: str, rng: np.random.Generator, body: FloatArray | None, seconds: float) -> Run:
-    """A run with any body, load friction on AXIS and noise of the current; it does not say what it carries."""
+def noisy_run(
+    truth: Truth, name: str, rng: np.random.Generator, body: FloatArray | None, seconds: float
+) -> Run:
+    """A run with any body, load friction on AXIS and noise of the current;
+    it does not say what it carries.
+    """
     mounted = truth.parameters.copy()
     mounted[truth.model.flange] += 0.0 if body is None else body
     run = record(replace(truth, parameters=mounted), name, rng, seconds=seconds, rate_hz=RATE_HZ)
-    data = differentiate(run, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * RATE_HZ))
+    data = differentiate(
+        run, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * RATE_HZ)
+    )
     load = truth.model.torques(data.motion(), mounted)[0][AXIS]
     torque = COEFFICIENT * np.abs(load) * np.sign(data.velocity_rad_s[:, AXIS])
     current = run.current_a.copy()
     current[1:-1] += np.outer(torque, truth.model.drive_train.to_motor[:, AXIS] / truth.gains)
-    return replace(run, current_a=current + coloured(rng, current.shape) * NOISE * np.sqrt(np.mean(current**2, axis=0)))
+    return replace(
+        run,
+        current_a=current
+        + coloured(rng, current.shape) * NOISE * np.sqrt(np.mean(current**2, axis=0)),
+    )
 
 
 def coloured(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
     """Noise of deviation one with CORRELATION_S, time first."""
     keep = np.exp(-1.0 / (CORRELATION_S * RATE_HZ))
-    return np.asarray(signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(shape), axis=0))
+    return np.asarray(
+        signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(shape), axis=0)
+    )

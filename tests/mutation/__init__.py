@@ -1,1 +1,3 @@
-"""Mutation study: small faults planted into the product, and whether a test notices each of them."""
+"""Mutation study: small faults planted into the product,
+and whether a test notices each of them.
+"""

@@ -1,4 +1,6 @@
-"""Which tests execute a line of the product: measured once, by one run of the tests under coverage."""
+"""Which tests execute a line of the product:
+measured once, by one run of the tests under coverage.
+"""
 
 from __future__ import annotations
 
@@ -41,18 +43,23 @@ class CoverageMap:
     tree: Path
 
     def tests_of(self, file: str, line: int) -> tuple[str, ...]:
-        """Tests that execute a line, the fastest first; none where it runs at import or in other processes only."""
+        """Tests that execute a line, the fastest first;
+        none where it runs at import or in other processes only.
+        """
         contexts = self.data.contexts_by_lineno(str(self.tree / file)).get(line, [])
         tests = [context for context in contexts if context]
         return tuple(sorted(tests, key=lambda test: self.durations_s.get(test, 0.0)))
 
     def runs_at_import(self, file: str, line: int) -> bool:
-        """Whether a line is executed outside of all tests: what it makes is used by tests that do not execute it."""
+        """Whether a line is executed outside of all tests:
+        what it makes is used by tests that do not execute it.
+        """
         return "" in self.data.contexts_by_lineno(str(self.tree / file)).get(line, [])
 
 
 def measured_map(tree: Path, folder: Path, jobs: int) -> CoverageMap:
-    """Run the tests of a tree under coverage, once for each of their rooms; a room that was measured is not run again.
+    """Run the tests of a tree under coverage, once for each of their rooms;
+    a room that was measured is not run again.
 
     Raises
     ------
@@ -111,10 +118,26 @@ def _measure(tree: Path, folder: Path, room: str) -> str:
     environment[DURATIONS_VARIABLE] = str(durations.with_suffix(".part"))
     sources = ",".join(str(tree / package) for package in ("daq", "ident", "drivers"))
     command = [sys.executable, "-m", "coverage", "run", f"--source={sources}", "--rcfile=/dev/null"]
-    command += ["-m", "pytest", "-q", "-p", "tests.mutation.contexts", "-p", "no:cacheprovider", "-m", FAST, room]
-    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
+    command += [
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "tests.mutation.contexts",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        FAST,
+        room,
+    ]
+    done = subprocess.run(
+        command, cwd=tree, env=environment, capture_output=True, text=True, check=False
+    )
     if done.returncode not in (0, NO_TESTS_WERE_COLLECTED):
-        raise RuntimeError(f"without any fault, tests of {room} fail:\n{done.stdout[-3000:]}\n{done.stderr[-1000:]}")
+        raise RuntimeError(
+            f"without any fault, tests of {room} "
+            f"fail:\n{done.stdout[-3000:]}\n{done.stderr[-1000:]}"
+        )
     durations.with_suffix(".part").rename(durations)
     return room
 

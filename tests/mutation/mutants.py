@@ -29,7 +29,18 @@ EXCHANGED_NAMES = {
 }
 """Functions that are called with the same arguments and mean something else."""
 
-SYMMETRIC = {"max", "min", "maximum", "minimum", "hypot", "isclose", "allclose", "array_equal", "gcd", "lcm"}
+SYMMETRIC = {
+    "max",
+    "min",
+    "maximum",
+    "minimum",
+    "hypot",
+    "isclose",
+    "allclose",
+    "array_equal",
+    "gcd",
+    "lcm",
+}
 """Functions of two arguments whose order does not matter."""
 
 EXCHANGED_COMPARISONS = {
@@ -89,8 +100,8 @@ def mutants_of(source: bytes) -> tuple[Mutant, ...]:
 
     A few do not compile (see `compiles`): an exchange inside a pattern, for example.
 
-    Docstrings, annotations, decorators, f-strings, `__all__` and blocks for type checkers are left out: what they
-    change is no behaviour, or has no position of its own in Python 3.11.
+    Docstrings, annotations, decorators, f-strings, `__all__` and blocks for type checkers are left
+    out: what they change is no behaviour, or has no position of its own in Python 3.11.
 
     Raises
     ------
@@ -103,7 +114,9 @@ def mutants_of(source: bytes) -> tuple[Mutant, ...]:
 
 
 def compiles(source: bytes) -> bool:
-    """Whether a source file is valid Python: a mutant that is not would be noticed by every test."""
+    """Whether a source file is valid Python:
+    a mutant that is not would be noticed by every test.
+    """
     try:
         compile(source, "mutant", "exec", dont_inherit=True)
     except (SyntaxError, ValueError):
@@ -144,7 +157,9 @@ class _Finder(ast.NodeVisitor):
     def _replace(self, kind: str, node: ast.expr | ast.stmt, after: str) -> None:
         self._add(kind, self._start(node), self._end(node), after)
 
-    def _exchange_between(self, kind: str, left: ast.expr, right: ast.expr, pattern: str, after: str) -> None:
+    def _exchange_between(
+        self, kind: str, left: ast.expr, right: ast.expr, pattern: str, after: str
+    ) -> None:
         """Replace the operator between two expressions."""
         start = self._end(left)
         between = self.source[start : self._start(right)].decode()
@@ -231,7 +246,11 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
-        if type(node.op) in EXCHANGED_OPERATORS and not _is_text(node.left) and not _is_text(node.right):
+        if (
+            type(node.op) in EXCHANGED_OPERATORS
+            and not _is_text(node.left)
+            and not _is_text(node.right)
+        ):
             pattern, after = EXCHANGED_OPERATORS[type(node.op)]
             self._exchange_between("arithmetic", node.left, node.right, pattern, after)
         self.generic_visit(node)

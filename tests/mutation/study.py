@@ -1,8 +1,8 @@
 """Plant faults into the product, one at a time, and see whether a test notices.
 
-`make mutation-study SEED=1 MUTANTS=300 MINUTES=55` goes on where it ended. A fault is tried with the tests of its own
-room that execute its line first (*mirrored*), and with the other tests that execute it where those pass. Rows go to
-a file for each seed beside the other evidence.
+`make mutation-study SEED=1 MUTANTS=300 MINUTES=55` goes on where it ended. A fault is tried with
+the tests of its own room that execute its line first (*mirrored*), and with the other tests that
+execute it where those pass. Rows go to a file for each seed beside the other evidence.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 PACKAGES = ("daq", "drivers", "ident")
 
 TESTS_AT_ONCE = 60
-"""Tests given to one process of pytest: a command line has a limit, and the fastest tests are tried first."""
+"""Tests given to one process of pytest:
+a command line has a limit, and the fastest tests are tried first.
+"""
 
 SLOWER = 5.0
 """A test that takes this many times its duration is taken as caught in an endless loop."""
@@ -44,8 +46,9 @@ START_S = 60.0
 class Outcome:
     """One row of the study.
 
-    `result` is "mirrored" or "other" for the tests that noticed, "survived", or "not executed" where no test of
-    `make test` runs the line in its own process and the tests of the room do not notice it either.
+    `result` is "mirrored" or "other" for the tests that noticed, "survived", or "not executed"
+    where no test of `make test` runs the line in its own process and the tests of the room do not
+    notice it either.
     """
 
     number: int
@@ -68,7 +71,9 @@ class Planted:
 
 
 def room_of(file: str) -> str:
-    """Room of a source file: `ident/model` of `ident/model/base.py`, `ident` of `ident/weighing.py`."""
+    """Room of a source file: `ident/model` of `ident/model/base.py`,
+    `ident` of `ident/weighing.py`.
+    """
     parts = Path(file).parts
     return "/".join(parts[: min(2, len(parts) - 1)])
 
@@ -83,7 +88,8 @@ def mirrored(test: str, file: str) -> bool:
 
 
 def chosen_mutants(tree: Path, seed: int, count: int) -> tuple[Planted, ...]:
-    """Mutants of all rooms: rooms in turn, a file by its number of places, then a kind, then a place.
+    """Mutants of all rooms: rooms in turn, a file by its number of places, then a kind,
+    then a place.
 
     Kinds are drawn evenly, since constants and arguments would be four of ten otherwise.
     """
@@ -112,7 +118,9 @@ def _places(tree: Path) -> dict[str, tuple[Mutant, ...]]:
     return places
 
 
-def _draw(rng: random.Random, places: dict[str, tuple[Mutant, ...]], room: str) -> tuple[str, Mutant]:
+def _draw(
+    rng: random.Random, places: dict[str, tuple[Mutant, ...]], room: str
+) -> tuple[str, Mutant]:
     files = [file for file in places if room_of(file) == room]
     sizes = [len(places[file]) for file in files]
     file = rng.choices(files, weights=sizes)[0]
@@ -123,7 +131,9 @@ def _draw(rng: random.Random, places: dict[str, tuple[Mutant, ...]], room: str) 
 
 
 def try_mutant(planted: Planted, tree: Path, covered: CoverageMap) -> Outcome:
-    """Plant one fault into a tree of its own, run the tests that could notice it, and take it out again."""
+    """Plant one fault into a tree of its own, run the tests that could notice it,
+    and take it out again.
+    """
     path = tree / planted.file
     source = path.read_bytes()
     try:
@@ -148,7 +158,9 @@ _written_at_s = iter(range(1_000_000_000, 2_000_000_000))
 
 
 def _write(path: Path, source: bytes) -> None:
-    """Write a source file with a time of its own, so that no compiled file of before is taken for it."""
+    """Write a source file with a time of its own,
+    so that no compiled file of before is taken for it.
+    """
     path.write_bytes(source)
     stamp = next(_written_at_s)
     os.utime(path, (stamp, stamp))
@@ -170,7 +182,9 @@ def _verdict(planted: Planted, tree: Path, covered: CoverageMap) -> tuple[str, s
 
 
 def _verdict_of_room(planted: Planted, tree: Path) -> tuple[str, str]:
-    """Judge a line that runs at import or in other processes: by the tests of its room, then by the pipeline's."""
+    """Judge a line that runs at import or in other processes:
+    by the tests of its room, then by the pipeline's.
+    """
     room = f"tests/{room_of(planted.file)}"
     for name, folder in (("mirrored", room), ("other", "tests/pipeline")):
         if not (tree / folder).is_dir():
@@ -193,7 +207,20 @@ def _first_that_fails(tests: list[str], tree: Path, covered: CoverageMap) -> str
 
 def _run(tests: list[str], tree: Path, timeout_s: float) -> str:
     """First test that fails, "timeout", or nothing where all pass."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", "-m", FAST, *tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        FAST,
+        *tests,
+    ]
     process = subprocess.Popen(
         command,
         cwd=tree,
@@ -212,7 +239,9 @@ def _run(tests: list[str], tree: Path, timeout_s: float) -> str:
     if process.returncode in (0, 5):
         return ""
     failed = [line for line in printed.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    return failed[0].split(" ", 1)[1].split(" - ")[0] if failed else f"pytest ended with {process.returncode}"
+    if failed:
+        return failed[0].split(" ", 1)[1].split(" - ")[0]
+    return f"pytest ended with {process.returncode}"
 
 
 def _tree_of_head(folder: Path) -> Path:
@@ -274,7 +303,8 @@ def _share(room: str, results: Counter[str]) -> str:
     missed = count - noticed
     by_mirrored = results["mirrored"]
     return (
-        f"{room:22s} {count:4d} mutants, noticed {noticed:4d}, by the mirrored tests {by_mirrored:4d}, missed {missed}"
+        f"{room:22s} {count:4d} mutants, noticed {noticed:4d}, by the mirrored tests "
+        f"{by_mirrored:4d}, missed {missed}"
     )
 
 
@@ -314,7 +344,10 @@ def main() -> int:
             outcome = finished.result()
             if outcome is not None:
                 _append(tables, outcome)
-                print_line(f"{outcome.number:4d} {outcome.result:12s} {outcome.file}:{outcome.line} {outcome.kind}")
+                print_line(
+                    f"{outcome.number:4d} {outcome.result:12s} "
+                    f"{outcome.file}:{outcome.line} {outcome.kind}"
+                )
     for line in summary(_rows_of(tables)):
         print_line(line)
     return 0

@@ -1,4 +1,6 @@
-"""Faults that the mutation study plants: what they are, where they stand, and which tests it runs."""
+"""Faults that the mutation study plants:
+what they are, where they stand, and which tests it runs.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +97,9 @@ def test_a_draw_is_repeated_by_its_seed_and_takes_every_room() -> None:
         ("tests/pipeline/test_main_job.py::test_a", "daq/jobs/session.py", False),
     ],
 )
-def test_a_mirrored_test_stands_in_the_room_of_the_file(test: str, file: str, expected: bool) -> None:
+def test_a_mirrored_test_stands_in_the_room_of_the_file(
+    test: str, file: str, expected: bool
+) -> None:
     assert mirrored(test, file) is expected
 
 

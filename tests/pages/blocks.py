@@ -3,7 +3,8 @@
 A comment before a block, which readers do not see, is its mark: ``<!-- not run: REASON -->``, or
 ``<!-- run by: FILE -->`` where a test of another room runs it, or ``<!-- saved as: FILE -->`` where
 the reader saves it and a command of the page runs it. A comment that begins with ``<!-- before:``
-has Python that stands for what the reader brings; ``<!-- needs: PACKAGE -->`` names what may be missing.
+has Python that stands for what the reader brings; ``<!-- needs: PACKAGE -->`` names what may be
+missing.
 
 Blocks of the language ``console`` are typed, line by line; those of ``python`` are executed. A
 command in a block of any other language needs a mark.
@@ -24,7 +25,20 @@ FENCE = re.compile(
 )
 NEEDS = re.compile(r"^<!-- needs: (\S+) -->$", re.MULTILINE)
 PROMPT = "$ "
-PROGRAMS = ("drivegain", "pip", "python", "python3", "make", "sudo", "ip", "cat", "echo", "mkdir", "dask", "git")
+PROGRAMS = (
+    "drivegain",
+    "pip",
+    "python",
+    "python3",
+    "make",
+    "sudo",
+    "ip",
+    "cat",
+    "echo",
+    "mkdir",
+    "dask",
+    "git",
+)
 COMMAND = re.compile(rf"^(?:[A-Z_]+=\S+ )*(?:{'|'.join(PROGRAMS)}|\S*bin/\S+) .*$")
 INLINE = re.compile(r"(?<![`\\])`(drivegain [a-z][^`\n]*)`(?!`)")
 
@@ -86,7 +100,12 @@ def blocks_of(page: str) -> tuple[Block, ...]:
         line = page.count("\n", 0, found.start("language")) + 1
         marks = {found["mark"]: found["reason"]}
         block = Block(
-            line, found["language"], found["text"], marks.get("not run"), marks.get("run by"), marks.get("saved as")
+            line,
+            found["language"],
+            found["text"],
+            marks.get("not run"),
+            marks.get("run by"),
+            marks.get("saved as"),
         )
         blocks.append(block)
     return tuple(blocks)
@@ -97,7 +116,9 @@ def without_marked(page: str) -> str:
 
     def emptied(found: re.Match[str]) -> str:
         block: str = found[0]
-        return block if found["mark"] is None else "\n" * block.count("\n")
+        if found["mark"] is None:
+            return block
+        return "\n" * block.count("\n")
 
     return FENCE.sub(emptied, page)
 

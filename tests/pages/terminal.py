@@ -16,7 +16,8 @@ from daq.cli.app import main
 from tests.pipeline.next_step import next_step
 from tests.pipeline.transcript import Command, shows
 
-LONGEST_S, STARTED_S = 300, 60
+LONGEST_S = 300
+STARTED_S = 60
 """Of a command; of what runs on in the second terminal, until it is of use."""
 ASKS_FOR_STATUS = "echo $?"
 
@@ -27,12 +28,14 @@ class Reader:
 
     page: str  #: for messages
     capfd: pytest.CaptureFixture[str]
-    proposed: set[str | None] = field(default_factory=set)  #: verbs that outputs named as the next step
+    #: verbs that outputs named as the next step
+    proposed: set[str | None] = field(default_factory=set)
 
     def follow(self, commands: list[Command]) -> None:
         """Type one command after the other, each seeing the exit code of the one before.
 
-        A command that fails is a mistake, unless the page shows its error or asks for its exit code.
+        A command that fails is a mistake, unless the page shows its error or asks for its exit
+        code.
         """
         status = 0
         for number, command in enumerate(commands):
@@ -55,7 +58,9 @@ class Reader:
 
 @contextmanager
 def second_terminal(command: Command) -> Iterator[None]:
-    """Something that runs on until the reader is done; it begins to be of use when it has said what the page shows."""
+    """Something that runs on until the reader is done;
+    it begins to be of use when it has said what the page shows.
+    """
     with subprocess.Popen(
         ["bash", "-c", f"exec {command.text}"],
         stdout=subprocess.PIPE,
@@ -84,8 +89,8 @@ def second_terminal(command: Command) -> Iterator[None]:
 def first_terminal(text: str, status: int, capfd: pytest.CaptureFixture[str]) -> tuple[int, str]:
     """Exit code and output of one command.
 
-    `drivegain` runs in this process, as its console script would run it: thirty processes would spend most of their
-    time importing the same libraries.
+    `drivegain` runs in this process, as its console script would run it: thirty processes would
+    spend most of their time importing the same libraries.
     """
     words = shlex.split(text)
     if words[0] == "drivegain" and not {"|", ">", "2>", "&&"} & set(words):

@@ -44,7 +44,13 @@ import pinocchio
 
 def test_a_command_without_console_or_mark_is_open() -> None:
     states = [(block.state, len(block.commands)) for block in blocks_of(PAGE)]
-    assert states == [(State.OPEN, 1), (State.MARKED, 1), (State.MARKED, 1), (State.RUN, 1), (State.RUN, 0)]
+    assert states == [
+        (State.OPEN, 1),
+        (State.MARKED, 1),
+        (State.MARKED, 1),
+        (State.RUN, 1),
+        (State.RUN, 0),
+    ]
 
 
 def test_a_saved_block_runs_by_a_command_alone() -> None:
@@ -73,7 +79,11 @@ def test_commands_in_sentences_and_needed_packages_are_found() -> None:
     ],
 )
 def test_the_reader_notices_what_differs(
-    typed: str, complaint: str, capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    typed: str,
+    complaint: str,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     commands = list(commands_of(f"```console\n{typed}```\n"))
@@ -85,5 +95,8 @@ def test_the_reader_takes_a_failure_that_the_page_shows(
     capfd: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    page = "```console\n$ sh -c 'echo error: no; exit 3'\nerror: no\n$ sh -c 'exit 4'\n$ echo $?\n4\n```\n"
+    page = (
+        "```console\n$ sh -c 'echo error: no; exit 3'\nerror: no\n$ sh -c 'exit 4'\n$ echo "
+        "$?\n4\n```\n"
+    )
     Reader("page", capfd).follow(list(commands_of(page)))

@@ -1,4 +1,5 @@
-"""Every command of every page is typed: first the tutorial, to the letter, then the pages that continue it.
+"""Every command of every page is typed:
+first the tutorial, to the letter, then the pages that continue it.
 
 Each of these pages begins in a copy of the folder that the tutorial leaves.
 """
@@ -17,7 +18,14 @@ from pathlib import Path
 import pytest
 
 from tests.pages.__main__ import main as counted
-from tests.pages.blocks import State, blocks_of, inline_commands, needed_packages, pages, without_marked
+from tests.pages.blocks import (
+    State,
+    blocks_of,
+    inline_commands,
+    needed_packages,
+    pages,
+    without_marked,
+)
 from tests.pages.options import verb_options
 from tests.pages.terminal import Reader
 from tests.pipeline.transcript import Command, commands_of
@@ -129,7 +137,10 @@ def test_every_command_is_typed_or_has_a_reason() -> None:
     for page in pages(DOCS):
         blocks = blocks_of(page.read_text(encoding="utf-8"))
         open_blocks = [block for block in blocks if block.commands and block.state is State.OPEN]
-        neither += [f"{page.relative_to(DOCS)}, line {block.line}: {block.commands[0]}" for block in open_blocks]
+        neither += [
+            f"{page.relative_to(DOCS)}, line {block.line}: {block.commands[0]}"
+            for block in open_blocks
+        ]
     assert neither == []
     assert counted().count(f" 0 {State.OPEN.value}") == 2
 

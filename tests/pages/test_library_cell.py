@@ -34,18 +34,27 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_calibration_of_arrays_is_exported_with_the_cell_file_of_the_page(folder: Path) -> None:
-    cell, calibration, model = (str(folder / name) for name in ("robot.cell.yaml", "calibration.yaml", "robot.xml"))
+    cell, calibration, model = (
+        str(folder / name) for name in ("robot.cell.yaml", "calibration.yaml", "robot.xml")
+    )
     assert main(["export", "mjcf", cell, calibration, "--out", model]) == 0
     loaded = mujoco.MjModel.from_xml_path(model)
     gains = loaded.actuator_gear[:, 0]
     assert np.abs(gains) == pytest.approx(np.abs(EXAMPLE.TRUE_GAINS_NM_A), rel=0.02)
 
 
-def test_another_name_is_refused_with_both_names(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_name_is_refused_with_both_names(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = folder / "other.cell.yaml"
-    other.write_text((folder / "robot.cell.yaml").read_text().replace("name: robot\n", "name: arm\n", 1))
+    other.write_text(
+        (folder / "robot.cell.yaml").read_text().replace("name: robot\n", "name: arm\n", 1)
+    )
     model = folder / "other.xml"
-    assert main(["export", "mjcf", str(other), str(folder / "calibration.yaml"), "--out", str(model)]) != 0
+    assert (
+        main(["export", "mjcf", str(other), str(folder / "calibration.yaml"), "--out", str(model)])
+        != 0
+    )
     said = capsys.readouterr().err
     assert "'arm'" in said
     assert "'robot'" in said

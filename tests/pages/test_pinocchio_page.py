@@ -23,12 +23,29 @@ def test_the_script_of_the_page_has_the_predicted_torque(
     monkeypatch.chdir(tmp_path)
     robot = robot_of("tx40")
     calibration = robot.saved(tmp_path)
-    assert main(["export", "urdf", str(robot.cell_file), str(calibration), "--out", "robot.urdf", "--json"]) == 0
+    assert (
+        main(
+            [
+                "export",
+                "urdf",
+                str(robot.cell_file),
+                str(calibration),
+                "--out",
+                "robot.urdf",
+                "--json",
+            ]
+        )
+        == 0
+    )
     Path("robot.json").write_text(capsys.readouterr().out, encoding="utf-8")
-    (script,) = [block for block in blocks_of(PAGE.read_text(encoding="utf-8")) if block.saved_as is not None]
+    (script,) = [
+        block for block in blocks_of(PAGE.read_text(encoding="utf-8")) if block.saved_as is not None
+    ]
     Path("torque.py").write_text(script.text, encoding="utf-8")
     torque_nm = runpy.run_path("torque.py")["torque_nm"]
     states = robot.states
-    samples = zip(states.position_rad, states.velocity_rad_s, states.acceleration_rad_s2, strict=True)
+    samples = zip(
+        states.position_rad, states.velocity_rad_s, states.acceleration_rad_s2, strict=True
+    )
     found = np.array([torque_nm(*sample) for sample in samples]).T
     assert apart(found, robot.predicted_nm()) <= 1e-6

@@ -1,4 +1,6 @@
-"""Every Python block of every page runs, after the Python that stands for what the reader brings."""
+"""Every Python block of every page runs, after the Python that stands for what the reader
+brings.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ WITH_PYTHON = [
 
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: str(page.relative_to(ROOT / "docs")))
-def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_of_a_page_runs(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -49,7 +53,12 @@ def test_every_page_of_the_api_has_an_example() -> None:
 
 @pytest.mark.parametrize("package", ["ident", "daq", "drivers"])
 def test_every_exported_name_is_on_one_page(package: str) -> None:
-    described = [name for page, (owner, _) in API_PAGES.items() if owner == package for name in api_names(page)]
+    described = [
+        name
+        for page, (owner, _) in API_PAGES.items()
+        if owner == package
+        for name in api_names(page)
+    ]
     exported = {f"{package}.{name}" for name in __import__(package).__all__}
     again = {"daq.Calibration"}  # it is `ident.Calibration`
     assert len(described) == len(set(described))

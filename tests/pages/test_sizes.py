@@ -26,7 +26,9 @@ def shown_mb() -> dict[str, int]:
         ("`foxglove` adds", "drivegain[foxglove]", "drivegain"),
     ],
 )
-def test_a_size_of_the_page_is_that_of_this_environment(name: str, wanted: str, without: str) -> None:
+def test_a_size_of_the_page_is_that_of_this_environment(
+    name: str, wanted: str, without: str
+) -> None:
     added = closure(wanted.split()) - closure(without.split())
     assert shown_mb()[name] == pytest.approx(megabytes(added), rel=ANOTHER_PYTHON)
 

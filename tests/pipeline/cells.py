@@ -1,4 +1,6 @@
-"""The whole way of a shipped simulated cell through the command line: plan, record, fit, and what came of it."""
+"""The whole way of a shipped simulated cell through the command line:
+plan, record, fit, and what came of it.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ class Job:
     @property
     def calibration(self) -> dict[str, Any]:
         """As written."""
-        document: dict[str, Any] = yaml.safe_load((self.folder / "calibration.yaml").read_text(encoding="utf-8"))
+        document: dict[str, Any] = yaml.safe_load(
+            (self.folder / "calibration.yaml").read_text(encoding="utf-8")
+        )
         return document
 
     @property
@@ -73,7 +77,8 @@ def record_job(
     noise: float = 1.0,
     changed: Callable[[CellSpec], CellSpec] = lambda spec: spec,
 ) -> tuple[Job, list[Path]]:
-    """Plan, and record in turn without and with the cell's first payload; return the job and its logs.
+    """Plan, and record in turn without and with the cell's first payload;
+    return the job and its logs.
 
     Args:
         name: of a shipped cell.
@@ -92,11 +97,15 @@ def record_job(
     cell_file = folder / "configs" / "cells" / f"{name}.yaml"
     cell = load_cell(cell_file)
     plant = load_simulation(shipped_simulation(simulation or name))
-    truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, plant.axes, strict=True)}
+    truth = {
+        axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, plant.axes, strict=True)
+    }
     job = Job(cell_file, cell, folder, truth, simulation or name, noise)
     logs = []
     for pair in range(pairs):
-        plan = make_plan(job, f"plan-{pair}.yaml", seed=10 * seed + pair, seconds=seconds, exchanges=exchanges)
+        plan = make_plan(
+            job, f"plan-{pair}.yaml", seed=10 * seed + pair, seconds=seconds, exchanges=exchanges
+        )
         for mounted in (None, cell.payloads[0].name):
             logs.append(folder / f"{'bare' if mounted is None else 'loaded'}-{pair}.mcap")
             record_run(
@@ -150,14 +159,18 @@ def record_run(
         changed: makes another plant of the simulation's.
     """
     spec = changed(load_simulation(shipped_simulation(job.simulation), mounted))
-    axes = tuple(replace(axis, current_noise_a=job.noise * axis.current_noise_a) for axis in spec.axes)
+    axes = tuple(
+        replace(axis, current_noise_a=job.noise * axis.current_noise_a) for axis in spec.axes
+    )
     chosen = []
     if declared:
         mass_kg = next(payload.mass_kg for payload in job.cell.payloads if payload.name == mounted)
         chosen = ["--payload", str(mounted), "--mass", str(mass_kg)]
     bus = open_bus(bus_address(job.cell))
     try:
-        with SimulatedCell(replace(spec, axes=axes, seed=seed, effects=spec.effects + effects), bus):
+        with SimulatedCell(
+            replace(spec, axes=axes, seed=seed, effects=spec.effects + effects), bus
+        ):
             moving = ["--enable-motion", "--operator", "test"]
             _do(["record", str(job.cell_file), str(plan), "--out", str(log), *moving, *chosen])
     finally:

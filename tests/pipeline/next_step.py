@@ -16,7 +16,8 @@ _FILLED_IN = {"KG": "1", "CELL": __file__}
 def next_step(output: str) -> str | None:
     """Return the verb of the next step after the output of a verb, or None where there is none.
 
-    Its options and values are parsed as the command line would; every file that it reads must exist.
+    Its options and values are parsed as the command line would; every file that it reads must
+    exist.
     """
     lines = [line for line in output.splitlines() if line.startswith("Next: ")]
     if not lines:
@@ -28,5 +29,7 @@ def next_step(output: str) -> str | None:
     context = called.command().make_context(verb, [_FILLED_IN.get(word, word) for word in words])
     for name, value in context.params.items():
         for path in value if isinstance(value, list | tuple) else [value]:
-            assert not isinstance(path, Path) or name in _WRITTEN or path.exists(), f"{line}: {name} {path}"
+            assert not isinstance(path, Path) or name in _WRITTEN or path.exists(), (
+                f"{line}: {name} {path}"
+            )
     return verb

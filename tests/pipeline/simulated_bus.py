@@ -13,16 +13,32 @@ from pathlib import Path
 
 @contextmanager
 def served_cell(folder: Path, checkout: Path) -> Iterator[Path]:
-    """Serve the clean demo cell within the block; yields a cell file in the folder whose bus is its hub."""
+    """Serve the clean demo cell within the block;
+    yields a cell file in the folder whose bus is its hub.
+    """
     configs = checkout / "configs"
-    command = [sys.executable, "-m", "daq", "simulate", str(configs / "simulation" / "clean.yaml"), "--port", "0"]
+    command = [
+        sys.executable,
+        "-m",
+        "daq",
+        "simulate",
+        str(configs / "simulation" / "clean.yaml"),
+        "--port",
+        "0",
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=checkout) as process:
         try:
             assert process.stdout is not None
-            recorded = list(iter(process.stdout.readline, "\n")) + list(iter(process.stdout.readline, "\n"))
+            recorded = list(iter(process.stdout.readline, "\n")) + list(
+                iter(process.stdout.readline, "\n")
+            )
             # What it prints to paste is pasted.
             bus = "".join(recorded[recorded.index("bus:\n") :])
-            text = (configs / "cells" / "demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+            text = (
+                (configs / "cells" / "demo.yaml")
+                .read_text()
+                .replace("../robots", str(configs / "robots"))
+            )
             path = folder / "cell.yaml"
             path.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL))
             yield path

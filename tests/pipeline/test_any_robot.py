@@ -1,4 +1,6 @@
-"""The whole way for robots that are not the paper's: seven axes on a wall with a differential, and a gantry."""
+"""The whole way for robots that are not the paper's:
+seven axes on a wall with a differential, and a gantry.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def test_every_gain_is_found_within_what_it_claims(job: Job) -> None:
 
 def test_gains_and_parameters_have_the_units_of_their_joints(job: Job) -> None:
     calibration = job.calibration
-    assert [gain["unit"] for gain in calibration["gains"]] == [f"{axis.unit.force}/A" for axis in job.cell.axes]
+    assert [gain["unit"] for gain in calibration["gains"]] == [
+        f"{axis.unit.force}/A" for axis in job.cell.axes
+    ]
     units = {parameter["name"]: parameter["unit"] for parameter in calibration["parameters"]}
     for number, axis in enumerate(job.cell.axes, start=1):
         assert units[f"fs{number}"] == axis.unit.force

@@ -1,4 +1,6 @@
-"""The simulated cell and the identification each have their own rule of the gears: here they are held to each other."""
+"""The simulated cell and the identification each have their own rule of the gears:
+here they are held to each other.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The real KUKA KR300: a third run does not refute the effects of two, and a floor from standstill is refuted."""
+"""The real KUKA KR300: a third run does not refute the effects of two,
+and a floor from standstill is refuted.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +32,21 @@ def _run(folder: Path, name: str) -> Run:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("out", "ABC")
-def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(shared_data: Path, out: str) -> None:
-    """The search once gave this arm a warm-up of 900 s in recordings of 20 s, and 3.17 % instead of 2.95 %."""
+def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(
+    shared_data: Path, out: str
+) -> None:
+    """The search once gave this arm a warm-up of 900 s in recordings of 20 s,
+    and 3.17 % instead of 2.95 %.
+    """
     folder = shared_data / "kr300"
     cell = load_cell(folder / "kr300-cell.yaml")
-    fit, held_out = [_run(folder, name) for name in "ABC" if name != out], [_run(folder, out)]
+    fit = [_run(folder, name) for name in "ABC" if name != out]
+    held_out = [_run(folder, out)]
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
     model = model_of(cell)
-    found = identify(model, fit, cell.conditioning, holdout=held_out, method=Method.ML, fixed_gains=gains)
+    found = identify(
+        model, fit, cell.conditioning, holdout=held_out, method=Method.ML, fixed_gains=gains
+    )
     start = gather(found, fit, held_out)
     after = find_effects(start, np.random.default_rng(0))[-1].after
     change = holdout_change(start, after)
@@ -51,7 +60,8 @@ def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(shar
 @pytest.mark.parametrize("gravity", [(9.81, 0.0, 0.0), (0.0, 9.81, 0.0), (0.0, 0.0, 9.81)])
 def test_a_wrong_mounting_is_found(shared_data: Path, gravity: tuple[float, ...]) -> None:
     folder = shared_data / "kr300"
-    cell, runs = load_cell(folder / "kr300-cell.yaml"), [_run(folder, name) for name in "ABC"]
+    cell = load_cell(folder / "kr300-cell.yaml")
+    runs = [_run(folder, name) for name in "ABC"]
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
     right = model_of(cell)
     instants = read_instants(right, runs, cell.conditioning)
@@ -63,9 +73,12 @@ def test_a_wrong_mounting_is_found(shared_data: Path, gravity: tuple[float, ...]
 
 
 def test_the_current_at_standstill_is_no_noise_floor(shared_data: Path) -> None:
-    """Before and after each motion the load passes between brakes, friction and motors of the standing arm."""
+    """Before and after each motion the load passes between brakes,
+    friction and motors of the standing arm.
+    """
     folder = shared_data / "kr300"
-    cell, runs = load_cell(folder / "kr300-cell.yaml"), [_run(folder, name) for name in "ABC"]
+    cell = load_cell(folder / "kr300-cell.yaml")
+    runs = [_run(folder, name) for name in "ABC"]
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
     found = identify(model_of(cell), runs, cell.conditioning, method=Method.ML, fixed_gains=gains)
     start = gather(found, runs)
@@ -76,4 +89,7 @@ def test_the_current_at_standstill_is_no_noise_floor(shared_data: Path) -> None:
     assert floor.noise_a > 3.0 * left_a[5]
     assert floor.is_refuted(left_a[5])
     # No run repeats a move of another or its own.
-    assert noise_floors(start.fit_runs, cell.conditioning, (FloorSource.REPEATED_MOVES,)) == (None,) * 6
+    assert (
+        noise_floors(start.fit_runs, cell.conditioning, (FloorSource.REPEATED_MOVES,))
+        == (None,) * 6
+    )

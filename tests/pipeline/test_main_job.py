@@ -1,4 +1,6 @@
-"""The whole way: recorded from a simulated cell by the driver, identified, its effect named, written back."""
+"""The whole way: recorded from a simulated cell by the driver, identified, its effect named,
+written back.
+"""
 
 from __future__ import annotations
 
@@ -35,12 +37,16 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_summary_reports_the_whole_story(demonstration: Path) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())
-    DemoReport.model_validate_json(json.dumps(summary), strict=False)  # the lists of its effects become tuples
+    # The lists of its effects become tuples
+    DemoReport.model_validate_json(json.dumps(summary), strict=False)
     assert [gain["axis"] for gain in summary["gains"]] == [f"J{number}" for number in range(1, 7)]
-    # Runs of 10 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by less than the root of that.
+    # Runs of 10 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by less than
+    # the root of that.
     for gain in summary["gains"]:
         assert abs(gain["error_percent"]) < 2.5
-        assert gain["error_percent"] == pytest.approx(100 * (gain["identified"] / gain["truth"] - 1))
+        assert gain["error_percent"] == pytest.approx(
+            100 * (gain["identified"] / gain["truth"] - 1)
+        )
     assert summary["effect"] == {"name": "load-friction", "axis": "J3"}
     assert len(summary["effects"]) == 1
     assert summary["error_after_percent"] < summary["error_before_percent"]
@@ -49,7 +55,9 @@ def test_the_summary_reports_the_whole_story(demonstration: Path) -> None:
     assert summary["applied"]
 
 
-def test_the_copy_of_the_controller_file_has_the_gains_and_every_comment(demonstration: Path, checkout: Path) -> None:
+def test_the_copy_of_the_controller_file_has_the_gains_and_every_comment(
+    demonstration: Path, checkout: Path
+) -> None:
     original = (checkout / "configs" / "controllers" / "demo.yaml").read_text()
     written = (demonstration / "controller.yaml").read_text()
     calibration = yaml.safe_load((demonstration / "calibration.yaml").read_text())
@@ -86,22 +94,40 @@ def test_a_log_is_enough_to_identify_from(
         elsewhere[-1].write_bytes((demonstration / f"{name}.mcap").read_bytes())
     assert main(["fit", *map(str, elsewhere), "--json"]) == ExitCode.OK
     fitted = json.loads(capsys.readouterr().out)
-    assert {"method", "gains", "parameters", "relative_error_percent", "condition", "rows", "filter", "effects"} <= set(
-        fitted
-    )
-    assert set(fitted["gains"][0]) >= {"axis", "value", "std_percent", "unit", "nameplate", "change_percent"}
+    assert {
+        "method",
+        "gains",
+        "parameters",
+        "relative_error_percent",
+        "condition",
+        "rows",
+        "filter",
+        "effects",
+    } <= set(fitted)
+    assert set(fitted["gains"][0]) >= {
+        "axis",
+        "value",
+        "std_percent",
+        "unit",
+        "nameplate",
+        "change_percent",
+    }
     assert set(fitted["parameters"][0]) >= {"name", "value", "unit", "std_percent"}
     assert len(fitted["relative_error_percent"]["axes"]) == 6
     assert fitted["method"] == "ml"
     assert len(fitted["compared"]["tls"]["gains"]) == 6
 
 
-def test_loaded_logs_alone_are_refused(demonstration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_loaded_logs_alone_are_refused(
+    demonstration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["fit", str(demonstration / "loaded-1.mcap")]) == ExitCode.DATA_UNFIT
     assert "without load too" in capsys.readouterr().err
 
 
-def test_bare_logs_alone_are_refused(demonstration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bare_logs_alone_are_refused(
+    demonstration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["fit", str(demonstration / "bare-1.mcap")]) == ExitCode.DATA_UNFIT
     assert "no run with a payload of known mass" in capsys.readouterr().err
 
@@ -117,7 +143,9 @@ def test_the_wrong_drive_train_shows_in_the_residual(
     )
     cell = tmp_path / "cell.yaml"
     cell.write_text(changed)
-    logs = [str(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
+    logs = [
+        str(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")
+    ]
     assert main(["fit", *logs, "--json"]) == ExitCode.OK
     right = json.loads(capsys.readouterr().out)["relative_error_percent"]["axes"]
     code = main(["fit", *logs, "--cell", str(cell), "--json"])
@@ -130,7 +158,9 @@ def test_the_wrong_drive_train_shows_in_the_residual(
 
 
 def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> None:
-    (bare, cell), (loaded, _) = (load_run(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1"))
+    (bare, cell), (loaded, _) = (
+        load_run(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1")
+    )
     payload = loaded.payload
     exchanged = (replace(bare, payload=payload), replace(loaded, payload=None))
     with pytest.raises(RolesExchanged, match=r"dry friction.*fs1 = -.*exchanged"):
@@ -151,13 +181,17 @@ def test_residual_prints_one_screen(
     """Standard output and standard error together, as a terminal or a log shows them."""
     progress, parts = searched
     out = StringIO()
-    console = Console(file=out, width=columns, soft_wrap=True, highlight=False, markup=False, force_terminal=True)
+    console = Console(
+        file=out, width=columns, soft_wrap=True, highlight=False, markup=False, force_terminal=True
+    )
     for part in parts:
         console.print(part)
     lines = out.getvalue().splitlines() + progress.splitlines()
     assert len(lines) <= 40
     text = " ".join(out.getvalue().split())
-    assert "J3 has friction that grows with the load: the error of J3 on held-out runs falls from" in text
+    assert (
+        "J3 has friction that grows with the load: the error of J3 on held-out runs falls from"
+    ) in text
     assert "Drive gains with the effects" in text
     assert f"Written: {demonstration / 'again.yaml'}" in text
     assert next_step(progress.splitlines()[-1]) == "apply"
@@ -165,7 +199,9 @@ def test_residual_prints_one_screen(
 
 @pytest.fixture(scope="module")
 def searched(demonstration: Path) -> tuple[str, list[RenderableType]]:
-    """What `residual` says on standard error, and the parts of what it prints on standard output."""
+    """What `residual` says on standard error, and the parts of what it prints on standard
+    output.
+    """
     names = ("bare-1", "loaded-1", "bare-2", "loaded-2")
     logs = [str(demonstration / f"{name}.mcap") for name in names]
     out = demonstration / "again.yaml"
@@ -188,7 +224,8 @@ def test_validate_measures_the_calibration_on_the_holdout_run(
 ) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())
     capsys.readouterr()
-    calibration, held_out = demonstration / "calibration.yaml", demonstration / "held-out.mcap"
+    calibration = demonstration / "calibration.yaml"
+    held_out = demonstration / "held-out.mcap"
     assert main(["validate", str(calibration), str(held_out), "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert found["logs"][0]["relative_error_percent"]["total"] == pytest.approx(
@@ -199,13 +236,23 @@ def test_validate_measures_the_calibration_on_the_holdout_run(
 def test_the_payload_of_the_holdout_run_is_weighed_and_nothing_touches_the_robot(
     demonstration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With runs of 10 s; with the 40 s of `make demo` the mass is within 0.5 % and the centre within 2 mm."""
-    held_out, known = str(demonstration / "held-out.mcap"), ["--calibration", str(demonstration / "calibration.yaml")]
+    """With runs of 10 s; with the 40 s of `make demo` the mass is within 0.5 % and the centre
+    within 2 mm.
+    """
+    held_out = str(demonstration / "held-out.mcap")
+    known = ["--calibration", str(demonstration / "calibration.yaml")]
     bare = ["--bare", str(demonstration / "bare-1.mcap")]
     assert main(["weigh", held_out, *known, *bare, "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert found["complete"]
-    assert found["mass_kg"]["value"] == pytest.approx(4.59, abs=min(0.1, 3.0 * found["mass_kg"]["std"]))
+    assert found["mass_kg"]["value"] == pytest.approx(
+        4.59, abs=min(0.1, 3.0 * found["mass_kg"]["std"])
+    )
     assert found["centre_m"]["value"] == pytest.approx([-0.06, -0.063, 0.095], abs=0.004)
-    assert main(["contact", held_out, *known, "--quiet", str(demonstration / "loaded-1.mcap"), "--json"]) == ExitCode.OK
+    assert (
+        main(
+            ["contact", held_out, *known, "--quiet", str(demonstration / "loaded-1.mcap"), "--json"]
+        )
+        == ExitCode.OK
+    )
     assert json.loads(capsys.readouterr().out)["contacts"] == []

@@ -1,4 +1,6 @@
-"""Mistakes of a tired technician at the end of the job: nothing is lost, and each of them is named."""
+"""Mistakes of a tired technician at the end of the job:
+nothing is lost, and each of them is named.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ pytestmark = pytest.mark.slow
 def tx40_log(tmp_path_factory: pytest.TempPathFactory, checkout: Path, shared_data: Path) -> bytes:
     log = tmp_path_factory.mktemp("tx40") / "tx40.mcap"
     description = checkout / "configs" / "imports" / "tx40.yaml"
-    assert main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(log)]) == ExitCode.OK
+    assert (
+        main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(log)])
+        == ExitCode.OK
+    )
     return log.read_bytes()
 
 
@@ -50,7 +55,8 @@ def test_no_output_over_an_input_or_another_file(
 def test_an_earlier_calibration_and_its_certificate_may_be_replaced(
     copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out, report = tmp_path / "calibration.yaml", tmp_path / "report"
+    out = tmp_path / "calibration.yaml"
+    report = tmp_path / "report"
     fit = ["fit", str(copied_log), "--gains", "fixed", "--out", str(out), "--report", str(report)]
     for _ in range(2):
         assert main(fit) == ExitCode.OK
@@ -67,7 +73,9 @@ def test_an_earlier_calibration_and_its_certificate_may_be_replaced(
     assert (report / "report.html").read_text() == "mine"
 
 
-def test_one_recording_counts_once(copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_recording_counts_once(
+    copied_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     twin = tmp_path / "twin.mcap"
     twin.write_bytes(copied_log.read_bytes())
     for arguments in ([str(copied_log), str(twin)], [str(copied_log), "--holdout", str(twin)]):
@@ -75,7 +83,9 @@ def test_one_recording_counts_once(copied_log: Path, tmp_path: Path, capsys: pyt
         assert "the same recording" in capsys.readouterr().err
 
 
-def test_the_demonstration_takes_no_other_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demonstration_takes_no_other_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recording = tmp_path / "bare-1.mcap.part"
     recording.write_bytes(b"precious")
     assert main(["demo", "--out", str(tmp_path)]) == ExitCode.USAGE

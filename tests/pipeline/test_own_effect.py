@@ -1,4 +1,5 @@
-"""An effect of one's own goes the whole way, with the code of the documentation's page, as module and as package.
+"""An effect of one's own goes the whole way, with the code of the documentation's page,
+as module and as package.
 
 The package is a folder on the path with its metadata, as an installation leaves it.
 """
@@ -57,7 +58,9 @@ def planted(name, payload, seed):
 bare = planted("bare", None, 1)
 loaded = planted("loaded", DISC, 2)
 """
-"""Recordings of the example's arm with the effect on J2, by a formula that is not the effect's own."""
+"""Recordings of the example's arm with the effect on J2,
+by a formula that is not the effect's own.
+"""
 
 USE = """
 import json
@@ -101,7 +104,9 @@ def _blocks(checkout: Path, language: str) -> list[str]:
 
 
 class OtherPackage:
-    """A folder with the page's module, which becomes an installed package, and programs that see it or not."""
+    """A folder with the page's module, which becomes an installed package,
+    and programs that see it or not.
+    """
 
     def __init__(self, checkout: Path, folder: Path) -> None:
         """Store the folders."""
@@ -123,10 +128,14 @@ class OtherPackage:
         metadata = self.site / f"ring_effect-{project['version']}.dist-info"
         metadata.mkdir()
         (metadata / "METADATA").write_text(
-            f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n", encoding="utf-8"
+            f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n",
+            encoding="utf-8",
         )
         lines = ["[drivegain.effects]"]
-        lines += [f"{name} = {value}" for name, value in project["entry-points"]["drivegain.effects"].items()]
+        lines += [
+            f"{name} = {value}"
+            for name, value in project["entry-points"]["drivegain.effects"].items()
+        ]
         (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def remove(self) -> None:
@@ -151,7 +160,9 @@ class OtherPackage:
 
     @property
     def calibration(self) -> Calibration:
-        """The calibration that was written, read in this process, which does not have the package."""
+        """The calibration that was written, read in this process,
+        which does not have the package.
+        """
         return load_calibration(self.work / "calibration.yaml")
 
 
@@ -168,7 +179,9 @@ def _search(checkout: Path) -> str:
     return code
 
 
-def test_the_page_goes_from_an_equation_to_a_finding_in_few_lines(checkout: Path, other: OtherPackage) -> None:
+def test_the_page_goes_from_an_equation_to_a_finding_in_few_lines(
+    checkout: Path, other: OtherPackage
+) -> None:
     code = "".join(_blocks(checkout, "python"))
     lines = [line for line in code.splitlines() if line.strip()]
     assert len(lines) <= 45
@@ -202,10 +215,14 @@ def test_an_effect_that_no_package_has_is_given_again(checkout: Path, other: Oth
     assert "give it as an argument (`own_effects`)" in refused.stderr
 
 
-def test_an_installed_effect_goes_the_whole_way_to_a_certificate_and_back(checkout: Path, other: OtherPackage) -> None:
+def test_an_installed_effect_goes_the_whole_way_to_a_certificate_and_back(
+    checkout: Path, other: OtherPackage
+) -> None:
     other.install()
     code = _search(checkout)
-    without_argument = code.replace(", own_effects=EFFECTS", "").replace("from ring_effect import EFFECTS\n", "")
+    without_argument = code.replace(", own_effects=EFFECTS", "").replace(
+        "from ring_effect import EFFECTS\n", ""
+    )
     assert "ring_effect" not in without_argument
     searched = other.run_code(without_argument)
     assert searched.returncode == 0, searched.stderr
@@ -230,14 +247,19 @@ def test_an_installed_effect_goes_the_whole_way_to_a_certificate_and_back(checko
     installed = other.run(report)
     assert installed.returncode == 0, installed.stderr
     page = (other.work / "calibration.html").read_text(encoding="utf-8")
-    text = r"J2 has friction of a slewing ring that its screws distort: amplitude 3\.3\d+ ± [0-9.]+ Nm, screws 3\."
+    text = (
+        r"J2 has friction of a slewing ring that its screws distort: amplitude 3\.3\d+ ± "
+        r"[0-9.]+ Nm, screws 3\."
+    )
     assert re.search(text, page)
     assert "is one of ring-effect 1.2.0" in page
 
     other.remove()
     refused = other.run_code(USE)
     assert refused.returncode == 1
-    assert "EffectNotInstalled: effect 'ring-friction' on J2: found no installed package that has it" in refused.stderr
+    assert (
+        "EffectNotInstalled: effect 'ring-friction' on J2: found no installed package that has it"
+    ) in refused.stderr
     assert "expected ring-effect 1.2.0, which had it" in refused.stderr
     assert other.run(report).returncode == 0
     page = (other.work / "calibration.html").read_text(encoding="utf-8")
@@ -292,7 +314,9 @@ def _verb(other: OtherPackage, *arguments: str) -> str:
 
 
 @pytest.mark.processes
-def test_the_command_line_searches_validates_and_weighs_with_it(checkout: Path, other: OtherPackage) -> None:
+def test_the_command_line_searches_validates_and_weighs_with_it(
+    checkout: Path, other: OtherPackage
+) -> None:
     other.install()
     assert other.run_code(TABLES).returncode == 0
     (other.work / "cell.yaml").write_text(CELL, encoding="utf-8")
@@ -331,7 +355,9 @@ def test_the_command_line_searches_validates_and_weighs_with_it(checkout: Path, 
         assert "expected ring-effect 1.2.0, which had it when the calibration was made" in text
         assert "install this package" in text
     _verb(other, "certificate", "calibration.yaml")
-    assert "is one of ring-effect 1.2.0" in (other.work / "calibration.html").read_text(encoding="utf-8")
+    assert ("is one of ring-effect 1.2.0") in (other.work / "calibration.html").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_a_cell_file_declares_it(checkout: Path, other: OtherPackage) -> None:

@@ -1,4 +1,6 @@
-"""Friction in the pivot that a closed chain is cut at: named, kept in a calibration, and used by what reads it."""
+"""Friction in the pivot that a closed chain is cut at:
+named, kept in a calibration, and used by what reads it.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,9 @@ PIVOT = "pivot tip"
 def _with_friction(made: Made, run: Run) -> Run:
     """The run with friction between the two rods, on top of its currents.
 
-    The rods point where their cranks and their own joints have turned them. The motors supply the power of the
-    friction: each its torque times how the angle between the rods turns with its crank, by differences of the poses.
+    The rods point where their cranks and their own joints have turned them. The motors supply the
+    power of the friction: each its torque times how the angle between the rods turns with its
+    crank, by differences of the poses.
     """
     data = differentiate(run, made.model.drive_train, made.conditioning)
     motion = data.motion()
@@ -58,7 +61,9 @@ def _between_rods(made: Made, cranks_rad: FloatArray) -> FloatArray:
     joints = made.model.follow(Motion(cranks_rad, still, still)).joints
     names = [joint.name for joint in made.model.robot.joints]
     angle = dict(zip(names, joints.position_rad.T, strict=True))
-    return np.asarray(angle["right-crank"] + angle["right-rod"] - angle["left-crank"] - angle["left-rod"])
+    return np.asarray(
+        angle["right-crank"] + angle["right-rod"] - angle["left-crank"] - angle["left-rod"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +98,10 @@ def test_a_calibration_with_a_pivot_is_the_same_from_its_file(
     save_calibration(calibration, tmp_path / "calibration.yaml")
     loaded = load_calibration(tmp_path / "calibration.yaml")
     assert loaded.passive_joints == ("left-rod", "right-rod", PIVOT)
-    assert placed_effect(loaded.effects[0], loaded)[0] == placed_effect(calibration.effects[0], calibration)[0]
+    assert (
+        placed_effect(loaded.effects[0], loaded)[0]
+        == placed_effect(calibration.effects[0], calibration)[0]
+    )
     data = differentiate(rubbing[0], made.model.drive_train, made.conditioning)
     predicted = predict_torque(calibration, made.model, data)
     assert_allclose(predict_torque(loaded, made.model, data), predicted, rtol=1e-9)

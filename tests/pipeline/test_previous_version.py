@@ -1,7 +1,8 @@
-"""The present version opens the files of the version before: cell, log, calibrations, audit and history.
+"""The present version opens the files of the version before:
+cell, log, calibrations, audit and history.
 
-`tests/data/make_previous_version.py` made them: wls.yaml was applied, then ml.yaml, which was rolled back; tls.yaml was
-entered by hand, and a change of J4 was acknowledged.
+`tests/data/make_previous_version.py` made them: wls.yaml was applied, then ml.yaml, which was
+rolled back; tls.yaml was entered by hand, and a change of J4 was acknowledged.
 """
 
 from __future__ import annotations
@@ -51,7 +52,9 @@ def _where_it_was_made(cell: Path) -> Cell:
     """The cell with its controller file under the name that the audit has for it."""
     declared = load_cell(cell)
     assert declared.history is not None
-    (subject,) = {one.subject for one in read_audit(declared.history.audit) if "applied" in one.action.value}
+    (subject,) = {
+        one.subject for one in read_audit(declared.history.audit) if "applied" in one.action.value
+    }
     return replace(declared, folder=Path(subject).parents[1] / "cells")
 
 
@@ -87,7 +90,12 @@ def test_the_history_is_what_was_written(cell: Path, capsys: pytest.CaptureFixtu
     assert [one["why"] for one in j4["acknowledged"]] == ["gearbox exchanged"]
     audit = found["audit"]
     # Of the SQLite file: three calibrations, and the acknowledgement with the name of the cell.
-    assert (audit["entries"], audit["holds"], audit["flaws"], audit["open_writes"]) == (7 + 4, True, [], [])
+    assert (audit["entries"], audit["holds"], audit["flaws"], audit["open_writes"]) == (
+        7 + 4,
+        True,
+        [],
+        [],
+    )
     assert (audit["history_broken"], audit["unknown_writes"]) == ([], [])
 
 
@@ -98,10 +106,14 @@ def test_the_history_knows_all_writes_of_the_audit(cell: Path) -> None:
     assert [write.ended.who.split()[0] for write in writes] == ["Ada", "Bert", "Cleo"]
     ledger = Ledger.of(declared)
     assert ledger is not None
-    assert [event.audit for event in read_history(ledger).events] == [write.ended.sha256 for write in writes]
+    assert [event.audit for event in read_history(ledger).events] == [
+        write.ended.sha256 for write in writes
+    ]
 
 
-def test_a_changed_line_of_the_audit_is_found(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changed_line_of_the_audit_is_found(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     audit = cell.with_name("press.audit.jsonl")
     audit.write_text(audit.read_text().replace("Bert", "Eve", 1))
     assert main(["history", str(cell), "--verify"]) == 4
@@ -120,7 +132,15 @@ def test_rollback_undoes_the_last_write(cell: Path, capsys: pytest.CaptureFixtur
 
 def test_apply_writes_behind_it(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = cell.parents[1]
-    arguments = ("apply", folder / "tls.yaml", "--cell", cell, "--yes", "--payload-mass", "disc=4.59")
+    arguments = (
+        "apply",
+        folder / "tls.yaml",
+        "--cell",
+        cell,
+        "--yes",
+        "--payload-mass",
+        "disc=4.59",
+    )
     assert _json(capsys, *arguments)["applied"]
     found = _json(capsys, "history", cell, "--verify")
     assert (found["calibrations"], found["in_force"]) == (3, _digest(cell, "tls"))

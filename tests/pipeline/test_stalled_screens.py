@@ -1,6 +1,8 @@
-"""Recordings whose screen takes nothing: a pipe that nobody reads, a terminal whose output is stopped.
+"""Recordings whose screen takes nothing:
+a pipe that nobody reads, a terminal whose output is stopped.
 
-No cycle is lost, the log is finished, the bus is free, and SIGINT ends the command within a stated time.
+No cycle is lost, the log is finished, the bus is free, and SIGINT ends the command within a stated
+time.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ pytestmark = pytest.mark.processes
 
 BEGUN_BYTES = 60_000  #: Of a log: the axes move
 WAIT_S = 120.0  #: For a whole recording on a busy computer
-END_S = 2 * PATIENCE_S + 10.0  #: After SIGINT: two streams, and the stop of the axes as it is promised
+#: After SIGINT: two streams, and the stop of the axes as it is promised
+END_S = 2 * PATIENCE_S + 10.0
 MOTION_S = 20.0
 
 
@@ -98,7 +101,11 @@ def _start(checkout: Path, screen: Screen, *arguments: str) -> Iterator[subproce
     """Run a command on a screen; one that has not ended with the block is killed."""
     command = [sys.executable, "-m", "daq", *arguments]
     with subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=screen.writing, stderr=screen.writing, cwd=checkout
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=screen.writing,
+        stderr=screen.writing,
+        cwd=checkout,
     ) as process:
         try:
             yield process
@@ -136,14 +143,18 @@ def _require_whole_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def _require_powerless(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The bus can be used as soon as the settings of the axes are restored, and no axis has power."""
+    """The bus can be used as soon as the settings of the axes are restored,
+    and no axis has power.
+    """
     end_s = time.monotonic() + END_S
     code = int(ExitCode.BUS_TAKEN)
     while code == ExitCode.BUS_TAKEN and time.monotonic() < end_s:
         capsys.readouterr()
         code = main(["scan", str(cell), "--json"])
     assert code == ExitCode.OK
-    assert {node["state"] for node in json.loads(capsys.readouterr().out)["nodes"]} == {"SWITCH ON DISABLED"}
+    assert {node["state"] for node in json.loads(capsys.readouterr().out)["nodes"]} == {
+        "SWITCH ON DISABLED"
+    }
 
 
 def _recording(cell: Path, plan: Path, log: Path) -> tuple[str, ...]:
@@ -151,7 +162,12 @@ def _recording(cell: Path, plan: Path, log: Path) -> tuple[str, ...]:
 
 
 def test_a_recording_into_a_pipe_that_nobody_reads_is_whole_and_sigint_ends_it(
-    cell: Path, plan: Path, full_pipe: Screen, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+    cell: Path,
+    plan: Path,
+    full_pipe: Screen,
+    tmp_path: Path,
+    checkout: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     log = tmp_path / "bare.mcap"
     with _start(checkout, full_pipe, *_recording(cell, plan, log)) as process:
@@ -165,12 +181,22 @@ def test_a_recording_into_a_pipe_that_nobody_reads_is_whole_and_sigint_ends_it(
 
 
 def test_a_recording_whose_remarks_nobody_reads_gives_its_result_and_ends_by_itself(
-    cell: Path, plan: Path, full_pipe: Screen, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+    cell: Path,
+    plan: Path,
+    full_pipe: Screen,
+    tmp_path: Path,
+    checkout: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     log = tmp_path / "bare.mcap"
     command = [sys.executable, "-m", "daq", *_recording(cell, plan, log), "--json"]
     done = subprocess.run(
-        command, stdout=subprocess.PIPE, stderr=full_pipe.writing, cwd=checkout, timeout=WAIT_S, check=False
+        command,
+        stdout=subprocess.PIPE,
+        stderr=full_pipe.writing,
+        cwd=checkout,
+        timeout=WAIT_S,
+        check=False,
     )
     assert done.returncode == ExitCode.OK
     assert json.loads(done.stdout)["lost_cycles"] == 0
@@ -178,7 +204,12 @@ def test_a_recording_whose_remarks_nobody_reads_gives_its_result_and_ends_by_its
 
 
 def test_sigint_in_motion_stops_a_recording_into_a_pipe_that_nobody_reads(
-    cell: Path, plan: Path, full_pipe: Screen, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+    cell: Path,
+    plan: Path,
+    full_pipe: Screen,
+    tmp_path: Path,
+    checkout: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     log = tmp_path / "bare.mcap"
     with _start(checkout, full_pipe, *_recording(cell, plan, log)) as process:
@@ -189,7 +220,12 @@ def test_sigint_in_motion_stops_a_recording_into_a_pipe_that_nobody_reads(
 
 
 def test_a_terminal_stopped_in_motion_holds_nothing_up_and_shows_the_result_later(
-    cell: Path, plan: Path, terminal: Screen, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+    cell: Path,
+    plan: Path,
+    terminal: Screen,
+    tmp_path: Path,
+    checkout: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     log = tmp_path / "bare.mcap"
     shown: list[bytes] = []
@@ -213,7 +249,9 @@ def test_a_terminal_stopped_in_motion_holds_nothing_up_and_shows_the_result_late
 def test_a_recording_outlives_its_terminal(
     cell: Path, plan: Path, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The SSH connection is gone, and SIGHUP was ignored or never came; the result alone is lost."""
+    """The SSH connection is gone, and SIGHUP was ignored or never came;
+    the result alone is lost.
+    """
     log = tmp_path / "bare.mcap"
     terminal = Screen(*pty.openpty())
     with _start(checkout, terminal, *_recording(cell, plan, log)) as process:
@@ -226,7 +264,12 @@ def test_a_recording_outlives_its_terminal(
 
 
 def test_sigint_ends_a_recording_in_a_stopped_terminal(
-    cell: Path, plan: Path, terminal: Screen, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+    cell: Path,
+    plan: Path,
+    terminal: Screen,
+    tmp_path: Path,
+    checkout: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     log = tmp_path / "bare.mcap"
     with _start(checkout, terminal, *_recording(cell, plan, log)) as process:
@@ -241,7 +284,10 @@ def test_sigint_ends_a_recording_in_a_stopped_terminal(
 def test_sigint_ends_what_runs_until_then_in_a_stopped_terminal(
     cell: Path, terminal: Screen, checkout: Path, verb: str
 ) -> None:
-    arguments = {"monitor": ["monitor", str(cell)], "simulate": ["simulate", "clean", "--port", "0"]}[verb]
+    arguments = {
+        "monitor": ["monitor", str(cell)],
+        "simulate": ["simulate", "clean", "--port", "0"],
+    }[verb]
     terminal.stop()
     with _start(checkout, terminal, *arguments) as process:
         # What it would print waits; it runs as soon as it handles SIGINT, in /proc/PID/status.

@@ -1,4 +1,6 @@
-"""The main job of a cell on two buses: scan, prepare, record, a valid log of one plant; and one bus that dies."""
+"""The main job of a cell on two buses: scan, prepare, record, a valid log of one plant;
+and one bus that dies.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ def wiring(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Wiring]:
     text = text.replace("../robots", str(CHECKOUT / "configs/robots"))
     path = tmp_path / "cell.yaml"
     name = request.node.name.replace("[", " ").replace("]", "")
-    path.write_text(on_two_buses(text, "virtual", f"{name} left", f"{name} right"), encoding="utf-8")
+    path.write_text(
+        on_two_buses(text, "virtual", f"{name} left", f"{name} right"), encoding="utf-8"
+    )
     cell = load_cell(path)
     ends = open_cell_bus(cell_address(cell))
     witnesses = [open_bus(part.address) for part in bus_parts(cell)]
@@ -82,7 +86,9 @@ def wiring(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Wiring]:
             end.shutdown()
 
 
-def test_scan_reports_the_bus_of_each_node(wiring: Wiring, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scan_reports_the_bus_of_each_node(
+    wiring: Wiring, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["scan", str(wiring.path), "--json"]) == ExitCode.OK
     rows = json.loads(capsys.readouterr().out)["nodes"]
     assert [(row["bus"], row["node_id"], row["axis"], row["verdict"]) for row in rows] == [
@@ -90,10 +96,16 @@ def test_scan_reports_the_bus_of_each_node(wiring: Wiring, capsys: pytest.Captur
     ]
     assert main(["scan", str(wiring.path)]) == ExitCode.OK
     lines = capsys.readouterr().out.splitlines()
-    assert sum(line.startswith("left") for line in lines) == sum(line.startswith("right") for line in lines) == 3
+    assert (
+        sum(line.startswith("left") for line in lines)
+        == sum(line.startswith("right") for line in lines)
+        == 3
+    )
 
 
-def test_an_amplifier_on_the_wrong_bus_is_found_there(wiring: Wiring, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_amplifier_on_the_wrong_bus_is_found_there(
+    wiring: Wiring, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = wiring.path.read_text(encoding="utf-8")
     swapped = text.replace("node_id: 3\n    bus: left", "node_id: 3\n    bus: right")
     assert swapped != text
@@ -116,8 +128,11 @@ def test_the_monitor_shows_both_buses(
     assert wiring.simulated.cycles == 0
 
 
-def test_a_short_recording_is_valid(wiring: Wiring, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plan, out = tmp_path / "plan.yaml", tmp_path / "bare.mcap"
+def test_a_short_recording_is_valid(
+    wiring: Wiring, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = tmp_path / "plan.yaml"
+    out = tmp_path / "bare.mcap"
     short = ["--duration", "5", "--exchanges", "2", "--seed", "1", "--condition", "1e9"]
     assert main(["plan", str(wiring.path), "--out", str(plan), *short]) == ExitCode.OK
     capsys.readouterr()
@@ -134,7 +149,9 @@ def test_a_short_recording_is_valid(wiring: Wiring, tmp_path: Path, capsys: pyte
     assert left[0x080] == right[0x080] == syncs  # one plant: time has moved once for both
     for counts, here, there in ((left, LEFT, RIGHT), (right, RIGHT, LEFT)):
         assert all(counts[0x180 + node] >= done["samples"] for node in here)
-        assert not any(counts[base + node] for node in there for base in (0x180, 0x200, 0x580, 0x600, 0x700))
+        assert not any(
+            counts[base + node] for node in there for base in (0x180, 0x200, 0x580, 0x600, 0x700)
+        )
         assert counts[0x77F] > 10  # the recorder's heartbeat, which the amplifiers of both watch
 
 
@@ -143,7 +160,9 @@ def _turn(network: CanopenNetwork, at_cycle: int, then: Callable[[], None]) -> N
     stream = SyncStream(network, LockstepSync(PERIOD_NS))
     start = next(stream).position_counts
     target = tuple(position + 60_000 for position in start)
-    with closing(execute(network, stream, (synchronised_move(start, target, ROOM),), PERMISSION)) as samples:
+    with closing(
+        execute(network, stream, (synchronised_move(start, target, ROOM),), PERMISSION)
+    ) as samples:
         for number, _ in enumerate(samples):
             if number == at_cycle:
                 then()
@@ -182,7 +201,10 @@ def test_when_one_bus_dies_the_axes_on_the_other_are_stopped(wiring: Wiring, cut
 
     name, alive = (("left", RIGHT), ("right", LEFT))[cut]
     network = CanopenNetwork(
-        cell_address(wiring.cell), drive_axes(wiring.cell), bounds=Bounds(silence_s=0.3), opener=opener
+        cell_address(wiring.cell),
+        drive_axes(wiring.cell),
+        bounds=Bounds(silence_s=0.3),
+        opener=opener,
     )
     with pytest.raises(BusError, match=rf"bus {name} \(virtual:") as caught, network:
         network.prepare()

@@ -21,7 +21,10 @@ def tx40(shared_data: Path, checkout: Path, tmp_path_factory: pytest.TempPathFac
     """The recording as a log."""
     log = tmp_path_factory.mktemp("tx40") / "tx40.mcap"
     description = checkout / "configs" / "imports" / "tx40.yaml"
-    assert main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(log)]) == ExitCode.OK
+    assert (
+        main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(log)])
+        == ExitCode.OK
+    )
     return log
 
 
@@ -37,7 +40,9 @@ def test_the_fit_agrees_with_the_published_parameters(
     assert max(error["axes"]) <= 11.0
     found = {parameter["name"]: parameter["value"] for parameter in fitted["parameters"]}
     with (shared_data / "tx40" / "published_base_parameters.csv").open() as stream:
-        published = [(row[0], tuple(float(cell) for cell in row[1:5])) for row in csv.reader(stream)]
+        published = [
+            (row[0], tuple(float(cell) for cell in row[1:5])) for row in csv.reader(stream)
+        ]
     # The published file has one row less: it leaves Ia6 out.
     assert {name for name, _ in published} == found.keys() - {"Ia6"}
     for name, (ls_value, ls_std_percent, wls_value, wls_std_percent) in published:
@@ -49,7 +54,12 @@ def test_the_fit_agrees_with_the_published_parameters(
 
 @pytest.mark.parametrize("gravity", ["[9.81, 0, 0]", "[0, 9.81, 0]", "[0, 0, 9.81]"])
 def test_a_wrong_mounting_is_named(
-    tx40: Path, checkout: Path, shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], gravity: str
+    tx40: Path,
+    checkout: Path,
+    shared_data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    gravity: str,
 ) -> None:
     """It once left an error of 8 to 12 % in place of 5 %, without a word."""
     declared = (checkout / "configs" / "cells" / "tx40.yaml").read_text()
@@ -59,7 +69,10 @@ def test_a_wrong_mounting_is_named(
     cell = tmp_path / "turned.yaml"
     cell.write_text(turned)
     capsys.readouterr()
-    assert main(["fit", str(tx40), "--gains", "fixed", "--cell", str(cell), "--json"]) == ExitCode.DATA_UNFIT
+    assert (
+        main(["fit", str(tx40), "--gains", "fixed", "--cell", str(cell), "--json"])
+        == ExitCode.DATA_UNFIT
+    )
     (diagnosis,) = json.loads(capsys.readouterr().out)["diagnoses"]
     assert diagnosis["name"] == "gravity-turned"
     found = re.match(r"gravity along \[(\S+), (\S+), (\S+)\]", diagnosis["found"])
@@ -80,7 +93,9 @@ def test_least_squares_too(tx40: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert json.loads(capsys.readouterr().out)["relative_error_percent"]["total"] <= 5.3
 
 
-def test_without_a_payload_free_gains_are_refused(tx40: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_payload_free_gains_are_refused(
+    tx40: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["fit", str(tx40)]) == ExitCode.DATA_UNFIT
     said = capsys.readouterr().err
     assert f"error:    run {tx40.stem}\n" in said
@@ -89,7 +104,9 @@ def test_without_a_payload_free_gains_are_refused(tx40: Path, capsys: pytest.Cap
 
 
 @pytest.mark.processes
-def test_known_lacks_of_this_robot_are_found(tx40: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_known_lacks_of_this_robot_are_found(
+    tx40: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     capsys.readouterr()
     assert main(["residual", str(tx40), "--gains", "fixed", "--json"]) == ExitCode.OK
     report = json.loads(capsys.readouterr().out)

@@ -1,4 +1,6 @@
-"""The real UR10: a base that is declared leaning by some degrees is named, and no joint is blamed for it."""
+"""The real UR10: a base that is declared leaning by some degrees is named,
+and no joint is blamed for it.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def test_a_leaning_base_is_named_and_no_zero(shared_data: Path, tilt_deg: float)
     leaning = with_gravity(right, declared)
     instants = read_instants(leaning, recording.runs, cell.conditioning)
     assert find_turned_geometry(leaning, instants, gains) is None
-    found = identify(leaning, recording.runs, cell.conditioning, method=Method.ML, fixed_gains=gains, judge=False)
+    found = identify(
+        leaning, recording.runs, cell.conditioning, method=Method.ML, fixed_gains=gains, judge=False
+    )
     (mistake,) = check_geometry(gather(found, recording.runs), np.random.default_rng(0)).mistakes
     assert isinstance(mistake.effect, GravityDirection)
     turn_deg = np.rad2deg(np.linalg.norm(mistake.coefficients))

@@ -5,7 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-_BLOCK = re.compile(r"^```console(?P<terminal> second terminal)?\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(
+    r"^```console(?P<terminal> second "
+    r"terminal)?\n(?P<body>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
 ANYTHING = "…"
 
 
@@ -27,7 +31,9 @@ class Command:
 
 
 def commands_of(page: str) -> tuple[Command, ...]:
-    """Every command of a page, in order: a line that begins with "$ ", with the lines ("> ") that continue it."""
+    """Every command of a page, in order: a line that begins with "$ ", with the lines ("> ")
+    that continue it.
+    """
     found = []
     for block in _BLOCK.finditer(page):
         first = page.count("\n", 0, block.start("body")) + 1
@@ -37,19 +43,26 @@ def commands_of(page: str) -> tuple[Command, ...]:
         for number, line in enumerate(block["body"].splitlines(), start=first):
             if line.startswith("$ "):
                 if typed:
-                    found.append(Command(begun, "\n".join(typed), "\n".join(shown), bool(block["terminal"])))
-                typed, shown, begun = [line[2:]], [], number
+                    found.append(
+                        Command(begun, "\n".join(typed), "\n".join(shown), bool(block["terminal"]))
+                    )
+                typed = [line[2:]]
+                shown = []
+                begun = number
             elif line.startswith("> ") and typed and not shown:
                 typed.append(line[2:])
             else:
                 shown.append(line)
         if typed:
-            found.append(Command(begun, "\n".join(typed), "\n".join(shown), bool(block["terminal"])))
+            found.append(
+                Command(begun, "\n".join(typed), "\n".join(shown), bool(block["terminal"]))
+            )
     return tuple(found)
 
 
 def shows(seen: str, output: str) -> str | None:
-    """The first line of what a page shows that is not in the output, in its order; None where all of it is there.
+    """The first line of what a page shows that is not in the output, in its order;
+    None where all of it is there.
 
     Spacing does not count: tables are as wide as their numbers.
     """

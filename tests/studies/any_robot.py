@@ -1,13 +1,15 @@
-"""Gains of every shipped robot and the mass of a second payload, over the whole driver path; effects of closed chains.
+"""Gains of every shipped robot and the mass of a second payload, over the whole driver path;
+effects of closed chains.
 
     python -m tests.studies.any_robot --only KR270 --seeds 1 2
     python -m tests.studies.any_robot --part effects --seeds 1
 
-Each seed has plans and noise of its own: runs in turn without load and with the weighed payload, a fit, then
-recordings with that payload and with a second body, which `weigh` finds with the calibration alone. A finished seed
-is kept in out/robot-study/ and not made again while the robot's row of ROBOTS and its files are the same. Writes
-out/robot-study.json and, if all robots and seeds are there, the tables of docs/evidence/robots.md. The effects that a
-plant has beside the declared ones, and what `residual` names, are in chain_effects.py.
+Each seed has plans and noise of its own: runs in turn without load and with the weighed payload, a
+fit, then recordings with that payload and with a second body, which `weigh` finds with the
+calibration alone. A finished seed is kept in out/robot-study/ and not made again while the robot's
+row of ROBOTS and its files are the same. Writes out/robot-study.json and, if all robots and seeds
+are there, the tables of docs/evidence/robots.md. The effects that a plant has beside the declared
+ones, and what `residual` names, are in chain_effects.py.
 """
 
 from __future__ import annotations
@@ -39,8 +41,11 @@ from tests.studies.robot_tables import write_tables
 OUT = Path("out/robot-study")
 TABLES = Path("docs/evidence/data")
 SEEDS = (1, 2, 3, 4)
-LAST_PLAN, LAST_NOISE = 9, 99
-"""Numbers of a seed's plans and noise for weighing, from which it counts down; those of the fit count up."""
+LAST_PLAN = 9
+LAST_NOISE = 99
+"""Numbers of a seed's plans and noise for weighing, from which it counts down;
+those of the fit count up.
+"""
 WITHIN = 1.96  #: σ of a 95 % interval
 
 
@@ -56,14 +61,20 @@ class StudiedRobot:
     second: str  #: second body in the simulation file
     weighed: int = 2  #: recordings with it, each with a plan of its own
     exchanges: int = 200  #: tries of the planner
-    noise: float = 1.0  #: factor of the simulation's current noise, for a relative error of 3 to 4 %
+    #: factor of the simulation's current noise, for a relative error of 3 to 4 %
+    noise: float = 1.0
 
     @property
     def fingerprint(self) -> str:
         """Digest of the row and of the files that it names."""
         cell = shipped_configurations() / "cells" / f"{self.cell}.yaml"
         simulation = shipped_simulation(self.simulation)
-        files = (cell.read_text(), load_cell(cell).urdf, simulation.read_text(), load_simulation(simulation).urdf)
+        files = (
+            cell.read_text(),
+            load_cell(cell).urdf,
+            simulation.read_text(),
+            load_simulation(simulation).urdf,
+        )
         return digest(self, files)
 
 
@@ -81,7 +92,9 @@ ROBOTS = (
 
 
 def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
-    """Gains and second payload of one seed; the folder is filled with its plans, logs and calibration."""
+    """Gains and second payload of one seed;
+    the folder is filled with its plans, logs and calibration.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         job, fitted = record_job(
             robot.cell,
@@ -97,18 +110,27 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
         first = job.cell.payloads[0].name
         plans = [
             make_plan(
-                job, f"weighed-{number}.yaml", seed=10 * seed + LAST_PLAN - number, seconds=robot.seconds, exchanges=0
+                job,
+                f"weighed-{number}.yaml",
+                seed=10 * seed + LAST_PLAN - number,
+                seconds=robot.seconds,
+                exchanges=0,
             )
             for number in range(robot.weighed)
         ]
-        # The weighed payload of the fit once more, in one run that no fit has seen (on moves that it can carry), then
-        # the second body in each.
+        # The weighed payload of the fit once more, in one run that no fit has seen (on moves that
+        # it can carry), then the second body in each.
         mounted = [(first, folder / "plan-0.yaml"), *((robot.second, plan) for plan in plans)]
         weighings: dict[str, list[Path]] = {first: [], robot.second: []}
         for number, (body, plan) in enumerate(mounted):
             weighings[body].append(folder / f"{body}-{number}.mcap")
             record_run(
-                job, plan, weighings[body][-1], mounted=body, declared=False, seed=100 * seed + LAST_NOISE - number
+                job,
+                plan,
+                weighings[body][-1],
+                mounted=body,
+                declared=False,
+                seed=100 * seed + LAST_NOISE - number,
             )
         calibration = load_calibration(folder / "calibration.yaml")
         weighed = {body: weigh_logs(calibration, mine).body for body, mine in weighings.items()}
@@ -135,11 +157,15 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
 
 def kept(robot: StudiedRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
     """Return the row of a seed, which is made unless it is there; logs are deleted once it is."""
-    return made_once(out, f"{robot.name}-{seed}", robot.fingerprint, lambda folder: study(robot, seed, folder))
+    return made_once(
+        out, f"{robot.name}-{seed}", robot.fingerprint, lambda folder: study(robot, seed, folder)
+    )
 
 
 def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures of one robot over its seeds [%]: magnitudes of errors, and the share of 95 % intervals that hold."""
+    """Figures of one robot over its seeds [%]:
+    magnitudes of errors, and the share of 95 % intervals that hold.
+    """
     errors, inside = gain_errors(rows)
     payload = np.abs([row["payload_error_percent"] for row in rows])
     return {
@@ -156,9 +182,13 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def gain_errors(rows: Iterable[dict[str, Any]]) -> tuple[FloatArray, BoolArray]:
-    """Magnitude of each gain's error [%] and whether it is inside its 95 % interval, all axes and seeds in a row."""
+    """Magnitude of each gain's error [%] and whether it is inside its 95 % interval,
+    all axes and seeds in a row.
+    """
     pairs = [
-        (abs(error), row["gain_std_percent"][axis]) for row in rows for axis, error in row["gain_error_percent"].items()
+        (abs(error), row["gain_std_percent"][axis])
+        for row in rows
+        for axis, error in row["gain_error_percent"].items()
     ]
     errors, std = np.array(pairs).T
     return errors, errors < WITHIN * std
@@ -167,7 +197,9 @@ def gain_errors(rows: Iterable[dict[str, Any]]) -> tuple[FloatArray, BoolArray]:
 def pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Coverage of the 95 % intervals over all robots, of gains and of weighed masses [%]."""
     inside = gain_errors(rows)[1]
-    masses = [abs(row["payload_error_percent"]) < WITHIN * row["payload_std_percent"] for row in rows]
+    masses = [
+        abs(row["payload_error_percent"]) < WITHIN * row["payload_std_percent"] for row in rows
+    ]
     return {
         "gains": len(inside),
         "gain_coverage_percent": 100.0 * float(np.mean(inside)),
@@ -179,47 +211,75 @@ def pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def table(robots: list[dict[str, Any]]) -> str:
     """One line a robot."""
     lines = [
-        "| robot | gains | relative error % | gain error mean % | worst % | second payload mean % | coverage % |",
+        "| robot | gains | relative error % | gain error mean % | worst % | second payload mean % "
+        "| coverage % |",
         "|---|---|---|---|---|---|---|",
     ]
     for one in robots:
-        shown = ("floor_percent", "mean_gain_error_percent", "worst_gain_error_percent", "mean_payload_error_percent")
+        shown = (
+            "floor_percent",
+            "mean_gain_error_percent",
+            "worst_gain_error_percent",
+            "mean_payload_error_percent",
+        )
         numbers = " | ".join(f"{one[key]:.2f}" for key in shown)
-        lines.append(f"| {one['robot']} | {one['gains']} | {numbers} | {one['coverage_percent']:.0f} |")
+        lines.append(
+            f"| {one['robot']} | {one['gains']} | {numbers} | {one['coverage_percent']:.0f} |"
+        )
     return "\n".join(lines)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Make the seeds that are missing, one after the other, and print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.any_robot", description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=[robot.name for robot in ROBOTS], metavar="ROBOT")
+    parser.add_argument(
+        "--only", nargs="+", choices=[robot.name for robot in ROBOTS], metavar="ROBOT"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--part", nargs="+", choices=["gains", "effects"], default=["gains", "effects"])
+    parser.add_argument(
+        "--part", nargs="+", choices=["gains", "effects"], default=["gains", "effects"]
+    )
     options = parser.parse_args(arguments)
     OUT.mkdir(parents=True, exist_ok=True)
     chosen = {robot.name for robot in ROBOTS if options.only is None or robot.name in options.only}
     path = OUT.with_suffix(".json")
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    document: dict[str, Any]
+    if path.is_file():
+        document = json.loads(path.read_text(encoding="utf-8"))
+    else:
+        document = {}
     if "gains" in options.part:
         document |= _gains(chosen, options.seeds)
     if "effects" in options.part:
-        effects = [kept_effect(one, seed, OUT) for one in PLANTED if one.robot in chosen for seed in options.seeds]
+        effects = [
+            kept_effect(one, seed, OUT)
+            for one in PLANTED
+            if one.robot in chosen
+            for seed in options.seeds
+        ]
         document["effects"] = effects
-        sys.stdout.write(f"\nUndeclared effects:\n\n{table_of_effects(effects)}\n" if effects else "")
+        sys.stdout.write(
+            f"\nUndeclared effects:\n\n{table_of_effects(effects)}\n" if effects else ""
+        )
     replace_file(path, f"{json.dumps(document, indent=2)}\n".encode())
     return 0
 
 
 def _gains(chosen: set[str], seeds: list[int]) -> dict[str, Any]:
-    """Figures of the chosen robots, printed as a table; of all of them also the tables of the documentation."""
+    """Figures of the chosen robots, printed as a table;
+    of all of them also the tables of the documentation.
+    """
     mine = [[kept(robot, seed) for seed in seeds] for robot in ROBOTS if robot.name in chosen]
     everything = [row for rows in mine for row in rows]
-    robots, over_all = [figures(rows) for rows in mine], pooled(everything)
+    robots = [figures(rows) for rows in mine]
+    over_all = pooled(everything)
     if len(robots) == len(ROBOTS) and set(seeds) >= set(SEEDS):
         write_tables(TABLES, robots, everything)
     sys.stdout.write(
-        f"{table(robots)}\n\n95 % intervals that hold: {over_all['gain_coverage_percent']:.0f} % of "
-        f"{over_all['gains']} gains, {over_all['mass_coverage_percent']:.0f} % of {over_all['masses']} masses\n"
+        f"{table(robots)}\n\n95 % intervals that hold: "
+        f"{over_all['gain_coverage_percent']:.0f} % of "
+        f"{over_all['gains']} gains, {over_all['mass_coverage_percent']:.0f} % of "
+        f"{over_all['masses']} masses\n"
     )
     return {"robots": robots, "pooled": over_all, "rows": everything}
 

@@ -1,7 +1,9 @@
-"""Cells of the effects study that nobody has chosen: count, family, axis and size of their effects are drawn.
+"""Cells of the effects study that nobody has chosen:
+count, family, axis and size of their effects are drawn.
 
-A seed that the author of a change has not run before shows what the search does beyond the cells that it was made on.
-Sizes are relative to the axis (its friction, inertia, rated current), around those of `effect_cells.SINGLE_EFFECTS`.
+A seed that the author of a change has not run before shows what the search does beyond the cells
+that it was made on. Sizes are relative to the axis (its friction, inertia, rated current), around
+those of `effect_cells.SINGLE_EFFECTS`.
 """
 
 from __future__ import annotations
@@ -37,7 +39,10 @@ def _viscous_nm_s_rad(axis: AxisSpec) -> float:
 
 def _nonlinear(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
     exponent = float(rng.choice([1 / 3, 2.0]))
-    return {"torque_at_1_rad_s_nm": (0.7 if exponent < 1.0 else 0.3) * size * _dry_nm(axis), "exponent": exponent}
+    return {
+        "torque_at_1_rad_s_nm": (0.7 if exponent < 1.0 else 0.3) * size * _dry_nm(axis),
+        "exponent": exponent,
+    }
 
 
 FAMILIES: dict[str, Draw] = {
@@ -80,7 +85,9 @@ FAMILIES: dict[str, Draw] = {
         "order": float(rng.choice([1, 2, 3, 4, 6])),
         "phase_rad": float(rng.uniform(-math.pi, math.pi)),
     },
-    "saturation": lambda axis, size, _: {"half_current_a": 4.2 * axis.rated_current_a / math.sqrt(size)},
+    "saturation": lambda axis, size, _: {
+        "half_current_a": 4.2 * axis.rated_current_a / math.sqrt(size)
+    },
     "lag": lambda _, size, __: {"time_constant_s": 0.008 * size},
     "coupling": lambda axis, size, _: {
         "coulomb_nm": 0.35 * size * _dry_nm(axis),
@@ -102,7 +109,10 @@ def blind_cases(seed: int, count: int) -> tuple[EffectCase, ...]:
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
         truth = int(rng.integers(10_000, 2**31))
         while True:
-            effects = tuple(_drawn(clean.axes, rng) for _ in range(rng.choice(len(EFFECT_COUNTS), p=EFFECT_COUNTS)))
+            effects = tuple(
+                _drawn(clean.axes, rng)
+                for _ in range(rng.choice(len(EFFECT_COUNTS), p=EFFECT_COUNTS))
+            )
             if len({(effect.name, effect.axis) for effect in effects}) < len(effects):
                 continue
             case = EffectCase(f"blind-{seed}-{number:02d}", truth, effects)
@@ -130,15 +140,16 @@ def _drawn(axes: Sequence[AxisSpec], rng: np.random.Generator) -> UndeclaredEffe
 def confusion(cells: Sequence[tuple[tuple[str, ...], tuple[str, ...]]]) -> str:
     """Return a Markdown table of true effects against what was named.
 
-    An effect that was named on its axis is found. Of the other names, each true effect takes one on its own axis, or is
-    missed; what is left over is false.
+    An effect that was named on its axis is found. Of the other names, each true effect takes one on
+    its own axis, or is missed; what is left over is false.
 
     Args:
         cells: true effects and named ones of each cell, as `family on J3`.
     """
     pairs: Counter[tuple[str, str]] = Counter()
     for true, named in cells:
-        missed, spare = [one for one in true if one not in named], [one for one in named if one not in true]
+        missed = [one for one in true if one not in named]
+        spare = [one for one in named if one not in true]
         for one in set(true) & set(named):
             pairs[_family(one), _family(one)] += 1
         for one in missed:
@@ -149,11 +160,17 @@ def confusion(cells: Sequence[tuple[tuple[str, ...], tuple[str, ...]]]) -> str:
         for one in spare:
             pairs[NOTHING, _family(one)] += 1
     rows, columns = (
-        sorted({pair[side] for pair in pairs}, key=lambda name: (name == NOTHING, name)) for side in (0, 1)
+        sorted({pair[side] for pair in pairs}, key=lambda name: (name == NOTHING, name))
+        for side in (0, 1)
     )
     lines = ["| true \\ named | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     texts = ([str(pairs[row, column] or "") for column in columns] for row in rows)
-    return "\n".join([*lines, *(f"| {row} | {' | '.join(cells)} |" for row, cells in zip(rows, texts, strict=True))])
+    return "\n".join(
+        [
+            *lines,
+            *(f"| {row} | {' | '.join(cells)} |" for row, cells in zip(rows, texts, strict=True)),
+        ]
+    )
 
 
 def _family(placed: str) -> str:

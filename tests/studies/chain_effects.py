@@ -1,7 +1,8 @@
-"""Effects that no file declares on closed chains, over the whole driver path: what `residual` names, and where.
+"""Effects that no file declares on closed chains, over the whole driver path:
+what `residual` names, and where.
 
-Each seed has plans and noise of its own: runs without load and with the weighed payload of a plant that has the effect,
-then `residual`. A part of the robot study (any_robot.py).
+Each seed has plans and noise of its own: runs without load and with the weighed payload of a plant
+that has the effect, then `residual`. A part of the robot study (any_robot.py).
 """
 
 from __future__ import annotations
@@ -41,8 +42,14 @@ class PlantedEffect:
     @property
     def fingerprint(self) -> str:
         """Digest of the row and of the files that it names."""
-        cell, simulation = shipped_configurations() / "cells" / f"{self.cell}.yaml", shipped_simulation(self.cell)
-        files = (cell.read_text(), load_cell(cell).urdf, simulation.read_text(), load_simulation(simulation).urdf)
+        cell = shipped_configurations() / "cells" / f"{self.cell}.yaml"
+        simulation = shipped_simulation(self.cell)
+        files = (
+            cell.read_text(),
+            load_cell(cell).urdf,
+            simulation.read_text(),
+            load_simulation(simulation).urdf,
+        )
         return digest(self, files)
 
 
@@ -59,19 +66,24 @@ PLANTED = (
     PlantedEffect(
         robot="DualV",
         cell="dualv",
-        effect=UndeclaredEffect("spring", 0, {"stiffness_nm_per_rad": 0.8, "rest_rad": 0.1}, joint="elbow-2"),
+        effect=UndeclaredEffect(
+            "spring", 0, {"stiffness_nm_per_rad": 0.8, "rest_rad": 0.1}, joint="elbow-2"
+        ),
         name="passive-spring",
         place="elbow-2",
         coefficient="stiffness",
         size=0.8,
     ),
 )
-"""One on a driven joint that gravity loads, one on a joint without a motor beside a redundant drive. A stiffer spring
-holds the DualV short of its targets, as its drives have no integral part."""
+"""One on a driven joint that gravity loads, one on a joint without a motor beside a redundant
+drive. A stiffer spring holds the DualV short of its targets, as its drives have no integral part.
+"""
 
 
 def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, Any]:
-    """Effects that `residual` names in one seed, and what they change; the folder is filled with plans and logs."""
+    """Effects that `residual` names in one seed, and what they change;
+    the folder is filled with plans and logs.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         job, logs = record_job(
             planted.cell,
@@ -86,7 +98,8 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
         code = drivegain(["residual", *map(str, logs), "--json"])
     assert code == ExitCode.OK, f"drivegain residual ended with {code}"
     found = as_json(printed.getvalue())
-    wanted, kept = (planted.name, planted.place), {(one["name"], one["axis"]) for one in found["effects"]}
+    wanted = (planted.name, planted.place)
+    kept = {(one["name"], one["axis"]) for one in found["effects"]}
     added = [one for turn in found["turns"] for one in turn["added"]]
     sizes = [
         coefficient
@@ -111,9 +124,15 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
         "error_before_percent": found["before"]["cross_validated_error_percent"]["total"],
         "error_after_percent": found["after"]["cross_validated_error_percent"]["total"],
         "gain_change_percent": {axis: one["change_percent"] for axis, one in changes.items()},
-        "gain_error_before_percent": {a: 100.0 * (one["before"] / job.truth[a] - 1.0) for a, one in changes.items()},
-        "gain_error_after_percent": {a: 100.0 * (one["after"] / job.truth[a] - 1.0) for a, one in changes.items()},
-        "gain_std_after_percent": {a: 100.0 * one["after_std"] / abs(job.truth[a]) for a, one in changes.items()},
+        "gain_error_before_percent": {
+            a: 100.0 * (one["before"] / job.truth[a] - 1.0) for a, one in changes.items()
+        },
+        "gain_error_after_percent": {
+            a: 100.0 * (one["after"] / job.truth[a] - 1.0) for a, one in changes.items()
+        },
+        "gain_std_after_percent": {
+            a: 100.0 * one["after_std"] / abs(job.truth[a]) for a, one in changes.items()
+        },
         "summary": found["summary"],
     }
 
@@ -121,7 +140,9 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
 def kept_effect(planted: PlantedEffect, seed: int, out: Path) -> dict[str, Any]:
     """Return the row of a seed, which is made unless it is there; logs are deleted once it is."""
     name = f"{planted.robot}-{planted.name}-{seed}"
-    return made_once(out, name, planted.fingerprint, lambda folder: study_effect(planted, seed, folder))
+    return made_once(
+        out, name, planted.fingerprint, lambda folder: study_effect(planted, seed, folder)
+    )
 
 
 def table_of_effects(rows: Sequence[dict[str, Any]]) -> str:
@@ -131,12 +152,19 @@ def table_of_effects(rows: Sequence[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        size = f"{row['found_size']:.3g} ± {row['found_size_std']:.2g}" if row["named"] else "not named"
+        if row["named"]:
+            size = f"{row['found_size']:.3g} ± {row['found_size_std']:.2g}"
+        else:
+            size = "not named"
         errors = f"{row['error_before_percent']:.2f} → {row['error_after_percent']:.2f}"
-        worst = (max(map(abs, row[f"gain_error_{when}_percent"].values())) for when in ("before", "after"))
+        worst = (
+            max(map(abs, row[f"gain_error_{when}_percent"].values()))
+            for when in ("before", "after")
+        )
         gains = " → ".join(f"{error:.2f}" for error in worst)
         lines.append(
             f"| {row['robot']} | {row['effect']} on {row['place']} | {row['size']:g} | {size} | "
-            f"{'yes' if row['named_first'] else 'no'} | {', '.join(row['others']) or 'none'} | {errors} | {gains} |"
+            f"{'yes' if row['named_first'] else 'no'} | {', '.join(row['others']) or 'none'} | "
+            f"{errors} | {gains} |"
         )
     return "\n".join(lines)

@@ -1,12 +1,13 @@
-"""A closed chain whose zero or rod is not as described, over the whole driver path: what `fit` and `residual` say.
+"""A closed chain whose zero or rod is not as described, over the whole driver path:
+what `fit` and `residual` say.
 
     python -m tests.studies.chain_geometry --seeds 1
     python -m tests.studies.chain_geometry --robot five-bar
 
-The plant is built otherwise than its cell file says. The encoders of the redundant DualV-like robot contradict each
-other then, and its drives work against each other; the five-bar has as many encoders as degrees of freedom, and shows
-it in its torques alone. Prints the errors of the gains, σ, the misfit and the corrections of each case; the first one
-is the clean cell.
+The plant is built otherwise than its cell file says. The encoders of the redundant DualV-like robot
+contradict each other then, and its drives work against each other; the five-bar has as many
+encoders as degrees of freedom, and shows it in its torques alone. Prints the errors of the gains,
+σ, the misfit and the corrections of each case; the first one is the clean cell.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ class WrongGeometry:
         """Build it into a URDF."""
         number = r"([-0-9.e]+)"
         found = re.search(
-            rf'<joint name="{self.joint}"[^>]*>\s*<origin xyz="{number} [^"]*"( rpy="0 0 {number})?', text
+            rf'<joint name="{self.joint}"[^>]*>\s*<origin xyz="{number} [^"]*"( rpy="0 0 '
+            rf"{number})?",
+            text,
         )
         assert found is not None
         if self.zero_deg:
@@ -78,11 +81,16 @@ def cases_of(robot: str) -> tuple[WrongGeometry | None, ...]:
 
 
 def study_case(job: Job, wrong: WrongGeometry | None, seed: int, verb: str) -> dict[str, Any]:
-    """Record the plan of a job with a plant that is built otherwise, and identify; the JSON of the verb."""
+    """Record the plan of a job with a plant that is built otherwise, and identify;
+    the JSON of the verb.
+    """
     logs = []
     with contextlib.redirect_stdout(io.StringIO()):
         for number, mounted in enumerate((None, job.cell.payloads[0].name)):
-            logs.append(job.folder / f"{'bare' if mounted is None else 'loaded'}-{wrong}.mcap".replace(" ", ""))
+            logs.append(
+                job.folder
+                / f"{'bare' if mounted is None else 'loaded'}-{wrong}.mcap".replace(" ", "")
+            )
             if not logs[-1].exists():
                 record_run(
                     job,
@@ -108,34 +116,52 @@ def row(job: Job, found: dict[str, Any]) -> str:
     encoders = "no encoder beyond the degrees of freedom"
     if misfit is not None:
         named = [
-            f"{one['kind']} {one['joint']} {one['end']} {one['change']:+.7f} ± {one['std']:.7f} {one['unit']}"
+            f"{one['kind']} {one['joint']} {one['end']} {one['change']:+.7f} ± {one['std']:.7f} "
+            f"{one['unit']}"
             for one in misfit["corrections"]
         ]
-        encoders = f"misfit {misfit['described']:.1e} → {misfit['left']:.1e}, {'; '.join(named) or 'nothing named'}"
+        encoders = (
+            f"misfit {misfit['described']:.1e} → {misfit['left']:.1e}, "
+            f"{'; '.join(named) or 'nothing named'}"
+        )
     effects = [f"{one['name']} on {one['axis']}" for one in found["effects"]]
     diagnoses = [f"{one['name']}: {one['found']}" for one in found["diagnoses"]]
     return (
-        f"errors {np.round(errors, 2)} σ {np.round(std, 2)} largest z {np.max(np.abs(errors / std)):.1f}, {encoders}; "
-        f"effects {', '.join(effects) or 'none'}; diagnoses {'; '.join(diagnoses) or 'none'}"
+        f"errors {np.round(errors, 2)} σ {np.round(std, 2)} largest z "
+        f"{np.max(np.abs(errors / std)):.1f}, {encoders}; effects {', '.join(effects) or 'none'}; "
+        f"diagnoses {'; '.join(diagnoses) or 'none'}"
     )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Study every case with plans and noise of each seed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.chain_geometry", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.chain_geometry", description=__doc__
+    )
     parser.add_argument("--robot", choices=ROD_ENDS, default="dualv")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--verbs", nargs="+", choices=["fit", "residual"], default=["fit", "residual"])
+    parser.add_argument(
+        "--verbs", nargs="+", choices=["fit", "residual"], default=["fit", "residual"]
+    )
     options = parser.parse_args(arguments)
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
-            job, _ = record_job(options.robot, Path(folder), seconds=options.seconds, pairs=0, seed=seed, noise=NOISE)
+            job, _ = record_job(
+                options.robot,
+                Path(folder),
+                seconds=options.seconds,
+                pairs=0,
+                seed=seed,
+                noise=NOISE,
+            )
             with contextlib.redirect_stdout(io.StringIO()):
                 make_plan(job, "plan.yaml", seed=10 * seed, seconds=options.seconds, exchanges=50)
             for wrong in cases_of(options.robot):
                 for verb in options.verbs:
-                    sys.stdout.write(f"{seed} {verb} {wrong}: {row(job, study_case(job, wrong, seed, verb))}\n")
+                    sys.stdout.write(
+                        f"{seed} {verb} {wrong}: {row(job, study_case(job, wrong, seed, verb))}\n"
+                    )
                     sys.stdout.flush()
     return 0
 

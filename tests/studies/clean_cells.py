@@ -1,6 +1,8 @@
-"""Clean simulated cells, several seeds: how far the gains are off, and whether an effect is seen that is not there.
+"""Clean simulated cells, several seeds: how far the gains are off,
+and whether an effect is seen that is not there.
 
-Run by `make gain-study`; writes out/gain-study.json and prints the table of docs/evidence/estimators.md.
+Run by `make gain-study`; writes out/gain-study.json and prints the table of
+docs/evidence/estimators.md.
 """
 
 from __future__ import annotations
@@ -25,16 +27,22 @@ def one(seed: int) -> dict[str, Any]:
     quiet = ProgressReporter(lambda _: None, lambda _done, _total, _remark: None)
     settings = Settings(OUT / str(seed), shipped_simulation("clean"), seed, DURATION_S)
     outcome = demonstrate(settings, lambda: datetime.now(UTC), quiet)
-    gains, paper = demo_gains(outcome), outcome.fitted.paper
+    gains = demo_gains(outcome)
+    paper = outcome.fitted.paper
     assert paper is not None  # no gain is held fixed
     ml = [gain.error_percent for gain in gains]
-    tls = [100.0 * (value / gain.truth - 1.0) for gain, value in zip(gains, paper.gains.tolist(), strict=True)]
+    tls = [
+        100.0 * (value / gain.truth - 1.0)
+        for gain, value in zip(gains, paper.gains.tolist(), strict=True)
+    ]
     return {
         "seed": seed,
         "floor_percent": outcome.calibration.relative_error_percent.total,
         "ml_error_percent": ml,
         "tls_error_percent": tls,
-        "scores": [gain.error_percent / gain.std_percent for gain in gains if gain.std_percent is not None],
+        "scores": [
+            gain.error_percent / gain.std_percent for gain in gains if gain.std_percent is not None
+        ],
         "effects": [effect.name for effect in outcome.calibration.effects],
     }
 
@@ -45,22 +53,31 @@ def main() -> int:
         rows = pool.map(one, SEEDS, chunksize=1)
     ml = [abs(error) for row in rows for error in row["ml_error_percent"]]
     tls = [abs(error) for row in rows for error in row["tls_error_percent"]]
-    sizes = {name: {"mean_percent": sum(e) / len(e), "max_percent": max(e)} for name, e in (("ml", ml), ("tls", tls))}
+    sizes = {
+        name: {"mean_percent": sum(e) / len(e), "max_percent": max(e)}
+        for name, e in (("ml", ml), ("tls", tls))
+    }
     false_effects = sum(len(row["effects"]) for row in rows)
     result = {"runs": rows, **sizes, "false_effects": false_effects}
     OUT.with_suffix(".json").write_text(json.dumps(result, indent=2) + "\n")
     lines = [
-        "| seed | floor % | " + " | ".join(f"J{n + 1} %" for n in range(6)) + " | paper's TLS, mean / max % | effects |"
+        "| seed | "
+        "floor % | " + " | ".join(f"J{n + 1} %" for n in range(6)) + " | paper's TLS, mean / max % "
+        "| effects |"
     ]
     lines.append("|---" * 10 + "|")
     for row in rows:
         gains = " | ".join(f"{error:+.2f}" for error in row["ml_error_percent"])
         paper_errors = [abs(error) for error in row["tls_error_percent"]]
         paper = f"{sum(paper_errors) / len(paper_errors):.1f} / {max(paper_errors):.1f}"
-        lines.append(f"| {row['seed']} | {row['floor_percent']:.2f} | {gains} | {paper} | {len(row['effects'])} |")
+        lines.append(
+            f"| {row['seed']} | {row['floor_percent']:.2f} | {gains} | {paper} | "
+            f"{len(row['effects'])} |"
+        )
     lines.append("")
     lines += [
-        f"{name}: mean {size['mean_percent']:.2f} %, max {size['max_percent']:.2f} %" for name, size in sizes.items()
+        f"{name}: mean {size['mean_percent']:.2f} %, max {size['max_percent']:.2f} %"
+        for name, size in sizes.items()
     ]
     lines.append(f"effects found in clean cells: {false_effects}")
     sys.stdout.write("\n".join(lines) + "\n")

@@ -1,13 +1,15 @@
 """`make console-study`: recordings on SocketCAN with the console alternately open and closed.
 
-Blocks of recordings follow one another, without and with a console whose page is read. Of each block: cycles lost, the
-jitter of SYNC by the kernel's stamps, and the console's processor time and memory. The rate is the highest of RATES_HZ
-that is lossless without a console: in some recordings before the blocks, and in every block without one. A block
-without a console that loses a cycle starts the study again at the next rate. Written to out/console-study.json.
+Blocks of recordings follow one another, without and with a console whose page is read. Of each
+block: cycles lost, the jitter of SYNC by the kernel's stamps, and the console's processor time and
+memory. The rate is the highest of RATES_HZ that is lossless without a console: in some recordings
+before the blocks, and in every block without one. A block without a console that loses a cycle
+starts the study again at the next rate. Written to out/console-study.json.
 
-A machine that stalls longer than a period loses cycles at every rate, whatever runs on it. `--despite-losses` goes on
-at the first rate. Every gap of SYNC is written with its time, to be compared with what a sleeper of the highest
-priority saw on the host (`python -m tests.studies.stalls`).
+A machine that stalls longer than a period loses cycles at every rate, whatever runs on it.
+`--despite-losses` goes on at the first rate. Every gap of SYNC is written with its time, to be
+compared with what a sleeper of the highest priority saw on the host (`python -m
+tests.studies.stalls`).
 """
 
 from __future__ import annotations
@@ -82,7 +84,14 @@ def recording(cell: Path, plan: Path, log: Path) -> dict[str, Any]:
     log.with_name(log.name + ".part").unlink(missing_ok=True)
     document = record_once(cell, plan, log)
     if not log.exists():
-        return {"ended_early": 1, "lost": 0, "missing": 0, "samples": 0, "jitter_us": [], "gaps": []}
+        return {
+            "ended_early": 1,
+            "lost": 0,
+            "missing": 0,
+            "samples": 0,
+            "jitter_us": [],
+            "gaps": [],
+        }
     found = read_log(log)
     interval_ns = np.diff(found.samples.time_ns)
     jitter_us = 1e-3 * np.abs(interval_ns - 1e9 / found.head.run.rate_hz)
@@ -103,32 +112,56 @@ def gaps_of(time_ns: IntArray, rate_hz: float) -> list[tuple[float, float]]:
     return [(round(1e-9 * float(time_ns[i]), 3), round(float(interval_ms[i]), 1)) for i in late]
 
 
-def block(cell: Path, plan: Path, log: Path, seconds: float, process: subprocess.Popen[str] | None) -> dict[str, Any]:
+def block(
+    cell: Path, plan: Path, log: Path, seconds: float, process: subprocess.Popen[str] | None
+) -> dict[str, Any]:
     """Recordings one after the other for a time."""
-    began_s, parts = time.monotonic(), []
+    began_s = time.monotonic()
+    parts = []
     start = (0.0, 0.0) if process is None else used(process.pid)
     while time.monotonic() - began_s < seconds:
         parts.append(recording(cell, plan, log))
     lasted_s = time.monotonic() - began_s
     jitter = np.concatenate([part.pop("jitter_us") for part in parts])
     gaps = [gap for part in parts for gap in part.pop("gaps", ())]
-    summed = {key: sum(part[key] for part in parts) for key in ("ended_early", "lost", "missing", "samples")}
-    found = {"open": process is not None, "recordings": len(parts), "seconds": round(lasted_s, 1), **summed}
+    summed = {
+        key: sum(part[key] for part in parts)
+        for key in ("ended_early", "lost", "missing", "samples")
+    }
+    found = {
+        "open": process is not None,
+        "recordings": len(parts),
+        "seconds": round(lasted_s, 1),
+        **summed,
+    }
     found["gaps"] = gaps
     if jitter.size:
-        found |= {f"jitter_us_p{share:g}": round(float(np.percentile(jitter, share)), 1) for share in (50, 99, 99.9)}
+        found |= {
+            f"jitter_us_p{share:g}": round(float(np.percentile(jitter, share)), 1)
+            for share in (50, 99, 99.9)
+        }
     if process is not None:
         end = used(process.pid)
-        found |= {"console_percent": round(100.0 * (end[0] - start[0]) / lasted_s, 2), "console_mb": [start[1], end[1]]}
+        found |= {
+            "console_percent": round(100.0 * (end[0] - start[0]) / lasted_s, 2),
+            "console_mb": [start[1], end[1]],
+        }
     return found
 
 
 def cell_at(folder: Path, rate_hz: int, seconds: float) -> tuple[Path, Path, Path]:
-    """Cell, simulation and plan at a rate; the kernel sends SYNC, so that a recorder that has to wait loses nothing."""
+    """Cell, simulation and plan at a rate; the kernel sends SYNC,
+    so that a recorder that has to wait loses nothing.
+    """
     folder.mkdir()
     cell = write_cell(folder, 1_000_000 // rate_hz, "timed\n  producer: kernel")
     plan = folder / "plan.yaml"
-    assert drivegain(["plan", str(cell), "--out", str(plan), "--duration", str(seconds), "--exchanges", "0"]) == 0
+    assert (
+        drivegain(
+            ["plan", str(cell), "--out", str(plan), "--duration", str(seconds), "--exchanges", "0"]
+        )
+        == 0
+    )
     return cell, write_simulation(folder, 1_000_000 // rate_hz), plan
 
 
@@ -137,7 +170,9 @@ def is_lossless(found: dict[str, Any]) -> bool:
     return not (found["lost"] or found["missing"] or found["ended_early"])
 
 
-def blocks_at(folder: Path, rate_hz: int, options: argparse.Namespace) -> list[dict[str, Any]] | None:
+def blocks_at(
+    folder: Path, rate_hz: int, options: argparse.Namespace
+) -> list[dict[str, Any]] | None:
     """All blocks at one rate; None where a recording without a console lost a sample."""
     cell, simulation, plan = cell_at(folder / str(rate_hz), rate_hz, options.seconds)
     log = folder / "run.mcap"
@@ -164,13 +199,24 @@ def _show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Go down the rates until one is lossless without a console; 1 where a console cost a cycle, or none is."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.console_study", description=__doc__)
+    """Go down the rates until one is lossless without a console;
+    1 where a console cost a cycle, or none is.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.console_study", description=__doc__
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="of all blocks together")
     parser.add_argument("--block", type=float, default=10.0, help="minutes of a block")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the plan")
     parser.add_argument("--tries", type=int, default=3, help="recordings before the blocks")
-    parser.add_argument("--rates", type=int, nargs="+", default=list(RATES_HZ), metavar="HZ", help="the highest first")
+    parser.add_argument(
+        "--rates",
+        type=int,
+        nargs="+",
+        default=list(RATES_HZ),
+        metavar="HZ",
+        help="the highest first",
+    )
     parser.add_argument("--despite-losses", action="store_true", help="go on at the first rate")
     options = parser.parse_args(arguments)
     out = Path(os.environ.get(OUT, "out")) / "console-study.json"
@@ -183,7 +229,9 @@ def main(arguments: list[str] | None = None) -> int:
         else:
             _show({"lossless_at_no_rate_of_hz": options.rates})
             return 1
-    out.write_text(json.dumps({"rate_hz": rate_hz, "blocks": blocks}, indent=1) + "\n", encoding="utf-8")
+    out.write_text(
+        json.dumps({"rate_hz": rate_hz, "blocks": blocks}, indent=1) + "\n", encoding="utf-8"
+    )
     return int(not all(map(is_lossless, blocks)))
 
 

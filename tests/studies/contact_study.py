@@ -1,12 +1,14 @@
-"""False alarms an hour of thresholds that were learned from minutes of quiet motion, and how high they are.
+"""False alarms an hour of thresholds that were learned from minutes of quiet motion,
+and how high they are.
 
     python -m tests.studies.contact_study --tables docs/evidence/data
 
-Residuals of six joints are drawn: first-order Gaussian autoregressions, or these transformed to a marginal distribution
-of Student's t with five degrees of freedom. Each band is learned from quiet minutes by `ident.contact.alarm_level`, and
-alarms in hours of later residual are counted by `ident.contact.ExternalTorque`, as `contact` does. Later residual has
-the same scale, or one that is 15 % larger. The scale s is one known constant: what the fit of its four terms to real
-motion adds is not in these figures.
+Residuals of six joints are drawn: first-order Gaussian autoregressions, or these transformed to a
+marginal distribution of Student's t with five degrees of freedom. Each band is learned from quiet
+minutes by `ident.contact.alarm_level`, and alarms in hours of later residual are counted by
+`ident.contact.ExternalTorque`, as `contact` does. Later residual has the same scale, or one that is
+15 % larger. The scale s is one known constant: what the fit of its four terms to real motion adds
+is not in these figures.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ QUIET_MINUTES = (2.0, 5.0, 15.0, 30.0)
 FIRST_SEED = 1000  #: The thresholds' constants were chosen with seeds up to 30
 BANDS = 40
 HOURS = 50
-KEPT_SIGMAS = 3.0  #: Gaussian; rows of later residual below it on all joints raise no alarm, and are not kept
+#: Gaussian; rows of later residual below it on all joints raise no alarm, and are not kept
+KEPT_SIGMAS = 3.0
 FARTHEST_SIGMAS = 8.0
 
 
@@ -55,7 +58,9 @@ class Later:
 
 
 def with_tail(gaussian: FloatArray, tail: str) -> FloatArray:
-    """Transform a standard normal signal to the marginal distribution of one of TAILS, same shape."""
+    """Transform a standard normal signal to the marginal distribution of one of TAILS,
+    same shape.
+    """
     if tail == "Gaussian":
         return gaussian
     nodes = np.linspace(0.0, FARTHEST_SIGMAS, 4001)
@@ -66,11 +71,15 @@ def with_tail(gaussian: FloatArray, tail: str) -> FloatArray:
 
 def sigma_of(tail: str) -> float:
     """Standard deviation of the signal of `with_tail`."""
-    return 1.0 if tail == "Gaussian" else float(np.sqrt(STUDENT_DEGREES / (STUDENT_DEGREES - 2.0)))
+    if tail == "Gaussian":
+        return 1.0
+    return float(np.sqrt(STUDENT_DEGREES / (STUDENT_DEGREES - 2.0)))
 
 
 def autoregression(rng: np.random.Generator, rows: int, correlation_s: float) -> FloatArray:
-    """Standard normal signal whose autocorrelation falls to 1/e in `correlation_s`, shape (JOINTS, rows)."""
+    """Standard normal signal whose autocorrelation falls to 1/e in `correlation_s`, shape (JOINTS,
+    rows).
+    """
     lag_one = np.exp(-ROW_S / correlation_s)
     white = rng.standard_normal((JOINTS, rows))
     white[:, 1:] *= np.sqrt(1.0 - lag_one**2)
@@ -90,19 +99,25 @@ def later_residual(rng: np.random.Generator, tail: str, correlation_s: float, ho
     return Later(np.concatenate(times), np.concatenate(torques, axis=1), hours)
 
 
-def learned_levels(rng: np.random.Generator, tail: str, correlation_s: float, minutes: float) -> FloatArray:
+def learned_levels(
+    rng: np.random.Generator, tail: str, correlation_s: float, minutes: float
+) -> FloatArray:
     """Threshold of each joint from quiet minutes, shape (JOINTS,)."""
     rows = round(60.0 * minutes / ROW_S)
     ratio = np.abs(with_tail(autoregression(rng, rows, correlation_s), tail))
     time_s: FloatArray = np.arange(rows) * np.float64(ROW_S)
     levels = []
     for joint in range(JOINTS):
-        level = alarm_level(ratio[joint], time_s, 2.0 * correlation_s, ALARMS_PER_HOUR / JOINTS, 60.0 * minutes)
+        level = alarm_level(
+            ratio[joint], time_s, 2.0 * correlation_s, ALARMS_PER_HOUR / JOINTS, 60.0 * minutes
+        )
         levels.append(np.nan if level is None else level)
     return np.array(levels)
 
 
-def alarms_an_hour(levels: FloatArray, later: Later, correlation_s: float, growth: float = 1.0) -> float:
+def alarms_an_hour(
+    levels: FloatArray, later: Later, correlation_s: float, growth: float = 1.0
+) -> float:
     """False alarms of all joints together in an hour of later residual."""
     ones = np.ones(JOINTS)
     scale = np.zeros((JOINTS, 4))
@@ -122,7 +137,9 @@ def alarms_an_hour(levels: FloatArray, later: Later, correlation_s: float, growt
 
 
 def least_level(later: Later, correlation_s: float) -> float:
-    """Level with ALARMS_PER_HOUR on this residual, for one who knows it: the lowest that any method could promise."""
+    """Level with ALARMS_PER_HOUR on this residual, for one who knows it:
+    the lowest that any method could promise.
+    """
     low = KEPT_SIGMAS
     high = float(np.abs(later.torque).max())
     for _ in range(25):
@@ -134,10 +151,14 @@ def least_level(later: Later, correlation_s: float) -> float:
     return high
 
 
-def measured_rows(tail: str, correlation_s: float, bands: int, hours: int, minutes: Sequence[float]) -> list[str]:
+def measured_rows(
+    tail: str, correlation_s: float, bands: int, hours: int, minutes: Sequence[float]
+) -> list[str]:
     """Rows of the table for one kind of residual."""
     kind = [TAILS.index(tail), round(1000.0 * correlation_s)]
-    later = later_residual(np.random.default_rng([FIRST_SEED - 1, *kind]), tail, correlation_s, hours)
+    later = later_residual(
+        np.random.default_rng([FIRST_SEED - 1, *kind]), tail, correlation_s, hours
+    )
     least = least_level(later, correlation_s) / sigma_of(tail)
     rows = []
     for quiet in minutes:
@@ -168,14 +189,16 @@ def measured_rows(tail: str, correlation_s: float, bands: int, hours: int, minut
 
 
 HEADER = (
-    "| tail | correlation, s | scale later | quiet, min | alarms/h, mean | worst band | bands above 1/h "
-    "| level, σ | lowest | highest | least possible |"
+    "| tail | correlation, s | scale later | quiet, min | alarms/h, mean | worst band | bands "
+    "above 1/h | level, σ | lowest | highest | least possible |"
 )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.contact_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.contact_study", description=__doc__
+    )
     parser.add_argument("--bands", type=int, default=BANDS)
     parser.add_argument("--hours", type=int, default=HOURS, help="of later residual")
     parser.add_argument("--tables", type=Path, help="folder for the table as CSV")

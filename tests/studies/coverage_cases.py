@@ -7,10 +7,11 @@
 - after-loop: as clean, with one undeclared effect that the search has to find;
 - continuous: as clean, in motion without any rest.
 
-Each cell has a truth, motions and noise of its own: two runs of 20 s without load and two with the disc. Runs and
-scores are kept in out/coverage-cases/<case>/; runs outlive any change but of the simulation, scores any change but of
-what they measure. A study that was interrupted goes on where it was; `--shard 2/4` takes every fourth cell from the
-second on, and the table has all that is there.
+Each cell has a truth, motions and noise of its own: two runs of 20 s without load and two with the
+disc. Runs and scores are kept in out/coverage-cases/<case>/; runs outlive any change but of the
+simulation, scores any change but of what they measure. A study that was interrupted goes on where
+it was; `--shard 2/4` takes every fourth cell from the second on, and the table has all that is
+there.
 """
 
 from __future__ import annotations
@@ -95,7 +96,9 @@ class CaseTask:
     @property
     def effects(self) -> tuple[UndeclaredEffect, ...]:
         """Undeclared effects of the cell; each of EFFECTS comes once before one comes again."""
-        return (EFFECTS[self.number % len(EFFECTS)],) if CASES[self.case].searched else ()
+        if CASES[self.case].searched:
+            return (EFFECTS[self.number % len(EFFECTS)],)
+        return ()
 
     @property
     def path(self) -> Path:
@@ -110,12 +113,18 @@ class CaseTask:
 
 def simulate(task: CaseTask, cell: Cell) -> tuple[RawRun, ...]:
     """The four runs of a cell."""
-    case, truth = CASES[task.case], world_cell(task.seed, CASES[task.case].world)
+    case = CASES[task.case]
+    truth = world_cell(task.seed, CASES[task.case].world)
     runs = []
     for number, (name, payload) in enumerate(RUNS):
         spec = replace(spec_of(truth, payload, number), effects=task.effects)
-        demand = case.motion(cell, spec.start_rad, np.random.default_rng([task.seed, number]), DURATION_S)
-        declared = None if payload is None else declared_payload(payload)
+        demand = case.motion(
+            cell, spec.start_rad, np.random.default_rng([task.seed, number]), DURATION_S
+        )
+        if payload is None:
+            declared = None
+        else:
+            declared = declared_payload(payload)
         runs.append(follow(cell, spec, demand, name, declared, BETWEEN_S * number))
     return tuple(runs)
 
@@ -123,7 +132,9 @@ def simulate(task: CaseTask, cell: Cell) -> tuple[RawRun, ...]:
 def make_runs(task: CaseTask, cell: Cell) -> None:
     """Simulate the runs of a cell unless the same ones are there."""
     spec = world_cell(task.seed, CASES[task.case].world).bare
-    source = digest_of_source("tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell"))
+    source = digest_of_source(
+        "tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell")
+    )
     fingerprint = digest(source, cell.digest, DURATION_S, spec.urdf, spec.axes, task.effects)
     if not is_finished(task.path, fingerprint):
         task.path.parent.mkdir(parents=True, exist_ok=True)
@@ -133,7 +144,8 @@ def make_runs(task: CaseTask, cell: Cell) -> None:
 
 def make(task: CaseTask) -> str:
     """Simulate and score a cell as far as that was not done; return what was done."""
-    cell, begun_s = load_cell(CELL), time.process_time()
+    cell = load_cell(CELL)
+    begun_s = time.process_time()
     make_runs(task, cell)
     simulated_s = time.process_time() - begun_s
     ways = ("ident.discovery.loop" if CASES[task.case].searched else "ident.estimators.identify",)
@@ -152,18 +164,24 @@ def make(task: CaseTask) -> str:
 
 
 def score_of(task: CaseTask, cell: Cell) -> GainScore:
-    """Identify the gains of a cell whose runs are there, after the search where the case has one."""
+    """Identify the gains of a cell whose runs are there,
+    after the search where the case has one.
+    """
     runs = [run_of(raw, cell) for raw in read_runs(task.path)]
     begun_s = time.process_time()
     found = identify(model_of(cell), runs, cell.conditioning, method=Method(task.method))
-    estimate, error = found.estimate, found.training_error.total
+    estimate = found.estimate
+    error = found.training_error.total
     effects: tuple[PlacedEffect, ...] = ()
     if CASES[task.case].searched:
         end = find_effects(gather(found, runs), np.random.default_rng(0))[-1].after
-        estimate, effects = end.estimate, end.effects
+        estimate = end.estimate
+        effects = end.effects
         error = estimate.relative_error(end.training.system()).total
     spent_s = time.process_time() - begun_s
-    true = np.array([axis.gain_nm_per_a for axis in world_cell(task.seed, CASES[task.case].world).bare.axes])
+    true = np.array(
+        [axis.gain_nm_per_a for axis in world_cell(task.seed, CASES[task.case].world).bare.axes]
+    )
     return GainScore(
         seed=task.seed,
         error_percent=tuple((100.0 * (estimate.gains / true - 1.0)).tolist()),
@@ -175,33 +193,49 @@ def score_of(task: CaseTask, cell: Cell) -> GainScore:
 
 
 def pooled(scores: list[GainScore]) -> str:
-    """Coverage of all intervals with its standard error: the gains of one cell share their noise, cells do not."""
+    """Coverage of all intervals with its standard error:
+    the gains of one cell share their noise, cells do not.
+    """
     inside = np.abs([one.z for one in scores]) <= NORMAL_95
     share = 100.0 * inside.mean()
-    error = 100.0 * inside.mean(axis=1).std(ddof=1) / np.sqrt(len(inside)) if len(inside) > 1 else float("nan")
+    if len(inside) > 1:
+        error = 100.0 * inside.mean(axis=1).std(ddof=1) / np.sqrt(len(inside))
+    else:
+        error = float("nan")
     return f"{share:.1f} ± {error:.1f} % of the 95 % intervals hold the truth"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Make what is missing, then print a table a case."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.coverage_cases", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.coverage_cases", description=__doc__
+    )
     parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--cells", type=int, default=CELLS)
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on")
-    parser.add_argument("--method", choices=(Method.ML.value, Method.IV.value), default=Method.ML.value)
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
+    )
+    parser.add_argument(
+        "--method", choices=(Method.ML.value, Method.IV.value), default=Method.ML.value
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     axes = load_cell(CELL).axis_names
     for case in options.case:
-        tasks = [CaseTask(options.out, case, number, options.method) for number in range(options.cells)]
+        tasks = [
+            CaseTask(options.out, case, number, options.method) for number in range(options.cells)
+        ]
         for line in side_by_side(make, options.shard.of(tasks), options.processes):
             sys.stdout.write(line + "\n")
             sys.stdout.flush()
-        kept = [json.loads(task.score_path.read_text()) for task in tasks if task.score_path.is_file()]
+        kept = [
+            json.loads(task.score_path.read_text()) for task in tasks if task.score_path.is_file()
+        ]
         scores = [GainScore(**document) for document in kept]
         sys.stdout.write(
-            f"\n{case}, {options.method}, {len(scores)} cells: {pooled(scores)}\n\n{table(scores, axes)}\n\n"
+            f"\n{case}, {options.method}, {len(scores)} cells: "
+            f"{pooled(scores)}\n\n{table(scores, axes)}\n\n"
         )
     return 0
 

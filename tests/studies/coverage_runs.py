@@ -1,13 +1,15 @@
-"""Runs of many clean simulated cells, for the coverage of the error bars and the bias of the estimators.
+"""Runs of many clean simulated cells, for the coverage of the error bars and the bias of the
+estimators.
 
     python -m tests.studies.coverage_runs --check       the direct path against one recording over the bus
     python -m tests.studies.coverage_runs --cells 100   two runs without load and two with the disc of each cell
 
-Each cell has a truth of its own (study_cells.py) and each of its runs a noise of its own; plans are shared by the
-cells in turn, because a plan is no part of what an error bar has to cover. Layout: out/coverage/<world>/<cell>.npz,
-counts as the amplifiers report them, with the demand that the position loops followed. What is there is kept.
-`load_coverage` gives cells back as runs with their truth.
-"""
+Each cell has a truth of its own (study_cells.py) and each of its runs a noise of its own; plans are
+shared by the cells in turn, because a plan is no part of what an error bar has to cover. Layout:
+out/coverage/<world>/<cell>.npz, counts as the amplifiers report them, with the demand that the
+position loops followed. What is there is kept. `load_coverage` gives cells back as runs with their
+truth.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -38,7 +40,15 @@ from tests.studies.fingerprint import digest, digest_of_source, finish, is_finis
 from tests.studies.output import print_line
 from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.side_by_side import Shard, shard, side_by_side
-from tests.studies.study_cells import WORLDS, Truth, declared_payload, spec_of, study_cell, truth_of, world_cell
+from tests.studies.study_cells import (
+    WORLDS,
+    Truth,
+    declared_payload,
+    spec_of,
+    study_cell,
+    truth_of,
+    world_cell,
+)
 from tests.studies.study_plans import CELL, PlanTask, kept_plan, make_plan
 
 OUT = Path("out/coverage")
@@ -99,18 +109,27 @@ class RunsTask:
     def plans(self) -> tuple[PlanTask, PlanTask]:
         """Plans of the first and of the second pair of runs."""
         first = FIRST_SEED + 2 * (self.number % PLAN_PAIRS)
-        return PlanTask(self.out, first, self.duration_s), PlanTask(self.out, first + 1, self.duration_s)
+        return PlanTask(self.out, first, self.duration_s), PlanTask(
+            self.out, first + 1, self.duration_s
+        )
 
 
 def tasks_of(
-    cells: int, world: str, *, out: Path = OUT, duration_s: float = DURATION_S, part: Shard | None = None
+    cells: int,
+    world: str,
+    *,
+    out: Path = OUT,
+    duration_s: float = DURATION_S,
+    part: Shard | None = None,
 ) -> tuple[RunsTask, ...]:
     """The cells of a world, or of one shard of it."""
     tasks = [RunsTask(out, world, number, duration_s) for number in range(cells)]
     return (part or Shard()).of(tasks)
 
 
-def simulate_runs(cell: Cell, seed: int, world: str, plans: tuple[Plan, Plan]) -> tuple[RawRun, ...]:
+def simulate_runs(
+    cell: Cell, seed: int, world: str, plans: tuple[Plan, Plan]
+) -> tuple[RawRun, ...]:
     """The four runs of one cell.
 
     Args:
@@ -141,7 +160,9 @@ def load_coverage(tasks: Iterable[RunsTask]) -> Iterator[CoverageCell]:
     cell = load_cell(CELL)
     for task in tasks:
         if not task.path.is_file():
-            raise FileNotFoundError(f"found no {task.path}; run `python -m tests.studies.coverage_runs` first")
+            raise FileNotFoundError(
+                f"found no {task.path}; run `python -m tests.studies.coverage_runs` first"
+            )
         raw = read_runs(task.path)
         runs = tuple(run_of(run, cell) for run in raw)
         demands = tuple(demand_rad(run, cell) for run in raw)
@@ -149,7 +170,10 @@ def load_coverage(tasks: Iterable[RunsTask]) -> Iterator[CoverageCell]:
 
 
 def make_coverage(
-    tasks: Sequence[RunsTask], *, processes: int = PROCESSES, report_line: Callable[[str], None] = lambda _: None
+    tasks: Sequence[RunsTask],
+    *,
+    processes: int = PROCESSES,
+    report_line: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Simulate and save the cells that are missing.
 
@@ -162,12 +186,15 @@ def make_coverage(
         TaskFailed: planning or simulating failed.
     """
     plans = dict.fromkeys(plan for task in tasks for plan in task.plans)
-    for line in chain(side_by_side(make_plan, plans, processes), side_by_side(make_runs, tasks, processes)):
+    for line in chain(
+        side_by_side(make_plan, plans, processes), side_by_side(make_runs, tasks, processes)
+    ):
         report_line(line)
 
 
 def difference(cell: Cell, spec: CellSpec, moves: Plan, folder: Path) -> tuple[str, ...]:
-    """Fields of a run that differ between the direct path and a recording over the bus; none if both are the same.
+    """Fields of a run that differ between the direct path and a recording over the bus;
+    none if both are the same.
 
     Args:
         cell: as declared.
@@ -196,7 +223,11 @@ def difference(cell: Cell, spec: CellSpec, moves: Plan, folder: Path) -> tuple[s
         bus.shutdown()
     recorded, _ = load_run(folder / "check.mcap")
     arrays = ("time_s", "position_rad", "current_a", "move", "valid")
-    differing = [name for name in arrays if not np.array_equal(getattr(direct, name), getattr(recorded, name))]
+    differing = [
+        name
+        for name in arrays
+        if not np.array_equal(getattr(direct, name), getattr(recorded, name))
+    ]
     if direct.payload != recorded.payload:
         differing.append("payload")
     return tuple(differing)
@@ -204,12 +235,19 @@ def difference(cell: Cell, spec: CellSpec, moves: Plan, folder: Path) -> tuple[s
 
 def make_runs(task: RunsTask) -> str:
     """Simulate the runs of a cell unless the same ones are there; return what was done."""
-    cell, path = load_cell(CELL), task.path
+    cell = load_cell(CELL)
+    path = task.path
     first, second = (kept_plan(made, cell) for made in task.plans)
     moving = digest_of_source("tests.studies.direct_cell", MOVING)
     truth = world_cell(task.seed, task.world)
     fingerprint = digest(
-        moving, cell.digest, first.moves, second.moves, truth.bare.urdf, truth.bare.axes, sorted(truth.bodies.items())
+        moving,
+        cell.digest,
+        first.moves,
+        second.moves,
+        truth.bare.urdf,
+        truth.bare.axes,
+        sorted(truth.bodies.items()),
     )
     if is_finished(path, fingerprint):
         return f"cell {task.seed}, {task.world}: kept"
@@ -230,11 +268,17 @@ def make_runs(task: RunsTask) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Check the direct path, or simulate the cells."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.coverage_runs", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="compare the direct path with the bus, and end")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.coverage_runs", description=__doc__
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="compare the direct path with the bus, and end"
+    )
     parser.add_argument("--cells", type=int, default=CELLS)
     parser.add_argument("--world", choices=WORLDS, default="measurement")
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on")
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
+    )
     parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")
     parser.add_argument("--processes", type=int, default=PROCESSES)
     parser.add_argument("--out", type=Path, default=OUT)
@@ -243,10 +287,20 @@ def main(arguments: list[str] | None = None) -> int:
         cell = load_cell(CELL)
         moves = plan(cell, seed=FIRST_SEED, duration_s=10.0)
         with tempfile.TemporaryDirectory() as folder:
-            differing = difference(cell, spec_of(study_cell(FIRST_SEED), "disc", 0), moves, Path(folder))
-        sys.stdout.write(f"direct path and bus differ in: {', '.join(differing) or 'nothing, to the count'}\n")
+            differing = difference(
+                cell, spec_of(study_cell(FIRST_SEED), "disc", 0), moves, Path(folder)
+            )
+        sys.stdout.write(
+            f"direct path and bus differ in: {', '.join(differing) or 'nothing, to the count'}\n"
+        )
         return 1 if differing else 0
-    tasks = tasks_of(options.cells, options.world, out=options.out, duration_s=options.duration, part=options.shard)
+    tasks = tasks_of(
+        options.cells,
+        options.world,
+        out=options.out,
+        duration_s=options.duration,
+        part=options.shard,
+    )
     make_coverage(tasks, processes=options.processes, report_line=print_line)
     return 0
 

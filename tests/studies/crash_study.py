@@ -1,7 +1,9 @@
-"""Kills recorders at random moments and damages finished logs, and counts what is lost and what is believed.
+"""Kills recorders at random moments and damages finished logs,
+and counts what is lost and what is believed.
 
-The truth comes from outside the killed process: the simulated cell lives in this one and keeps every SYNC that reached
-it and every frame that it sent. Sent = recovered + lost, and what was recovered must be what was sent.
+The truth comes from outside the killed process: the simulated cell lives in this one and keeps
+every SYNC that reached it and every frame that it sent. Sent = recovered + lost, and what was
+recovered must be what was sent.
 """
 
 from __future__ import annotations
@@ -72,7 +74,9 @@ class Tap:
 
 
 ASKED = 1
-"""SYNCs before the log begins: a recorder first reads the positions of the axes (daq/workflow/record.py)."""
+"""SYNCs before the log begins: a recorder first reads the positions of the axes
+(daq/workflow/record.py).
+"""
 
 
 @dataclass(frozen=True)
@@ -108,14 +112,20 @@ class Kill:
 
 
 @contextmanager
-def recording(cell_file: Path, plan: Path, log: Path) -> Iterator[tuple[Tap, subprocess.Popen[bytes]]]:
-    """A recorder in a process of its own, and the cell that it records, fresh from power-on, in this one."""
+def recording(
+    cell_file: Path, plan: Path, log: Path
+) -> Iterator[tuple[Tap, subprocess.Popen[bytes]]]:
+    """A recorder in a process of its own, and the cell that it records, fresh from power-on,
+    in this one.
+    """
     with Hub(("can0",)) as hub:
         address = hub.address()
         bus = open_bus(address)
         tap = Tap(bus)
         reported = cell_file.with_name("cell-on-hub.yaml")
-        reported.write_text(_on_hub(cell_file.read_text(encoding="utf-8"), address), encoding="utf-8")
+        reported.write_text(
+            _on_hub(cell_file.read_text(encoding="utf-8"), address), encoding="utf-8"
+        )
         command = [
             sys.executable,
             "-m",
@@ -130,7 +140,9 @@ def recording(cell_file: Path, plan: Path, log: Path) -> Iterator[tuple[Tap, sub
         try:
             with (
                 SimulatedCell(load_simulation(shipped_simulation("clean")), cast(can.BusABC, tap)),
-                subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as recorder,
+                subprocess.Popen(
+                    command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+                ) as recorder,
             ):
                 try:
                     yield tap, recorder
@@ -142,52 +154,79 @@ def recording(cell_file: Path, plan: Path, log: Path) -> Iterator[tuple[Tap, sub
 
 def _on_hub(text: str, address: BusAddress) -> str:
     bus = (
-        f"bus:\n  interface: socketcand\n  channel: {address.channel}\n  host: {address.host}\n  port: {address.port}\n"
+        f"bus:\n  interface: socketcand\n  channel: {address.channel}\n  host: {address.host}\n  "
+        f"port: {address.port}\n"
     )
-    bus += f"  bitrate_bit_s: {address.bitrate_bit_s}\nsync:\n  period_us: 1000\n  pacing: lockstep\n"
+    bus += (
+        f"  bitrate_bit_s: {address.bitrate_bit_s}\nsync:\n  period_us: 1000\n  pacing: lockstep\n"
+    )
     robots = str(shipped_configurations() / "robots")
     return re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL).replace("../robots", robots)
 
 
 def kill_once(cell_file: Path, plan: Path, folder: Path, target: int) -> Kill:
     """Record, kill -9 once so many SYNCs have reached the cell, salvage, compare."""
-    log, saved = folder / "killed.mcap", folder / "saved.mcap"
+    log = folder / "killed.mcap"
+    saved = folder / "saved.mcap"
     part = log.with_name(log.name + ".part")
     with recording(cell_file, plan, log) as (tap, recorder):
         begun = time.monotonic()
-        while tap.syncs < target and recorder.poll() is None and time.monotonic() < begun + PATIENCE_S:
+        while (
+            tap.syncs < target and recorder.poll() is None and time.monotonic() < begun + PATIENCE_S
+        ):
             time.sleep(POLL_S)
         recorder.kill()  # SIGKILL: nothing of the recorder runs after this
         recorder.wait()
-        quiet_since, seen = time.monotonic(), tap.syncs
+        quiet_since = time.monotonic()
+        seen = tap.syncs
         while time.monotonic() < quiet_since + QUIET_S:
             time.sleep(POLL_S)
             if tap.syncs != seen:
-                quiet_since, seen = time.monotonic(), tap.syncs
+                quiet_since = time.monotonic()
+                seen = tap.syncs
     refused = drivegain(["info", str(part)]) == ExitCode.DATA_UNFIT
     code = drivegain(["salvage", str(part), "--out", str(saved)])
-    recovered, same, partial = 0, False, False
+    recovered = 0
+    same = False
+    partial = False
     if code == ExitCode.OK:
         found = read_log(saved)
-        recovered, same, partial = len(found.samples.cycle), _as_sent(found.samples, tap.answers), found.partial
+        recovered = len(found.samples.cycle)
+        same = _as_sent(found.samples, tap.answers)
+        partial = found.partial
     part.unlink(missing_ok=True)
     saved.unlink(missing_ok=True)
     lost = tap.syncs - ASKED - recovered
-    return Kill(target, tap.syncs - ASKED, recovered, lost, lost * CYCLE_MS, same, code, partial, refused)
+    return Kill(
+        target, tap.syncs - ASKED, recovered, lost, lost * CYCLE_MS, same, code, partial, refused
+    )
 
 
 def _as_sent(samples: SampleBlock, answers: list[tuple[int, bytes]]) -> bool:
-    """Every sample from the first SYNC on, without a gap, with the numbers that the cell put on the bus."""
+    """Every sample from the first SYNC on, without a gap,
+    with the numbers that the cell put on the bus.
+    """
     axes = samples.position_counts.shape[1]
     sent = np.array(
-        [[FEEDBACK.unpack(data) for node, data in answers if node == axis + 1] for axis in range(axes)], dtype=np.int64
+        [
+            [FEEDBACK.unpack(data) for node, data in answers if node == axis + 1]
+            for axis in range(axes)
+        ],
+        dtype=np.int64,
     )
     length = len(samples.cycle)
-    logged: tuple[NDArray[np.integer], ...] = (samples.position_counts, samples.current_raw, samples.statusword)
+    logged: tuple[NDArray[np.integer], ...] = (
+        samples.position_counts,
+        samples.current_raw,
+        samples.statusword,
+    )
     return bool(
         np.array_equal(samples.cycle, np.arange(length, dtype=np.uint64))
         and not samples.missing.any()
-        and all(np.array_equal(column, sent[:, ASKED : ASKED + length, field].T) for field, column in enumerate(logged))
+        and all(
+            np.array_equal(column, sent[:, ASKED : ASKED + length, field].T)
+            for field, column in enumerate(logged)
+        )
     )
 
 
@@ -201,7 +240,8 @@ class Damage:
         same: read, and the same as before in every number.
         wrong: read, and another in some number; must be zero.
         crashed: any other exception, by its name; must be empty.
-        salvage_wrong: something before the damage that salvage would take was not as recorded; must be zero.
+        salvage_wrong: something before the damage that salvage would take was not as recorded; must
+            be zero.
         recovered_share: of the samples before the damage, least and mean.
     """
 
@@ -216,7 +256,9 @@ class Damage:
     @property
     def kept(self) -> bool:
         """No wrong data, no crash, every one named."""
-        return sum(self.named.values()) == self.tried and not (self.wrong or self.crashed or self.salvage_wrong)
+        return sum(self.named.values()) == self.tried and not (
+            self.wrong or self.crashed or self.salvage_wrong
+        )
 
 
 def damage(log: Path, changed: Iterator[bytes], tried: int) -> Damage:
@@ -248,7 +290,15 @@ def damage(log: Path, changed: Iterator[bytes], tried: int) -> Damage:
             crashed[f"{type(error).__name__} in salvage"] += 1
     copy.unlink()
     mean = float(np.mean(shares)) if shares else 0.0
-    return Damage(tried, dict(named), same, wrong, dict(crashed), salvage_wrong, (min(shares, default=0.0), mean))
+    return Damage(
+        tried,
+        dict(named),
+        same,
+        wrong,
+        dict(crashed),
+        salvage_wrong,
+        (min(shares, default=0.0), mean),
+    )
 
 
 def equal(one: Log, other: Log) -> bool:
@@ -262,16 +312,24 @@ def _columns(one: SampleBlock, other: SampleBlock) -> Iterator[tuple[Any, Any]]:
 
 
 def _before_damage(path: Path, original: Log) -> tuple[bool, float]:
-    """Whether what salvage would take is a beginning of the original, and its share of the samples."""
-    reader, done = LogReader(path), 0
+    """Whether what salvage would take is a beginning of the original,
+    and its share of the samples.
+    """
+    reader = LogReader(path)
+    done = 0
     for block in reader.until_damage():
         end = done + len(block.cycle)
-        if not all(np.array_equal(now, then[done:end]) for now, then in _columns(block, original.samples)):
+        if not all(
+            np.array_equal(now, then[done:end]) for now, then in _columns(block, original.samples)
+        ):
             return False, 0.0
         done = end
     if not done:
         return True, 0.0
-    right = reader.head == original.head and tuple(reader.events) == original.events[: len(reader.events)]
+    right = (
+        reader.head == original.head
+        and tuple(reader.events) == original.events[: len(reader.events)]
+    )
     return right, done / len(original.samples.cycle)
 
 
@@ -294,10 +352,23 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
     chance = random.Random(seed)
     with TemporaryDirectory(prefix="crash-study-") as name:
         folder = Path(name)
-        cell_file, plan, log = folder / "cell.yaml", folder / "plan.yaml", folder / "whole.mcap"
+        cell_file = folder / "cell.yaml"
+        plan = folder / "plan.yaml"
+        log = folder / "whole.mcap"
         text = (shipped_configurations() / "cells" / "demo.yaml").read_text(encoding="utf-8")
-        cell_file.write_text(text.replace("../robots", str(shipped_configurations() / "robots")), encoding="utf-8")
-        options = ["--out", str(plan), "--duration", str(seconds), "--exchanges", "0", "--condition", "1e9"]
+        cell_file.write_text(
+            text.replace("../robots", str(shipped_configurations() / "robots")), encoding="utf-8"
+        )
+        options = [
+            "--out",
+            str(plan),
+            "--duration",
+            str(seconds),
+            "--exchanges",
+            "0",
+            "--condition",
+            "1e9",
+        ]
         if drivegain(["plan", str(cell_file), *options]) != ExitCode.OK:
             raise SystemExit("no plan")
         begun = time.monotonic()
@@ -306,23 +377,32 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
         whole = read_log(log)
         length = len(whole.samples.cycle)
         print_line(
-            f"a whole recording: {tap.syncs} SYNCs, {length} samples, {time.monotonic() - begun:.0f} s of wall time"
+            f"a whole recording: {tap.syncs} SYNCs, {length} samples, "
+            f"{time.monotonic() - begun:.0f} s of wall time"
         )
         done = []
         for number in range(kills):
             done.append(kill_once(cell_file, plan, folder, chance.randrange(1, length)))
             one = done[-1]
             print_line(
-                f"kill {number + 1}: sent {one.sent} = recovered {one.recovered} + lost {one.lost}, as sent: {one.same}"
+                f"kill {number + 1}: sent {one.sent} = recovered {one.recovered} + lost "
+                f"{one.lost}, as sent: {one.same}"
             )
         data = log.read_bytes()
-        flips, cuts = damage(log, flipped(data, chance), damages), damage(log, cut(data, chance), damages)
-    kept = all(one.kept for one in done) and flips.kept and cuts.kept and tap.syncs == ASKED + length
+        flips = damage(log, flipped(data, chance), damages)
+        cuts = damage(log, cut(data, chance), damages)
+    kept = (
+        all(one.kept for one in done) and flips.kept and cuts.kept and tap.syncs == ASKED + length
+    )
     return {
         "kept": kept,
         "promised_ms": PROMISED_MS,
         "seed": seed,
-        "whole": {"sent": tap.syncs - ASKED, "logged": length, "as_sent": _as_sent(whole.samples, tap.answers)},
+        "whole": {
+            "sent": tap.syncs - ASKED,
+            "logged": length,
+            "as_sent": _as_sent(whole.samples, tap.answers),
+        },
         "kills": [asdict(one) for one in done],
         "largest_loss_ms": max((one.lost_ms for one in done), default=None),
         "bit_flips": asdict(flips),
@@ -333,9 +413,13 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the study; 1 when a promise was broken."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.crash_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.crash_study", description=__doc__
+    )
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--damages", type=int, default=200, help="bit flips, and as many truncations")
+    parser.add_argument(
+        "--damages", type=int, default=200, help="bit flips, and as many truncations"
+    )
     parser.add_argument("--seconds", type=float, default=12.0, help="of the plan [s]")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=OUT)
@@ -344,11 +428,14 @@ def main(arguments: list[str] | None = None) -> int:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     print_line(
-        f"largest loss of {len(document['kills'])} kills: {document['largest_loss_ms']} ms, {PROMISED_MS:g} promised"
+        f"largest loss of {len(document['kills'])} kills: {document['largest_loss_ms']} ms, "
+        f"{PROMISED_MS:g} promised"
     )
     for title in ("bit_flips", "truncations"):
         found = document[title]
-        counts = ", ".join(f"{key} {found[key]}" for key in ("named", "same", "wrong", "crashed", "salvage_wrong"))
+        counts = ", ".join(
+            f"{key} {found[key]}" for key in ("named", "same", "wrong", "crashed", "salvage_wrong")
+        )
         print_line(f"{found['tried']} {title.replace('_', ' ')}: {counts}")
     print_line(f"every promise kept: {document['kept']}; {options.out}")
     return 0 if document["kept"] else 1

@@ -1,12 +1,15 @@
-"""What can happen to a recording: readings that are held, drives that give less than asked, faults of single channels.
+"""What can happen to a recording: readings that are held, drives that give less than asked,
+faults of single channels.
 
-Run by `make damage-study`; half an hour. `--part held`, `limited`, `channels` or `sound` makes one part. The real
-recordings are in ../shared/data or $DRIVEGAIN_DATA, and what needs one that is not there is left out.
+Run by `make damage-study`; half an hour. `--part held`, `limited`, `channels` or `sound` makes one
+part. The real recordings are in ../shared/data or $DRIVEGAIN_DATA, and what needs one that is not
+there is left out.
 
-held: each reading of the TX-40's positions, its currents or both is held for a while, and the error of the whole arm is
-that of a fit with the nameplate gains. limited: a simulated drive of J4 gives 1.6 A at most where its reference asks
-for more. channels: every fault of `planted_faults.py` by each way, as a table in out/damaged-recordings. sound: the
-judgement of a simulated run of every shipped robot and of the real ones, which have none of these faults.
+held: each reading of the TX-40's positions, its currents or both is held for a while, and the error
+of the whole arm is that of a fit with the nameplate gains. limited: a simulated drive of J4 gives
+1.6 A at most where its reference asks for more. channels: every fault of `planted_faults.py` by
+each way, as a table in out/damaged-recordings. sound: the judgement of a simulated run of every
+shipped robot and of the real ones, which have none of these faults.
 """
 
 from __future__ import annotations
@@ -37,7 +40,9 @@ from tests.studies.study_plans import CELL, make_plan
 OUT = Path("out/damaged-recordings")
 HOLDS_S = (0.002, 0.005, 0.010)
 WORLD = "measurement"
-LIMITED = EffectCase("limited-J4", 2322, (UndeclaredEffect("clipped-current", 3, {"limit_a": 1.6}),))
+LIMITED = EffectCase(
+    "limited-J4", 2322, (UndeclaredEffect("clipped-current", 3, {"limit_a": 1.6}),)
+)
 NOISE_HZ = 300.0  #: From which on the currents of the real arm hold noise alone
 
 
@@ -60,7 +65,10 @@ def held_readings(recording: Recording) -> None:
         of_each = "positions {:.2f} %, currents {:.2f} %, both {:.2f} %".format(*errors)
         print_line(f"held for {1e3 * hold_s:g} ms: {of_each}")
     noise_a = _noise_a(run)
-    print_line(f"noise of the currents above {NOISE_HZ:g} Hz: {', '.join(f'{one:.3f}' for one in noise_a)} A")
+    print_line(
+        f"noise of the currents above {NOISE_HZ:g} Hz: "
+        f"{', '.join(f'{one:.3f}' for one in noise_a)} A"
+    )
 
 
 def _error_percent(recording: Recording, run: Run) -> float:
@@ -80,7 +88,9 @@ def _noise_a(run: Run) -> list[float]:
 
 
 def limited_drive() -> None:
-    """Print the gain of a motor whose drive gives less than its reference, with and without these samples."""
+    """Print the gain of a motor whose drive gives less than its reference,
+    with and without these samples.
+    """
     task = CaseTask(OUT, WORLD, LIMITED)
     for plan in task.plans:
         make_plan(plan)

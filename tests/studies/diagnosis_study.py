@@ -1,7 +1,7 @@
 """False alarms of the diagnoses on clean recordings, and how often each planted mistake is named.
 
-`make diagnosis-study` prints how often each diagnosis fires, and writes it as docs/evidence/data/diagnoses.csv has it.
-The arm is that of tests/ident/mistaken.py.
+`make diagnosis-study` prints how often each diagnosis fires, and writes it as
+docs/evidence/data/diagnoses.csv has it. The arm is that of tests/ident/mistaken.py.
 """
 
 from __future__ import annotations
@@ -70,7 +70,10 @@ def named(
             keep_rows=True,
         )
         error_percent = found.training_error.total
-        names += [" ".join((one.name, *one.runs, *one.axes)) for one in diagnose(found, AXES, gains, LIMIT_NM)]
+        names += [
+            " ".join((one.name, *one.runs, *one.axes))
+            for one in diagnose(found, AXES, gains, LIMIT_NM)
+        ]
         described += of_description(found)
     except CurrentUnsigned as error:
         return [" ".join(("CurrentUnsigned", *error.axes))]
@@ -126,12 +129,16 @@ def offset(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
     """Diagnoses where the zero of J2 is off; NOISES_A in turn."""
     added = np.array([0.0, np.radians(degrees), 0.0])
     runs = small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)])
-    return named(truth, [replace(run, position_rad=run.position_rad + added) for run in runs], fixed=fixed)
+    return named(
+        truth, [replace(run, position_rad=run.position_rad + added) for run in runs], fixed=fixed
+    )
 
 
 def tilted(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
     """Diagnoses of an arm whose base is not level; NOISES_A in turn."""
-    gravity_m_s2 = rotation_by(np.array([np.radians(degrees), 0.0, 0.0])) @ truth.model.robot.gravity_m_s2
+    gravity_m_s2 = (
+        rotation_by(np.array([np.radians(degrees), 0.0, 0.0])) @ truth.model.robot.gravity_m_s2
+    )
     return mounted(truth, seed, fixed, gravity_m_s2.tolist())
 
 
@@ -156,7 +163,9 @@ def carried(truth: Truth, seed: int, fixed: bool, body: FloatArray) -> list[str]
 
 
 def lifted(truth: Truth, seed: int) -> list[str]:
-    """Refusals of currents that are shifted so far that they are never negative, as where a load is always carried."""
+    """Refusals of currents that are shifted so far that they are never negative,
+    as where a load is always carried.
+    """
     names = []
     for run in small_recordings(truth, seed, count=2, noise_a=NOISES_A[seed % len(NOISES_A)]):
         least = run.current_a.min(axis=0)
@@ -174,7 +183,9 @@ def mounted(truth: Truth, seed: int, fixed: bool, gravity_m_s2: Sequence[float])
 
 
 def counted(truth: Truth, seed: int, fixed: bool, axis: int, current_sign: float) -> list[str]:
-    """Diagnoses where the position of an axis counts the other way, alone or with its current; NOISES_A in turn."""
+    """Diagnoses where the position of an axis counts the other way, alone or with its current;
+    NOISES_A in turn.
+    """
     runs = []
     for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
         position = run.position_rad.copy()
@@ -188,7 +199,9 @@ def counted(truth: Truth, seed: int, fixed: bool, axis: int, current_sign: float
 MISTAKES: dict[str, Callable[[Truth, int, bool], list[str]]] = {
     "r3 turned by 90 degrees": lambda t, s, f: carried(t, s, f, turned(0.5 * np.pi)),
     "r3 without payload": lambda t, s, f: carried(t, s, f, 0.0 * BODY),
-    "J2 and J3 exchanged": lambda t, s, f: named(t, with_currents(small_recordings(t, s), 1.0, (0, 2, 1)), fixed=f),
+    "J2 and J3 exchanged": lambda t, s, f: named(
+        t, with_currents(small_recordings(t, s), 1.0, (0, 2, 1)), fixed=f
+    ),
     "J2 reversed": lambda t, s, f: scaled(t, s, f, np.array([1.0, -1.0, 1.0])),
     "mA": lambda t, s, f: scaled(t, s, f, 1000.0),
     "current of J2 0.51 times": lambda t, s, f: scaled(t, s, f, np.array([1.0, 0.51, 1.0])),
@@ -228,7 +241,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--only", default="", help="Mistakes whose names contain this text.")
     given = parser.parse_args(arguments)
     rows = [("recordings", "gains", "said", "sessions")]
-    truth, alarms = three_axes_truth(), Counter[str]()
+    truth = three_axes_truth()
+    alarms = Counter[str]()
     for seed in range(given.cells):
         runs = small_recordings(truth, seed, count=5, noise_a=NOISES_A[seed % len(NOISES_A)])
         for fixed in (False, True):
@@ -238,22 +252,32 @@ def main(arguments: Sequence[str]) -> int:
         alarms.update(named(truth, runs[:4], runs[4:], nameplate=truth.gains / ratio))
         alarms.update(lifted(truth, seed))
     _say(
-        f"{given.cells} clean recordings, with free and with fixed gains, with nameplates up to 30 % off, and with "
-        f"currents of one sign: {sum(alarms.values())} false alarms {dict(alarms)}"
+        f"{given.cells} clean recordings, with free and with fixed gains, with nameplates up to 30 "
+        f"% off, and with currents of one sign: {sum(alarms.values())} false alarms {dict(alarms)}"
     )
-    rows.append(("clean", "both", "; ".join(alarms) or "nothing", f"{sum(alarms.values())} false of {given.cells}"))
+    rows.append(
+        (
+            "clean",
+            "both",
+            "; ".join(alarms) or "nothing",
+            f"{sum(alarms.values())} false of {given.cells}",
+        )
+    )
     for mistake, said in MISTAKES.items():
         if given.only not in mistake:
             continue
         for fixed in (False, True):
-            counts = Counter(" + ".join(said(truth, seed, fixed)) or "nothing" for seed in range(given.mistaken))
+            counts = Counter(
+                " + ".join(said(truth, seed, fixed)) or "nothing" for seed in range(given.mistaken)
+            )
             gains = "fixed" if fixed else "free"
             _say(f"{mistake}, gains {gains}: {dict(counts)}")
             for words, times in counts.items():
                 rows.append((mistake, gains, words, f"{times} of {given.mistaken}"))
     _say(
-        f"limits: share {payload_diagnosis.LEAST_SHARE:g}, p {payload_diagnosis.LARGEST_PROBABILITY:g}, "
-        f"exchange {diagnosis.CHANNEL_FALL:g}, geometry {turned_geometry.LEAST_FALL:g}"
+        f"limits: share {payload_diagnosis.LEAST_SHARE:g}, p "
+        f"{payload_diagnosis.LARGEST_PROBABILITY:g}, exchange {diagnosis.CHANNEL_FALL:g}, geometry "
+        f"{turned_geometry.LEAST_FALL:g}"
     )
     given.out.parent.mkdir(parents=True, exist_ok=True)
     with given.out.open("w", newline="", encoding="utf-8") as file:

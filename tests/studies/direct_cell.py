@@ -1,10 +1,11 @@
-"""Runs of a simulated cell without a bus: the same plant, loops, nodes and moves, and no frames back and forth.
+"""Runs of a simulated cell without a bus:
+the same plant, loops, nodes and moves, and no frames back and forth.
 
-The coverage study needs hundreds of runs, and most of a recorded run's time is frames and threads. What moves the
-cell is unchanged: `drivers.motion.execute.execute` walks the moves of `daq.workflow.record.motor_moves` through the
-nodes' own CiA 402
-state machines, and the amplifiers round and add noise as they do on the bus. `tests.studies.coverage_runs --check`
-compares it with a recording over the bus, count by count.
+The coverage study needs hundreds of runs, and most of a recorded run's time is frames and threads.
+What moves the cell is unchanged: `drivers.motion.execute.execute` walks the moves of
+`daq.workflow.record.motor_moves` through the nodes' own CiA 402 state machines, and the amplifiers
+round and add noise as they do on the bus. `tests.studies.coverage_runs --check` compares it with a
+recording over the bus, count by count.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ from ident.data.run import Run
 from ident.model.bodies import Payload
 
 MOVING = ("drivers.simulation", "drivers.motion")
-"""What moves a simulated cell: kept runs outlive a change of anything else, as of what reads the samples."""
+"""What moves a simulated cell: kept runs outlive a change of anything else,
+as of what reads the samples.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,12 +140,17 @@ def run_of(raw: RawRun, cell: Cell) -> Run:
 
 
 def demand_rad(raw: RawRun, cell: Cell) -> NDArray[np.float64]:
-    """Position demand of the joints [rad], shape (k, n): the trajectory that the position loops were to follow."""
+    """Position demand of the joints [rad], shape (k, n):
+    the trajectory that the position loops were to follow.
+    """
     return _scaling(cell, raw.ampere_per_unit).joint_position(raw.demand_counts.astype(np.int64))
 
 
 def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> SiScaling:
-    answers = (AxisReadback(name, float(scale)) for name, scale in zip(cell.axis_names, ampere_per_unit, strict=True))
+    answers = (
+        AxisReadback(name, float(scale))
+        for name, scale in zip(cell.axis_names, ampere_per_unit, strict=True)
+    )
     return scaling(cell, Readback(tuple(answers)))
 
 
@@ -163,7 +171,10 @@ class DirectStream:
 
     def __init__(self, cell: Cell, spec: CellSpec, began_s: float = 0.0) -> None:
         if cell.sync is None or cell.sync.period_us != spec.sync_period_us:
-            raise ValueError(f"cell {cell.name}: its sync period is not the simulated one, {spec.sync_period_us} us")
+            raise ValueError(
+                f"cell {cell.name}: its sync period is not the simulated one, "
+                f"{spec.sync_period_us} us"
+            )
         self.pacing = LockstepSync(spec.sync_period_us * 1000)
         self.bus = self
         self.silent = False
@@ -172,7 +183,9 @@ class DirectStream:
         self.demand_counts: list[tuple[int, ...]] = []
         self._cycle = 0
         # Its nodes answer on a bus without readers.
-        self._cell = SimulatedCell(spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None)))
+        self._cell = SimulatedCell(
+            spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None))
+        )
         self._cell.plant.time_s = began_s
         self.outgoing: list[can.Message] = []
         axes = drive_axes(cell)
@@ -197,7 +210,8 @@ class DirectStream:
         for access in accesses:
             access.prepare()
         self.ampere_per_unit = tuple(
-            axis.profile.current_scale.factor * math.prod(map(access.read, axis.profile.current_scale.objects))
+            axis.profile.current_scale.factor
+            * math.prod(map(access.read, axis.profile.current_scale.objects))
             for axis, access in zip(axes, accesses, strict=True)
         )
 
@@ -216,7 +230,8 @@ class DirectStream:
 
     def advance(self) -> Sample:
         """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""
-        outgoing, self.outgoing = self.outgoing, []
+        outgoing = self.outgoing
+        self.outgoing = []
         nodes = self._cell.nodes
         for message in outgoing:
             for node in nodes:
@@ -229,7 +244,11 @@ class DirectStream:
         self.demand_counts.append(tuple(readings.demand))
         statuswords = tuple(node.drive.statusword() for node in nodes)
         sample = Sample(
-            self._cycle, self.time_ns, tuple(readings.position), tuple(readings.current_demand), statuswords
+            self._cycle,
+            self.time_ns,
+            tuple(readings.position),
+            tuple(readings.current_demand),
+            statuswords,
         )
         self._cycle += 1
         return sample
@@ -237,7 +256,9 @@ class DirectStream:
 
 @dataclass(frozen=True, slots=True)
 class _DirectAccess:
-    """The objects of one node, as drivers.sdo.ObjectAccess reads and writes them, without SDO frames."""
+    """The objects of one node, as drivers.sdo.ObjectAccess reads and writes them,
+    without SDO frames.
+    """
 
     node: Node
 
@@ -246,7 +267,9 @@ class _DirectAccess:
         return self.node.node_id
 
     def read(self, entry: ObjectEntry) -> int:
-        return int.from_bytes(self.node.read(entry.index, entry.subindex), "little", signed=entry.signed)
+        return int.from_bytes(
+            self.node.read(entry.index, entry.subindex), "little", signed=entry.signed
+        )
 
     def read_optional(self, entry: ObjectEntry) -> int | None:
         return self.read(entry)  # a simulated node has every object that is optional
@@ -256,7 +279,9 @@ class _DirectAccess:
         self.node.write(entry.index, entry.subindex, data)
 
     def prepare(self) -> None:
-        """Act as `CanopenNetwork.prepare` does on a node that has just been powered on: it needs no SYNC for that."""
+        """Act as `CanopenNetwork.prepare` does on a node that has just been powered on:
+        it needs no SYNC for that.
+        """
         self.node.boot(0.0)
         for record in records(Direction.RPDO, self.node_id, SETPOINT_PDOS):
             write_pdo_record(cast(ObjectAccess, self), record)

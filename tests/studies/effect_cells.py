@@ -1,7 +1,7 @@
 """The cells of the effects study: which plant does what beyond the declared model.
 
-An effect is made by the plant's own physics (drivers/simulation/effects.py), by parameters that a mechanic would know;
-nothing here comes from the formulas that the search tries.
+An effect is made by the plant's own physics (drivers/simulation/effects.py), by parameters that a
+mechanic would know; nothing here comes from the formulas that the search tries.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ def _effect(name: str, joint: int, **parameters: float) -> UndeclaredEffect:
 
 
 SINGLE_EFFECTS = (
-    (_effect("stribeck", 2, rise_nm=4.0, speed_rad_s=0.25), _effect("stribeck", 4, rise_nm=1.2, speed_rad_s=0.2)),
+    (
+        _effect("stribeck", 2, rise_nm=4.0, speed_rad_s=0.25),
+        _effect("stribeck", 4, rise_nm=1.2, speed_rad_s=0.2),
+    ),
     (
         _effect("nonlinear-viscous", 1, torque_at_1_rad_s_nm=4.0, exponent=1 / 3),
         _effect("nonlinear-viscous", 3, torque_at_1_rad_s_nm=2.0, exponent=2.0),
@@ -58,8 +61,12 @@ SINGLE_EFFECTS = (
         _effect("presliding", 4, torque_nm=1.6, distance_rad=0.08),
     ),
     (
-        _effect("backlash", 3, gap_rad=0.005, stiffness_nm_per_rad=20000.0, damping_nm_s_per_rad=30.0),
-        _effect("backlash", 2, gap_rad=0.004, stiffness_nm_per_rad=40000.0, damping_nm_s_per_rad=100.0),
+        _effect(
+            "backlash", 3, gap_rad=0.005, stiffness_nm_per_rad=20000.0, damping_nm_s_per_rad=30.0
+        ),
+        _effect(
+            "backlash", 2, gap_rad=0.004, stiffness_nm_per_rad=40000.0, damping_nm_s_per_rad=100.0
+        ),
     ),
     (
         _effect("elasticity", 1, stiffness_nm_per_rad=12000.0, damping_nm_s_per_rad=60.0),
@@ -88,9 +95,16 @@ SINGLE_EFFECTS = (
 
 
 def _cable(
-    name: str, joint: int, other: int, radii_m: tuple[float, float], stiffness_nm: float, rest: float
+    name: str,
+    joint: int,
+    other: int,
+    radii_m: tuple[float, float],
+    stiffness_nm: float,
+    rest: float,
 ) -> UndeclaredEffect:
-    """A cable around two joints; its stiffness at the first of them, and the way at rest in radians of that joint."""
+    """A cable around two joints; its stiffness at the first of them,
+    and the way at rest in radians of that joint.
+    """
     return _effect(
         name,
         joint,
@@ -122,7 +136,9 @@ FURTHER_EFFECTS = (
     _effect("backlash", 5, gap_rad=0.008, stiffness_nm_per_rad=2500.0, damping_nm_s_per_rad=3.0),
     _effect("backlash", 5, gap_rad=0.014, stiffness_nm_per_rad=1500.0, damping_nm_s_per_rad=2.0),
 )
-"""Cables over two joints, offsets that drift, and free play where no weight holds the flanks together."""
+"""Cables over two joints, offsets that drift, and free play where no weight holds the flanks
+together.
+"""
 
 _SIZES = frozenset(
     {
@@ -150,7 +166,9 @@ def _smaller(effect: UndeclaredEffect) -> UndeclaredEffect:
         parameters["stiffness_nm_per_rad"] /= SMALL
     else:
         sizes = _SIZES - ({"time_constant_s"} if effect.name == "warm-up" else set())
-        parameters = {key: value * (SMALL if key in sizes else 1.0) for key, value in parameters.items()}
+        parameters = {
+            key: value * (SMALL if key in sizes else 1.0) for key, value in parameters.items()
+        }
     if effect.name == "spring":
         parameters["stiffness_nm_per_rad"] *= SMALL
     return replace(effect, parameters=parameters)
@@ -165,15 +183,23 @@ FURTHER = tuple(
     for number, effect in enumerate(FURTHER_EFFECTS)
 )
 CLEAN = tuple(EffectCase(f"clean-{number:02d}", 2001 + number, ()) for number in range(28))
-"""The same cells without their effect: the clean floor of each seed, and the count of false effects."""
+"""The same cells without their effect:
+the clean floor of each seed, and the count of false effects.
+"""
 SMALLS = tuple(
-    EffectCase(f"small-{number:02d}-{pair[0].name}-J{pair[0].axis + 1}", 2001 + 2 * number, (_smaller(pair[0]),))
+    EffectCase(
+        f"small-{number:02d}-{pair[0].name}-J{pair[0].axis + 1}",
+        2001 + 2 * number,
+        (_smaller(pair[0]),),
+    )
     for number, pair in enumerate(SINGLE_EFFECTS)
 )
 
 
 def _pair(number: int, kind: str, first: UndeclaredEffect, second: UndeclaredEffect) -> EffectCase:
-    return EffectCase(f"{kind}-{number:02d}-{first.name}-{second.name}", 2101 + number, (first, second))
+    return EffectCase(
+        f"{kind}-{number:02d}-{first.name}-{second.name}", 2101 + number, (first, second)
+    )
 
 
 APART = tuple(
@@ -206,7 +232,10 @@ TOGETHER = tuple(
                 _effect("load-friction", 3, coefficient=0.12),
                 _effect("position-friction", 3, amplitude_nm=2.0, phase_rad=0.4),
             ),
-            (_effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0), _effect("load-friction", 2, coefficient=0.08)),
+            (
+                _effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0),
+                _effect("load-friction", 2, coefficient=0.08),
+            ),
             (
                 _effect("nonlinear-viscous", 1, torque_at_1_rad_s_nm=4.0, exponent=1 / 3),
                 _effect("lag", 1, time_constant_s=0.008),
@@ -215,7 +244,10 @@ TOGETHER = tuple(
                 _effect("cogging", 4, amplitude_nm=1.2, order=1.0, phase_rad=0.5),
                 _effect("stribeck", 4, rise_nm=1.2, speed_rad_s=0.2),
             ),
-            (_effect("saturation", 2, half_current_a=9.0), _effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0)),
+            (
+                _effect("saturation", 2, half_current_a=9.0),
+                _effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0),
+            ),
             (
                 _effect("warm-up", 1, cold_fraction=0.6, time_constant_s=60.0),
                 _effect("spring", 1, stiffness_nm_per_rad=8.0, rest_rad=0.2),
@@ -228,7 +260,10 @@ TOGETHER = tuple(
                 _effect("spring", 3, stiffness_nm_per_rad=6.0, rest_rad=1.0),
                 _effect("load-friction", 3, coefficient=0.12),
             ),
-            (_effect("lag", 3, time_constant_s=0.008), _effect("asymmetric-viscous", 3, coefficient_nm_s_rad=1.5)),
+            (
+                _effect("lag", 3, time_constant_s=0.008),
+                _effect("asymmetric-viscous", 3, coefficient_nm_s_rad=1.5),
+            ),
         )
     )
 )

@@ -1,7 +1,9 @@
-"""Runs of the effects study: two without load and two with the disc to fit, and two that no fit may see.
+"""Runs of the effects study: two without load and two with the disc to fit,
+and two that no fit may see.
 
-Loaded and unloaded runs alternate in one session, so that the load cannot be taken for the time. Layout:
-out/effects-study/<world>/<case>.npz, counts as the amplifiers report them. What is there is kept.
+Loaded and unloaded runs alternate in one session, so that the load cannot be taken for the time.
+Layout: out/effects-study/<world>/<case>.npz, counts as the amplifiers report them. What is there is
+kept.
 """
 
 from __future__ import annotations
@@ -80,19 +82,26 @@ class CaseTask:
     @property
     def path(self) -> Path:
         """File of the runs."""
-        folder = self.world if self.duration_s == DURATION_S else f"{self.world}-{self.duration_s:g}s"
+        if self.duration_s == DURATION_S:
+            folder = self.world
+        else:
+            folder = f"{self.world}-{self.duration_s:g}s"
         return self.out / folder / f"{self.case.name}.npz"
 
     @property
     def plans(self) -> tuple[PlanTask, ...]:
         """Plans of the case's set."""
         first = FIRST_PLAN + self.case.seed % PLAN_SETS * PLANS_A_SET
-        return tuple(PlanTask(self.out, first + letter, self.duration_s) for letter in range(PLANS_A_SET))
+        return tuple(
+            PlanTask(self.out, first + letter, self.duration_s) for letter in range(PLANS_A_SET)
+        )
 
 
 def specs_of(task: CaseTask) -> list[CellSpec]:
     """The plant of each run."""
-    return [task.case.spec(task.world, payload, number) for number, (_, payload, _) in enumerate(RUNS)]
+    return [
+        task.case.spec(task.world, payload, number) for number, (_, payload, _) in enumerate(RUNS)
+    ]
 
 
 def fingerprint_of_runs(task: CaseTask) -> str:
@@ -109,7 +118,9 @@ def fingerprint_of_runs(task: CaseTask) -> str:
 
 
 def make_case(task: CaseTask) -> float:
-    """Simulate the runs of a case unless the same ones are there; return the processor time that it took [s]."""
+    """Simulate the runs of a case unless the same ones are there;
+    return the processor time that it took [s].
+    """
     begun_s = time.process_time()
     fingerprint = fingerprint_of_runs(task)
     if is_finished(task.path, fingerprint):
@@ -125,7 +136,9 @@ def make_case(task: CaseTask) -> float:
             None if payload is None else declared_payload(payload),
             number * (task.duration_s + PAUSE_S),
         )
-        for number, (spec, (name, payload, letter)) in enumerate(zip(specs_of(task), RUNS, strict=True))
+        for number, (spec, (name, payload, letter)) in enumerate(
+            zip(specs_of(task), RUNS, strict=True)
+        )
     ]
     task.path.parent.mkdir(parents=True, exist_ok=True)
     write_runs(task.path, raw)
@@ -138,7 +151,8 @@ def load_runs(task: CaseTask, *, imported: bool) -> CaseRuns:
 
     Args:
         task: its runs were simulated.
-        imported: take the way of another controller's recordings, through CSV files with absolute stamps.
+        imported: take the way of another controller's recordings, through CSV files with absolute
+            stamps.
 
     Raises:
         FileNotFoundError: they have not been simulated.
@@ -146,14 +160,18 @@ def load_runs(task: CaseTask, *, imported: bool) -> CaseRuns:
     """
     cell = load_cell(CELL)
     raw = read_runs(task.path)
-    runs = imported_runs(raw, cell) if imported else tuple(run_of(one, cell) for one in raw)
+    if imported:
+        runs = imported_runs(raw, cell)
+    else:
+        runs = tuple(run_of(one, cell) for one in raw)
     return CaseRuns(runs[:-HELD_OUT], runs[-HELD_OUT:])
 
 
 def imported_runs(raw: tuple[RawRun, ...], cell: Cell) -> tuple[Run, ...]:
     """Write runs to CSV files, import them and read the logs."""
     axes = range(1, len(cell.axes) + 1)
-    positions, currents = [f"q{axis}" for axis in axes], [f"i{axis}" for axis in axes]
+    positions = [f"q{axis}" for axis in axes]
+    currents = [f"i{axis}" for axis in axes]
     runs = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

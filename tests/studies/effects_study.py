@@ -1,15 +1,17 @@
-"""Which effects are named, how far the error falls, and what happens to the gains: cells with undeclared effects.
+"""Which effects are named, how far the error falls, and what happens to the gains:
+cells with undeclared effects.
 
-Run by `make effects-study`; simulates what is missing (effect_runs.py), searches, and prints the tables of
-docs/evidence/effects-study.md. Runs and rows are kept in out/effects-study/<world>, so that a study that was
-interrupted goes on where it ended:
+Run by `make effects-study`; simulates what is missing (effect_runs.py), searches, and prints the
+tables of docs/evidence/effects-study.md. Runs and rows are kept in out/effects-study/<world>, so
+that a study that was interrupted goes on where it ended:
 
     python -m tests.studies.effects_study --world loop3 --shard 2/4     every fourth case; the tables show all there is
     python -m tests.studies.effects_study --only single clean --kept    nothing is simulated or searched
     python -m tests.studies.effects_study --blind 4711 --count 20       cells that nobody has chosen (blind_cells.py)
 
-A row is scored with what no search has seen: the two runs that were held out, and the truth of the cell.
-"""
+A row is scored with what no search has seen: the two runs that were held out, and the truth of the
+cell.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -36,7 +38,13 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
 from tests.studies.effect_cells import APART, CLEAN, FURTHER, SINGLES, SMALLS, TOGETHER, EffectCase
-from tests.studies.effect_runs import DURATION_S, CaseTask, fingerprint_of_runs, load_runs, make_case
+from tests.studies.effect_runs import (
+    DURATION_S,
+    CaseTask,
+    fingerprint_of_runs,
+    load_runs,
+    make_case,
+)
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 from tests.studies.output import as_csv
 from tests.studies.side_by_side import Shard, shard, side_by_side
@@ -55,11 +63,19 @@ VARIABLES = {
 }
 """Families that the dictionary is made to lack, and what their residual is a function of.
 
-Stribeck and non-linear viscous friction are not among them: each explains the other (their ambiguity says so)."""
+Stribeck and non-linear viscous friction are not among them: each explains the other (their
+ambiguity says so).
+"""
 REMOVED = tuple(case for case in SINGLES if case.effects[0].name in VARIABLES)
 IMPORTED = tuple(case for case in SINGLES if case.effects[0].name == "warm-up")
-"""Cases whose runs are imported from CSV files as well: what depends on the time needs the order of the files."""
-SAME = {"spring": ("hinge", "gravity-compensator"), "cogging": ("ripple",), "load-friction": ("efficiency",)}
+"""Cases whose runs are imported from CSV files as well:
+what depends on the time needs the order of the files.
+"""
+SAME = {
+    "spring": ("hinge", "gravity-compensator"),
+    "cogging": ("ripple",),
+    "load-friction": ("efficiency",),
+}
 """Families that say the same as another one, and are removed with it."""
 FRICTION = frozenset(
     {
@@ -73,7 +89,9 @@ FRICTION = frozenset(
     }
 )
 LARGEST_RISE_PERCENT = 0.2
-"""By which an accepted set of effects may raise the worst gain error [points], or by the σ of that gain."""
+"""By which an accepted set of effects may raise the worst gain error [points],
+or by the σ of that gain.
+"""
 GAIN_PERCENT = 1.5  #: Largest gain error of a cell with one effect that counts as small
 WITHIN_95 = 1.96  #: Half-width of a 95 % interval in σ
 PARTS: tuple[tuple[str, tuple[EffectCase, ...]], ...] = (
@@ -102,19 +120,23 @@ class Row:
         true: effects of the plant, as `family on J3`.
         named: effects that the search accepted, in its order.
         ambiguity: of the first one.
-        error_before_percent, error_after_percent: on the held-out runs, of the first true effect's axis; of the whole
-            for a clean cell.
+        error_before_percent, error_after_percent: on the held-out runs, of the first true effect's
+            axis; of the whole for a clean cell.
         clean_percent: the error before the search of each axis, of a clean cell alone.
-        floor_percent: the same error of the same seed's clean cell, None where that was not searched.
+        floor_percent: the same error of the same seed's clean cell, None where that was not
+            searched.
         max_gain_error_before_percent, max_gain_error_percent: of the worst gain before and after.
         worst_std_percent: σ of that gain after.
-        excess_removed: share of the excess over the floor, squared, that went; None without a floor.
+        excess_removed: share of the excess over the floor, squared, that went; None without a
+            floor.
         limit_nm: what would have been found on that axis at the end.
         processor_s: of identification and search.
         simulation_s: processor time of the simulation, 0 where the runs were there.
         set_aside: findings that passed the search, but not a gate of the joint fit.
-        gain_error_percent, gain_std_percent: of each gain after the search, the error with its sign.
-        iv_gain_error_percent, iv_gain_std_percent: the same by ``iv``; empty where no demanded motion is known.
+        gain_error_percent, gain_std_percent: of each gain after the search, the error with its
+            sign.
+        iv_gain_error_percent, iv_gain_std_percent: the same by ``iv``; empty where no demanded
+            motion is known.
     """
 
     part: str
@@ -179,7 +201,10 @@ def study(
     cases = {case.name: case for _, case in chosen}
     # A shard has whole cases: two of its parts search the same runs.
     tasks = [
-        _Task(CaseTask(out, world, case, duration_s), tuple(name for name, other in chosen if other is case))
+        _Task(
+            CaseTask(out, world, case, duration_s),
+            tuple(name for name, other in chosen if other is case),
+        )
         for case in cases.values()
     ]
     mine = () if kept else (part or Shard()).of(tasks)
@@ -215,7 +240,11 @@ def _work(task: _Task) -> tuple[str, ...]:
     searching = digest_of_source("ident.discovery.loop"), digest_of_source("daq.log.importing")
     fingerprint = digest(*searching, f"{fingerprint_of_runs(task.runs)}\n")
     lacking = [part for part in task.parts if not is_finished(task.path(part), fingerprint)]
-    lines = [f"{part} {task.runs.case.name}, {task.runs.world}: kept" for part in task.parts if part not in lacking]
+    lines = [
+        f"{part} {task.runs.case.name}, {task.runs.world}: kept"
+        for part in task.parts
+        if part not in lacking
+    ]
     # A row that was carried here from another machine (kept_rows.py) needs no recordings.
     simulation_s = make_case(task.runs) if lacking else 0.0
     for part in lacking:
@@ -224,9 +253,10 @@ def _work(task: _Task) -> tuple[str, ...]:
         replace_file(path, json.dumps(asdict(row)).encode())
         finish(path, fingerprint)
         lines.append(
-            f"{part} {row.case}, {row.world}: {', '.join(row.named) or 'nothing'}; {row.error_before_percent:.2f} -> "
-            f"{row.error_after_percent:.2f} %, worst gain {row.max_gain_error_percent:.2f} %, "
-            f"{row.processor_s:.0f} s, simulated in {row.simulation_s:.0f} s"
+            f"{part} {row.case}, {row.world}: {', '.join(row.named) or 'nothing'}; "
+            f"{row.error_before_percent:.2f} -> {row.error_after_percent:.2f} %, worst gain "
+            f"{row.max_gain_error_percent:.2f} %, {row.processor_s:.0f} s, simulated in "
+            f"{row.simulation_s:.0f} s"
         )
         simulation_s = 0.0
     return tuple(lines)
@@ -248,10 +278,15 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     end = steps[-1].after
     axis = case.effects[0].axis if case.effects else None
     accepted = tuple(step.accepted for step in steps if step.accepted is not None)
-    error_before, error_after = _gain_error(start, truth), _gain_error(end, truth)
+    error_before = _gain_error(start, truth)
+    error_after = _gain_error(end, truth)
     worst = int(np.argmax(error_after))
     (error, std), refitted = _gains_of(end.estimate, truth), by_instruments(end)
-    aside = [PlacedEffect(one.finding.effect, one.finding.axis) for step in steps for one in step.set_aside]
+    aside = [
+        PlacedEffect(one.finding.effect, one.finding.axis)
+        for step in steps
+        for one in step.set_aside
+    ]
     return Row(
         part=part,
         case=case.name,
@@ -262,10 +297,14 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
         ambiguity=() if not accepted else tuple(_placed(rival) for rival in accepted[0].ambiguity),
         error_before_percent=_holdout(start, axis),
         error_after_percent=_holdout(end, axis),
-        clean_percent=() if case.effects else tuple(_holdout(start, one) for one in range(len(truth))),
+        clean_percent=()
+        if case.effects
+        else tuple(_holdout(start, one) for one in range(len(truth))),
         max_gain_error_before_percent=float(error_before.max()),
         max_gain_error_percent=float(error_after[worst]),
-        worst_std_percent=float(100.0 * end.estimate.gains_std[worst] / abs(end.estimate.gains[worst])),
+        worst_std_percent=float(
+            100.0 * end.estimate.gains_std[worst] / abs(end.estimate.gains[worst])
+        ),
         limit_nm=float(steps[-1].limits_nm[axis or 0]),
         processor_s=spent_s,
         simulation_s=simulation_s,
@@ -291,7 +330,8 @@ def _gain_error(evidence: Evidence, truth: FloatArray) -> FloatArray:
 
 def _gains_of(estimate: Estimate, truth: FloatArray) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Error and σ of each gain [% of the truth]."""
-    error, std = 100.0 * (estimate.gains / truth - 1.0), 100.0 * estimate.gains_std / np.abs(truth)
+    error = 100.0 * (estimate.gains / truth - 1.0)
+    std = 100.0 * estimate.gains_std / np.abs(truth)
     return tuple(error.tolist()), tuple(std.tolist())
 
 
@@ -301,8 +341,11 @@ def _true(effect: UndeclaredEffect) -> str:
 
 
 def _placed(placed: PlacedEffect) -> str:
-    axes = sorted({placed.axis + 1, int(placed.effect.settings.get("other_axis", 0)) or placed.axis + 1})
-    axes = axes if placed.effect.side is GearSide.TWO_JOINTS else [placed.axis + 1]
+    axes = sorted(
+        {placed.axis + 1, int(placed.effect.settings.get("other_axis", 0)) or placed.axis + 1}
+    )
+    if placed.effect.side is not GearSide.TWO_JOINTS:
+        axes = [placed.axis + 1]
     return f"{placed.effect.name} on {'+'.join(f'J{axis}' for axis in axes)}"
 
 
@@ -312,39 +355,54 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
     single = [row for row in rows if row.part == "single"]
     if single:
         first = [row for row in single if row.named[:1] == row.true]
-        known = [row for row in single if row.true[0] in (*row.named[:1], *row.ambiguity) and row.named]
-        friction = [row for row in single if row.true[0].split()[0] in FRICTION and row.floor_percent is not None]
-        near = [row for row in friction if row.error_after_percent <= (row.floor_percent or 0.0) + 0.3]
+        known = [
+            row for row in single if row.true[0] in (*row.named[:1], *row.ambiguity) and row.named
+        ]
+        friction = [
+            row
+            for row in single
+            if row.true[0].split()[0] in FRICTION and row.floor_percent is not None
+        ]
+        near = [
+            row for row in friction if row.error_after_percent <= (row.floor_percent or 0.0) + 0.3
+        ]
         small = [row for row in single if row.max_gain_error_percent <= GAIN_PERCENT]
         lines += [
-            f"one effect: {len(first)} of {len(single)} named first, {len(known)} named or in the ambiguity set",
+            f"one effect: {len(first)} of {len(single)} named first, {len(known)} named or in the "
+            "ambiguity set",
             f"friction: {len(near)} of {len(friction)} within 0.3 points of their clean floor",
-            f"processor time with one effect: median {np.median([row.processor_s for row in single]):.0f} s, "
-            f"most {max(row.processor_s for row in single):.0f} s",
+            "processor time with one effect: median "
+            f"{np.median([row.processor_s for row in single]):.0f} s, most "
+            f"{max(row.processor_s for row in single):.0f} s",
             f"gains: {len(small)} of {len(single)} within {GAIN_PERCENT} %",
         ]
     clean = [row for row in rows if row.part == "clean"]
     if clean:
-        error, gain = (
-            np.mean([row.error_before_percent for row in clean]),
-            max(row.max_gain_error_percent for row in clean),
-        )
+        error = np.mean([row.error_before_percent for row in clean])
+        gain = max(row.max_gain_error_percent for row in clean)
         lines.append(
             f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect, "
-            f"{sum(bool(row.set_aside) and not row.named for row in clean)} with one that was set aside; "
-            f"error {error:.2f} % in the mean, worst gain {gain:.2f} %"
+            f"{sum(bool(row.set_aside) and not row.named for row in clean)} with one that was set "
+            f"aside; error {error:.2f} % in the mean, worst gain {gain:.2f} %"
         )
     for name, group in (("clean", clean), ("with one effect", single)):
         for method in ("", "iv_"):
             errors, stds = (
-                np.array([getattr(row, f"{method}gain_{kind}_percent") for row in group if row.iv_gain_error_percent])
+                np.array(
+                    [
+                        getattr(row, f"{method}gain_{kind}_percent")
+                        for row in group
+                        if row.iv_gain_error_percent
+                    ]
+                )
                 for kind in ("error", "std")
             )
             if errors.size:
                 held = 100.0 * np.mean(np.abs(errors) < WITHIN_95 * stds)
                 lines.append(
-                    f"gains of cells {name} by {method.strip('_') or 'ml'}: error {np.abs(errors).mean():.2f} % in the "
-                    f"mean, {np.abs(errors).max():.2f} % at most; 95 % intervals hold {held:.1f} %"
+                    f"gains of cells {name} by {method.strip('_') or 'ml'}: error "
+                    f"{np.abs(errors).mean():.2f} % in the mean, {np.abs(errors).max():.2f} % at "
+                    f"most; 95 % intervals hold {held:.1f} %"
                 )
     if rows:
         bent = [
@@ -354,8 +412,8 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
             > row.max_gain_error_before_percent + max(LARGEST_RISE_PERCENT, row.worst_std_percent)
         ]
         lines.append(
-            f"worst gain error raised by more than {LARGEST_RISE_PERCENT} points and its σ: {len(bent)} of {len(rows)}"
-            + "".join(f", {row.case}" for row in bent)
+            f"worst gain error raised by more than {LARGEST_RISE_PERCENT} points and its σ: "
+            f"{len(bent)} of {len(rows)}" + "".join(f", {row.case}" for row in bent)
         )
     for part in ("apart", "together"):
         both = [row for row in rows if row.part == part]
@@ -367,8 +425,8 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         first = [row for row in further if row.named[:1] == row.true]
         small = [row for row in further if row.max_gain_error_percent <= GAIN_PERCENT]
         lines.append(
-            f"cables, drifts and play: {len(first)} of {len(further)} named first, gains of {len(small)} within "
-            f"{GAIN_PERCENT} %"
+            f"cables, drifts and play: {len(first)} of {len(further)} named first, gains of "
+            f"{len(small)} within {GAIN_PERCENT} %"
         )
     imported = [row for row in rows if row.part == "imported"]
     if imported:
@@ -379,15 +437,21 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         right = [row for row in removed if {*row.named, *row.set_aside} & set(_structures_of(row))]
         most = [row for row in right if (row.excess_removed or 0.0) >= 0.6]
         lines.append(
-            f"family removed: structure on the right axis and variable in {len(right)} of {len(removed)}, set aside in "
+            f"family removed: structure on the right axis and variable in {len(right)} of "
+            f"{len(removed)}, set aside in "
             f"{sum(not set(row.named) & set(_structures_of(row)) for row in right)} of these; "
             f"60 % of the excess removed in {len(most)}"
         )
     smalls = [row for row in rows if row.part == "small"]
     if smalls:
-        named = sum(bool(row.named) and row.true[0] in (*row.named[:1], *row.ambiguity) for row in smalls)
+        named = sum(
+            bool(row.named) and row.true[0] in (*row.named[:1], *row.ambiguity) for row in smalls
+        )
         silent = sum(not row.named for row in smalls)
-        lines.append(f"0.4 of the size: {named} of {len(smalls)} named or in the ambiguity set, {silent} silent")
+        lines.append(
+            f"0.4 of the size: {named} of {len(smalls)} named or in the ambiguity set, "
+            f"{silent} silent"
+        )
     return tuple(lines)
 
 
@@ -400,11 +464,15 @@ def _structures_of(row: Row) -> tuple[str, ...]:
 def table(rows: Iterable[Row]) -> str:
     """For docs/evidence/effects-study.md."""
     lines = [
-        "| part | effects | named | error before % | after % | clean % | worst gain before % | after % |",
+        "| part | effects | named | error before % | after % | clean % | worst gain before % | "
+        "after % |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        floor = "" if row.floor_percent is None else f"{row.floor_percent:.2f}"
+        if row.floor_percent is None:
+            floor = ""
+        else:
+            floor = f"{row.floor_percent:.2f}"
         lines.append(
             f"| {row.part} | {', '.join(row.true) or 'clean'} | {', '.join(row.named) or '–'} | "
             f"{row.error_before_percent:.2f} | {row.error_after_percent:.2f} | {floor} | "
@@ -420,25 +488,37 @@ def _print_line(line: str) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Make the study and print its tables."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.effects_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.effects_study", description=__doc__
+    )
     names = [part for part, _ in PARTS]
     parser.add_argument("--world", nargs="+", choices=WORLDS, default=["measurement"])
     parser.add_argument("--only", nargs="+", choices=names, default=names)
     parser.add_argument("--cases", nargs="+", default=[], help="these alone, as clean-03")
-    parser.add_argument("--blind", type=int, metavar="SEED", help="draw the cells from a seed instead")
+    parser.add_argument(
+        "--blind", type=int, metavar="SEED", help="draw the cells from a seed instead"
+    )
     parser.add_argument("--count", type=int, default=20, help="of the blind cells")
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th case from the i-th on")
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th case from the i-th on"
+    )
     parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")
-    parser.add_argument("--kept", action="store_true", help="simulate and search nothing: report what is there")
+    parser.add_argument(
+        "--kept", action="store_true", help="simulate and search nothing: report what is there"
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     blind = options.blind is not None
     for world in options.world:
-        chosen: Cases = tuple((part, case) for part, cases in PARTS if part in options.only for case in cases)
+        chosen: Cases = tuple(
+            (part, case) for part, cases in PARTS if part in options.only for case in cases
+        )
         if blind:
             chosen = tuple(("blind", case) for case in blind_cases(options.blind, options.count))
-        chosen = tuple(pair for pair in chosen if not options.cases or pair[1].name in options.cases)
+        chosen = tuple(
+            pair for pair in chosen if not options.cases or pair[1].name in options.cases
+        )
         rows = study(
             chosen,
             world,
@@ -449,12 +529,23 @@ def main(arguments: list[str] | None = None) -> int:
             duration_s=options.duration,
         )
         name = f"blind-{options.blind}-{world}" if blind else world
-        name += "" if options.duration == DURATION_S else f"-{options.duration:g}s"
+        if options.duration == DURATION_S:
+            name += ""
+        else:
+            name += f"-{options.duration:g}s"
         report = options.out / f"{name}.json"
         replace_file(report, json.dumps({"rows": [asdict(row) for row in rows]}, indent=1).encode())
-        shown = confusion([(row.true, row.named) for row in rows]) if blind else table(rows)
+        if blind:
+            shown = confusion([(row.true, row.named) for row in rows])
+        else:
+            shown = table(rows)
         replace_file(report.with_suffix(".csv"), as_csv(shown).encode())
-        for line in (f"\n{name}: {len(rows)} of {len(chosen)} searched\n", table(rows), "", shown if blind else ""):
+        for line in (
+            f"\n{name}: {len(rows)} of {len(chosen)} searched\n",
+            table(rows),
+            "",
+            shown if blind else "",
+        ):
             _print_line(line)
         for line in verdicts(rows):
             _print_line(line)

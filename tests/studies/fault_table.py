@@ -1,7 +1,8 @@
-"""Tables of the damage study: each planted fault by each way, and the judgement of recordings without any.
+"""Tables of the damage study: each planted fault by each way,
+and the judgement of recordings without any.
 
-The simulated cell has its fault in one of four runs, on J2; an outcome is its largest gain error, the error of the fit,
-and what is said of that axis. The TX-40 has it on J3, and its gains are held.
+The simulated cell has its fault in one of four runs, on J2; an outcome is its largest gain error,
+the error of the fit, and what is said of that axis. The TX-40 has it on J3, and its gains are held.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from tests.studies.study_cells import world_cell
 from tests.studies.study_plans import make_plan
 
 CLEAN = EffectCase("clean", 2322, ())
-SIMULATED_AXIS, TX40_AXIS = 1, 2
+SIMULATED_AXIS = 1
+TX40_AXIS = 2
 TX40_WAYS = ("arrays", "import")
 ROBOTS = {
     "demo": "demo",
@@ -45,7 +47,8 @@ ROBOTS = {
     "orthoglide": "orthoglide",
 }
 """Cell of each shipped simulation."""
-SOUND_S, SOUND_SEED = 20.0, 7
+SOUND_S = 20.0
+SOUND_SEED = 7
 
 
 def write_fault_table(out: Path, world: str, data: Path) -> None:
@@ -80,7 +83,9 @@ def write_fault_table(out: Path, world: str, data: Path) -> None:
     print_line(f"written: {file}")
 
 
-def _simulated(raw: tuple[RawRun, ...], true_gains: FloatArray, fault: PlantedFault | None) -> list[str]:
+def _simulated(
+    raw: tuple[RawRun, ...], true_gains: FloatArray, fault: PlantedFault | None
+) -> list[str]:
     """Outcomes of the simulated cell by each way; a log cannot hold what is not a number."""
     rows = []
     for way in WAYS:
@@ -92,7 +97,8 @@ def _simulated(raw: tuple[RawRun, ...], true_gains: FloatArray, fault: PlantedFa
 
 
 def judge_sound_recordings(data: Path) -> None:
-    """Print what is found in recordings without a planted fault: a simulated run of each robot, and the real ones.
+    """Print what is found in recordings without a planted fault:
+    a simulated run of each robot, and the real ones.
 
     Args:
         data: folder of the real recordings; those that are not there are left out.

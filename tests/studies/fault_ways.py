@@ -1,7 +1,9 @@
-"""The ways of a recording with a planted fault to a fit: arrays, a native log, an import; and what became of it.
+"""The ways of a recording with a planted fault to a fit: arrays, a native log, an import;
+and what became of it.
 
-Layout of the two recordings: a simulated cell with two runs without load and two with the disc, of which one has the
-fault; and the TX-40's real one, which has a single run and is fitted with the nameplate gains.
+Layout of the two recordings: a simulated cell with two runs without load and two with the disc, of
+which one has the fault; and the TX-40's real one, which has a single run and is fitted with the
+nameplate gains.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ from tests.studies.effect_runs import IMPORT
 from tests.studies.planted_faults import PlantedFault, SoundChannel
 
 DAMAGED_RUN = 1  #: Of the simulated cell: disc-1
-INT16_LARGEST = 2000.0  #: Counts of the largest current of the real arm, as a drive of 16 bits might report it
+#: Counts of the largest current of the real arm, as a drive of 16 bits might report it
+INT16_LARGEST = 2000.0
 STATUS = 0x1237  #: Of a drive in operation
 PERIOD_NS = 1_000_000
 BEGAN_NS = 1_770_000_000_000_000_000
@@ -45,7 +48,8 @@ BEGAN_NS = 1_770_000_000_000_000_000
 class Outcome:
     """What became of a recording."""
 
-    gain_error_percent: float  #: largest of all axes; NaN for a real robot, and where nothing was fitted
+    #: largest of all axes; NaN for a real robot, and where nothing was fitted
+    gain_error_percent: float
     error_percent: float  #: relative error of the fit; NaN where nothing was fitted
     said: tuple[str, ...]  #: names of the refusal or of what was diagnosed
     text: str  #: first message that names the axis; empty without one
@@ -60,7 +64,10 @@ class Outcome:
         words = ", ".join(self.said) or "silent"
         if self.is_refused:
             return f"refused: {words}"
-        gain = "" if np.isnan(self.gain_error_percent) else f"gain {self.gain_error_percent:.2f} %, "
+        if np.isnan(self.gain_error_percent):
+            gain = ""
+        else:
+            gain = f"gain {self.gain_error_percent:.2f} %, "
         return f"{gain}error {self.error_percent:.2f} %; {words}"
 
 
@@ -77,7 +84,11 @@ class Heard(logging.Handler):
 
 
 def outcome(
-    fit: Callable[[], Identification], axis: str, cell: Cell, true_gains: FloatArray | None, given: FloatArray | None
+    fit: Callable[[], Identification],
+    axis: str,
+    cell: Cell,
+    true_gains: FloatArray | None,
+    given: FloatArray | None,
 ) -> Outcome:
     """Fit, and note what became of it.
 
@@ -104,13 +115,17 @@ def outcome(
     gain_error = float("nan")
     if true_gains is not None:
         gain_error = 100.0 * float(np.max(np.abs(found.estimate.gains / true_gains - 1.0)))
-    return Outcome(gain_error, found.training_error.total, tuple(dict.fromkeys(said)), next(iter(texts), ""))
+    return Outcome(
+        gain_error, found.training_error.total, tuple(dict.fromkeys(said)), next(iter(texts), "")
+    )
 
 
 # A simulated cell
 
 
-def damaged_raw(raw: RawRun, cell: Cell, fault: PlantedFault, axis: int) -> tuple[FloatArray, FloatArray]:
+def damaged_raw(
+    raw: RawRun, cell: Cell, fault: PlantedFault, axis: int
+) -> tuple[FloatArray, FloatArray]:
     """Positions [counts] and currents [raw] of a run with a fault, shape (k, n) each."""
     position = raw.position_counts.astype(np.float64)
     current = raw.current_raw.astype(np.float64)
@@ -134,17 +149,23 @@ def as_arrays(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray
     scale = scaling(cell, _readback(raw, cell))
     motor_rad = position * scale.rad_per_count
     position_rad = motor_rad @ scale.to_joint.T + scale.offset_rad
-    return replace(run_of(raw, cell), position_rad=position_rad, current_a=current * scale.current_per_unit)
+    return replace(
+        run_of(raw, cell), position_rad=position_rad, current_a=current * scale.current_per_unit
+    )
 
 
 def as_log(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray, path: Path) -> Run:
     """The run through a log as the recorder writes it."""
     readback = _readback(raw, cell)
     info = RunInfo(raw.name, 1e9 / PERIOD_NS, raw.payload, "", "damage study", BEGAN_NS, BEGAN_NS)
-    content = LogContent.of(cell, info, bundle(shipped_configurations() / "cells" / "demo.yaml"), readback)
+    content = LogContent.of(
+        cell, info, bundle(shipped_configurations() / "cells" / "demo.yaml"), readback
+    )
     begun_ns = BEGAN_NS + round(1e9 * raw.began_s)
     starts = np.flatnonzero(np.diff(raw.move, prepend=-1))
-    with LogWriter(path, content, scaling(cell, readback).joint_position_of, clock_ns=lambda: 0) as log:
+    with LogWriter(
+        path, content, scaling(cell, readback).joint_position_of, clock_ns=lambda: 0
+    ) as log:
         for start in starts.tolist():
             stamp_ns = begun_ns + start * PERIOD_NS
             log.event(CellEvent(stamp_ns, None, EventKind.MOVE_START, int(raw.move[start]), ""))
@@ -158,15 +179,21 @@ def as_log(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray, p
     return load_run(path)[0]
 
 
-def as_import(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray, path: Path) -> Run:
-    """The run through a CSV file with stamps, motor counts and currents, as another controller exports it."""
+def as_import(
+    raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray, path: Path
+) -> Run:
+    """The run through a CSV file with stamps, motor counts and currents,
+    as another controller exports it.
+    """
     folder = path.parent
     name = path.stem
     names = [f"q{axis}" for axis in range(1, 7)]
     columns = [f"i{axis}" for axis in range(1, 7)]
     scale = scaling(cell, _readback(raw, cell))
     stamp_us = np.rint(1e6 * (BEGAN_NS * 1e-9 + raw.began_s)) + 1000.0 * np.arange(len(position))
-    rows = np.column_stack((stamp_us, position * scale.rad_per_count, current * scale.current_per_unit))
+    rows = np.column_stack(
+        (stamp_us, position * scale.rad_per_count, current * scale.current_per_unit)
+    )
     with (folder / f"{name}.csv").open("w", encoding="utf-8") as file:
         file.write(",".join(["stamp", *names, *columns]) + "\n")
         np.savetxt(file, rows, fmt=["%d"] + ["%.9f"] * 12, delimiter=",")
@@ -214,7 +241,10 @@ def simulated_outcome(
                 if fault is not None and number == DAMAGED_RUN:
                     position, current = damaged_raw(one, cell, fault, axis)
                 # An undamaged log has nothing to show: only the damaged run takes the slow ways.
-                take = WAYS[way] if number == DAMAGED_RUN else as_arrays
+                if number == DAMAGED_RUN:
+                    take = WAYS[way]
+                else:
+                    take = as_arrays
                 run = take(one, cell, position, current, Path(name) / f"{one.name}.mcap")
                 runs.append(replace(run, started_s=None))
         return identify(model_of(cell), runs, cell.conditioning, axes=cell.axis_names)
@@ -243,7 +273,9 @@ def tx40_outcome(folder: Path, fault: PlantedFault | None, axis: int, way: str) 
         position[:, axis] = fault.plant(channel)
     elif fault is not None:
         largest = float(np.max(np.abs(current[:, axis])))
-        current[:, axis] = fault.plant(SoundChannel(current[:, axis], largest / INT16_LARGEST, largest, 5000.0))
+        current[:, axis] = fault.plant(
+            SoundChannel(current[:, axis], largest / INT16_LARGEST, largest, 5000.0)
+        )
 
     def fit() -> Identification:
         gains = np.array([one.nameplate_gain for one in cell.axes])
@@ -253,7 +285,9 @@ def tx40_outcome(folder: Path, fault: PlantedFault | None, axis: int, way: str) 
             run = Run("tx40", np.arange(len(position)) / 5000.0, joint_rad, current)
         else:
             run = _imported_tx40(position, current, shipped / "imports" / "tx40.yaml")
-        return identify(model_of(cell), (run,), cell.conditioning, fixed_gains=gains, axes=cell.axis_names)
+        return identify(
+            model_of(cell), (run,), cell.conditioning, fixed_gains=gains, axes=cell.axis_names
+        )
 
     given = np.array([one.nameplate_gain for one in cell.axes])
     return outcome(fit, cell.axis_names[axis], cell, None, given)

@@ -1,4 +1,6 @@
-"""Fingerprints of what a study has made, so that what is finished and still the same is not made again."""
+"""Fingerprints of what a study has made, so that what is finished and still the same is not made
+again.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ def digest(*things: object) -> str:
 
 
 def digest_of_source(module: str, rooms: tuple[str, ...] = ROOMS) -> str:
-    """Digest of a module and of all modules of this repository that it imports, in hex; docstrings and comments apart.
+    """Digest of a module and of all modules of this repository that it imports, in hex;
+    docstrings and comments apart.
 
     Args:
         module: dotted name.
@@ -55,8 +58,11 @@ def finish(path: Path, fingerprint: str) -> None:
     replace_file(mark_of(path), f"{fingerprint}\n".encode())
 
 
-def made_once(out: Path, name: str, fingerprint: str, make: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
-    """Return the document `name`.json of a folder; it is made unless it is there with this fingerprint.
+def made_once(
+    out: Path, name: str, fingerprint: str, make: Callable[[Path], dict[str, Any]]
+) -> dict[str, Any]:
+    """Return the document `name`.json of a folder;
+    it is made unless it is there with this fingerprint.
 
     Args:
         out: the folder.
@@ -64,7 +70,8 @@ def made_once(out: Path, name: str, fingerprint: str, make: Callable[[Path], dic
         fingerprint: of what it depends on.
         make: fills the folder of logs and returns the document.
     """
-    path, logs = out / f"{name}.json", out / name
+    path = out / f"{name}.json"
+    logs = out / name
     if not is_finished(path, fingerprint):
         shutil.rmtree(logs, ignore_errors=True)
         logs.mkdir(parents=True)

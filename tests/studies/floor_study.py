@@ -1,11 +1,13 @@
-"""Noise floors beside the error of a fit on the same rows: which part of it they are, and whether they bound it.
+"""Noise floors beside the error of a fit on the same rows:
+which part of it they are, and whether they bound it.
 
-`python -m tests.studies.floor_study --seeds 1 2` prints a line a recording and source: the noise of each axis by that
-source relative to what the fit leaves, ± σ, or "-" where there is none. Then, for each noise world and source, how
-many lower limits are above the error of the fit, which is of the right model: one in twenty, if the limit is a bound.
-Simulated cells repeat one plan, twice without and twice with load, or with `--apart` have a plan for each run, so that
-standstill is the only source; `--worlds clean --apart --duration 40` is like the demonstration. The real KR300 and
-TX-40, from ../shared/data or $DRIVEGAIN_DATA, repeat nothing.
+`python -m tests.studies.floor_study --seeds 1 2` prints a line a recording and source: the noise of
+each axis by that source relative to what the fit leaves, ± σ, or "-" where there is none. Then, for
+each noise world and source, how many lower limits are above the error of the fit, which is of the
+right model: one in twenty, if the limit is a bound. Simulated cells repeat one plan, twice without
+and twice with load, or with `--apart` have a plan for each run, so that standstill is the only
+source; `--worlds clean --apart --duration 40` is like the demonstration. The real KR300 and TX-40,
+from ../shared/data or $DRIVEGAIN_DATA, repeat nothing.
 """
 
 from __future__ import annotations
@@ -48,12 +50,16 @@ class FloorScore:
     """Noise of each axis relative to what the fit leaves."""
 
     lines: tuple[str, ...]  #: of the table
-    least: dict[FloorSource, list[float]]  #: lower limits by each source, of the axes where it is known
+    #: lower limits by each source, of the axes where it is known
+    least: dict[FloorSource, list[float]]
 
 
 def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> FloorScore:
     """Compare the noise by each source with the error of a fit."""
-    gains = np.array([axis.nameplate_gain for axis in cell.axes]) if fixed else None
+    if fixed:
+        gains = np.array([axis.nameplate_gain for axis in cell.axes])
+    else:
+        gains = None
     found = identify(model_of(cell), runs, cell.conditioning, method=Method.ML, fixed_gains=gains)
     start = gather(found, runs)
     left_a = left_on(start.training, start.estimate)
@@ -64,7 +70,8 @@ def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Floor
         ratios = [
             "-"
             if floor is None
-            else f"{floor.noise_a / left:.2f} ± {floor.noise_a / left * floor.std_percent / 100:.2f}"
+            else f"{floor.noise_a / left:.2f} ± "
+            f"{floor.noise_a / left * floor.std_percent / 100:.2f}"
             for floor, left in zip(floors, left_a, strict=True)
         ]
         lines.append(f"| {name} | {source.value} | {' | '.join(ratios)} |")
@@ -76,11 +83,20 @@ def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Floor
 def simulated(world: str, seed: int, duration_s: float, *, apart: bool) -> tuple[Cell, list[Run]]:
     """Four runs of one plan, or of one plan each."""
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    truth = study_cell(seed) if world == UNCHANGED else world_cell(seed, world)
-    plans = [plan(cell, seed=10 * seed + number, duration_s=duration_s) for number in range(4 if apart else 1)]
+    if world == UNCHANGED:
+        truth = study_cell(seed)
+    else:
+        truth = world_cell(seed, world)
+    plans = [
+        plan(cell, seed=10 * seed + number, duration_s=duration_s)
+        for number in range(4 if apart else 1)
+    ]
     runs: list[Run] = []
     for number, payload in enumerate((None, "disc", None, "disc")):
-        declared = None if payload is None else declared_payload(payload)
+        if payload is None:
+            declared = None
+        else:
+            declared = declared_payload(payload)
         moves = plans[number % len(plans)]
         raw = simulate_run(cell, spec_of(truth, payload, number), moves, f"run-{number}", declared)
         runs.append(run_of(raw, cell))
@@ -90,14 +106,18 @@ def simulated(world: str, seed: int, duration_s: float, *, apart: bool) -> tuple
 def kr300(folder: Path) -> tuple[Cell, list[Run]]:
     """Three runs without load."""
     tables = {name: np.loadtxt(folder / f"kr300_{name}.csv", delimiter=",") for name in "ABC"}
-    runs = [Run(name, table[:, 0], np.deg2rad(table[:, 1:7]), table[:, 7:13]) for name, table in tables.items()]
+    runs = [
+        Run(name, table[:, 0], np.deg2rad(table[:, 1:7]), table[:, 7:13])
+        for name, table in tables.items()
+    ]
     return load_cell(folder / "kr300-cell.yaml"), runs
 
 
 def tx40(folder: Path) -> tuple[Cell, list[Run]]:
     """One run without load."""
     with tempfile.TemporaryDirectory() as made, redirect_stdout(sys.stderr):
-        log, description = Path(made) / "tx40.mcap", shipped_configurations() / "imports" / "tx40.yaml"
+        log = Path(made) / "tx40.mcap"
+        description = shipped_configurations() / "imports" / "tx40.yaml"
         drivegain(["import", str(description), "--data", str(folder), "--out", str(log)])
         run, cell = load_run(log)
     return cell, [run]
@@ -105,13 +125,19 @@ def tx40(folder: Path) -> tuple[Cell, list[Run]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.floor_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.floor_study", description=__doc__
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--worlds", choices=(*WORLDS, UNCHANGED), nargs="+", default=list(WORLDS))
     parser.add_argument("--duration", type=float, default=20.0, help="of each simulated run [s]")
-    parser.add_argument("--apart", action="store_true", help="a plan for each run: no move is repeated")
+    parser.add_argument(
+        "--apart", action="store_true", help="a plan for each run: no move is repeated"
+    )
     options = parser.parse_args(arguments)
-    print_line("| recording | source | J1 | J2 | J3 | J4 | J5 | J6 |\n|---|---|---|---|---|---|---|---|")
+    print_line(
+        "| recording | source | J1 | J2 | J3 | J4 | J5 | J6 |\n|---|---|---|---|---|---|---|---|"
+    )
     data = Path(os.environ.get("DRIVEGAIN_DATA", SHARED))
     for name, read in (("kr300", kr300), ("tx40", tx40)):
         if (data / name).is_dir():
@@ -128,8 +154,9 @@ def main(arguments: list[str] | None = None) -> int:
             ratios = np.array([ratio for score in scores for ratio in score.least[source]])
             if len(ratios):
                 print_line(
-                    f"{world}, {source.value}: {np.sum(ratios > 1.0)} of {len(ratios)} lower limits above the error of "
-                    f"the fit; they are {ratios.min():.2f} to {ratios.max():.2f} of it, median {np.median(ratios):.2f}"
+                    f"{world}, {source.value}: {np.sum(ratios > 1.0)} of {len(ratios)} lower "
+                    f"limits above the error of the fit; they are {ratios.min():.2f} to "
+                    f"{ratios.max():.2f} of it, median {np.median(ratios):.2f}"
                 )
     return 0
 

@@ -1,8 +1,10 @@
-"""Runs of a simulated cell whose position loops follow a demand of their own: the same plant and loops, without nodes.
+"""Runs of a simulated cell whose position loops follow a demand of their own:
+the same plant and loops, without nodes.
 
-`tests.studies.direct_cell` walks the moves through CiA 402, which takes two thirds of its time and knows no motion but
-from rest to rest. Here the demand goes straight to the loops, in pieces of constant acceleration, so that a run of 20 s
-takes one to two seconds of processor time, and may have no rest at all.
+`tests.studies.direct_cell` walks the moves through CiA 402, which takes two thirds of its time and
+knows no motion but from rest to rest. Here the demand goes straight to the loops, in pieces of
+constant acceleration, so that a run of 20 s takes one to two seconds of processor time, and may
+have no rest at all.
 """
 
 from __future__ import annotations
@@ -43,47 +45,75 @@ class Demand:
     first: int
 
 
-def point_to_point(cell: Cell, start_rad: FloatArray, rng: np.random.Generator, duration_s: float) -> Demand:
+def point_to_point(
+    cell: Cell, start_rad: FloatArray, rng: np.random.Generator, duration_s: float
+) -> Demand:
     """Random moves from rest to rest, as a plan begins with before any is exchanged."""
     low, high = _room(cell)
     rate_hz = _rate_hz(cell)
-    here, positions, moves, samples = start_rad, [start_rad[None]], [np.zeros(1, dtype=np.int64)], 1
+    here = start_rad
+    positions = [start_rad[None]]
+    moves = [np.zeros(1, dtype=np.int64)]
+    samples = 1
     while samples < duration_s * rate_hz:
         target = tuple(float(value) for value in rng.uniform(low, high))
-        move = PlannedMove(target, float(rng.uniform(0.35, 1.0)), float(rng.uniform(0.4, 1.0)), DWELL_S)
+        move = PlannedMove(
+            target, float(rng.uniform(0.35, 1.0)), float(rng.uniform(0.4, 1.0)), DWELL_S
+        )
         path = path_of(cell, here, move)
         count = round((path.duration_s + DWELL_S) * rate_hz)
         positions.append(path.at(np.arange(1, count + 1) / rate_hz)[0])
         moves.append(np.full(count, len(moves), dtype=np.int64))
-        here, samples = np.array(target), samples + count
+        here = np.array(target)
+        samples = samples + count
     return Demand(np.concatenate(positions), np.concatenate(moves), 0)
 
 
-def without_rest(cell: Cell, start_rad: FloatArray, rng: np.random.Generator, duration_s: float) -> Demand:
-    """Sum of sines for each joint within its limits: the joints turn back at different times, and none ever waits."""
+def without_rest(
+    cell: Cell, start_rad: FloatArray, rng: np.random.Generator, duration_s: float
+) -> Demand:
+    """Sum of sines for each joint within its limits:
+    the joints turn back at different times, and none ever waits.
+    """
     low, high = _room(cell)
     rate_hz = _rate_hz(cell)
     time_s = np.arange(round((duration_s + APPROACH_S) * rate_hz)) / rate_hz
     positions = np.empty((len(time_s), len(low)))
     for joint, axis in enumerate(cell.axes):
         frequency = rng.uniform(*FREQUENCY_HZ, SINES)
-        omega, phase = 2.0 * np.pi * frequency, rng.uniform(0.0, 2.0 * np.pi, SINES)
+        omega = 2.0 * np.pi * frequency
+        phase = rng.uniform(0.0, 2.0 * np.pi, SINES)
         size = rng.uniform(0.3, 1.0, SINES) / frequency
         angle = np.outer(time_s, omega) + phase
-        way, speed = np.sin(angle) @ size, np.cos(angle) @ (size * omega)
+        way = np.sin(angle) @ size
+        speed = np.cos(angle) @ (size * omega)
         push = -np.sin(angle) @ (size * omega**2)
-        limits = (0.5 * (high - low)[joint], 0.9 * axis.limits.velocity, 0.6 * axis.limits.acceleration)
-        scale = min(limit / float(np.abs(one).max()) for limit, one in zip(limits, (way, speed, push), strict=True))
+        limits = (
+            0.5 * (high - low)[joint],
+            0.9 * axis.limits.velocity,
+            0.6 * axis.limits.acceleration,
+        )
+        scale = min(
+            limit / float(np.abs(one).max())
+            for limit, one in zip(limits, (way, speed, push), strict=True)
+        )
         positions[:, joint] = 0.5 * (low + high)[joint] + scale * way
     share = np.clip(time_s / APPROACH_S, 0.0, 1.0)[:, None]
     blend = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     return Demand(
-        start_rad + blend * (positions - start_rad), np.zeros(len(time_s), dtype=np.int64), round(APPROACH_S * rate_hz)
+        start_rad + blend * (positions - start_rad),
+        np.zeros(len(time_s), dtype=np.int64),
+        round(APPROACH_S * rate_hz),
     )
 
 
 def follow(
-    cell: Cell, spec: CellSpec, demand: Demand, name: str, payload: Payload | None, began_s: float = 0.0
+    cell: Cell,
+    spec: CellSpec,
+    demand: Demand,
+    name: str,
+    payload: Payload | None,
+    began_s: float = 0.0,
 ) -> RawRun:
     """Record a simulated cell that follows a demand.
 
@@ -107,13 +137,17 @@ def follow(
     counts = demand.position_rad @ spec.ratio.T * counts_per_rad(spec)
     speed = np.gradient(counts[::PIECE], piece_s, axis=0)
     speed[0] = 0.0
-    recorded, loops = [], amplifiers.loops
+    recorded = []
+    loops = amplifiers.loops
     for sample in range((len(speed) - 1) * PIECE):
         if sample % PIECE == 0:
             acceleration = (speed[sample // PIECE + 1] - loops["demand_velocity"]) / piece_s
             for motor, value in enumerate(acceleration):
                 # Twice as long as it lasts: a set-point that ends would stop.
-                amplifiers.move(motor, ProfileMove((2.0 * piece_s, 0.0, 0.0, 0.0), (float(value), 0.0, 0.0, 0.0), 0.0))
+                amplifiers.move(
+                    motor,
+                    ProfileMove((2.0 * piece_s, 0.0, 0.0, 0.0), (float(value), 0.0, 0.0, 0.0), 0.0),
+                )
         loops["limited"] = 0
         for _ in range(spec.substeps):
             plant.step(loops["current_a"])
@@ -121,7 +155,9 @@ def follow(
         amplifiers.report()
         now = amplifiers.readings
         recorded.append((now.position, now.demand, now.current_demand, now.limited))
-    position, asked, current, limited = (np.array(column) for column in zip(*recorded[demand.first :], strict=True))
+    position, asked, current, limited = (
+        np.array(column) for column in zip(*recorded[demand.first :], strict=True)
+    )
     return RawRun(
         name=name,
         payload=payload,

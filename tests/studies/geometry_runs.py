@@ -1,8 +1,9 @@
-"""Runs of the geometry study: of each robot and seed two without load and two with the weighed payload, made once.
+"""Runs of the geometry study: of each robot and seed two without load and two with the weighed
+payload, made once.
 
-Mistakes are planted into their arrays or into the description afterwards (planted_mistakes.py). The robots, their
-times and noise are those of the robot study (any_robot.py), so the relative error without any mistake is the usual
-3 to 4 %. Layout: out/geometry-study/runs/<robot>-<seed>.npz.
+Mistakes are planted into their arrays or into the description afterwards (planted_mistakes.py). The
+robots, their times and noise are those of the robot study (any_robot.py), so the relative error
+without any mistake is the usual 3 to 4 %. Layout: out/geometry-study/runs/<robot>-<seed>.npz.
 """
 
 from __future__ import annotations
@@ -93,12 +94,17 @@ def simulate(task: RunsOfRobot) -> tuple[RawRun, ...]:
         )
         for mounted in (None, body.name):
             spec = load_simulation(shipped_simulation(robot.simulation), mounted)
-            axes = tuple(replace(axis, current_noise_a=robot.noise * axis.current_noise_a) for axis in spec.axes)
+            axes = tuple(
+                replace(axis, current_noise_a=robot.noise * axis.current_noise_a)
+                for axis in spec.axes
+            )
             number = len(runs)
             spec = replace(spec, axes=axes, seed=100 * task.seed + number)
             declared = None if mounted is None else body.payload
             name = f"{mounted or 'bare'}-{pair + 1}"
-            runs.append(simulate_run(cell, spec, moves, name, declared, number * (robot.seconds + PAUSE_S)))
+            runs.append(
+                simulate_run(cell, spec, moves, name, declared, number * (robot.seconds + PAUSE_S))
+            )
     return tuple(runs)
 
 

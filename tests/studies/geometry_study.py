@@ -1,17 +1,20 @@
-"""Are mistakes of geometry and time named on the right joint, and what are the gains worth then: four robots.
+"""Are mistakes of geometry and time named on the right joint, and what are the gains worth then:
+four robots.
 
-Run by `make geometry-study`. The runs of each robot and seed are simulated once (geometry_runs.py); each mistake is
-planted into their arrays or into the description (planted_mistakes.py), everything is fitted, and the search looks for
-what the model lacks. A zero offset is planted on every joint on which these runs would show it.
+Run by `make geometry-study`. The runs of each robot and seed are simulated once (geometry_runs.py);
+each mistake is planted into their arrays or into the description (planted_mistakes.py), everything
+is fitted, and the search looks for what the model lacks. A zero offset is planted on every joint on
+which these runs would show it.
 
-    python -m tests.studies.geometry_study --shard 1/2 --minutes 60  every second unit; goes on where it ended
+    python -m tests.studies.geometry_study --shard 1/2 --minutes 60  every second unit
     python -m tests.studies.geometry_study --only TX-40 --mistakes clean zero-offset --seeds 1
     python -m tests.studies.geometry_study --minutes 0               nothing is searched: the tables of what is there
 
-Layout: out/geometry-study/<unit>.csv, the row of one unit; out/geometry-study.csv has all. Where all units of the seeds
-are there, docs/evidence/data gets them with the summary. Real recordings whose gravity is turned by 90 and by 180
-degrees are units of the study, too: their rows say what direction `fit` names, and what error it has as declared.
-"""
+Layout: out/geometry-study/<unit>.csv, the row of one unit; out/geometry-study.csv has all. Where
+all units of the seeds are there, docs/evidence/data gets them with the summary. Real recordings
+whose gravity is turned by 90 and by 180 degrees are units of the study, too: their rows say what
+direction `fit` names, and what error it has as declared.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -56,7 +59,9 @@ SEEDS = (1, 2, 3, 4)
 WORSE_PERCENT = 0.2  #: By which a worst gain may be worse than in the clean cell
 
 
-def units_of(out: Path, robots: Sequence[str], seeds: Sequence[int], mistakes: Sequence[str]) -> list[MistakeUnit]:
+def units_of(
+    out: Path, robots: Sequence[str], seeds: Sequence[int], mistakes: Sequence[str]
+) -> list[MistakeUnit]:
     """Units of the study, by seed; delays go round the axes, one axis a size and seed."""
     units: list[MistakeUnit] = []
     for seed in seeds:
@@ -64,35 +69,48 @@ def units_of(out: Path, robots: Sequence[str], seeds: Sequence[int], mistakes: S
             axes = len(RunsOfRobot(out, robot, seed).cell.axes)
             own = [MistakeUnit(out, robot, seed, Mistake.CLEAN.value, -1, 0)]
             for level in range(len(OFFSETS_DEG)):
-                own += [MistakeUnit(out, robot, seed, Mistake.ZERO.value, axis, level) for axis in range(axes)]
+                own += [
+                    MistakeUnit(out, robot, seed, Mistake.ZERO.value, axis, level)
+                    for axis in range(axes)
+                ]
                 own.append(MistakeUnit(out, robot, seed, Mistake.GRAVITY.value, -1, level))
                 late = (3 * seed + level) % axes
                 own.append(MistakeUnit(out, robot, seed, Mistake.ENCODER.value, late, level))
-                own.append(MistakeUnit(out, robot, seed, Mistake.CURRENT.value, (late + 1) % axes, level))
+                own.append(
+                    MistakeUnit(out, robot, seed, Mistake.CURRENT.value, (late + 1) % axes, level)
+                )
             units += [unit for unit in own if unit.mistake in mistakes]
     if TURNED in mistakes:
         for robot in REAL:
-            units += [MistakeUnit(out, robot, 0, TURNED, -1, level) for level in range(len(TURNS_DEG))]
+            units += [
+                MistakeUnit(out, robot, 0, TURNED, -1, level) for level in range(len(TURNS_DEG))
+            ]
     return units
 
 
 def summary(rows: Sequence[MistakeRow]) -> str:
     """A line for each robot, mistake and size."""
     lines = [
-        "| robot | mistake | size | planted | refused | named | within 3 σ | sense +/− | with others | "
-        "error % | worst gain % |",
+        "| robot | mistake | size | planted | refused | named | within 3 σ | sense +/− | with "
+        "others | error % | worst gain % |",
         "|" + "---|" * 11,
     ]
     kinds = dict.fromkeys((row.robot, row.mistake, row.size) for row in rows)
     for robot, mistake, size in sorted(kinds, key=lambda kind: (kind[0], kind[1], kind[2])):
-        own = [row for row in rows if (row.robot, row.mistake, row.size) == (robot, mistake, size) and row.planted]
+        own = [
+            row
+            for row in rows
+            if (row.robot, row.mistake, row.size) == (robot, mistake, size) and row.planted
+        ]
         if own:
             lines.append(f"| {robot} | {mistake} | {size:.4g} | {_figures(own)} |")
     return "\n".join(lines)
 
 
 def totals(rows: Sequence[MistakeRow]) -> str:
-    """How many mistakes are named, how many clean cells have an effect, and which worst gains stay worse."""
+    """How many mistakes are named, how many clean cells have an effect,
+    and which worst gains stay worse.
+    """
     simulated = [row for row in rows if row.planted and row.mistake != TURNED]
     mistaken = [row for row in simulated if row.mistake != Mistake.CLEAN.value]
     smallest: dict[str, float] = {}
@@ -111,7 +129,9 @@ def totals(rows: Sequence[MistakeRow]) -> str:
     for row in mistaken:
         raised = row.gain_error_after_percent - worst.get((row.robot, row.seed), NAN)
         if raised > WORSE_PERCENT:
-            lines.append(f"worst gain {raised:.2f} points worse than the clean cell's: {_place(row)}")
+            lines.append(
+                f"worst gain {raised:.2f} points worse than the clean cell's: {_place(row)}"
+            )
     return "\n".join(lines)
 
 
@@ -132,7 +152,9 @@ def _figures(rows: Sequence[MistakeRow]) -> str:
         return f"{counts} | {senses} | 0 | | "
     others = sum(bool(row.others) for row in fits)
     errors = f"{_mean(fits, 'error_before_percent')} → {_mean(fits, 'error_after_percent')}"
-    gains = [[getattr(row, f"gain_error_{when}_percent") for row in fits] for when in ("before", "after")]
+    gains = [
+        [getattr(row, f"gain_error_{when}_percent") for row in fits] for when in ("before", "after")
+    ]
     worst = " → ".join(f"{max(column):.2f}" for column in gains)
     return f"{counts} | {senses} | {others} | {errors} | {worst}"
 
@@ -143,12 +165,21 @@ def _mean(rows: Sequence[MistakeRow], field: str) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Simulate and search what is missing, write the table of all rows, and print the summary."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.geometry_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.geometry_study", description=__doc__
+    )
     kinds = [*(mistake.value for mistake in Mistake), TURNED]
-    parser.add_argument("--only", nargs="+", choices=STUDIED, default=list(STUDIED), metavar="ROBOT")
+    parser.add_argument(
+        "--only", nargs="+", choices=STUDIED, default=list(STUDIED), metavar="ROBOT"
+    )
     parser.add_argument("--mistakes", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th robot and seed from the i-th on")
+    parser.add_argument(
+        "--shard",
+        type=shard,
+        default=Shard(),
+        help="i/n: every n-th robot and seed from the i-th on",
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no unit is begun")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
@@ -158,19 +189,31 @@ def main(arguments: list[str] | None = None) -> int:
     # A shard has whole robots and seeds: their runs are simulated once.
     places = list(dict.fromkeys((unit.robot, unit.seed) for unit in units))
     mine = set(options.shard.of(places))
-    followed = ("daq.config", "daq.workflow", "ident", "tests.studies.planted", "tests.studies.geometry_runs")
+    followed = (
+        "daq.config",
+        "daq.workflow",
+        "ident",
+        "tests.studies.planted",
+        "tests.studies.geometry_runs",
+    )
     source = digest_of_source("tests.studies.geometry_units", followed)
 
     def fingerprint_of(unit: MistakeUnit) -> str:
-        return digest(source, unit.name, "" if unit.mistake == TURNED else fingerprint_of_runs(unit.runs))
+        return digest(
+            source, unit.name, "" if unit.mistake == TURNED else fingerprint_of_runs(unit.runs)
+        )
 
     def offsets_of(unit: MistakeUnit) -> OffsetRow:
         shown = replace(unit, mistake=OBSERVABLE, axis=-1, level=0)
-        (row,) = rows_of_unit(options.out / OBSERVABLE, shown, OffsetRow, fingerprint_of(shown), observe_offsets)
+        (row,) = rows_of_unit(
+            options.out / OBSERVABLE, shown, OffsetRow, fingerprint_of(shown), observe_offsets
+        )
         return row
 
     def made(unit: MistakeUnit) -> tuple[MistakeRow, ...]:
-        return turned_unit(unit) if unit.mistake == TURNED else search_unit(unit, offsets_of(unit))
+        if unit.mistake == TURNED:
+            return turned_unit(unit)
+        return search_unit(unit, offsets_of(unit))
 
     def done(unit: MistakeUnit) -> str:
         (row,) = rows_of_unit(options.out, unit, MistakeRow, fingerprint_of(unit), made)
@@ -197,12 +240,23 @@ def line_of(unit: MistakeUnit, row: MistakeRow) -> str:
     if row.refused:
         return f"{unit.name}: refused: {row.refused[:100]}"
     if unit.mistake == TURNED:
-        found = f"{math.degrees(row.value):.1f} ± {math.degrees(row.std):.1f}°" if row.named else "not named"
-        return f"{unit.name}: fitted with {row.error_before_percent:.2f} %, gravity turned by {found}"
-    found = f"{row.value:.4g} ± {row.std:.2g}" if row.named else "not named"
-    gains = f"worst gain {row.gain_error_before_percent:.2f} -> {row.gain_error_after_percent:.2f} %"
+        if row.named:
+            found = f"{math.degrees(row.value):.1f} ± {math.degrees(row.std):.1f}°"
+        else:
+            found = "not named"
+        return (
+            f"{unit.name}: fitted with {row.error_before_percent:.2f} %, gravity turned by {found}"
+        )
+    if row.named:
+        found = f"{row.value:.4g} ± {row.std:.2g}"
+    else:
+        found = "not named"
+    gains = (
+        f"worst gain {row.gain_error_before_percent:.2f} -> {row.gain_error_after_percent:.2f} %"
+    )
     return (
-        f"{unit.name}: {row.size:.4g}: {found}; {', '.join(row.others) or 'no other'}; {gains}, {row.processor_s:.0f} s"
+        f"{unit.name}: {row.size:.4g}: {found}; {', '.join(row.others) or 'no other'}; {gains}, "
+        f"{row.processor_s:.0f} s"
     )
 
 

@@ -25,7 +25,14 @@ from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from ident.estimators.turned_geometry import find_turned_geometry
 from tests.studies.geometry_runs import RunsOfRobot, load_runs, make_runs
-from tests.studies.planted_mistakes import Mistake, Planted, is_prismatic, judge_mistake, plant, predicted_offset_std
+from tests.studies.planted_mistakes import (
+    Mistake,
+    Planted,
+    is_prismatic,
+    judge_mistake,
+    plant,
+    predicted_offset_std,
+)
 from tests.studies.real_runs import RECORDINGS, data_folder
 
 OFFSETS_DEG = (0.3, 1.0, 2.0)
@@ -33,11 +40,14 @@ OFFSETS_MM = (1.0, 3.0, 6.0)
 TILTS_DEG = (0.5, 1.0, 3.0)
 DELAYS_MS = (1.0, 3.0, 5.0)
 SIGMAS = 3.0
-"""σ within which a value must be; and a joint shows its zero where the smallest offset is as many predicted σ."""
+"""σ within which a value must be; and a joint shows its zero where the smallest offset is as many
+predicted σ.
+"""
 TURNED = "turned gravity"
 TURNS_DEG = (90.0, 180.0)
 WITHIN_RAD = math.radians(5.0)  #: Of the true direction, gravity that was turned counts as named
-REAL = {"TX-40 recording": "tx40", "KR300 recording": "kr300-A"}  #: Recordings with turned gravity, by robot
+#: Recordings with turned gravity, by robot
+REAL = {"TX-40 recording": "tx40", "KR300 recording": "kr300-A"}
 OBSERVABLE = "observable"
 
 
@@ -65,7 +75,7 @@ class MistakeUnit:
     def name(self) -> str:
         """Name of its file."""
         where = "" if self.axis < 0 else f"-{self.axis + 1}"
-        return f"{self.robot.replace(' ', '-')}-{self.seed}-{self.mistake.replace(' ', '-')}{where}-{self.level}"
+        return f"{self.robot.replace(' ', '-')}-{self.seed}-{self.mistake.replace(' ', '-')}{where}-{self.level}"  # noqa: E501
 
     @property
     def runs(self) -> RunsOfRobot:
@@ -80,7 +90,8 @@ class OffsetRow:
     Attributes:
         robot, seed: of the runs.
         prismatic: of each axis.
-        std: σ that an offset would be found with, rad or m of each axis; infinite where it is not seen.
+        std: σ that an offset would be found with, rad or m of each axis; infinite where it is not
+            seen.
         observable: of each axis.
     """
 
@@ -105,8 +116,10 @@ class MistakeRow:
         value, std, z: as of NamedMistake.
         others: other effects that joined.
         set_aside: findings that passed the search, but did not join.
-        error_before_percent, error_after_percent: relative error of the fit, before and after the search.
-        gain_error_before_percent, gain_error_after_percent: of the worst gain; NaN of a real recording.
+        error_before_percent, error_after_percent: relative error of the fit, before and after the
+            search.
+        gain_error_before_percent, gain_error_after_percent: of the worst gain; NaN of a real
+            recording.
         gain_std_percent: σ of the worst gain after.
         refused: why there is no fit; else empty.
         processor_s: of fit and search.
@@ -137,7 +150,9 @@ class MistakeRow:
 NAN = float("nan")
 
 
-def blank(unit: MistakeUnit, axis: str, size: float, *, planted: bool = True, predicted_std: float = NAN) -> MistakeRow:
+def blank(
+    unit: MistakeUnit, axis: str, size: float, *, planted: bool = True, predicted_std: float = NAN
+) -> MistakeRow:
     """The row of a unit of which nothing is known yet."""
     return MistakeRow(
         robot=unit.robot,
@@ -171,7 +186,9 @@ def size_of(mistake: Mistake, level: int, *, prismatic: bool) -> float:
         return 1e-3 * DELAYS_MS[level]
     if mistake is Mistake.GRAVITY:
         return math.radians(TILTS_DEG[level])
-    return 1e-3 * OFFSETS_MM[level] if prismatic else math.radians(OFFSETS_DEG[level])
+    if prismatic:
+        return 1e-3 * OFFSETS_MM[level]
+    return math.radians(OFFSETS_DEG[level])
 
 
 def fitted(cell: Cell, runs: Sequence[Run]) -> Evidence:
@@ -196,7 +213,11 @@ def observe_offsets(unit: MistakeUnit) -> tuple[OffsetRow, ...]:
     prismatic = is_prismatic(evidence)
     least = [size_of(Mistake.ZERO, 0, prismatic=linear) for linear in prismatic]
     observable = SIGMAS * std <= np.array(least)
-    return (OffsetRow(unit.robot, unit.seed, prismatic, tuple(std.tolist()), tuple(observable.tolist())),)
+    return (
+        OffsetRow(
+            unit.robot, unit.seed, prismatic, tuple(std.tolist()), tuple(observable.tolist())
+        ),
+    )
 
 
 def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]:
@@ -208,7 +229,9 @@ def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]
     axis = cell.axis_names[unit.axis] if unit.axis >= 0 else ""
     row = blank(unit, axis, size)
     if mistake is Mistake.ZERO:
-        row = replace(row, predicted_std=offsets.std[unit.axis], planted=offsets.observable[unit.axis])
+        row = replace(
+            row, predicted_std=offsets.std[unit.axis], planted=offsets.observable[unit.axis]
+        )
         if not row.planted:
             return (row,)
     planted = Planted(mistake, unit.axis, size)
@@ -218,7 +241,13 @@ def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]
         start = fitted(wrong, runs)
         steps = find_effects(start, np.random.default_rng(0), axes=cell.place_names)
     except IdentificationError as error:
-        return (replace(row, refused=str(error).replace("\n", " "), processor_s=time.process_time() - begun_s),)
+        return (
+            replace(
+                row,
+                refused=str(error).replace("\n", " "),
+                processor_s=time.process_time() - begun_s,
+            ),
+        )
     spent_s = time.process_time() - begun_s
     end = steps[-1].after
     judged = judge_mistake(end, planted)
@@ -239,14 +268,18 @@ def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]
         error_after_percent=end.estimate.relative_error(end.identification.system).total,
         gain_error_before_percent=float(before.max()),
         gain_error_after_percent=float(after[worst]),
-        gain_std_percent=float(100.0 * end.estimate.gains_std[worst] / abs(end.estimate.gains[worst])),
+        gain_std_percent=float(
+            100.0 * end.estimate.gains_std[worst] / abs(end.estimate.gains[worst])
+        ),
         processor_s=spent_s,
     )
     return (row,)
 
 
 def turned_unit(unit: MistakeUnit) -> tuple[MistakeRow, ...]:
-    """Fit a real recording with gravity turned about x of its base, and look for the true one as `fit` does."""
+    """Fit a real recording with gravity turned about x of its base,
+    and look for the true one as `fit` does.
+    """
     recording = RECORDINGS[REAL[unit.robot]](data_folder())
     angle_deg = TURNS_DEG[unit.level]
     row = blank(unit, "", math.radians(angle_deg))
@@ -264,9 +297,13 @@ def turned_unit(unit: MistakeUnit) -> tuple[MistakeRow, ...]:
         off_rad = math.acos(min(along, 1.0))
         std_rad = math.radians(found.gravity.std_deg)
         value = math.radians(found.gravity.turned_deg)
-        row = replace(row, named=off_rad <= WITHIN_RAD, value=value, std=std_rad, z=off_rad / std_rad)
+        row = replace(
+            row, named=off_rad <= WITHIN_RAD, value=value, std=std_rad, z=off_rad / std_rad
+        )
     try:
-        fit = identify(model, recording.runs, cell.conditioning, method=Method.ML, fixed_gains=recording.gains)
+        fit = identify(
+            model, recording.runs, cell.conditioning, method=Method.ML, fixed_gains=recording.gains
+        )
     except IdentificationError as error:
         return (replace(row, refused=str(error).replace("\n", " ")),)
     spent_s = time.process_time() - begun_s

@@ -1,8 +1,10 @@
-"""Verdict of the hold-out on the gains beside an effect: of right ones, and of one that is wrong among them.
+"""Verdict of the hold-out on the gains beside an effect:
+of right ones, and of one that is wrong among them.
 
-`make holdout-study` prints the figures of docs/evidence/hold-out.md. Sessions obey the declared model and a
-low-speed friction that it lacks; the loop finds it. Each session is fitted twice: for a cell whose nameplate is 2 to
-20 % off, and for one whose nameplate is true. Then one gain is made wrong, and all the rest is refitted to it.
+`make holdout-study` prints the figures of docs/evidence/hold-out.md. Sessions obey the declared
+model and a low-speed friction that it lacks; the loop finds it. Each session is fitted twice: for a
+cell whose nameplate is 2 to 20 % off, and for one whose nameplate is true. Then one gain is made
+wrong, and all the rest is refitted to it.
 """
 
 from __future__ import annotations
@@ -44,12 +46,16 @@ class Ratio:
 
     def __str__(self) -> str:
         axes = " ".join(f"{axis:6.3f}" for axis in self.axes)
-        return f"{self.seed:4d}  {self.nameplate:9s}  J4 × {self.factor:.1f}  {self.total:6.3f}  {axes}"
+        return (
+            f"{self.seed:4d}  {self.nameplate:9s}  J4 × {self.factor:.1f}  "
+            f"{self.total:6.3f}  {axes}"
+        )
 
 
 def session(seed: int) -> dict[str, Run]:
     """Four runs for the fit and one to be held out, by name."""
-    truth, rng = tx40_truth(), np.random.default_rng(seed)
+    truth = tx40_truth()
+    rng = np.random.default_rng(seed)
     mounted = {name: None if name.startswith("bare") else MOUNTED for name in (*FIT, HELD_OUT)}
     return {
         name: _sticking(record(truth, name, rng, payload, noise_a=0.3, seconds=22.0, averaged=1))
@@ -66,7 +72,8 @@ def _sticking(run: Run) -> Run:
 
 def fitted(cell: Cell, runs: dict[str, Run]) -> Fit:
     """With the effects that the loop accepts."""
-    trained, unseen = [runs[name] for name in FIT], [runs[HELD_OUT]]
+    trained = [runs[name] for name in FIT]
+    unseen = [runs[HELD_OUT]]
     found = identify(model_of(cell), trained, cell.conditioning, holdout=unseen)
     steps = find_effects(gather(found, trained, unseen), np.random.default_rng(0))
     return Fit(cell, (), (), (), found, steps, None)
@@ -85,7 +92,10 @@ def with_factor(right: Fit, factor: float) -> Fit:
 def ratios(seeds: range) -> Iterator[Ratio]:
     """Yield the ratios of every session, nameplate and factor."""
     off = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    axes = (replace(axis, nameplate_gain=float(gain)) for axis, gain in zip(off.axes, GAINS, strict=True))
+    axes = (
+        replace(axis, nameplate_gain=float(gain))
+        for axis, gain in zip(off.axes, GAINS, strict=True)
+    )
     true = replace(off, axes=tuple(axes))
     for seed in seeds:
         runs = session(seed)
@@ -93,10 +103,13 @@ def ratios(seeds: range) -> Iterator[Ratio]:
             right = fitted(cell, runs)
             for factor in FACTORS:
                 of = calibration_of(with_factor(right, factor), datetime(2025, 1, 2, tzinfo=UTC))
-                held, nameplate = of.holdout_error_percent, of.nameplate_holdout_error_percent
+                held = of.holdout_error_percent
+                nameplate = of.nameplate_holdout_error_percent
                 if held is None or nameplate is None:
                     raise LookupError("a session without a hold-out")
-                compared = tuple(one / other for one, other in zip(held.axes, nameplate.axes, strict=True))
+                compared = tuple(
+                    one / other for one, other in zip(held.axes, nameplate.axes, strict=True)
+                )
                 yield Ratio(seed, name, factor, held.total / nameplate.total, compared)
 
 

@@ -1,7 +1,7 @@
 """How far the gains are off, by estimator and noise floor.
 
-Run by `make ident-study`; records what is missing (record_study.py, over the real driver path), and writes
-out/ident-study.json and the first table of docs/evidence/estimators.md.
+Run by `make ident-study`; records what is missing (record_study.py, over the real driver path), and
+writes out/ident-study.json and the first table of docs/evidence/estimators.md.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class Score:
 
     Attributes:
         error_percent: of each gain.
-        second_payload_percent: of the second payload's mass on each of its trajectories, found with these gains.
+        second_payload_percent: of the second payload's mass on each of its trajectories, found with
+            these gains.
         relative_error_percent: of the fit.
     """
 
@@ -66,12 +67,16 @@ class Summary:
 def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str, Score]:
     """Every estimator on one cell of the study.
 
-    The second payload is weighed as in the paper's Table 8: gains fixed, classical IDIM-WLS on the runs without load
-    and one trajectory with the payload, of which nothing is known.
+    The second payload is weighed as in the paper's Table 8: gains fixed, classical IDIM-WLS on the
+    runs without load and one trajectory with the payload, of which nothing is known.
     """
-    system = _system(model, [load_run(path)[0] for path in logs.fit], conditioning, instruments=True)
+    system = _system(
+        model, [load_run(path)[0] for path in logs.fit], conditioning, instruments=True
+    )
     bare = [run for run in (load_run(path)[0] for path in logs.fit) if run.payload is None]
-    weighing = [_system(model, [*bare, load_run(path)[0]], conditioning) for path in logs.second_payload]
+    weighing = [
+        _system(model, [*bare, load_run(path)[0]], conditioning) for path in logs.second_payload
+    ]
     true = np.array(logs.truth.gains_nm_per_a)
     mass = logs.truth.payloads[PLATE].mass_kg
     scores = {}
@@ -79,13 +84,17 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
         found = estimator(system)
         scores[name] = Score(
             error_percent=tuple(float(error) for error in 100.0 * (found.gains / true - 1.0)),
-            second_payload_percent=tuple(100.0 * (_mass(one, found.gains) / mass - 1.0) for one in weighing),
+            second_payload_percent=tuple(
+                100.0 * (_mass(one, found.gains) / mass - 1.0) for one in weighing
+            ),
             relative_error_percent=found.relative_error(system).total,
         )
     return scores
 
 
-def _system(model: Model, runs: Sequence[Run], conditioning: Conditioning, *, instruments: bool = False) -> System:
+def _system(
+    model: Model, runs: Sequence[Run], conditioning: Conditioning, *, instruments: bool = False
+) -> System:
     """Equations of some runs; `iv` needs the instruments."""
     return regrouped(reduce_runs(model, runs, conditioning, instruments=instruments))
 
@@ -121,10 +130,14 @@ def _print_line(line: str) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, score and report."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.ident_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.ident_study", description=__doc__
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--floors", nargs="+", choices=tuple(FLOORS), default=list(FLOORS))
-    parser.add_argument("--kept", action="store_true", help="score what was recorded, whatever software recorded it")
+    parser.add_argument(
+        "--kept", action="store_true", help="score what was recorded, whatever software recorded it"
+    )
     parser.add_argument("--table", type=Path, default=TABLE)
     options = parser.parse_args(arguments)
     cell = load_cell(CELL)
@@ -134,12 +147,20 @@ def main(arguments: list[str] | None = None) -> int:
     else:
         logs = record_study(options.seeds, options.floors, report_line=_print_line)
     result: dict[str, Any] = {_key(name): {} for name in ESTIMATORS}
-    lines = ["| floor % | estimator | gain error mean / max % | second payload mean / max % |", "|---|---|---|---|"]
+    lines = [
+        "| floor % | estimator | gain error mean / max % | second payload mean / max % |",
+        "|---|---|---|---|",
+    ]
     cells: list[dict[str, Any]] = []
     for floor in options.floors:
-        scored = [(one.seed, score(one, model, cell.conditioning)) for one in logs if one.floor == floor]
+        scored = [
+            (one.seed, score(one, model, cell.conditioning)) for one in logs if one.floor == floor
+        ]
         for seed, of in scored:
-            cells += [{"floor": floor, "seed": seed, "estimator": name, **asdict(one)} for name, one in of.items()]
+            cells += [
+                {"floor": floor, "seed": seed, "estimator": name, **asdict(one)}
+                for name, one in of.items()
+            ]
         for name in ESTIMATORS:
             reported = summarise([of[name] for _, of in scored])
             result[_key(name)][floor] = asdict(reported)

@@ -1,11 +1,13 @@
-"""Carry the finished units of a study from one machine to another, with the fingerprints of what they depend on.
+"""Carry the finished units of a study from one machine to another,
+with the fingerprints of what they depend on.
 
     python -m tests.studies.kept_rows pack out/effects-study FILE
     python -m tests.studies.kept_rows unpack FILE out/effects-study
 
-A study of several hours is done in pieces, on machines that forget. What is packed are its small results alone, rows in
-JSON or CSV, one line of the file for each; recordings and plans are made again. A study that finds a row with another
-fingerprint than its own does that unit again, so an unpacked file never answers for code that has changed.
+A study of several hours is done in pieces, on machines that forget. What is packed are its small
+results alone, rows in JSON or CSV, one line of the file for each; recordings and plans are made
+again. A study that finds a row with another fingerprint than its own does that unit again, so an
+unpacked file never answers for code that has changed.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ def pack(folder: Path, file: Path) -> int:
 
 
 def unpack(file: Path, folder: Path) -> int:
-    """Put packed rows into a study's folder, except where there is one already; return the number put there."""
+    """Put packed rows into a study's folder, except where there is one already;
+    return the number put there.
+    """
     number = 0
     for line in file.read_text(encoding="utf-8").splitlines():
         entry = json.loads(line)

@@ -1,12 +1,14 @@
 """Bias of an estimator and truth of its σ where the noise goes round the position loop.
 
-Run by `make loop-noise-study`; simulates what is missing (coverage_runs.py), identifies every cell of each world and
-prints a table a world. `--shard 2/4` takes every fourth cell from the second on, and prints what is there of all.
+Run by `make loop-noise-study`; simulates what is missing (coverage_runs.py), identifies every cell
+of each world and prints a table a world. `--shard 2/4` takes every fourth cell from the second on,
+and prints what is there of all.
 
     python -m tests.studies.loop_noise --world loop3 --cells 8 --method ml wls
 
-Errors are of the gains against the truth of each cell; z is error / σ. Runs and scores are kept: another estimator
-reads the same samples, and finds the position demand of every run in `CoverageCell.demand_rad`.
+Errors are of the gains against the truth of each cell; z is error / σ. Runs and scores are kept:
+another estimator reads the same samples, and finds the position demand of every run in
+`CoverageCell.demand_rad`.
 """
 
 from __future__ import annotations
@@ -26,7 +28,15 @@ from daq.config.cell_file import load_cell
 from daq.files import replace_file
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
-from tests.studies.coverage_runs import DURATION_S, OUT, PROCESSES, RunsTask, load_coverage, make_coverage, tasks_of
+from tests.studies.coverage_runs import (
+    DURATION_S,
+    OUT,
+    PROCESSES,
+    RunsTask,
+    load_coverage,
+    make_coverage,
+    tasks_of,
+)
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, mark_of
 from tests.studies.side_by_side import Shard, shard, side_by_side
 from tests.studies.study_cells import WORLDS
@@ -34,7 +44,9 @@ from tests.studies.study_plans import CELL
 
 CELLS = 8
 NORMAL_95 = 1.959964
-"""Half-width of a 95 % interval in standard deviations: some hundred moves leave nothing of Student's t."""
+"""Half-width of a 95 % interval in standard deviations:
+some hundred moves leave nothing of Student's t.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +82,9 @@ class _Task:
 
 def make_score(task: _Task) -> str:
     """Identify a cell unless it was done with the same runs and software; return what was done."""
-    fingerprint = digest(digest_of_source("ident.estimators.identify"), mark_of(task.runs.path).read_text())
+    fingerprint = digest(
+        digest_of_source("ident.estimators.identify"), mark_of(task.runs.path).read_text()
+    )
     if is_finished(task.path, fingerprint):
         return f"{task.path.name}, {task.runs.world}: kept"
     (case,) = load_coverage([task.runs])
@@ -89,12 +103,16 @@ def make_score(task: _Task) -> str:
     )
     replace_file(task.path, json.dumps(asdict(score)).encode())
     finish(task.path, fingerprint)
-    return f"{task.path.name}, {task.runs.world}: worst gain {np.abs(score.error_percent).max():.2f} %, {spent_s:.1f} s"
+    return (
+        f"{task.path.name}, {task.runs.world}: worst gain "
+        f"{np.abs(score.error_percent).max():.2f} %, {spent_s:.1f} s"
+    )
 
 
 def table(scores: Sequence[GainScore], axes: Sequence[str]) -> str:
     """Errors, scores and coverage by axis and of all."""
-    error, z = np.array([one.error_percent for one in scores]), np.array([one.z for one in scores])
+    error = np.array([one.error_percent for one in scores])
+    z = np.array([one.z for one in scores])
     columns = [*((error[:, i], z[:, i]) for i in range(len(axes))), (error, z)]
     rows = (
         ("mean absolute error of the gain, %", [f"{np.abs(e).mean():.2f}" for e, _ in columns]),
@@ -121,8 +139,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.studies.loop_noise", description=__doc__)
     parser.add_argument("--world", nargs="+", choices=WORLDS, default=list(WORLDS))
     parser.add_argument("--cells", type=int, default=CELLS)
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on")
-    parser.add_argument("--method", nargs="+", choices=[one.value for one in Method], default=[Method.ML.value])
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
+    )
+    parser.add_argument(
+        "--method", nargs="+", choices=[one.value for one in Method], default=[Method.ML.value]
+    )
     parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")
     parser.add_argument("--processes", type=int, default=PROCESSES)
     parser.add_argument("--out", type=Path, default=OUT)

@@ -1,4 +1,5 @@
-"""How the relative error of a fit of a clean cell grows with its current noise; what the study's noise factors rest on.
+"""How the relative error of a fit of a clean cell grows with its current noise;
+what the study's noise factors rest on.
 
 `python -m tests.studies.noise_floor --seeds 1 2 --factors 1 3` prints a line a cell and factor.
 """
@@ -23,7 +24,9 @@ RUNS = ((None, 0), ("disc", 0), (None, 1), ("disc", 1))
 
 def main(arguments: list[str] | None = None) -> int:
     """Print relative errors and gain errors of each cell and factor."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.noise_floor", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.noise_floor", description=__doc__
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--factors", type=float, nargs="+", default=[1.0, 3.0])
     parser.add_argument("--duration", type=float, default=20.0, help="of each run [s]")
@@ -31,19 +34,31 @@ def main(arguments: list[str] | None = None) -> int:
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     sys.stdout.write("| seed | factor | relative error % | gain errors % |\n|---|---|---|---|\n")
     for seed in options.seeds:
-        plans = [plan(cell, seed=10 * seed + index, duration_s=options.duration) for index in range(2)]
+        plans = [
+            plan(cell, seed=10 * seed + index, duration_s=options.duration) for index in range(2)
+        ]
         for factor in options.factors:
             truth = study_cell(seed, factor)
             runs = []
             for number, (payload, moves) in enumerate(RUNS):
-                declared = None if payload is None else declared_payload(payload)
-                raw = simulate_run(cell, spec_of(truth, payload, number), plans[moves], f"run-{number}", declared)
+                if payload is None:
+                    declared = None
+                else:
+                    declared = declared_payload(payload)
+                raw = simulate_run(
+                    cell, spec_of(truth, payload, number), plans[moves], f"run-{number}", declared
+                )
                 runs.append(run_of(raw, cell))
             found = identify(model_of(cell), tuple(runs), cell.conditioning, method=Method.ML)
             true = [axis.gain_nm_per_a for axis in truth.bare.axes]
-            errors = [100.0 * (gain / value - 1.0) for gain, value in zip(found.estimate.gains, true, strict=True)]
+            errors = [
+                100.0 * (gain / value - 1.0)
+                for gain, value in zip(found.estimate.gains, true, strict=True)
+            ]
             reported = ", ".join(f"{error:+.2f}" for error in errors)
-            sys.stdout.write(f"| {seed} | {factor:g} | {found.training_error.total:.2f} | {reported} |\n")
+            sys.stdout.write(
+                f"| {seed} | {factor:g} | {found.training_error.total:.2f} | {reported} |\n"
+            )
             sys.stdout.flush()
     return 0
 

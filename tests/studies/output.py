@@ -1,4 +1,6 @@
-"""Output of the studies: lines while they run, and tables as CSV, which the pages of docs/evidence show."""
+"""Output of the studies: lines while they run, and tables as CSV,
+which the pages of docs/evidence show.
+"""
 
 from __future__ import annotations
 

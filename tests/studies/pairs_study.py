@@ -1,19 +1,20 @@
-"""Gains of independent recordings of one simulated arm, after the search: is their difference what σ says?
+"""Gains of independent recordings of one simulated arm, after the search:
+is their difference what σ says?
 
     python -m tests.studies.pairs_study --recordings 400 --minutes 60          both worlds, one shard
     python -m tests.studies.pairs_study --shard 2/4 --minutes 60               every fourth recording from the second on
     python -m tests.studies.pairs_study --recordings 0                         the tables of what is there
 
-The arm has one truth and the undeclared effects of ARM_EFFECTS in every recording. Each recording has random moves and
-a noise of its own: two runs of 20 s without load, two with the disc. Each is fitted with the search, and knows nothing
-of the others. Pairs are disjoint, recordings 1 and 2, 3 and 4, …, so 400 recordings of a world are 200 independent
-pairs. For each pair and axis
+The arm has one truth and the undeclared effects of ARM_EFFECTS in every recording. Each recording
+has random moves and a noise of its own: two runs of 20 s without load, two with the disc. Each is
+fitted with the search, and knows nothing of the others. Pairs are disjoint, recordings 1 and 2, 3
+and 4, …, so 400 recordings of a world are 200 independent pairs. For each pair and axis
 
     z = (g₁ − g₂) / √(σ₁² + σ₂²),
 
-whose root mean square is 1 where σ is true. Scores are kept in out/pairs/<world>/, and are made again when the search
-or the simulation changed; a study that was interrupted goes on where it was.
-"""
+whose root mean square is 1 where σ is true. Scores are kept in out/pairs/<world>/, and are made
+again when the search or the simulation changed; a study that was interrupted goes on where it was.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -106,7 +107,9 @@ class RecordingScore:
 def record_runs(
     cell: Cell, world: str, number: int, effects: tuple[UndeclaredEffect, ...] = ARM_EFFECTS
 ) -> tuple[Run, ...]:
-    """Record the arm once: the truth is that of ARM_SEED, moves and noise are those of the recording's number."""
+    """Record the arm once: the truth is that of ARM_SEED,
+    moves and noise are those of the recording's number.
+    """
     arm = world_cell(ARM_SEED, world)
     runs = []
     for index, (name, payload) in enumerate(RUNS):
@@ -116,7 +119,10 @@ def record_runs(
         spec = replace(spec, effects=effects, seed=noise_seed)
         moves_rng = np.random.default_rng([ARM_SEED, number, index])
         demand = point_to_point(cell, spec.start_rad, moves_rng, DURATION_S)
-        declared = None if payload is None else declared_payload(payload)
+        if payload is None:
+            declared = None
+        else:
+            declared = declared_payload(payload)
         raw = follow(cell, spec, demand, name, declared, BETWEEN_S * index)
         runs.append(run_of(raw, cell))
     return tuple(runs)
@@ -166,11 +172,15 @@ def make_scores(
 ) -> Iterator[str]:
     """Score recordings one after the other; begin none after `minutes`."""
     cell = load_cell(CELL)
-    simulating = digest_of_source("tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell"))
+    simulating = digest_of_source(
+        "tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell")
+    )
     searching = digest_of_source("ident.discovery.loop")
     arms = {world: world_cell(ARM_SEED, world).bare for world in PAIR_WORLDS}
     fingerprints = {
-        world: digest(simulating, searching, cell.digest, DURATION_S, arm.urdf, arm.axes, ARM_EFFECTS)
+        world: digest(
+            simulating, searching, cell.digest, DURATION_S, arm.urdf, arm.axes, ARM_EFFECTS
+        )
         for world, arm in arms.items()
     }
     end_s = clock_s() + 60.0 * minutes
@@ -186,13 +196,19 @@ def load_scores(folder: Path, world: str) -> tuple[RecordingScore, ...]:
     return tuple(RecordingScore(**with_tuples(document)) for document in documents)
 
 
-def disjoint_pairs(scores: Sequence[RecordingScore]) -> tuple[tuple[RecordingScore, RecordingScore], ...]:
-    """Pair scores, each of which is in one pair: the first with the second, the third with the fourth, …"""
+def disjoint_pairs(
+    scores: Sequence[RecordingScore],
+) -> tuple[tuple[RecordingScore, RecordingScore], ...]:
+    """Pair scores, each of which is in one pair:
+    the first with the second, the third with the fourth, …
+    """
     even = len(scores) - len(scores) % 2
     return tuple(zip(scores[0:even:2], scores[1:even:2], strict=True))
 
 
-def pair_z(pairs: Sequence[tuple[RecordingScore, RecordingScore]], *, plain: bool = False) -> FloatArray:
+def pair_z(
+    pairs: Sequence[tuple[RecordingScore, RecordingScore]], *, plain: bool = False
+) -> FloatArray:
     """z of each pair and axis, shape (pairs, n); `plain` without the search."""
     values = []
     for first, second in pairs:
@@ -212,7 +228,9 @@ def truth_z(scores: Sequence[RecordingScore]) -> FloatArray:
 
 
 def rms_interval(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Root mean square of each column, and its standard error by leaving out a row at a time, shape (n,) each."""
+    """Root mean square of each column, and its standard error by leaving out a row at a time,
+    shape (n,) each.
+    """
     count = len(z)
     square = z**2
     rms = np.sqrt(square.mean(axis=0))
@@ -257,17 +275,27 @@ def found_effects(scores: Sequence[RecordingScore]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Score what is missing, then print the tables of what is there."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.pairs_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.pairs_study", description=__doc__
+    )
     parser.add_argument("--world", nargs="+", choices=PAIR_WORLDS, default=list(PAIR_WORLDS))
-    parser.add_argument("--recordings", type=int, default=RECORDINGS, help="of each world; two are a pair")
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th recording from the i-th on")
-    parser.add_argument("--minutes", type=float, default=SHARD_MINUTES, help="begin no recording after these")
+    parser.add_argument(
+        "--recordings", type=int, default=RECORDINGS, help="of each world; two are a pair"
+    )
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th recording from the i-th on"
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=SHARD_MINUTES, help="begin no recording after these"
+    )
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--tables", type=Path, help="folder for the table as CSV")
     options = parser.parse_args(arguments)
     # Worlds in turn, so that an interrupted study has as many recordings of each.
     tasks = [
-        RecordingTask(options.out, world, number) for number in range(options.recordings) for world in options.world
+        RecordingTask(options.out, world, number)
+        for number in range(options.recordings)
+        for world in options.world
     ]
     for line in make_scores(options.shard.of(tasks), options.minutes):
         print_line(line)
@@ -279,7 +307,9 @@ def main(arguments: list[str] | None = None) -> int:
             print_line(f"{world}: {len(scores)} recordings, too few for a table")
             continue
         shown = tables(scores, axes)
-        print_line(f"\n{world}: {len(scores)} recordings; effects: {found_effects(scores)}\n\n{shown}")
+        print_line(
+            f"\n{world}: {len(scores)} recordings; effects: {found_effects(scores)}\n\n{shown}"
+        )
         written.append(shown)
     if options.tables is not None:
         text = "".join(as_csv(one) for one in written)

@@ -1,4 +1,6 @@
-"""The paper's own figures, for comparison with ours: Gautier and Briot, doi 10.1115/1.4027506, Tables 1 to 8."""
+"""The paper's own figures, for comparison with ours:
+Gautier and Briot, doi 10.1115/1.4027506, Tables 1 to 8.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,16 @@ from daq.report.paper_tables import PaperTable
 SETS = ("manufacturer", "case 1", "case 2", "case 3", "case 4")
 
 _PARAMETERS = {
-    1: (("essential parameters of the robot", "29", "31"), ("mean %e", "", "7.86"), ("‖ρ‖/‖Y‖ [%]", "12.40", "12.43")),
-    3: (("essential parameters of the robot", "28", "32"), ("mean %e", "", "8.28"), ("‖ρ‖/‖Y‖ [%]", "11.95", "11.15")),
+    1: (
+        ("essential parameters of the robot", "29", "31"),
+        ("mean %e", "", "7.86"),
+        ("‖ρ‖/‖Y‖ [%]", "12.40", "12.43"),
+    ),
+    3: (
+        ("essential parameters of the robot", "28", "32"),
+        ("mean %e", "", "8.28"),
+        ("‖ρ‖/‖Y‖ [%]", "11.95", "11.15"),
+    ),
 }
 
 _GAINS = {
@@ -88,7 +98,9 @@ _MASSES = {
 
 
 def paper_table(number: int) -> PaperTable:
-    """A table of the paper; of the parameter tables only what can be compared between two robots."""
+    """A table of the paper; of the parameter tables only what can be compared between two
+    robots.
+    """
     title = f"the paper's Table {number}"
     if number in _PARAMETERS:
         return PaperTable(title, ("", "10 CAD", "mass alone"), _PARAMETERS[number])
@@ -103,6 +115,10 @@ def paper_table(number: int) -> PaperTable:
             for run, joints in _ERRORS.items()
             for joint, errors in enumerate(joints, start=1)
         )
-        return PaperTable(title, ("run, joint", *SETS), (*rows, ("mean", "17.99", "18.54", "17.96", "18.62", "17.79")))
+        return PaperTable(
+            title,
+            ("run, joint", *SETS),
+            (*rows, ("mean", "17.99", "18.54", "17.96", "18.62", "17.79")),
+        )
     of = {7: "4.59 kg", 8: "1.686 kg"}[number]
     return PaperTable(f"{title}: {of}", ("run", *SETS), _MASSES[number])

@@ -1,8 +1,9 @@
 """Tables 1 to 8 of the paper on simulated cells, beside the paper's own figures: `make paper`.
 
-`python -m tests.studies.paper_tables --seeds 1 2 3` records what is missing, fits every case, validates all of them on
-runs that no fit has seen, and puts the tables of the first seed and the order of merit over all of them into
-docs/evidence/paper.md, between its two marks. Everything goes through the command line, as a technician would do it.
+`python -m tests.studies.paper_tables --seeds 1 2 3` records what is missing, fits every case,
+validates all of them on runs that no fit has seen, and puts the tables of the first seed and the
+order of merit over all of them into docs/evidence/paper.md, between its two marks. Everything goes
+through the command line, as a technician would do it.
 """
 
 from __future__ import annotations
@@ -43,11 +44,17 @@ MARKS = ("<!-- made by `make paper`: begin -->", "<!-- made by `make paper`: end
 FLOOR = "3.5"
 RATIO = 20
 CENTRE_ERROR = 0.05
-"""Of each coordinate of the payload's centre in its drawing: first moments 5 % off, to either side."""
+"""Of each coordinate of the payload's centre in its drawing:
+first moments 5 % off, to either side.
+"""
 INERTIA_ERROR = (0.10, 0.20)
-"""Of its inertia about the centre: 10 to 20 % off, to either side, as the paper found drawings to be (§4.2)."""
+"""Of its inertia about the centre: 10 to 20 % off, to either side,
+as the paper found drawings to be (§4.2).
+"""
 DISC_PLANS = ("d", "e", "f")
-"""Three runs with the disc that no fit sees, on plans of their own, as the paper's three trajectories."""
+"""Three runs with the disc that no fit sees, on plans of their own,
+as the paper's three trajectories.
+"""
 CASES = ("manufacturer", "case-1", "case-2", "case-3", "case-4", "ml")
 
 
@@ -73,21 +80,40 @@ def one(logs: StudyLogs) -> dict[str, Merit]:
     cell = _cell_with_drawing(logs, folder / "cell.yaml")
     discs = tuple(_disc_run(logs, plan, folder) for plan in DISC_PLANS)
     common = ("--cell", str(cell), "--json")
-    fit = ("fit", *map(str, logs.fit), "--cases", str(folder / "cases"), "--essential", str(RATIO), *common)
+    fit = (
+        "fit",
+        *map(str, logs.fit),
+        "--cases",
+        str(folder / "cases"),
+        "--essential",
+        str(RATIO),
+        *common,
+    )
     fitted = _drivegain(fit)["cases"]
     runs = (logs.validation[0], *discs, *logs.second_payload)
-    beside = (str(folder / "cases" / "manufacturer.yaml"), *map(str, runs), "--beside", str(folder / "cases"))
+    beside = (
+        str(folder / "cases" / "manufacturer.yaml"),
+        *map(str, runs),
+        "--beside",
+        str(folder / "cases"),
+    )
     checked = _drivegain(("validate", *beside, "--out", str(folder), *common))
     truth = np.array(logs.truth.gains_nm_per_a)
     return {case: _merit(case, fitted[case], checked, truth) for case in CASES}
 
 
-def _merit(case: str, fitted: dict[str, Any], checked: dict[str, Any], truth: np.ndarray[Any, Any]) -> Merit:
+def _merit(
+    case: str, fitted: dict[str, Any], checked: dict[str, Any], truth: np.ndarray[Any, Any]
+) -> Merit:
     gains = np.array([gain["value"] for gain in fitted["gains"]])
     errors = [v for run in checked["runs"] if case in run["relative_error_percent"]
               for v in run["relative_error_percent"][case]["axes"]]  # fmt: skip
     masses = {
-        name: [run["masses"][case]["error_percent"] for run in checked["payloads"] if run["payload"] == name]
+        name: [
+            run["masses"][case]["error_percent"]
+            for run in checked["payloads"]
+            if run["payload"] == name
+        ]
         for name in ("disc", "plate")
     }
     return Merit(
@@ -111,7 +137,9 @@ def _drivegain(arguments: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _cell_with_drawing(logs: StudyLogs, path: Path) -> Path:
-    """The cell file of the recordings, with what a drawing of the disc might say of it, and the plate's weight."""
+    """The cell file of the recordings, with what a drawing of the disc might say of it,
+    and the plate's weight.
+    """
     rng = np.random.default_rng(np.random.SeedSequence(logs.seed, spawn_key=(4,)))
     body = study_cell(logs.seed, FLOORS[logs.floor]).bodies["disc"]
     drawn = _drawing(body, rng)
@@ -121,7 +149,9 @@ def _cell_with_drawing(logs: StudyLogs, path: Path) -> Path:
         entry[key] = os.path.relpath(CELL.parent / entry[key], path.parent)
     (disc,) = document["payloads"]
     disc |= {"centre_m": list(drawn.centre_m), "inertia_kg_m2": list(drawn.inertia_kg_m2)}
-    document["payloads"].append({"name": "plate", "mounting": "flange-b", "mass_kg": study_masses()["plate"]})
+    document["payloads"].append(
+        {"name": "plate", "mounting": "flange-b", "mass_kg": study_masses()["plate"]}
+    )
     path.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
     return path
 
@@ -165,13 +195,17 @@ def _disc_run(logs: StudyLogs, letter: str, folder: Path) -> Path:
     finally:
         bus.shutdown()
     if not recorded.log.valid:
-        raise RuntimeError(f"{path}: {recorded.log.reason}; record again on a machine with less to do")
+        raise RuntimeError(
+            f"{path}: {recorded.log.reason}; record again on a machine with less to do"
+        )
     finish(path, fingerprint)
     return path
 
 
 def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
-    """Each set of gains over all cells: the true error of the gains, and what Tables 6 to 8 say of it."""
+    """Each set of gains over all cells: the true error of the gains,
+    and what Tables 6 to 8 say of it.
+    """
     rows = []
     for case in CASES:
         of = [cell[case] for cell in merits.values()]
@@ -185,9 +219,19 @@ def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
     seeds = ", ".join(map(str, merits))
     return PaperTable(
         title="Order of merit",
-        headings=("set", "gain error, mean", "max", "Table 6, mean", "Table 7, mean %e", "Table 8, mean %e"),
+        headings=(
+            "set",
+            "gain error, mean",
+            "max",
+            "Table 6, mean",
+            "Table 7, mean %e",
+            "Table 8, mean %e",
+        ),
         rows=tuple(rows),
-        notes=(f"In %, cells of seed {seeds}. The error of the gains is against the truth of the simulated cell.",),
+        notes=(
+            f"In %, cells of seed {seeds}. The error of the gains is against the truth of the "
+            "simulated cell.",
+        ),
     )
 
 
@@ -210,12 +254,18 @@ def _print_line(line: str) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record what is missing, fit, validate, and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.paper_tables", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.paper_tables", description=__doc__
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--floor", choices=tuple(FLOORS), default=FLOOR)
-    parser.add_argument("--processes", type=int, default=PROCESSES, help="that plan and record side by side")
+    parser.add_argument(
+        "--processes", type=int, default=PROCESSES, help="that plan and record side by side"
+    )
     options = parser.parse_args(arguments)
-    logs = record_study(options.seeds, (options.floor,), processes=options.processes, report_line=_print_line)
+    logs = record_study(
+        options.seeds, (options.floor,), processes=options.processes, report_line=_print_line
+    )
     merits = {cell.seed: one(cell) for cell in logs}
     before, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
     made = merit_table(merits).markdown()

@@ -1,12 +1,14 @@
-"""Friction of the pivots that closed chains are cut at, over the whole driver path: what `residual` names.
+"""Friction of the pivots that closed chains are cut at, over the whole driver path:
+what `residual` names.
 
     python -m tests.studies.pivot_friction
     python -m tests.studies.pivot_friction --only five-bar-tip-0.3 five-bar-clean-31
 
-Twelve cells have such friction, in each pivot of the shipped planar robots at three sizes. Beside them are the plants
-as they are shipped, with small friction in the joints of the tree that have no motor, and clean plants without that. A
-finished cell is kept in out/pivot-study/ while its row and its files are the same. Prints a line for each, and writes
-docs/evidence/data/pivots.csv once all are there.
+Twelve cells have such friction, in each pivot of the shipped planar robots at three sizes. Beside
+them are the plants as they are shipped, with small friction in the joints of the tree that have no
+motor, and clean plants without that. A finished cell is kept in out/pivot-study/ while its row and
+its files are the same. Prints a line for each, and writes docs/evidence/data/pivots.csv once all
+are there.
 """
 
 from __future__ import annotations
@@ -72,7 +74,12 @@ class PivotCell:
         """Digest of the row and of the files that it names."""
         cell = shipped_configurations() / "cells" / f"{self.robot}.yaml"
         simulation = shipped_simulation(self.robot)
-        files = (cell.read_text(), load_cell(cell).urdf, simulation.read_text(), load_simulation(simulation).urdf)
+        files = (
+            cell.read_text(),
+            load_cell(cell).urdf,
+            simulation.read_text(),
+            load_simulation(simulation).urdf,
+        )
         return digest(self, files)
 
 
@@ -91,8 +98,10 @@ class CleanCell(PivotCell):
 
 PIVOTS = (("five-bar", "tip"), ("dualv", "arm-2"), ("dualv", "arm-3"), ("dualv", "arm-4"))
 SIZES_NM = {"five-bar": (0.3, 0.6, 1.2), "dualv": (0.1, 0.2, 0.3)}
-"""A half, one and two times the dry friction of a drive of the five-bar; a third to one of a DualV's. With 0.6 Nm in
-one pivot, the DualV's recording is refused: a move does not end within its time."""
+"""A half, one and two times the dry friction of a drive of the five-bar; a third to one of a
+DualV's. With 0.6 Nm in one pivot, the DualV's recording is refused: a move does not end within its
+time.
+"""
 
 SHIPPED_SEEDS = {"five-bar": (21, 22, 23), "dualv": (21,)}
 CLEAN_SEEDS = {"five-bar": (31, 32, 33), "dualv": (31, 32)}
@@ -112,7 +121,9 @@ def cells() -> tuple[PivotCell, ...]:
 
 
 def study_cell(cell: PivotCell, folder: Path) -> dict[str, Any]:
-    """Record a run without load and one with the weighed payload, and search: what is named, and the gains' errors."""
+    """Record a run without load and one with the weighed payload, and search:
+    what is named, and the gains' errors.
+    """
     with contextlib.redirect_stdout(io.StringIO()):
         job, logs = record_job(
             cell.robot,
@@ -156,9 +167,15 @@ def study_cell(cell: PivotCell, folder: Path) -> dict[str, Any]:
 
 def line_of(row: dict[str, Any]) -> list[str]:
     """One line of the table."""
-    found = "–" if row["found_nm"] is None else f"{row['found_nm']:.3f} ± {row['found_std_nm']:.3f}"
+    if row["found_nm"] is None:
+        found = "–"
+    else:
+        found = f"{row['found_nm']:.3f} ± {row['found_std_nm']:.3f}"
     gains = [row["worst_gain_error_before_percent"], row["worst_gain_error_after_percent"]]
-    shown_gains = "–" if None in gains else f"{gains[0]:.2f} → {gains[1]:.2f}"
+    if None in gains:
+        shown_gains = "–"
+    else:
+        shown_gains = f"{gains[0]:.2f} → {gains[1]:.2f}"
     return [
         row["cell"],
         f"{row['dry_nm']:g}",
@@ -179,15 +196,17 @@ def verdict(rows: Sequence[dict[str, Any]]) -> str:
     on_pivots = [row for row in shipped if any(" on pivot " in name for name in row["named"])]
     silent = [row for row in clean if not row["named"]]
     return (
-        f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; friction of the tree "
-        f"named on a pivot in {len(on_pivots)} of {len(shipped)} shipped plants; {len(silent)} of {len(clean)} clean "
-        "plants silent"
+        f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; "
+        f"friction of the tree named on a pivot in {len(on_pivots)} of {len(shipped)} shipped "
+        f"plants; {len(silent)} of {len(clean)} clean plants silent"
     )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Study the chosen cells."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.pivot_friction", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.pivot_friction", description=__doc__
+    )
     names = [cell.name for cell in cells()]
     parser.add_argument("--only", nargs="+", choices=names, default=names)
     chosen = parser.parse_args(arguments).only
@@ -203,7 +222,16 @@ def main(arguments: list[str] | None = None) -> int:
     if len(rows) == len(names):
         table = io.StringIO()
         writer = csv.writer(table, lineterminator="\n")
-        writer.writerow(["cell", "dry friction [Nm]", "named", "found ± σ [Nm]", "left-out error", "worst gain error"])
+        writer.writerow(
+            [
+                "cell",
+                "dry friction [Nm]",
+                "named",
+                "found ± σ [Nm]",
+                "left-out error",
+                "worst gain error",
+            ]
+        )
         writer.writerows(map(line_of, rows))
         replace_file(TABLE, table.getvalue().encode())
     return 0

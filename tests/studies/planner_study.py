@@ -2,11 +2,13 @@
 
     python -m tests.studies.planner_study --recordings 8
 
-The arm of `pairs_study`, without undeclared effects: two runs of 20 s without load, two with the disc. A fit of the
-first two gives gains, parameters and noise; from them and from the motion of all four the planner predicts σ of every
-gain, as a session does for its next blocks (`daq.workflow.outlook`): its own σ, times σ of the fit over its own σ for
-what was fitted. Then all four are fitted. Worlds `loop3` and `loop8` disturb the joints slowly, by 3 and 8 % of their
-torque. Printed are predicted σ over that of the fit, by axis: geometric means over recordings, and the extremes.
+The arm of `pairs_study`, without undeclared effects: two runs of 20 s without load, two with the
+disc. A fit of the first two gives gains, parameters and noise; from them and from the motion of all
+four the planner predicts σ of every gain, as a session does for its next blocks
+(`daq.workflow.outlook`): its own σ, times σ of the fit over its own σ for what was fitted. Then all
+four are fitted. Worlds `loop3` and `loop8` disturb the joints slowly, by 3 and 8 % of their torque.
+Printed are predicted σ over that of the fit, by axis: geometric means over recordings, and the
+extremes.
 """
 
 from __future__ import annotations
@@ -68,7 +70,10 @@ def predicted_std(cell: Cell, runs: Sequence[Run]) -> PredictedStd:
 def _motion_of(run: Run, fitted: Identification) -> tuple[Excitation, tuple[int | None, ...]]:
     mountings = [payload.mounting for payload in fitted.system.payloads]
     data = differentiate(run, fitted.model.drive_train, fitted.conditioning)
-    mounted = None if run.payload is None else mountings.index(run.payload.mounting)
+    if run.payload is None:
+        mounted = None
+    else:
+        mounted = mountings.index(run.payload.mounting)
     return recorded(fitted.model, data, fitted.conditioning), (mounted,)
 
 
@@ -92,14 +97,19 @@ def table_rows(world: str, found: Sequence[PredictedStd]) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.planner_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.planner_study", description=__doc__
+    )
     parser.add_argument("--world", nargs="+", choices=WORLDS, default=list(WORLDS))
     parser.add_argument("--recordings", type=int, default=RECORDINGS, help="of each world")
     parser.add_argument("--tables", type=Path, help="folder for the table as CSV")
     options = parser.parse_args(arguments)
     cell = load_cell(CELL)
     axes = cell.axis_names
-    lines = [f"| world | predicted over fitted σ | {' | '.join(axes)} | all |", "|---" * (len(axes) + 3) + "|"]
+    lines = [
+        f"| world | predicted over fitted σ | {' | '.join(axes)} | all |",
+        "|---" * (len(axes) + 3) + "|",
+    ]
     for world in options.world:
         found: list[PredictedStd] = []
         for number in range(options.recordings):

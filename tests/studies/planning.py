@@ -2,8 +2,8 @@
 
     python -m tests.studies.planning
 
-Random plans keep the same limits, clearance and duration. "Truth" judges both with parameters that the planner does not
-know: inertias, friction, gains and payload of tests/ident/recordings.py.
+Random plans keep the same limits, clearance and duration. "Truth" judges both with parameters that
+the planner does not know: inertias, friction, gains and payload of tests/ident/recordings.py.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ ANYTHING = 1e9
 def main() -> None:
     """Print the table."""
     out = sys.stdout
-    out.write("| cell, seed | random σ % (median) | planned σ % | lower by | with truth: random, planned | CPU s |\n")
+    out.write(
+        "| cell, seed | random σ % (median) | planned σ % | lower by | with truth: random, "
+        "planned | CPU s |\n"
+    )
     out.write("|---|---|---|---|---|---|\n")
     for name, seed in CASES:
         experiment = experiment_of(load_cell(CELLS / f"{name}.yaml"))
@@ -50,7 +53,10 @@ def main() -> None:
             both = (np.median([_worst(truth, one) for one in random]), _worst(truth, planned))
             judged = f"{both[0]:.2f}, {both[1]:.2f}"
         lower = 100.0 * (1.0 - after / before)
-        out.write(f"| {name}, {seed} | {before:.2f} | {after:.2f} | {lower:.0f} % | {judged} | {seconds:.0f} |\n")
+        out.write(
+            f"| {name}, {seed} | {before:.2f} | {after:.2f} | {lower:.0f} % | {judged} | "
+            f"{seconds:.0f} |\n"
+        )
         out.flush()
 
 
@@ -67,16 +73,23 @@ def _plan(experiment: Experiment, seed: int, exchanges: int) -> Plan:
 
 
 def _truth(experiment: Experiment) -> Experiment:
-    payload = ExpectedPayload(frozenset({"m"}), np.array([PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS]))
+    payload = ExpectedPayload(
+        frozenset({"m"}), np.array([PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS])
+    )
     expectation = replace(
-        experiment.design.expectation, gains=GAINS, parameters=tx40_truth().parameters, payloads=(payload,)
+        experiment.design.expectation,
+        gains=GAINS,
+        parameters=tx40_truth().parameters,
+        payloads=(payload,),
     )
     return replace(experiment, design=Design(expectation, experiment.design.base))
 
 
 def _worst(experiment: Experiment, made: Plan) -> float:
     excitation, _ = experiment.excitation(paths_of(experiment.cell, made.moves))
-    return float(experiment.design.std_percent(experiment.design.information(excitation, RUNS)).max())
+    return float(
+        experiment.design.std_percent(experiment.design.information(excitation, RUNS)).max()
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""Faults of single channels, planted in a recording: what an encoder, a counter, a drive or an export does to numbers.
+"""Faults of single channels, planted in a recording:
+what an encoder, a counter, a drive or an export does to numbers.
 
-A fault changes one channel of one run as its recorder stored it: a motor's position in counts or radians, or a motor's
-current in the unit of the drive.
+A fault changes one channel of one run as its recorder stored it: a motor's position in counts or
+radians, or a motor's current in the unit of the drive.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ class PlantedFault:
 
 
 def _places(channel: SoundChannel, count: int) -> IntArray:
-    """Samples in the middle nine tenths of a run in which the channel is far from zero and moves."""
+    """Samples in the middle nine tenths of a run in which the channel is far from zero and
+    moves.
+    """
     rng = np.random.default_rng(SEED)
     size = np.abs(channel.values)
     steps = np.abs(np.diff(channel.values, prepend=channel.values[0]))
@@ -82,7 +85,9 @@ def _constant(channel: SoundChannel) -> FloatArray:
     return np.full_like(channel.values, channel.values[0])
 
 
-def _wrapped(size: Callable[[SoundChannel], float], *, signed: bool) -> Callable[[SoundChannel], FloatArray]:
+def _wrapped(
+    size: Callable[[SoundChannel], float], *, signed: bool
+) -> Callable[[SoundChannel], FloatArray]:
     def plant(channel: SoundChannel) -> FloatArray:
         whole = size(channel)
         lowest = -0.5 * whole if signed else 0.0
@@ -111,7 +116,9 @@ def _clipped_both_ways(channel: SoundChannel) -> FloatArray:
     return np.clip(channel.values, -limit, limit)
 
 
-def _spikes(count: int, size: Callable[[SoundChannel], float]) -> Callable[[SoundChannel], FloatArray]:
+def _spikes(
+    count: int, size: Callable[[SoundChannel], float]
+) -> Callable[[SoundChannel], FloatArray]:
     def plant(channel: SoundChannel) -> FloatArray:
         values = channel.values.copy()
         places = _places(channel, count)
@@ -169,15 +176,23 @@ FAULTS = (
     PlantedFault("frozen for 1 s", ChannelKind.POSITION, _frozen(1.0)),
     PlantedFault("frozen to the end", ChannelKind.POSITION, _frozen_to_the_end),
     PlantedFault("frozen throughout", ChannelKind.POSITION, _constant),
-    PlantedFault("wraps at 16 bits, signed", ChannelKind.POSITION, _wrapped(_sixteen_bits, signed=True)),
-    PlantedFault("wraps at 16 bits, unsigned", ChannelKind.POSITION, _wrapped(_sixteen_bits, signed=False)),
-    PlantedFault("wraps at a turn of the motor", ChannelKind.POSITION, _wrapped(_turn, signed=False)),
+    PlantedFault(
+        "wraps at 16 bits, signed", ChannelKind.POSITION, _wrapped(_sixteen_bits, signed=True)
+    ),
+    PlantedFault(
+        "wraps at 16 bits, unsigned", ChannelKind.POSITION, _wrapped(_sixteen_bits, signed=False)
+    ),
+    PlantedFault(
+        "wraps at a turn of the motor", ChannelKind.POSITION, _wrapped(_turn, signed=False)
+    ),
     PlantedFault("clipped above its 95th percentile", ChannelKind.POSITION, _clipped(95.0)),
     PlantedFault("clipped above its 80th percentile", ChannelKind.POSITION, _clipped(80.0)),
     PlantedFault("1 spike of 0.02 turns, 1 sample", ChannelKind.POSITION, _spikes(1, _turns(0.02))),
     PlantedFault("1 spike of 0.2 turns, 1 sample", ChannelKind.POSITION, _spikes(1, _turns(0.2))),
     PlantedFault("1 spike of 5 turns, 1 sample", ChannelKind.POSITION, _spikes(1, _turns(5.0))),
-    PlantedFault("10 spikes of 0.2 turns, 1 sample", ChannelKind.POSITION, _spikes(10, _turns(0.2))),
+    PlantedFault(
+        "10 spikes of 0.2 turns, 1 sample", ChannelKind.POSITION, _spikes(10, _turns(0.2))
+    ),
     PlantedFault("1 sign flip, 1 sample", ChannelKind.POSITION, _sign_flips(1)),
     PlantedFault("1 dropout to zero, 1 sample", ChannelKind.POSITION, _zeros(1, ONE_SAMPLE)),
     PlantedFault("1 dropout to zero, 10 ms", ChannelKind.POSITION, _zeros(1, 0.01)),
@@ -186,14 +201,32 @@ FAULTS = (
     PlantedFault("frozen for 1 s", ChannelKind.CURRENT, _frozen(1.0)),
     PlantedFault("frozen to the end", ChannelKind.CURRENT, _frozen_to_the_end),
     PlantedFault("frozen throughout", ChannelKind.CURRENT, _constant),
-    PlantedFault("int16 read as unsigned", ChannelKind.CURRENT, _wrapped(_sixteen_bits, signed=False)),
-    PlantedFault("wraps at half of its range", ChannelKind.CURRENT, _wrapped(_times_largest(1.0), signed=True)),
+    PlantedFault(
+        "int16 read as unsigned", ChannelKind.CURRENT, _wrapped(_sixteen_bits, signed=False)
+    ),
+    PlantedFault(
+        "wraps at half of its range",
+        ChannelKind.CURRENT,
+        _wrapped(_times_largest(1.0), signed=True),
+    ),
     PlantedFault("size without sign", ChannelKind.CURRENT, lambda channel: np.abs(channel.values)),
     PlantedFault("clipped above its 95th percentile", ChannelKind.CURRENT, _clipped(95.0)),
-    PlantedFault("clipped at its 85th percentile, both ways", ChannelKind.CURRENT, _clipped_both_ways),
-    PlantedFault("1 spike of its largest, 1 sample", ChannelKind.CURRENT, _spikes(1, _times_largest(1.0))),
-    PlantedFault("1 spike of 30 times its largest, 1 sample", ChannelKind.CURRENT, _spikes(1, _times_largest(30.0))),
-    PlantedFault("10 spikes of 30 times its largest, 1 sample", ChannelKind.CURRENT, _spikes(10, _times_largest(30.0))),
+    PlantedFault(
+        "clipped at its 85th percentile, both ways", ChannelKind.CURRENT, _clipped_both_ways
+    ),
+    PlantedFault(
+        "1 spike of its largest, 1 sample", ChannelKind.CURRENT, _spikes(1, _times_largest(1.0))
+    ),
+    PlantedFault(
+        "1 spike of 30 times its largest, 1 sample",
+        ChannelKind.CURRENT,
+        _spikes(1, _times_largest(30.0)),
+    ),
+    PlantedFault(
+        "10 spikes of 30 times its largest, 1 sample",
+        ChannelKind.CURRENT,
+        _spikes(10, _times_largest(30.0)),
+    ),
     PlantedFault("20 sign flips, 1 sample", ChannelKind.CURRENT, _sign_flips(20)),
     PlantedFault("20 dropouts to zero, 1 sample", ChannelKind.CURRENT, _zeros(20, ONE_SAMPLE)),
     PlantedFault("20 dropouts to zero, 10 ms", ChannelKind.CURRENT, _zeros(20, 0.01)),

@@ -1,8 +1,9 @@
-"""Mistakes of geometry and time that are planted into runs or into the description, and whether a search names them.
+"""Mistakes of geometry and time that are planted into runs or into the description,
+and whether a search names them.
 
-A zero offset is added to the recorded positions of one joint; a late encoder reads them, and a late current those of a
-motor, where they were a while before; a tilt turns the gravity that the identification is given. It is given nothing
-else of the mistake.
+A zero offset is added to the recorded positions of one joint; a late encoder reads them, and a late
+current those of a motor, where they were a while before; a tilt turns the gravity that the
+identification is given. It is given nothing else of the mistake.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ SI_OF_UNIT = {
     "m/s^2": 1.0 / GRAVITY_M_S2,
     "": 1.0,
 }
-"""Units that a coefficient may have; a component of gravity counts as the angle that it turns gravity by."""
+"""Units that a coefficient may have; a component of gravity counts as the angle that it turns
+gravity by.
+"""
 UNSEEN = 1e-6  #: Share of a column, squared, below which the declared directions contain it
 SHIFT = 1e-5  #: Step of the derivative to a joint's position [rad or m]
 
@@ -82,8 +85,10 @@ class NamedMistake:
 
     Attributes:
         named: whether it did, on the right axis.
-        value, std: of the coefficient in SI, its length where there are several; NaN where it was not named.
-        z: distance of the value found from that which corrects what was planted, in σ; of a turn, by its size.
+        value, std: of the coefficient in SI, its length where there are several; NaN where it was
+            not named.
+        z: distance of the value found from that which corrects what was planted, in σ; of a turn,
+            by its size.
         others: all other effects that joined, but those that the cell declares.
     """
 
@@ -94,7 +99,9 @@ class NamedMistake:
     others: tuple[PlacedEffect, ...]
 
 
-def plant(runs: Sequence[Run], cell: Cell, planted: Planted, seed: int) -> tuple[tuple[Run, ...], Cell]:
+def plant(
+    runs: Sequence[Run], cell: Cell, planted: Planted, seed: int
+) -> tuple[tuple[Run, ...], Cell]:
     """Plant a mistake into runs or into the description of the cell.
 
     Args:
@@ -106,7 +113,9 @@ def plant(runs: Sequence[Run], cell: Cell, planted: Planted, seed: int) -> tuple
     if planted.mistake is Mistake.CLEAN:
         return tuple(runs), cell
     if planted.mistake is Mistake.GRAVITY:
-        return tuple(runs), replace(cell, gravity_m_s2=tilted(cell.gravity_m_s2, planted.size, float(seed)))
+        return tuple(runs), replace(
+            cell, gravity_m_s2=tilted(cell.gravity_m_s2, planted.size, float(seed))
+        )
     return tuple(_wrong(run, planted) for run in runs), cell
 
 
@@ -125,11 +134,15 @@ def _wrong(run: Run, planted: Planted) -> Run:
 
 
 def late(time_s: FloatArray, values: FloatArray, delay_s: float) -> FloatArray:
-    """Values as they were a while before, shape (k,) each; before the first sample they were as in it."""
+    """Values as they were a while before, shape (k,) each;
+    before the first sample they were as in it.
+    """
     return np.interp(time_s - delay_s, time_s, values)
 
 
-def tilted(gravity_m_s2: Sequence[float], angle_rad: float, heading_rad: float) -> tuple[float, float, float]:
+def tilted(
+    gravity_m_s2: Sequence[float], angle_rad: float, heading_rad: float
+) -> tuple[float, float, float]:
     """Gravity turned about a direction across it [m/s²].
 
     Args:
@@ -158,7 +171,10 @@ def value_of(evidence: Evidence, placed: PlacedEffect) -> tuple[float, float]:
     units = [estimate.unknowns[place].unit for place in own]
     unknown = sorted(set(units) - SI_OF_UNIT.keys())
     if unknown:
-        raise ValueError(f"{placed.effect.name} has the unit {unknown[0]!r}; expected one of {', '.join(SI_OF_UNIT)}")
+        raise ValueError(
+            f"{placed.effect.name} has the unit {unknown[0]!r}; expected one of "
+            f"{', '.join(SI_OF_UNIT)}"
+        )
     scale = np.array([SI_OF_UNIT[unit] for unit in units])
     values = values_of(estimate, own) * scale
     place = len(estimate.gains) + own
@@ -175,7 +191,11 @@ def judge_mistake(evidence: Evidence, planted: Planted) -> NamedMistake:
     found = evidence.effects[evidence.declared :]
     name = EFFECT_OF.get(planted.mistake)
     anywhere = planted.mistake is Mistake.GRAVITY
-    own = [placed for placed in found if placed.effect.name == name and (anywhere or placed.axis == planted.axis)]
+    own = [
+        placed
+        for placed in found
+        if placed.effect.name == name and (anywhere or placed.axis == planted.axis)
+    ]
     others = tuple(placed for placed in found if placed not in own)
     if not own:
         return NamedMistake(False, float("nan"), float("nan"), float("nan"), others)
@@ -184,16 +204,21 @@ def judge_mistake(evidence: Evidence, planted: Planted) -> NamedMistake:
 
 
 def correcting_value(planted: Planted) -> float:
-    """Coefficient that corrects a mistake: what has to be added to a position, or by how much a signal is late."""
-    return -planted.size if planted.mistake is Mistake.ZERO else planted.size
+    """Coefficient that corrects a mistake: what has to be added to a position,
+    or by how much a signal is late.
+    """
+    if planted.mistake is Mistake.ZERO:
+        return -planted.size
+    return planted.size
 
 
 def predicted_offset_std(evidence: Evidence) -> FloatArray:
-    """σ with which a zero offset of each joint would be found beside the declared model [rad or m], shape (n,).
+    """σ with which a zero offset of each joint would be found beside the declared model [rad or m],
+    shape (n,).
 
-    The column of an offset is ∂τ/∂q_j of the whole arm, on all axes. What the declared directions leave of it, φ⊥,
-    finds the offset with the variance Σ_c (φ⊥_cᵀ e_c)²/(φ⊥ᵀφ⊥)², of clusters c of rows and with e the residual beside
-    the column. Infinite where they leave none.
+    The column of an offset is ∂τ/∂q_j of the whole arm, on all axes. What the declared directions
+    leave of it, φ⊥, finds the offset with the variance Σ_c (φ⊥_cᵀ e_c)²/(φ⊥ᵀφ⊥)², of clusters c of
+    rows and with e the residual beside the column. Infinite where they leave none.
     """
     model = evidence.model
     estimate = evidence.estimate

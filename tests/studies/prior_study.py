@@ -1,12 +1,14 @@
-"""Full parameters with a prior: coverage of gains, base parameters and links, and whether a wrong prior is noticed.
+"""Full parameters with a prior: coverage of gains, base parameters and links,
+and whether a wrong prior is noticed.
 
     python -m tests.studies.prior_study --cells 17
 
-Simulated cells of four robots, each with motions and noise of its own: two runs of 20 s without load and two with the
-weighed payload. Each is fitted once. Then each tolerance has priors drawn around the plant's links by the distribution
-that the prior declares (`right`), and these with all masses and inertias times 1.3 (`heavy`), 0.7 (`light`), or either
-of them, link by link (`mixed`). Cells are kept in out/prior-study; a study that was interrupted goes on where it was.
-The real TX-40, where DRIVEGAIN_DATA has it, is fitted with fixed gains and the prior of the cell's URDF.
+Simulated cells of four robots, each with motions and noise of its own: two runs of 20 s without
+load and two with the weighed payload. Each is fitted once. Then each tolerance has priors drawn
+around the plant's links by the distribution that the prior declares (`right`), and these with all
+masses and inertias times 1.3 (`heavy`), 0.7 (`light`), or either of them, link by link (`mixed`).
+Cells are kept in out/prior-study; a study that was interrupted goes on where it was. The real
+TX-40, where DRIVEGAIN_DATA has it, is fitted with fixed gains and the prior of the cell's URDF.
 Writes the tables of docs/evidence/prior.md if all cells are there.
 """
 
@@ -74,11 +76,15 @@ ROBOTS = (
 
 
 def kept_runs(robot: PriorRobot, seed: int, out: Path) -> tuple[Cell, CellSpec, list[Run]]:
-    """Return a cell, its truth without load and its four runs, which are simulated unless they are there."""
+    """Return a cell, its truth without load and its four runs,
+    which are simulated unless they are there.
+    """
     cell = load_cell(shipped_configurations() / "cells" / f"{robot.cell}.yaml")
     spec = load_simulation(shipped_simulation(robot.simulation))
     path = out / f"{robot.name}-{seed}.npz"
-    source = digest_of_source("tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell"))
+    source = digest_of_source(
+        "tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell")
+    )
     fingerprint = digest(source, cell.digest, DURATION_S, spec.urdf, spec.axes, spec.effects)
     if not is_finished(path, fingerprint):
         out.mkdir(parents=True, exist_ok=True)
@@ -94,7 +100,10 @@ def simulated_runs(robot: PriorRobot, cell: Cell, seed: int) -> list[RawRun]:
     body = cell.payloads[0]
     runs = []
     for number, mounted in enumerate((None, body.name, None, body.name)):
-        spec = replace(load_simulation(shipped_simulation(robot.simulation), mounted), seed=1000 * seed + number)
+        spec = replace(
+            load_simulation(shipped_simulation(robot.simulation), mounted),
+            seed=1000 * seed + number,
+        )
         rng = np.random.default_rng([seed, number])
         demand = point_to_point(cell, spec.start_rad, rng, DURATION_S)
         payload = None
@@ -108,14 +117,21 @@ def fitted(cell: Cell, runs: Sequence[Run]) -> Identification:
     """Fit runs by ``ml``, with the effects that the cell declares."""
     effects = declared_effects(cell)
     start = identify(
-        model_of(cell), runs, cell.conditioning, method=Method.ML, keep_rows=bool(effects), judge=not effects
+        model_of(cell),
+        runs,
+        cell.conditioning,
+        method=Method.ML,
+        keep_rows=bool(effects),
+        judge=not effects,
     )
     steps = with_effects_of_cell(start, effects, cell.place_names)
     return steps[-1].after.identification if steps else start
 
 
 def true_standard(spec: CellSpec, model: Model) -> FloatArray:
-    """True standard parameters of a simulated serial cell, shape (c,): what motors turn acts on joints by r rᵀ."""
+    """True standard parameters of a simulated serial cell, shape (c,):
+    what motors turn acts on joints by r rᵀ.
+    """
     index = {column.name: number for number, column in enumerate(model.columns)}
     standard = np.zeros(len(index))
     standard[model.link_columns] = urdf_links(spec.urdf)
@@ -142,7 +158,12 @@ def priors(links: FloatArray, tolerance: float, rng: np.random.Generator) -> dic
     right = LinkPrior(links, tolerance).drawn(rng)
     even = np.ones((len(links), 1))
     either = rng.choice((1.0 - OFF, 1.0 + OFF), size=(len(links), 1))
-    scales = {"right": even, "heavy": (1.0 + OFF) * even, "light": (1.0 - OFF) * even, "mixed": either}
+    scales = {
+        "right": even,
+        "heavy": (1.0 + OFF) * even,
+        "light": (1.0 - OFF) * even,
+        "mixed": either,
+    }
     return {kind: LinkPrior(scale * right, tolerance) for kind, scale in scales.items()}
 
 
@@ -160,7 +181,13 @@ def study(robot: PriorRobot, seed: int, out: Path) -> dict[str, Any]:
     for tolerance in TOLERANCES:
         for kind, prior in priors(urdf_links(spec.urdf), tolerance, rng).items():
             full = full_parameters(found.system, estimate, prior)
-            cases.append({"tolerance": tolerance, "prior": kind, **case(full, estimate, gains, base, standard)})
+            cases.append(
+                {
+                    "tolerance": tolerance,
+                    "prior": kind,
+                    **case(full, estimate, gains, base, standard),
+                }
+            )
     return {
         "robot": robot.name,
         "seed": seed,
@@ -174,7 +201,11 @@ def study(robot: PriorRobot, seed: int, out: Path) -> dict[str, Any]:
 
 
 def case(
-    full: FullParameters, estimate: Estimate, gains: FloatArray, base: FloatArray, standard: FloatArray
+    full: FullParameters,
+    estimate: Estimate,
+    gains: FloatArray,
+    base: FloatArray,
+    standard: FloatArray,
 ) -> dict[str, Any]:
     """Figures of one prior of one cell, from the true gains, base and standard parameters."""
     # Rotors, friction and offsets have no prior of their own.
@@ -205,10 +236,16 @@ def case(
 
 def kept(robot: PriorRobot, seed: int, out: Path = OUT) -> dict[str, Any]:
     """Return the figures of a cell, which are made unless they are there."""
-    modules = ("tests.studies.followed_cell", "ident.estimators.identify", "ident.physical.full_parameters")
+    modules = (
+        "tests.studies.followed_cell",
+        "ident.estimators.identify",
+        "ident.physical.full_parameters",
+    )
     sources = [digest_of_source(module) for module in modules]
     fingerprint = digest(robot, seed, DURATION_S, TOLERANCES, OFF, sources)
-    return made_once(out, f"{robot.name}-{seed}", fingerprint, lambda _: study(robot, seed, out / "runs"))
+    return made_once(
+        out, f"{robot.name}-{seed}", fingerprint, lambda _: study(robot, seed, out / "runs")
+    )
 
 
 def coverage(z: Sequence[Sequence[float]]) -> str:
@@ -259,7 +296,9 @@ def of_prior(cells: Sequence[dict[str, Any]], tolerance: float) -> list[str]:
     ]
 
 
-def cases_of(cells: Iterable[dict[str, Any]], tolerance: float, kind: str) -> Iterable[dict[str, Any]]:
+def cases_of(
+    cells: Iterable[dict[str, Any]], tolerance: float, kind: str
+) -> Iterable[dict[str, Any]]:
     """The cases of one tolerance and kind of prior."""
     for cell in cells:
         for one in cell["cases"]:
@@ -299,27 +338,50 @@ def noticed(cells: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 
 def by_gain(cells: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """Every gain: its σ, its error without a prior, and its shift by the right prior of each tolerance."""
+    """Every gain: its σ, its error without a prior,
+    and its shift by the right prior of each tolerance.
+    """
     rows = []
     for cell in cells:
-        shifts = [next(iter(cases_of([cell], tolerance, "right")))["shift"] for tolerance in TOLERANCES]
+        shifts = [
+            next(iter(cases_of([cell], tolerance, "right")))["shift"] for tolerance in TOLERANCES
+        ]
         for number, axis in enumerate(cell["axes"]):
-            figures = [cell["std_percent"][number], cell["z"][number], *(shift[number] for shift in shifts)]
-            rows.append([cell["robot"], str(cell["seed"]), axis, *(f"{figure:.3f}" for figure in figures)])
+            figures = [
+                cell["std_percent"][number],
+                cell["z"][number],
+                *(shift[number] for shift in shifts),
+            ]
+            rows.append(
+                [cell["robot"], str(cell["seed"]), axis, *(f"{figure:.3f}" for figure in figures)]
+            )
     return rows
 
 
 def published_base(folder: Path) -> dict[str, tuple[float, float]]:
     """Published weighted values of the TX-40's base parameters and their σ, by name."""
     with (folder / "tx40" / "published_base_parameters.csv").open(encoding="utf-8") as stream:
-        return {row[0]: (float(row[3]), 0.01 * float(row[4]) * abs(float(row[3]))) for row in csv.reader(stream)}
+        return {
+            row[0]: (float(row[3]), 0.01 * float(row[4]) * abs(float(row[3])))
+            for row in csv.reader(stream)
+        }
 
 
-def real_tx40(folder: Path, tolerance: float) -> tuple[list[list[str]], list[list[str]], FullParameters]:
-    """Full parameters of the real TX-40, and its base parameters beside the published ones, as rows."""
+def real_tx40(
+    folder: Path, tolerance: float
+) -> tuple[list[list[str]], list[list[str]], FullParameters]:
+    """Full parameters of the real TX-40, and its base parameters beside the published ones,
+    as rows.
+    """
     recording = tx40(folder)
     cell = recording.cell
-    found = identify(model_of(cell), recording.runs, cell.conditioning, method=Method.ML, fixed_gains=recording.gains)
+    found = identify(
+        model_of(cell),
+        recording.runs,
+        cell.conditioning,
+        method=Method.ML,
+        fixed_gains=recording.gains,
+    )
     prior = LinkPrior(urdf_links(cell.urdf), tolerance)
     full = full_parameters(found.system, found.estimate, prior)
     index = {name: number for number, name in enumerate(full.names)}
@@ -327,7 +389,10 @@ def real_tx40(folder: Path, tolerance: float) -> tuple[list[list[str]], list[lis
     given[found.model.link_columns] = prior.links
     rows = []
     for name, number in index.items():
-        said = "" if np.isnan(given[number]) else f"{given[number]:.4g}"
+        if np.isnan(given[number]):
+            said = ""
+        else:
+            said = f"{given[number]:.4g}"
         value = f"{full.standard[number]:.4g}"
         std = f"{full.standard_std[number]:.2g}"
         share = f"{100.0 * full.prior_share[number]:.0f}"
@@ -338,12 +403,16 @@ def real_tx40(folder: Path, tolerance: float) -> tuple[list[list[str]], list[lis
         known, known_std = published.get(name, (np.nan, np.nan))
         here = found.estimate.parameters[number], found.estimate.parameters_std[number]
         figures = (known, known_std, *here, full.base[number], full.base_std[number])
-        base_rows.append([name, *("" if np.isnan(figure) else f"{figure:.4g}" for figure in figures)])
+        base_rows.append(
+            [name, *("" if np.isnan(figure) else f"{figure:.4g}" for figure in figures)]
+        )
     return rows, base_rows, full
 
 
 def agreement(base_rows: Sequence[Sequence[str]]) -> str:
-    """Say how far the TX-40's base parameters are from the published ones, as a share of both σ together."""
+    """Say how far the TX-40's base parameters are from the published ones,
+    as a share of both σ together.
+    """
     sigmas: dict[str, list[float]] = {"the fit": [], "the fit with the prior": []}
     for _, published, published_std, *others in base_rows:
         if not published:
@@ -354,8 +423,8 @@ def agreement(base_rows: Sequence[Sequence[str]]) -> str:
     moved = [abs(float(row[5]) - float(row[3])) / float(row[4]) for row in base_rows]
     said = [f"{name} {np.sum(np.array(one) < 2.0)} of {len(one)}" for name, one in sigmas.items()]
     return (
-        f"base parameters within 2 σ of the published ones: {', '.join(said)}; the prior moves them by "
-        f"{max(moved):.1f} σ of the fit at most"
+        f"base parameters within 2 σ of the published ones: {', '.join(said)}; the prior moves "
+        f"them by {max(moved):.1f} σ of the fit at most"
     )
 
 
@@ -369,16 +438,22 @@ def write_csv(path: Path, headings: Sequence[str], rows: Iterable[Sequence[str]]
 
 def main(arguments: list[str] | None = None) -> int:
     """Make the cells that are missing, then print and write the tables."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.prior_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.prior_study", description=__doc__
+    )
     parser.add_argument("--cells", type=int, default=CELLS, help="of each robot")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--tx40-tolerance", type=float, default=0.2, help="of the real robot's URDF")
+    parser.add_argument(
+        "--tx40-tolerance", type=float, default=0.2, help="of the real robot's URDF"
+    )
     options = parser.parse_args(arguments)
     cells = []
     for seed in range(1, options.cells + 1):
         for robot in ROBOTS:
             cells.append(kept(robot, seed, options.out))
-            print_line(f"{robot.name} {seed}: relative error {cells[-1]['relative_error_percent']:.2f} %")
+            print_line(
+                f"{robot.name} {seed}: relative error {cells[-1]['relative_error_percent']:.2f} %"
+            )
     summary = [without_prior(cells), *(of_prior(cells, tolerance) for tolerance in TOLERANCES)]
     for row in summary:
         for heading, figure in zip(HEADINGS, row, strict=False):
@@ -389,24 +464,45 @@ def main(arguments: list[str] | None = None) -> int:
         print_line(" | ".join(row))
     if options.cells >= CELLS:
         shift_names = [f"shift at {100.0 * tolerance:.0f} % σ" for tolerance in TOLERANCES]
-        write_csv(TABLES / "prior.csv", HEADINGS, [row + [""] * (len(HEADINGS) - len(row)) for row in summary])
+        write_csv(
+            TABLES / "prior.csv",
+            HEADINGS,
+            [row + [""] * (len(HEADINGS) - len(row)) for row in summary],
+        )
         write_csv(TABLES / "prior-noticed.csv", ("robot", "tolerance", *KINDS), wrong)
-        write_csv(TABLES / "prior-gains.csv", ("robot", "seed", "axis", "std %", "z", *shift_names), by_gain(cells))
+        write_csv(
+            TABLES / "prior-gains.csv",
+            ("robot", "seed", "axis", "std %", "z", *shift_names),
+            by_gain(cells),
+        )
     folder = data_folder()
     if not (folder / "tx40").is_dir():
-        print_line(f"found no {folder / 'tx40'}; expected the TX-40's recording there: its tables are not made")
+        print_line(
+            f"found no {folder / 'tx40'}; expected the TX-40's recording there: its tables "
+            "are not made"
+        )
         return 0
     rows, base_rows, full = real_tx40(folder, options.tx40_tolerance)
     check = full.check
     by_data = sum(basis is RestsOn.DATA for basis in full.basis)
     print_line(
-        f"\nreal TX-40, tolerance {options.tx40_tolerance:g}: {by_data} of {len(rows)} parameters by the data; misfit "
+        f"\nreal TX-40, tolerance {options.tx40_tolerance:g}: {by_data} of {len(rows)} parameters "
+        "by the data; misfit "
         f"{check.chi_square:.0f} for {check.degrees_of_freedom:.0f} degrees of freedom; masses "
-        f"{check.mass_ratio:.2f} ± {check.mass_ratio_std:.2f} of the prior's; called wrong: {check.is_wrong}; "
+        f"{check.mass_ratio:.2f} ± {check.mass_ratio_std:.2f} of the prior's; called wrong: "
+        f"{check.is_wrong}; "
         f"bounded: {full.bounded}; least eigenvalue {full.eigenvalues.min():.2g}"
     )
     print_line(agreement(base_rows))
-    headings = ("parameter", "unit", "prior", "value", "std", "basis", "prior's share of the variance %")
+    headings = (
+        "parameter",
+        "unit",
+        "prior",
+        "value",
+        "std",
+        "basis",
+        "prior's share of the variance %",
+    )
     write_csv(TABLES / "prior-tx40.csv", headings, rows)
     headings = ("base parameter", "published", "std", "fit", "std", "with the prior", "std")
     write_csv(TABLES / "prior-tx40-base.csv", headings, base_rows)

@@ -19,20 +19,27 @@ def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
     """Save runs; of their payloads the names alone."""
     arrays: dict[str, NDArray[Any]] = {}
     for run in raw:
-        # Steps of positions are small numbers, which pack better than positions; the first one is a step from zero.
-        arrays[f"{run.name}.position_steps"] = np.diff(run.position_counts, axis=0, prepend=np.int32(0)).T
+        # Steps of positions are small numbers, which pack better than positions; the first one is a
+        # step from zero.
+        arrays[f"{run.name}.position_steps"] = np.diff(
+            run.position_counts, axis=0, prepend=np.int32(0)
+        ).T
         arrays[f"{run.name}.error_counts"] = (run.demand_counts - run.position_counts).T
         arrays[f"{run.name}.current_raw"] = run.current_raw.T
         arrays[f"{run.name}.limited"] = run.limited.T
         arrays[f"{run.name}.move"] = run.move.astype(np.int32)
         arrays[f"{run.name}.ampere_per_unit"] = run.ampere_per_unit
-    payloads = {run.name: (None if run.payload is None else run.payload.name, run.began_s) for run in raw}
+    payloads = {
+        run.name: (None if run.payload is None else run.payload.name, run.began_s) for run in raw
+    }
     with path.open("wb") as file:
         # The stubs take every keyword for `allow_pickle`.
         np.savez_compressed(file, runs=np.array(json.dumps(payloads)), **arrays)  # type: ignore[arg-type]
 
 
-def read_runs(path: Path, payload_of: Callable[[str], Payload] = declared_payload) -> tuple[RawRun, ...]:
+def read_runs(
+    path: Path, payload_of: Callable[[str], Payload] = declared_payload
+) -> tuple[RawRun, ...]:
     """The runs of a file that `write_runs` made.
 
     Args:

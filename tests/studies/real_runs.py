@@ -1,7 +1,7 @@
 """Recordings of real robots for the studies, as runs: they are no part of the repository.
 
-$DRIVEGAIN_DATA names their folder, ../shared/data beside the checkout by default. None has a payload, so all gains are
-held at their nameplate values.
+$DRIVEGAIN_DATA names their folder, ../shared/data beside the checkout by default. None has a
+payload, so all gains are held at their nameplate values.
 """
 
 from __future__ import annotations
@@ -42,11 +42,14 @@ class Recording:
         name: in the tables.
         cell: as declared.
         runs: without load.
-        stretch_s: length of the pieces that a split by region deals out [s]: some windows of the row filter.
-        stretches_are_moves: they are in the split so far, too: moves of the usual length would be too few.
+        stretch_s: length of the pieces that a split by region deals out [s]: some windows of the
+            row filter.
+        stretches_are_moves: they are in the split so far, too: moves of the usual length would be
+            too few.
         parts: of a split as it was made so far.
         part_of: the part of each sample of each run in that split, shape (k,) each.
-        left_out_whole: a run that the split so far leaves out as a whole; splits by region are of the others. Or empty.
+        left_out_whole: a run that the split so far leaves out as a whole; splits by region are of
+            the others. Or empty.
     """
 
     name: str
@@ -82,7 +85,8 @@ def tx40(folder: Path) -> Recording:
         description = shipped_configurations() / "imports" / "tx40.yaml"
         drivegain(["import", str(description), "--data", str(folder / "tx40"), "--out", str(log)])
         run, cell = load_run(log)
-    block_s, parts = 0.5, 4
+    block_s = 0.5
+    parts = 4
     return Recording("tx40", cell, (run,), block_s, True, parts, (stretches(run, block_s) % parts,))
 
 

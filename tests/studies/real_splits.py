@@ -1,8 +1,9 @@
 """Effects that a search on a part of a real recording writes, judged on the part that was left out.
 
-The search runs on the rest alone, and only then the part is predicted, without and with the effects that are written.
-Each written effect is judged on its own, too, against a model of the others that is refitted without it: it must raise
-the error of no axis by more than noise (regions.py). real_study.py makes the tables.
+The search runs on the rest alone, and only then the part is predicted, without and with the effects
+that are written. Each written effect is judged on its own, too, against a model of the others that
+is refitted without it: it must raise the error of no axis by more than noise (regions.py).
+real_study.py makes the tables.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ class JudgedEffect:
         total_t, total_t_limit, total_raises: the same of all axes together.
         largest_rise_points: largest rise of the relative error of an axis [points], noise or not.
         total_rise_points: of the relative error of all axes [points].
-        size_nm2, before_nm2, after_nm2: ‖Y_j‖² and ‖ρ_j‖² without and with it on the part that was left out.
+        size_nm2, before_nm2, after_nm2: ‖Y_j‖² and ‖ρ_j‖² without and with it on the part that was
+            left out.
         processor_s: of the search; of EVERYTHING alone.
     """
 
@@ -105,7 +107,8 @@ def written_effects(steps: Sequence[Step], holdout: Sequence[Run] = ()) -> tuple
 
     Args:
         steps: of the search.
-        holdout: runs by which effects may be refused. The part of a recording that judges is never among them.
+        holdout: runs by which effects may be refused. The part of a recording that judges is never
+            among them.
     """
     del holdout  # no effect is refused by itself so far
     return steps[-1].after.effects
@@ -128,7 +131,8 @@ def sides_of(unit: SplitUnit) -> tuple[list[Run], list[Run]]:
         part_of = split_by_region(runs, recording.stretch_s, unit.seed)
     # A split in two has its held-out part as number 0.
     masks = [part == unit.part for part in part_of]
-    # A region leaves whole stretches out, and too few moves of the usual length would be left of a short recording.
+    # A region leaves whole stretches out, and too few moves of the usual length would be left of a
+    # short recording.
     if recording.stretches_are_moves or unit.split == REGION:
         runs = [replace(run, move=stretches(run, recording.stretch_s)) for run in runs]
     return two_sides(runs, masks, model_of(recording.cell), recording.cell.conditioning)
@@ -140,13 +144,16 @@ def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
     cell = recording.cell
     rest, unseen = sides_of(unit)
     begun_s = time.process_time()
-    found = identify(model_of(cell), rest, cell.conditioning, method=Method.ML, fixed_gains=recording.gains)
+    found = identify(
+        model_of(cell), rest, cell.conditioning, method=Method.ML, fixed_gains=recording.gains
+    )
     # The search is given no row of the part that judges it.
     steps = find_effects(gather(found, rest), np.random.default_rng(0))
     spent_s = time.process_time() - begun_s
     written = written_effects(steps)
     start = gather(found, rest, unseen)
-    end = start  # where nothing is written; a refit would differ by rounding, and that alike in all blocks
+    # Where nothing is written; a refit would differ by rounding, and that alike in all blocks
+    end = start
     if written:
         end = with_effects(_around(start, steps[-1].after), written)
     names = [placed.name_among(cell.axis_names) for placed in written]
@@ -159,7 +166,9 @@ def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
 
 
 def _around(start: Evidence, found: Evidence) -> Evidence:
-    """Evidence with held-out runs whose columns are predicted by the estimate of a search without them."""
+    """Evidence with held-out runs whose columns are predicted by the estimate of a search without
+    them.
+    """
     return replace(start, training=found.training, effects=found.effects, estimate=found.estimate)
 
 
@@ -186,7 +195,9 @@ def _judged(
         raise ValueError(f"{unit.name}: nothing was left out")
     size, left_before = squares(first, before.estimate)
     _, left_after = squares(second, after.estimate)
-    change = after.estimate.residual_torque(second) ** 2 - before.estimate.residual_torque(first) ** 2
+    change = (
+        after.estimate.residual_torque(second) ** 2 - before.estimate.residual_torque(first) ** 2
+    )
     change = np.where(first.use, change, 0.0)
     rises = axis_rises(change, first)
     worst = max(range(len(rises)), key=lambda axis: rises[axis].t - rises[axis].limit)
@@ -220,7 +231,9 @@ def _judged(
 
 
 def axis_rises(change: FloatArray, rows: Observation) -> tuple[Rise, ...]:
-    """Judge the rise of each axis's squared error, shape (n, r); the level is shared by the axes."""
+    """Judge the rise of each axis's squared error, shape (n, r);
+    the level is shared by the axes.
+    """
     level = LEVEL / len(change)
     pairs = zip(change, rows.use, strict=True)
     return tuple(judge_rise(own[used], rows.run[used], level) for own, used in pairs)

@@ -1,18 +1,20 @@
-"""Do effects that are found on real robots hold where the arm was elsewhere: TX-40, KR300 and UR10, split by region.
+"""Do effects that are found on real robots hold where the arm was elsewhere:
+TX-40, KR300 and UR10, split by region.
 
-Run by `make real-study`; needs the recordings (real_runs.py). A recording is split into four parts by region of the
-workspace, several times (regions.py). Each part is left out in turn: the search runs on the rest alone, and only then
-the part is predicted, without and with the effects that are written. Each written effect is judged on its own, too,
-against a model of the others that is refitted without it. It must raise the error of no axis by more than noise. The
-same is done for the one split of each recording that was made before: `today`.
+Run by `make real-study`; needs the recordings (real_runs.py). A recording is split into four parts
+by region of the workspace, several times (regions.py). Each part is left out in turn: the search
+runs on the rest alone, and only then the part is predicted, without and with the effects that are
+written. Each written effect is judged on its own, too, against a model of the others that is
+refitted without it. It must raise the error of no axis by more than noise. The same is done for the
+one split of each recording that was made before: `today`.
 
     python -m tests.studies.real_study --shard 1/2 --minutes 60      every second unit; goes on where it ended
     python -m tests.studies.real_study --only ur10 --splits today
     python -m tests.studies.real_study --minutes 0                   nothing is searched: the tables of what is there
 
-Layout: out/real-study/<unit>.csv, rows of one unit; out/real-study.csv has all. Where all units are there, it is
-written to docs/evidence/data, with the summary.
-"""
+Layout: out/real-study/<unit>.csv, rows of one unit; out/real-study.csv has all. Where all units are
+there, it is written to docs/evidence/data, with the summary.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ SEEN_POINTS = 0.1  #: Rise of an axis's error that a report shows [points]
 CLEAR_POINTS = 1.0  #: Rise that is large, noise or not [points]
 
 
-def units_of(recordings: Sequence[str], splits: Sequence[str], seeds: Sequence[int]) -> tuple[SplitUnit, ...]:
+def units_of(
+    recordings: Sequence[str], splits: Sequence[str], seeds: Sequence[int]
+) -> tuple[SplitUnit, ...]:
     """Units of the study, the split of today and the first seed first."""
     parts_today = {name: 4 if name == "tx40" else 1 for name in RECORDINGS}
     units: list[SplitUnit] = []
@@ -62,8 +66,8 @@ def summary(rows: Sequence[JudgedEffect]) -> str:
     """A line for each recording and split, and one for all splits by region."""
     lines = [
         "| recording | split | parts | effects written | raise an axis beyond noise | these by "
-        f"{SEEN_POINTS:g} points | raise an axis by {CLEAR_POINTS:g} point at all | totals that rise | beyond noise | "
-        "mean error % | total error % |",
+        f"{SEEN_POINTS:g} points | raise an axis by {CLEAR_POINTS:g} point at all | totals that "
+        "rise | beyond noise | mean error % | total error % |",
         "|" + "---|" * 11,
     ]
     for name in RECORDINGS:
@@ -86,7 +90,9 @@ def _figures(rows: Sequence[JudgedEffect], *, errors: bool = True) -> str:
     clearly = sum(row.largest_rise_points >= CLEAR_POINTS for row in effects)
     rising = sum(row.total_rise_points >= ROUNDED_POINTS for row in wholes)
     shown = sum(row.total_raises for row in wholes)
-    counts = f"{len(wholes)} | {len(effects)} | {len(raising)} | {seen} | {clearly} | {rising} | {shown}"
+    counts = (
+        f"{len(wholes)} | {len(effects)} | {len(raising)} | {seen} | {clearly} | {rising} | {shown}"
+    )
     if not errors:  # torques of different robots are not added
         return f"{counts} | | |"
     size = np.sum([row.size_nm2 for row in wholes], axis=0)
@@ -98,27 +104,40 @@ def _figures(rows: Sequence[JudgedEffect], *, errors: bool = True) -> str:
 
 def raising_effects(rows: Sequence[JudgedEffect]) -> str:
     """A line for each written effect that raises the error of an axis by more than noise."""
-    lines = ["| recording | split | part | effect | axis | t | limit | blocks | rise, points |", "|" + "---|" * 9]
+    lines = [
+        "| recording | split | part | effect | axis | t | limit | blocks | rise, points |",
+        "|" + "---|" * 9,
+    ]
     for row in rows:
         if row.effect != EVERYTHING and row.raises:
             where = f"{row.split} {row.seed} | {row.part}"
             judged = f"{row.raised_axis} | {row.t:.1f} | {row.t_limit:.1f} | {row.blocks}"
-            lines.append(f"| {row.recording} | {where} | {row.effect} | {judged} | {row.raised_points:+.2f} |")
+            lines.append(
+                f"| {row.recording} | {where} | {row.effect} | {judged} | "
+                f"{row.raised_points:+.2f} |"
+            )
     return "\n".join(lines)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Search what is missing, write the table of all rows, and print the summary."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.real_study", description=__doc__)
-    parser.add_argument("--only", nargs="+", choices=RECORDINGS, default=list(RECORDINGS), metavar="RECORDING")
+    parser.add_argument(
+        "--only", nargs="+", choices=RECORDINGS, default=list(RECORDINGS), metavar="RECORDING"
+    )
     parser.add_argument("--splits", nargs="+", choices=(TODAY, REGION), default=[TODAY, REGION])
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th unit from the i-th on")
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th unit from the i-th on"
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no unit is begun")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     if not (data_folder() / "tx40").is_dir():
-        print_line(f"found no {data_folder() / 'tx40'}; expected the recordings there, or DRIVEGAIN_DATA to name it")
+        print_line(
+            f"found no {data_folder() / 'tx40'}; expected the recordings there, or "
+            "DRIVEGAIN_DATA to name it"
+        )
         return 2
     units = units_of(options.only, options.splits, options.seeds)
     source = digest_of_source("tests.studies.real_splits", ("daq.log", "ident", "tests.studies.re"))
@@ -133,18 +152,25 @@ def main(arguments: list[str] | None = None) -> int:
             return f"{unit.name}: the rest is refused: {error}"
         whole = rows[0]
         change = f"{whole.error_before.total:.2f} -> {whole.error_after.total:.2f} %"
-        return f"{unit.name}: {change}, {', '.join(whole.written) or 'nothing'}, {whole.processor_s:.0f} s"
+        return (
+            f"{unit.name}: {change}, {', '.join(whole.written) or 'nothing'}, "
+            f"{whole.processor_s:.0f} s"
+        )
 
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
     rows = finished_rows(options.out, units, JudgedEffect, fingerprint_of)
     table = to_csv(JudgedEffect, rows).encode()
     replace_file(options.out.with_suffix(".csv"), table)
-    is_all = {unit.name for unit in units_of(list(RECORDINGS), (TODAY, REGION), SEEDS)} <= {unit.name for unit in units}
+    is_all = {unit.name for unit in units_of(list(RECORDINGS), (TODAY, REGION), SEEDS)} <= {
+        unit.name for unit in units
+    }
     complete = sum(row.effect == EVERYTHING for row in rows) == len(units)
     if is_all and complete:
         replace_file(TABLE, table)
         replace_file(SUMMARY, as_csv(summary(rows)).encode())
-    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}\n\n{raising_effects(rows)}")
+    print_line(
+        f"\n{left} units of this piece were not begun\n\n{summary(rows)}\n\n{raising_effects(rows)}"
+    )
     return 0
 
 

@@ -1,4 +1,5 @@
-"""Whole jobs week after week, recordings included, on a simulated cell: quiet weeks, a gain that falls, faults between.
+"""Whole jobs week after week, recordings included, on a simulated cell:
+quiet weeks, a gain that falls, faults between.
 
     python -m tests.studies.recalibration_study [--weeks 8] [--seconds 12]
     python -m tests.studies.recalibration_study --kills
@@ -6,15 +7,16 @@
     python -m tests.studies.recalibration_study --recordings 5
     python -m tests.studies.recalibration_study --years 300
 
-Each week the timer calls the job, and where it was ended calls it again the next day. J4 loses 6 % in the middle of the
-time; in one week a drive fails, in another the door is open. What is printed: outcome, drift in σ, and the truth beside
-what the controller has.
+Each week the timer calls the job, and where it was ended calls it again the next day. J4 loses 6 %
+in the middle of the time; in one week a drive fails, in another the door is open. What is printed:
+outcome, drift in σ, and the truth beside what the controller has.
 
-`--kills` kills a job (-9) before and behind every call to another room and lets the next one finish it; the tests do
-the same at some of them. `--moments` kills at random moments instead, and checks that the controller's file is the old
-or the new one, that `history --verify` reports exactly the writes that the history lacks, and that the next job ends
-with exit code 0. `--recordings` kills jobs in recordings, at a simulated cell that is a process of its own: the next
-job takes the drives over and ends with exit code 0. `--years` draws years of weekly jobs in which nothing changes, and
+`--kills` kills a job (-9) before and behind every call to another room and lets the next one finish
+it; the tests do the same at some of them. `--moments` kills at random moments instead, and checks
+that the controller's file is the old or the new one, that `history --verify` reports exactly the
+writes that the history lacks, and that the next job ends with exit code 0. `--recordings` kills
+jobs in recordings, at a simulated cell that is a process of its own: the next job takes the drives
+over and ends with exit code 0. `--years` draws years of weekly jobs in which nothing changes, and
 counts those in which a gain was changed all the same.
 """
 
@@ -46,11 +48,17 @@ from ident.drift.change import DISPERSION, decide
 from ident.errors import IdentificationError
 from tests.daq.jobs.made import made_rig, whole_job
 from tests.daq.jobs.rig import RUNS, Rig, make_plan, make_rig
-from tests.daq.jobs.test_killed import Kill, finished_by_the_next, finished_from_any_moment, job_duration_s
+from tests.daq.jobs.test_killed import (
+    Kill,
+    finished_by_the_next,
+    finished_from_any_moment,
+    job_duration_s,
+)
 from tests.daq.jobs.test_killed_recording import taken_up_from_a_recording
 from tests.studies.output import print_line
 
-AXIS, LOSS = 3, 0.94
+AXIS = 3
+LOSS = 0.94
 FAULT = FaultSpec(FaultKind.EMERGENCY, 2, 2000, None, 0x7305)
 
 
@@ -85,14 +93,23 @@ def week_text(rig: Rig, factor: float) -> str:
         return ""
     gain = state.decision.gains[AXIS]
     true = truth(None, factor).axes[AXIS].gain_nm_per_a
-    drift = "-" if gain.drift_sigma is None else f"{gain.drift_sigma:+.1f}"
-    return f"{drift:>6} σ   found {gain.new:.3f} ± {gain.new_std:.3f}   was {gain.old:.3f}   truth {true:.3f}"
+    if gain.drift_sigma is None:
+        drift = "-"
+    else:
+        drift = f"{gain.drift_sigma:+.1f}"
+    return (
+        f"{drift:>6} σ   found {gain.new:.3f} ± {gain.new_std:.3f}   was {gain.old:.3f}   truth "
+        f"{true:.3f}"
+    )
 
 
 def study(weeks: int, seconds: float, folder: Path) -> int:
     """Run it; 1 where a quiet week was written, or the loss was not."""
     shipped = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    plans = [make_plan(shipped, folder / f"{seed}.yaml", seed=seed, duration_s=seconds) for seed in (10, 11, 12)]
+    plans = [
+        make_plan(shipped, folder / f"{seed}.yaml", seed=seed, duration_s=seconds)
+        for seed in (10, 11, 12)
+    ]
     runs = [
         {**RUNS[0], "plan_file": str(plans[0])},
         {**RUNS[1], "plan_file": str(plans[0])},
@@ -101,11 +118,16 @@ def study(weeks: int, seconds: float, folder: Path) -> int:
         {**RUNS[2], "plan_file": str(plans[2])},
     ]
     policy = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
-    rig = make_rig(folder / "cell", plans[0], policy=policy, runs=runs, every_h=160, resume_within_h=36)
+    rig = make_rig(
+        folder / "cell", plans[0], policy=policy, runs=runs, every_h=160, resume_within_h=36
+    )
     wrong = []
     for week in range(weeks):
         factor = LOSS if week >= weeks // 2 else 1.0
-        expected = "applied" if week in (0, weeks // 2) else "unchanged"
+        if week in (0, weeks // 2):
+            expected = "applied"
+        else:
+            expected = "unchanged"
         if week == 1:
             rig.closed.unlink()
         outcome = one_job(rig, factor, week, *((FAULT,) if week == 2 else ()))
@@ -117,12 +139,16 @@ def study(weeks: int, seconds: float, folder: Path) -> int:
             print_line(f"  next day: {outcome:12} {week_text(rig, factor)}")
         wrong += [week] if outcome != expected else []
         rig.clock.go_on(days=7)
-    print_line(f"{weeks - len(wrong)} of {weeks} weeks as expected{f'; not {wrong}' if wrong else ''}")
+    print_line(
+        f"{weeks - len(wrong)} of {weeks} weeks as expected{f'; not {wrong}' if wrong else ''}"
+    )
     return int(bool(wrong))
 
 
 def kills(folder: Path) -> int:
-    """A kill before and behind every call; an AssertionError where one was not finished as it should be."""
+    """A kill before and behind every call;
+    an AssertionError where one was not finished as it should be.
+    """
     (folder / "whole").mkdir()
     _, made = whole_job(folder / "whole")
     counted = made_rig(new(folder / "counted"), made, metrics=None)
@@ -133,37 +159,52 @@ def kills(folder: Path) -> int:
             rig = made_rig(new(folder / f"{at}-{behind}"), made, metrics=None)
             finished_by_the_next(rig, Kill(at, behind=behind))
             shutil.rmtree(rig.folder)
-        print_line(f"call {at + 1} of {len(kill.calls)}, {name}: applied once, killed before it and behind it")
+        print_line(
+            f"call {at + 1} of {len(kill.calls)}, {name}: applied once, killed before it "
+            "and behind it"
+        )
     return 0
 
 
 def moments(folder: Path, count: int, seed: int = 1) -> int:
-    """Kills at so many random moments; an AssertionError where the next job does not finish it as it should."""
+    """Kills at so many random moments; an AssertionError where the next job does not finish it as
+    it should.
+    """
     (folder / "whole").mkdir()
     _, made = whole_job(folder / "whole")
-    whole_s, chance = job_duration_s(made_rig(new(folder / "timed"), made, metrics=None)), random.Random(seed)
+    whole_s = job_duration_s(made_rig(new(folder / "timed"), made, metrics=None))
+    chance = random.Random(seed)
     done = killed = written = 0
     while killed < count and done < 4 * count:
         rig = made_rig(new(folder / f"{done}"), made, metrics=None)
-        # A killed job is a process of its own, and slower: most of those that are given twice the time end before it.
+        # A killed job is a process of its own, and slower: most of those that are given twice the
+        # time end before it.
         was_killed, was_written = finished_from_any_moment(rig, chance.uniform(0.0, 2.0 * whole_s))
         shutil.rmtree(rig.folder)
-        done, killed, written = done + 1, killed + was_killed, written + (was_killed and was_written)
+        done = done + 1
+        killed = killed + was_killed
+        written = written + (was_killed and was_written)
     print_line(
-        f"{killed} jobs killed within {2.0 * whole_s:.1f} s, {written} of them after their write; every next job ended "
-        "with 0, every file was the old or the new one, every --verify was right"
+        f"{killed} jobs killed within {2.0 * whole_s:.1f} s, {written} of them after their write; "
+        "every next job ended with 0, every file was the old or the new one, every --verify was "
+        "right"
     )
     return int(killed < count)
 
 
 def recordings(folder: Path, count: int, seed: int = 1) -> int:
-    """Kills in so many recordings; an AssertionError where the next job does not take the session up."""
+    """Kills in so many recordings; an AssertionError where the next job does not take the session
+    up.
+    """
     (folder / "whole").mkdir()
     _, made = whole_job(folder / "whole")
     chance = random.Random(seed)
     for number in range(count):
-        name, share = chance.choice(sorted(made.logs)), chance.uniform(0.05, 0.9)
-        taken_up_from_a_recording(make_rig(new(folder / f"{number}"), made.plan_file), made, name, share)
+        name = chance.choice(sorted(made.logs))
+        share = chance.uniform(0.05, 0.9)
+        taken_up_from_a_recording(
+            make_rig(new(folder / f"{number}"), made.plan_file), made, name, share
+        )
         print_line(f"killed in {name} with {share:.0%} of its log: the next job ended with 0")
     return 0
 
@@ -175,9 +216,13 @@ def new(folder: Path) -> Path:
 
 
 def unchanged_years(years: int, seed: int = 1) -> int:
-    """Weekly jobs that write what differs, on a robot that stays as it is; its scatter is as large as is known."""
+    """Weekly jobs that write what differs, on a robot that stays as it is;
+    its scatter is as large as is known.
+    """
     rng = np.random.default_rng(seed)
-    axes, gain, std = tuple(f"J{number}" for number in range(1, 7)), 1000.0, 1.0
+    axes = tuple(f"J{number}" for number in range(1, 7))
+    gain = 1000.0
+    std = 1.0
     changes = np.zeros(years, int)
     for year in range(years):
         in_force = gain + DISPERSION * std * rng.standard_normal(len(axes))
@@ -186,13 +231,18 @@ def unchanged_years(years: int, seed: int = 1) -> int:
             if decide(axes, in_force, std, found, std).differs:
                 changes[year] += 1
                 in_force = found
-    print_line(f"{years} years of 52 jobs: a change in {(changes > 0).mean():.0%} of them, {changes.mean():.2f} a year")
+    print_line(
+        f"{years} years of 52 jobs: a change in {(changes > 0).mean():.0%} of them, "
+        f"{changes.mean():.2f} a year"
+    )
     return 0
 
 
 def main() -> int:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--weeks", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--kills", action="store_true")
@@ -207,7 +257,9 @@ def main() -> int:
             return moments(Path(folder), chosen.moments)
         if chosen.recordings is not None:
             return recordings(Path(folder), chosen.recordings)
-        return kills(Path(folder)) if chosen.kills else study(chosen.weeks, chosen.seconds, Path(folder))
+        if chosen.kills:
+            return kills(Path(folder))
+        return study(chosen.weeks, chosen.seconds, Path(folder))
 
 
 if __name__ == "__main__":

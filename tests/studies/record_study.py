@@ -1,13 +1,16 @@
-"""Recordings for the study of the estimators, over the real driver path: virtual bus, CANopen, MCAP.
+"""Recordings for the study of the estimators, over the real driver path:
+virtual bus, CANopen, MCAP.
 
-`python -m tests.studies.record_study --seeds 1 2 --floors 3.5` records what is missing and keeps what was recorded of
-the same cell, plan and software. Scoring code calls `record_study` for the same, or `study_logs` for what is there:
+`python -m tests.studies.record_study --seeds 1 2 --floors 3.5` records what is missing and keeps
+what was recorded of the same cell, plan and software. Scoring code calls `record_study` for the
+same, or `study_logs` for what is there:
 
     for logs in study_logs(SEEDS, ("3.5",)):
         fitted = fit(logs.fit, holdout=logs.validation)
         error = fitted.estimate.gains / logs.truth.gains_nm_per_a - 1
 
-Layout: out/ident-study/<floor>/<seed>/<run>.mcap with truth.json beside, out/ident-study/plans/<seed>-<plan>.yaml.
+Layout: out/ident-study/<floor>/<seed>/<run>.mcap with truth.json beside,
+out/ident-study/plans/<seed>-<plan>.yaml.
 """
 
 from __future__ import annotations
@@ -35,14 +38,24 @@ from drivers.simulation.spec import CellSpec
 from tests.studies.direct_cell import simulate_run
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 from tests.studies.side_by_side import side_by_side
-from tests.studies.study_cells import Truth, declared_payload, spec_of, study_cell, truth_from, truth_of
+from tests.studies.study_cells import (
+    Truth,
+    declared_payload,
+    spec_of,
+    study_cell,
+    truth_from,
+    truth_of,
+)
 
 OUT = Path("out/ident-study")
 SEEDS = tuple(range(1, 13))
 FLOORS = {"3.5": 1.59, "10": 4.55}
-"""Relative error of the fit [%] and the factor of the clean cell's current noise that gives it on the study's plans.
+"""Relative error of the fit [%] and the factor of the clean cell's current noise that gives it on
+the study's plans.
 
-The error falls as plans ask for more torque: measure the factors again (noise_floor.py) when the planner changes."""
+The error falls as plans ask for more torque: measure the factors again (noise_floor.py) when the
+planner changes.
+"""
 DURATION_S = 40.0
 PROCESSES = 2
 CELL = shipped_configurations() / "cells" / "demo.yaml"
@@ -87,7 +100,8 @@ class StudyLogs:
         truth: for scoring alone.
         fit: two runs without load and two with the disc, of the weighed mass alone.
         validation: one without load and one with the disc, that no fit may use.
-        second_payload: three runs with the plate, of which the logs say nothing but that it is mounted.
+        second_payload: three runs with the plate, of which the logs say nothing but that it is
+            mounted.
     """
 
     seed: int
@@ -143,7 +157,9 @@ def record_study(
             truth = truth_of(study_cell(seed, FLOORS[floor]))
             path = _folder(out, floor, seed) / "truth.json"
             path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(path, (json.dumps(asdict(truth), indent=1, default=_plain) + "\n").encode())
+            replace_file(
+                path, (json.dumps(asdict(truth), indent=1, default=_plain) + "\n").encode()
+            )
     (out / "plans").mkdir(parents=True, exist_ok=True)
     for line in side_by_side(_plan, plans, processes):
         report_line(line)
@@ -159,7 +175,9 @@ def _plain(value: object) -> object:
     raise TypeError(f"{value!r} is nothing that JSON can say")
 
 
-def study_logs(seeds: Sequence[int], floors: Sequence[str], *, out: Path = OUT) -> tuple[StudyLogs, ...]:
+def study_logs(
+    seeds: Sequence[int], floors: Sequence[str], *, out: Path = OUT
+) -> tuple[StudyLogs, ...]:
     """The recorded logs of some cells of the study, floor by floor.
 
     Raises:
@@ -172,18 +190,20 @@ def study_logs(seeds: Sequence[int], floors: Sequence[str], *, out: Path = OUT) 
 def _logs(out: Path, floor: str, seed: int) -> StudyLogs:
     folder = _folder(out, floor, seed)
     fit, validation, second = (
-        tuple(folder / f"{run.name}.mcap" for run in runs) for runs in (FIT, VALIDATION, SECOND_PAYLOAD)
+        tuple(folder / f"{run.name}.mcap" for run in runs)
+        for runs in (FIT, VALIDATION, SECOND_PAYLOAD)
     )
     missing = [str(path) for path in (*fit, *validation, *second) if not path.is_file()]
     if missing:
         raise FileNotFoundError(
-            f"found no {', '.join(missing)}; record with "
-            f"`python -m tests.studies.record_study --seeds {seed} --floors {floor}`"
+            f"found no {', '.join(missing)}; record with `python -m tests.studies.record_study "
+            f"--seeds {seed} --floors {floor}`"
         )
     truth = truth_from(json.loads((folder / "truth.json").read_text()))
     if truth.noise_factor != FLOORS[floor]:
         raise ValueError(
-            f"{folder}: found noise factor {truth.noise_factor:g}, expected {FLOORS[floor]:g}; record again"
+            f"{folder}: found noise factor {truth.noise_factor:g}, expected {FLOORS[floor]:g}; "
+            "record again"
         )
     return StudyLogs(seed, floor, truth, fit, validation, second)
 
@@ -193,22 +213,30 @@ def _plan(task: _PlanTask) -> str:
     cell = load_cell(CELL)
     path = task.out / "plans" / f"{task.seed}-{task.plan}.yaml"
     number = 10 * task.seed + ord(task.plan) - ord("a")
-    fingerprint = digest(digest_of_source("daq.workflow.plan"), cell.digest, number, task.duration_s)
+    fingerprint = digest(
+        digest_of_source("daq.workflow.plan"), cell.digest, number, task.duration_s
+    )
     if is_finished(path, fingerprint):
         return f"plan {path.stem}: kept"
     begun_s = time.perf_counter()
     made = plan(cell, seed=number, duration_s=task.duration_s)
     save_plan(made, path)
     finish(path, fingerprint)
-    return f"plan {path.stem}: {len(made.moves)} moves, condition {made.condition:.0f}, {_since(begun_s)}"
+    return (
+        f"plan {path.stem}: {len(made.moves)} moves, condition {made.condition:.0f}, "
+        f"{_since(begun_s)}"
+    )
 
 
 def _record(task: _RunTask) -> str:
     """One run, unless its log is there and was recorded of the same cell, plan and software."""
     cell = load_cell(CELL)
-    # From the file, as a technician's recording would be: the log then belongs to the plan that can be read.
+    # From the file, as a technician's recording would be: the log then belongs to the plan that can
+    # be read.
     moves = load_plan(task.out / "plans" / f"{task.seed}-{task.run.plan}.yaml", cell)
-    spec = spec_of(study_cell(task.seed, FLOORS[task.floor]), task.run.payload, RUNS.index(task.run))
+    spec = spec_of(
+        study_cell(task.seed, FLOORS[task.floor]), task.run.payload, RUNS.index(task.run)
+    )
     path = _folder(task.out, task.floor, task.seed) / f"{task.run.name}.mcap"
     fingerprint = _fingerprint(cell, spec, moves, task.run)
     title = f"{task.floor} %, seed {task.seed}, {task.run.name}"
@@ -226,7 +254,9 @@ def _record(task: _RunTask) -> str:
                     cell,
                     moves,
                     path,
-                    payload=None if task.run.payload is None else declared_payload(task.run.payload),
+                    payload=None
+                    if task.run.payload is None
+                    else declared_payload(task.run.payload),
                     operator="study",
                     granted_by="the study of the estimators: a simulated cell",
                     run_id=f"study-{task.floor}-{task.seed}-{task.run.name}",
@@ -235,9 +265,14 @@ def _record(task: _RunTask) -> str:
     finally:
         bus.shutdown()
     if not recorded.log.valid:
-        raise RuntimeError(f"{path}: {recorded.log.reason}; record again on a machine with less to do")
+        raise RuntimeError(
+            f"{path}: {recorded.log.reason}; record again on a machine with less to do"
+        )
     finish(path, fingerprint)
-    return f"{title}: {recorded.log.samples} samples, {path.stat().st_size / 1e6:.1f} MB, {_since(begun_s)}"
+    return (
+        f"{title}: {recorded.log.samples} samples, {path.stat().st_size / 1e6:.1f} MB, "
+        f"{_since(begun_s)}"
+    )
 
 
 def _folder(out: Path, floor: str, seed: int) -> Path:
@@ -247,12 +282,23 @@ def _folder(out: Path, floor: str, seed: int) -> Path:
 def _fingerprint(cell: Cell, spec: CellSpec, moves: Plan, run: StudyRun) -> str:
     """Digest of everything that decides what is in a log, but the time of day.
 
-    Of the simulator and the walk of the moves it takes what they do, not how they are written: the samples of the first
-    move, which the direct path gives as they would be in the log.
+    Of the simulator and the walk of the moves it takes what they do, not how they are written: the
+    samples of the first move, which the direct path gives as they would be in the log.
     """
-    declared = None if run.payload is None else declared_payload(run.payload)
-    truth = (spec.urdf, spec.gravity_m_s2, spec.ratio.tolist(), spec.axes, spec.start_rad.tolist(), spec.payload)
-    assembly, passive = sorted(spec.assembly_rad.items()), sorted(spec.passive.items())
+    if run.payload is None:
+        declared = None
+    else:
+        declared = declared_payload(run.payload)
+    truth = (
+        spec.urdf,
+        spec.gravity_m_s2,
+        spec.ratio.tolist(),
+        spec.axes,
+        spec.start_rad.tolist(),
+        spec.payload,
+    )
+    assembly = sorted(spec.assembly_rad.items())
+    passive = sorted(spec.passive.items())
     chain = (spec.closures, spec.motors, spec.platform, assembly, passive) if spec.closures else ()
     simulation = (*truth, *chain, spec.effects, spec.sync_period_us, spec.substeps, spec.seed)
     probe = simulate_run(cell, spec, replace(moves, moves=moves.moves[:1]), run.name, declared)
@@ -271,7 +317,9 @@ def _print_line(line: str) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record what is missing."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.record_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.record_study", description=__doc__
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--floors", choices=tuple(FLOORS), nargs="+", default=list(FLOORS))
     parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")

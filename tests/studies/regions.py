@@ -1,12 +1,15 @@
-"""Splits of recordings by region of the workspace, and whether an error on what was left out rises by more than noise.
+"""Splits of recordings by region of the workspace, and whether an error on what was left out rises
+by more than noise.
 
-A split cuts runs into stretches and deals them to four parts by where the arm was: the stretches are halved at the
-median along the direction in which their joint positions differ most, and each half again. Each seed weighs the joints
-differently, so it halves along other directions. Parts are of one size, and each is apart from the others.
+A split cuts runs into stretches and deals them to four parts by where the arm was: the stretches
+are halved at the median along the direction in which their joint positions differ most, and each
+half again. Each seed weighs the joints differently, so it halves along other directions. Parts are
+of one size, and each is apart from the others.
 
-A rise is judged on blocks of rows that are independent of each other: rows are joined in pairs until neighbours no
-longer show a correlation (batch means: Fishman 1978), as `ident.equations.linearisation.independent_blocks` joins
-moves. With d_b the rise of the squared error in block b of B,
+A rise is judged on blocks of rows that are independent of each other: rows are joined in pairs
+until neighbours no longer show a correlation (batch means: Fishman 1978), as
+`ident.equations.linearisation.independent_blocks` joins moves. With d_b the rise of the squared
+error in block b of B,
 
     Σ d_b > t_(1 − p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²)
 
@@ -32,10 +35,12 @@ from tests.studies.real_runs import stretches
 
 PARTS = 4
 LEVEL = 0.01  #: Share of splits in which noise alone makes a rise, over all axes together
-FIRST_BLOCK = 4  #: Rows in half a window of the row filter: what is farther apart shares little of it
+#: Rows in half a window of the row filter: what is farther apart shares little of it
+FIRST_BLOCK = 4
 LEAST_BLOCKS = 8
 OWN_RUN_S = 10.0  #: A side in one stretch of this length is as if it had been recorded alone
-CORRELATED = 2.0  #: Standard errors of the correlation of neighbouring blocks, above which they are joined
+#: Standard errors of the correlation of neighbouring blocks, above which they are joined
+CORRELATED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +94,9 @@ def region_of(position: FloatArray, seed: int, parts: int = PARTS) -> IntArray:
 
 
 def _upper_half(points: FloatArray) -> IntArray:
-    """1 for the half of the points, shape (s, n), that lies farther along their widest direction; else 0."""
+    """1 for the half of the points, shape (s, n), that lies farther along their widest direction;
+    else 0.
+    """
     centred = points - points.mean(axis=0)
     direction = np.linalg.svd(centred, full_matrices=False)[2][0]
     # The sign of a singular vector is a matter of rounding.
@@ -117,7 +124,8 @@ def split_by_region(runs: Sequence[Run], stretch_s: float, seed: int) -> tuple[I
 def two_sides(
     runs: Sequence[Run], left_out: Sequence[BoolArray], model: Model, conditioning: Conditioning
 ) -> tuple[list[Run], list[Run]]:
-    """The rest of some runs and what is left out of them; a row whose window touches both sides belongs to neither.
+    """The rest of some runs and what is left out of them;
+    a row whose window touches both sides belongs to neither.
 
     A run of which a side has no row that counts is none of that side.
 
@@ -130,9 +138,16 @@ def two_sides(
     rest = []
     unseen = []
     for run, mask in zip(runs, left_out, strict=True):
-        valid = np.ones(run.position_rad.shape, dtype=np.bool_) if run.valid is None else run.valid
-        rest.append(_side(replace(run, name=f"{run.name}, the rest", valid=valid & ~mask[:, None]), ~mask))
-        unseen.append(_side(replace(run, name=f"{run.name}, left out", valid=valid & mask[:, None]), mask))
+        if run.valid is None:
+            valid = np.ones(run.position_rad.shape, dtype=np.bool_)
+        else:
+            valid = run.valid
+        rest.append(
+            _side(replace(run, name=f"{run.name}, the rest", valid=valid & ~mask[:, None]), ~mask)
+        )
+        unseen.append(
+            _side(replace(run, name=f"{run.name}, left out", valid=valid & mask[:, None]), mask)
+        )
     with_rows = partial(_has_rows, model=model, conditioning=conditioning)
     return list(filter(with_rows, rest)), list(filter(with_rows, unseen))
 
@@ -145,7 +160,9 @@ def _has_rows(run: Run, model: Model, conditioning: Conditioning) -> bool:
 
 
 def _side(run: Run, own: BoolArray) -> Run:
-    """A run with the samples of one side, shape (k,); a side that is one long stretch is a run of its own."""
+    """A run with the samples of one side, shape (k,);
+    a side that is one long stretch is a run of its own.
+    """
     first = int(np.argmax(own))
     last = len(own) - int(np.argmax(own[::-1]))
     part = slice(first, last)
@@ -185,11 +202,15 @@ def independent_sums(change: FloatArray, run: IntArray) -> FloatArray:
 def _firsts(run: IntArray, size: int) -> IntArray:
     """First of every so many entries of each run, ascending."""
     firsts = [np.flatnonzero(run == one)[::size] for one in np.unique(run)]
-    return np.sort(np.concatenate(firsts)) if firsts else np.zeros(0, dtype=np.int64)
+    if firsts:
+        return np.sort(np.concatenate(firsts))
+    return np.zeros(0, dtype=np.int64)
 
 
 def judge_rise(change: FloatArray, run: IntArray, level: float = LEVEL) -> Rise:
-    """Judge the rise of a squared error by its change in each row, shape (r,), of runs, shape (r,)."""
+    """Judge the rise of a squared error by its change in each row, shape (r,), of runs,
+    shape (r,).
+    """
     sums = independent_sums(change, run)
     blocks = len(sums)
     if blocks < 2:

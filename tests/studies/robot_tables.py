@@ -1,7 +1,7 @@
 """The tables of docs/evidence/robots.md, from the rows of the robot study (any_robot.py).
 
-Form of the paper's Tables 4, 7 and 8: gains of the first seed beside the nameplate, and the masses of the
-payload that the fit was given (in a run of its own) and of a second one.
+Form of the paper's Tables 4, 7 and 8: gains of the first seed beside the nameplate, and the masses
+of the payload that the fit was given (in a run of its own) and of a second one.
 """
 
 from __future__ import annotations
@@ -14,12 +14,42 @@ from typing import Any
 
 from daq.files import replace_file
 
-SUMMARY = ("robot", "gains", "relative error", "gain error mean", "worst", "second payload mean", "worst", "coverage")
-GAINS = ("robot", "axis", "unit", "nameplate", "identified", "%σ", "%e from the nameplate", "%e from the truth")
-PAYLOADS = ("robot", "first payload [kg]", "identified", "%σ", "%e", "second payload [kg]", "identified", "%σ", "%e")
+SUMMARY = (
+    "robot",
+    "gains",
+    "relative error",
+    "gain error mean",
+    "worst",
+    "second payload mean",
+    "worst",
+    "coverage",
+)
+GAINS = (
+    "robot",
+    "axis",
+    "unit",
+    "nameplate",
+    "identified",
+    "%σ",
+    "%e from the nameplate",
+    "%e from the truth",
+)
+PAYLOADS = (
+    "robot",
+    "first payload [kg]",
+    "identified",
+    "%σ",
+    "%e",
+    "second payload [kg]",
+    "identified",
+    "%σ",
+    "%e",
+)
 
 
-def write_tables(folder: Path, figures: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]) -> None:
+def write_tables(
+    folder: Path, figures: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]]
+) -> None:
     """Write robots.csv, robots-gains.csv and robots-payloads.csv.
 
     Args:
@@ -30,7 +60,10 @@ def write_tables(folder: Path, figures: Sequence[dict[str, Any]], rows: Sequence
     first = {row["robot"]: row for row in reversed(rows)}
     tables = {
         "robots.csv": (SUMMARY, [_summary(robot) for robot in figures]),
-        "robots-gains.csv": (GAINS, [line for robot in figures for line in _gains(first[robot["robot"]])]),
+        "robots-gains.csv": (
+            GAINS,
+            [line for robot in figures for line in _gains(first[robot["robot"]])],
+        ),
         "robots-payloads.csv": (PAYLOADS, [_payloads(first[robot["robot"]]) for robot in figures]),
     }
     for name, (headings, lines) in tables.items():
@@ -54,7 +87,8 @@ def _summary(robot: dict[str, Any]) -> tuple[str, ...]:
 
 def _gains(row: dict[str, Any]) -> Iterable[tuple[str, ...]]:
     for axis, error in row["gain_error_percent"].items():
-        nameplate, true = row["nameplate_gain"][axis], row["true_gain"][axis]
+        nameplate = row["nameplate_gain"][axis]
+        true = row["true_gain"][axis]
         identified = true * (1.0 + error / 100.0)
         change = 100.0 * abs(identified / nameplate - 1.0)
         yield (
@@ -73,6 +107,13 @@ def _gains(row: dict[str, Any]) -> Iterable[tuple[str, ...]]:
 def _payloads(row: dict[str, Any]) -> tuple[str, ...]:
     cells = [row["robot"]]
     for role in ("first_payload", "payload"):
-        true, error, std = (row[f"{role}_{what}"] for what in ("kg", "error_percent", "std_percent"))
-        cells += [f"{true:g}", f"{true * (1.0 + error / 100.0):.4g}", f"{std:.2f}", f"{abs(error):.2f}"]
+        true, error, std = (
+            row[f"{role}_{what}"] for what in ("kg", "error_percent", "std_percent")
+        )
+        cells += [
+            f"{true:g}",
+            f"{true * (1.0 + error / 100.0):.4g}",
+            f"{std:.2f}",
+            f"{abs(error):.2f}",
+        ]
     return tuple(cells)

@@ -1,18 +1,21 @@
-"""Guided sessions that are killed (-9) at random moments of all stages, each finished by the same command.
+"""Guided sessions that are killed (-9) at random moments of all stages,
+each finished by the same command.
 
     python -m tests.studies.session_kills --kills 40 --seed 1 --minutes 60      goes on where it ended
     python -m tests.studies.session_kills --real 5
 
-A moment is drawn from the tools that a session calls (`daq.jobs.context.Tools`): any tool, any of its calls, any time
-of that call. So the write, which takes milliseconds, is hit as often as a recording. After each kill the same command
-is started until it ends with 0. Then there is one session, one certificate that says "accepted", and one write; the
-controller's file was the old or the new one at any time; and the interlock was asked right before each motion. A kill
-that does not end so is an AssertionError.
+A moment is drawn from the tools that a session calls (`daq.jobs.context.Tools`): any tool, any of
+its calls, any time of that call. So the write, which takes milliseconds, is hit as often as a
+recording. After each kill the same command is started until it ends with 0. Then there is one
+session, one certificate that says "accepted", and one write; the controller's file was the old or
+the new one at any time; and the interlock was asked right before each motion. A kill that does not
+end so is an AssertionError.
 
-One session is made first, over the driver. The others copy its recordings, and know the result of its fits. With
-`--real`, recordings are made over the driver, at a simulated cell that is a process of its own and goes on when the
-session is killed; these kills are all drawn from recordings. Layout: out/session-kills/<number>.csv.
-"""
+One session is made first, over the driver. The others copy its recordings, and know the result of
+its fits. With `--real`, recordings are made over the driver, at a simulated cell that is a process
+of its own and goes on when the session is killed; these kills are all drawn from recordings.
+Layout: out/session-kills/<number>.csv.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -88,7 +91,9 @@ def kill(unit: KillUnit, made: MadeSession, calls: Sequence[TimedCall]) -> KillR
         else:
             with cell_process(rig):
                 found = ends_well_after(rig, moment)
-    return KillRow(unit.number, unit.real, found.tool, found.in_time, found.was_written, found.attempts)
+    return KillRow(
+        unit.number, unit.real, found.tool, found.in_time, found.was_written, found.attempts
+    )
 
 
 def made_once(out: Path, fingerprint: str) -> MadeSession:
@@ -113,9 +118,10 @@ def summary(rows: Sequence[KillRow]) -> str:
     tools = Counter(row.tool for row in killed)
     listed = ", ".join(f"{tool} {count}" for tool, count in tools.most_common())
     return (
-        f"{len(killed)} sessions killed ({sum(row.real for row in killed)} with recordings over the driver), "
+        f"{len(killed)} sessions killed ({sum(row.real for row in killed)} with recordings over "
+        "the driver), "
         f"{after_write} of them after their write; the same command ended with 0 after "
-        f"{', '.join(f'{number} more start(s): {count}' for number, count in sorted(again.items()))}\n"
+        f"{', '.join(f'{number} more start(s): {count}' for number, count in sorted(again.items()))}\n"  # noqa: E501
         f"last call before the kill: {listed}\n"
         "every session: one certificate, one write, the interlock asked before every motion"
     )
@@ -124,10 +130,16 @@ def summary(rows: Sequence[KillRow]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Kill what was not killed yet, and print what all kills have shown."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m {MODULE}", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=f"python -m {MODULE}",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--kills", type=int, default=40, help="of sessions that copy their recordings")
-    parser.add_argument("--real", type=int, default=0, help="of sessions that record over the driver")
+    parser.add_argument(
+        "--kills", type=int, default=40, help="of sessions that copy their recordings"
+    )
+    parser.add_argument(
+        "--real", type=int, default=0, help="of sessions that record over the driver"
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no kill is begun")
     parser.add_argument("--out", type=Path, default=OUT)
@@ -141,7 +153,9 @@ def main(arguments: list[str] | None = None) -> int:
     rows: list[KillRow] = []
 
     def done(unit: KillUnit) -> str:
-        (row,) = rows_of_unit(options.out, unit, KillRow, digest(source, unit), lambda one: [kill(one, made, calls)])
+        (row,) = rows_of_unit(
+            options.out, unit, KillRow, digest(source, unit), lambda one: [kill(one, made, calls)]
+        )
         rows.append(row)
         return f"{unit.name}: killed in or behind {row.tool}, {row.attempts} more start(s)"
 

@@ -1,4 +1,5 @@
-"""How long a guided session takes, beside the way step by step, and whether stopping when it is precise bends a gain.
+"""How long a guided session takes, beside the way step by step,
+and whether stopping when it is precise bends a gain.
 
     python -m tests.studies.session_study --only TX-40 --seeds 1 2
     python -m tests.studies.session_study --shard 1/4 --minutes 60      goes on where it ended
@@ -6,11 +7,12 @@
 A unit that ends with an error is a row with its reason: a missed target, and no ratio. `--tables
 docs/evidence/data` writes the tables of docs/evidence/session.md.
 
-Each shipped robot is calibrated over the driver by `daq.jobs.calibrate.calibrate`, until σ of every gain is 0.5 %. The
-time is that of the motion, and three minutes for each change of the payload. Its cell file has `friction_by_payload`,
-as those that `drivegain init` writes. Step by step it is the shortest of five durations of a plan whose three runs
-(bare, loaded, held out) give every gain within 1 % of the truth. Both ways have the same plant, noise of their own, and
-plans of their own. Layout: out/session-study/<robot>-<seed>.json.
+Each shipped robot is calibrated over the driver by `daq.jobs.calibrate.calibrate`, until σ of every
+gain is 0.5 %. The time is that of the motion, and three minutes for each change of the payload. Its
+cell file has `friction_by_payload`, as those that `drivegain init` writes. Step by step it is the
+shortest of five durations of a plan whose three runs (bare, loaded, held out) give every gain
+within 1 % of the truth. Both ways have the same plant, noise of their own, and plans of their own.
+Layout: out/session-study/<robot>-<seed>.json.
 """
 
 from __future__ import annotations
@@ -78,9 +80,15 @@ class Plant:
 
     def record(self, request: RecordingRequest, number: int, **further: Any) -> Recorded:
         """Record a run over the driver; its number makes the noise."""
-        mounted = None if request.payload is None else request.payload.name
+        if request.payload is None:
+            mounted = None
+        else:
+            mounted = request.payload.name
         spec = load_simulation(shipped_simulation(self.robot.simulation), mounted)
-        axes = tuple(replace(axis, current_noise_a=self.robot.noise * axis.current_noise_a) for axis in spec.axes)
+        axes = tuple(
+            replace(axis, current_noise_a=self.robot.noise * axis.current_noise_a)
+            for axis in spec.axes
+        )
         bus = open_bus(bus_address(request.cell))
         try:
             with SimulatedCell(replace(spec, axes=axes, seed=1000 * self.seed + number), bus):
@@ -91,7 +99,9 @@ class Plant:
     def truth(self, cell: Cell) -> dict[str, float]:
         """True gain by axis."""
         spec = load_simulation(shipped_simulation(self.robot.simulation))
-        return {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
+        return {
+            axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)
+        }
 
 
 def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
@@ -106,7 +116,9 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
     return {
         "robot": robot.name,
         "seed": seed,
-        "guided": way_or_reason(lambda: guided_way(plant, by_payload_file, load_cell(by_payload_file), folder)),
+        "guided": way_or_reason(
+            lambda: guided_way(plant, by_payload_file, load_cell(by_payload_file), folder)
+        ),
         "step_by_step": way_or_reason(lambda: step_by_step(plant, cell_file, cell, folder)),
     }
 
@@ -129,14 +141,24 @@ def guided_way(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[
 
     tools = Tools(
         save_report=save_report,
-        drives=lambda _cell, _block, _take_over: None,  # no cell is on the bus between two recordings
-        plan=partial(plan, exchanges=EXCHANGES, largest_condition=NO_CONDITION, largest_std_percent=NO_STD_PERCENT),
+        # No cell is on the bus between two recordings
+        drives=lambda _cell, _block, _take_over: None,
+        plan=partial(
+            plan,
+            exchanges=EXCHANGES,
+            largest_condition=NO_CONDITION,
+            largest_std_percent=NO_STD_PERCENT,
+        ),
         record=recorded,
         free=lambda _: 10**12,
     )
     payload = cell.payloads[0]
     operator = GivenAnswers(
-        "the study", {payload.name: payload.mass_kg}, lambda _: None, "the study: a simulated cell", writes=False
+        "the study",
+        {payload.name: payload.mass_kg},
+        lambda _: None,
+        "the study: a simulated cell",
+        writes=False,
     )
     settings = GuidedSettings(
         folder / "sessions",
@@ -155,7 +177,9 @@ def guided_way(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[
     state = guided(ended.session)
     mounted = [block.payload for block in state.blocks]
     truth = plant.truth(cell)
-    errors = {gain.axis: 100.0 * (gain.value / truth[gain.axis] - 1.0) for gain in calibration.gains}
+    errors = {
+        gain.axis: 100.0 * (gain.value / truth[gain.axis] - 1.0) for gain in calibration.gains
+    }
     return {
         "motion_s": motion_s(state.blocks, BLOCK_S),
         "changes": changes(mounted),
@@ -173,7 +197,9 @@ def step_by_step(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dic
     worst: dict[str, float] = {}
     for duration_s in DURATIONS_S:
         try:
-            error = _worst_error(plant, cell_file, cell, folder / f"steps-{duration_s:g}", duration_s)
+            error = _worst_error(
+                plant, cell_file, cell, folder / f"steps-{duration_s:g}", duration_s
+            )
         except PlanTooShort:  # a person would take the next duration
             error = float("inf")
         worst[f"{duration_s:g}"] = error
@@ -182,8 +208,12 @@ def step_by_step(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dic
     return {"duration_s": None, "worst_error_percent": worst}
 
 
-def _worst_error(plant: Plant, cell_file: Path, cell: Cell, folder: Path, duration_s: float) -> float:
-    """The largest true error of a gain of three runs [%]; infinite where they do not give the gains."""
+def _worst_error(
+    plant: Plant, cell_file: Path, cell: Cell, folder: Path, duration_s: float
+) -> float:
+    """The largest true error of a gain of three runs [%];
+    infinite where they do not give the gains.
+    """
     folder.mkdir()
     first, second = (
         plan(
@@ -198,7 +228,11 @@ def _worst_error(plant: Plant, cell_file: Path, cell: Cell, folder: Path, durati
     )
     payload = cell.payloads[0]
     logs = []
-    for name, mounted, moves in (("bare", None, first), ("loaded", payload, first), ("held-out", payload, second)):
+    for name, mounted, moves in (
+        ("bare", None, first),
+        ("loaded", payload, first),
+        ("held-out", payload, second),
+    ):
         logs.append(folder / f"{name}.mcap")
         request = RecordingRequest(
             cell_file,
@@ -229,16 +263,26 @@ def changes(mounted: Sequence[str | None]) -> int:
 def main(arguments: list[str] | None = None) -> int:
     """Make what is missing, and print the table of what is there."""
     names = [robot.name for robot in ROBOTS]
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.session_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.session_study", description=__doc__
+    )
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="ROBOT")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th unit from the i-th on")
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th unit from the i-th on"
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no unit is begun")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--tables", type=Path, help="folder of the tables of docs/evidence/session.md, to write them")
+    parser.add_argument(
+        "--tables",
+        type=Path,
+        help="folder of the tables of docs/evidence/session.md, to write them",
+    )
     options = parser.parse_args(arguments)
     source = digest_of_source("tests.studies.session_study")
-    units = [(robot, seed) for seed in options.seeds for robot in ROBOTS if robot.name in options.only]
+    units = [
+        (robot, seed) for seed in options.seeds for robot in ROBOTS if robot.name in options.only
+    ]
 
     def fingerprint(robot: StudiedRobot, seed: int) -> str:
         return digest(source, robot.fingerprint, seed)
@@ -254,7 +298,10 @@ def main(arguments: list[str] | None = None) -> int:
         way = row["guided"]
         found = way.get("failed") or f"{way['motion_s']:.0f} s and {way['changes']} changes"
         steps = row["step_by_step"]
-        return f"{robot.name}-{seed}: guided {found}, step by step {steps.get('failed') or steps['duration_s']}"
+        return (
+            f"{robot.name}-{seed}: guided {found}, step by step "
+            f"{steps.get('failed') or steps['duration_s']}"
+        )
 
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
     rows: list[dict[str, Any]] = []

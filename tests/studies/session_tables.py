@@ -1,4 +1,5 @@
-"""Tables of the session study: a row for each unit, and one for each robot (docs/evidence/session.md).
+"""Tables of the session study: a row for each unit,
+and one for each robot (docs/evidence/session.md).
 
 They are apart from the study, so that a change here makes no unit again.
 """
@@ -29,11 +30,15 @@ def session_s(way: dict[str, Any]) -> float:
 def steps_s(way: dict[str, Any]) -> float:
     """Motion of the three runs with their one change [s]; infinite where no duration was enough."""
     duration_s = way.get("duration_s")
-    return float("inf") if duration_s is None else 3.0 * float(duration_s) + CHANGE_S
+    if duration_s is None:
+        return float("inf")
+    return 3.0 * float(duration_s) + CHANGE_S
 
 
 def ratio_of(row: dict[str, Any]) -> float:
-    """Time of a guided session over that step by step; infinite where it failed, 0 where only the other way did."""
+    """Time of a guided session over that step by step;
+    infinite where it failed, 0 where only the other way did.
+    """
     guided_s = session_s(row["guided"])
     if np.isinf(guided_s):
         return float("inf")
@@ -132,13 +137,14 @@ def robot_rows(units: Sequence[dict[str, Any]]) -> list[RobotRow]:
 def summary(units: Sequence[dict[str, Any]]) -> str:
     """A line for each robot, and the reasons of what failed."""
     lines = [
-        "| robot | seeds | guided: motion s | changes | step by step: duration s | ratio of times, median | worst | "
-        "target missed | error / σ, rms | worst error % |",
+        "| robot | seeds | guided: motion s | changes | step by step: duration s | ratio of times, "
+        "median | worst | target missed | error / σ, rms | worst error % |",
         "|" + "---|" * 10,
     ]
     for row in robot_rows(units):
         times = (
-            f"{row.motion_s:.0f} | {row.changes} | {row.step_by_step_s:.0f} | {row.ratio:.2f} | {row.worst_ratio:.2f}"
+            f"{row.motion_s:.0f} | {row.changes} | {row.step_by_step_s:.0f} | {row.ratio:.2f} | "
+            f"{row.worst_ratio:.2f}"
         )
         errors = f"{row.targets_missed} | {row.rms_z:.2f} | {row.worst_error_percent:.2f}"
         lines.append(f"| {row.robot} | {row.seeds} | {times} | {errors} |")
@@ -156,7 +162,9 @@ def _z(units: Sequence[dict[str, Any]]) -> list[float]:
 
 
 def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else float("nan")
+    if values:
+        return float(np.sqrt(np.mean(np.square(values))))
+    return float("nan")
 
 
 def write_tables(folder: Path, units: Sequence[dict[str, Any]]) -> None:

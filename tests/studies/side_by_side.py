@@ -19,7 +19,9 @@ class TaskFailed(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Every `count`-th task of a study, from the `number`-th on (both from 1): shards together are the whole."""
+    """Every `count`-th task of a study, from the `number`-th on (both from 1):
+    shards together are the whole.
+    """
 
     number: int = 1
     count: int = 1
@@ -39,7 +41,9 @@ def shard(text: str) -> Shard:
 
 @dataclass(frozen=True, slots=True)
 class _Reporting(Generic[Task, Made]):
-    """Errors with keyword arguments do not survive pickling, and a pool then waits for ever: they go over as text."""
+    """Errors with keyword arguments do not survive pickling, and a pool then waits for ever:
+    they go over as text.
+    """
 
     function: Callable[[Task], Made]
 
@@ -50,7 +54,9 @@ class _Reporting(Generic[Task, Made]):
             return None, f"{task}:\n{traceback.format_exc()}"
 
 
-def side_by_side(function: Callable[[Task], Made], tasks: Iterable[Task], processes: int) -> Iterator[Made]:
+def side_by_side(
+    function: Callable[[Task], Made], tasks: Iterable[Task], processes: int
+) -> Iterator[Made]:
     """Yield the results of a function for each task, in the order of the tasks.
 
     Args:

@@ -1,9 +1,11 @@
-"""Time skews that are printed: none on clean recordings, and a planted one with a value that is right.
+"""Time skews that are printed: none on clean recordings,
+and a planted one with a value that is right.
 
-`make diagnosis-study` runs it after the false alarms of the diagnoses. A cell is two runs, without load and with the
-disc, of a truth of its own. Half of the cells have noise in the currents alone, half a torque disturbance inside the
-position loop, which bends least squares. What decides the sentence is computed (`ident.discovery.time_skew`), not a
-whole search. `--csv docs/evidence/data/skew.csv` writes its table.
+`make diagnosis-study` runs it after the false alarms of the diagnoses. A cell is two runs, without
+load and with the disc, of a truth of its own. Half of the cells have noise in the currents alone,
+half a torque disturbance inside the position loop, which bends least squares. What decides the
+sentence is computed (`ident.discovery.time_skew`), not a whole search. `--csv
+docs/evidence/data/skew.csv` writes its table.
 """
 
 from __future__ import annotations
@@ -39,13 +41,17 @@ WORLDS = {
     "3.5": (World(1.59, 0.0), World(1.0, 2.0)),
     "10": (World(4.55, 0.0), World(1.0, 7.0)),
 }
-"""Noise of the currents and disturbance in the loop that leave a relative error of about so many per cent."""
+"""Noise of the currents and disturbance in the loop that leave a relative error of about so many
+per cent.
+"""
 CLEAN = 50
 PLANTED_S = (0.0, 0.002, -0.002, 0.004, -0.004)
 PLANTED_SEEDS = 4
 LARGEST_Z = 3.0
 VISIBLE_SIGMAS = CERTAIN_SIGMAS + 2.0
-"""A planted skew of as many σ is stated in 98 % of recordings; one of 2 ms is smaller in a strongly disturbed loop."""
+"""A planted skew of as many σ is stated in 98 % of recordings;
+one of 2 ms is smaller in a strongly disturbed loop.
+"""
 PROCESSES = 2
 
 
@@ -84,7 +90,9 @@ class SkewScore:
 
 
 def late(run: Run, delay_s: float) -> Run:
-    """Delay the currents of a run by a multiple of its sampling period; the ends without a current are cut off."""
+    """Delay the currents of a run by a multiple of its sampling period;
+    the ends without a current are cut off.
+    """
     shift = round(delay_s * run.rate_hz)
     edge = abs(shift)
     kept = np.arange(edge, len(run.time_s) - edge)
@@ -105,13 +113,18 @@ def score(task: SkewTask) -> tuple[SkewScore, ...]:
     truth = study_cell(task.seed, task.world.noise_factor, task.world.disturbance_percent)
     runs: list[Run] = []
     for number, (payload, name) in enumerate(RUNS):
-        declared = None if payload is None else declared_payload(payload)
+        if payload is None:
+            declared = None
+        else:
+            declared = declared_payload(payload)
         raw = simulate_run(cell, spec_of(truth, payload, number), plan, name, declared)
         runs.append(run_of(raw, cell))
     scores: list[SkewScore] = []
     for planted_s in task.planted_s:
         recorded = [late(run, planted_s) for run in runs]
-        found = identify(model_of(cell), recorded, cell.conditioning, method=Method.ML, keep_rows=True)
+        found = identify(
+            model_of(cell), recorded, cell.conditioning, method=Method.ML, keep_rows=True
+        )
         skew = time_skew(gather(found))
         if skew is None:
             raise ValueError(f"cell {task.seed}: the demanded motion is not known")
@@ -150,8 +163,14 @@ def table(scores: Sequence[SkewScore]) -> str:
     """Tabulate the scores, a line a floor, kind of noise and planted skew."""
     lines = [f"| {' | '.join(HEADINGS)} |", "|---" * len(HEADINGS) + "|"]
     kinds = dict.fromkeys((one.floor, one.kind, one.planted_s) for one in scores)
-    for floor, kind, planted_s in sorted(kinds, key=lambda kind: (float(kind[0]), kind[1], kind[2])):
-        own = [one for one in scores if (one.floor, one.kind, one.planted_s) == (floor, kind, planted_s)]
+    for floor, kind, planted_s in sorted(
+        kinds, key=lambda kind: (float(kind[0]), kind[1], kind[2])
+    ):
+        own = [
+            one
+            for one in scores
+            if (one.floor, one.kind, one.planted_s) == (floor, kind, planted_s)
+        ]
         z = np.array([one.z for one in own])
         beyond = sum(abs(one.fit_s) > 2.0 * one.fit_std for one in own)
         cells = (
@@ -172,7 +191,9 @@ def table(scores: Sequence[SkewScore]) -> str:
 
 
 def mistakes(scores: Iterable[SkewScore]) -> list[SkewScore]:
-    """Clean recordings with a printed skew, visible skews that are not printed, and values off by LARGEST_Z."""
+    """Clean recordings with a printed skew, visible skews that are not printed,
+    and values off by LARGEST_Z.
+    """
     wrong: list[SkewScore] = []
     for one in scores:
         is_false = one.printed and one.planted_s == 0.0
@@ -184,10 +205,14 @@ def mistakes(scores: Iterable[SkewScore]) -> list[SkewScore]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the table; 1 if a clean recording has a skew, or a visible planted one is missing or wrong."""
+    """Print the table; 1 if a clean recording has a skew,
+    or a visible planted one is missing or wrong.
+    """
     parser = argparse.ArgumentParser(prog="python -m tests.studies.skew_study", description=__doc__)
     parser.add_argument("--clean", type=int, default=CLEAN, help="clean cells of each floor")
-    parser.add_argument("--planted", type=int, default=PLANTED_SEEDS, help="cells of each floor with planted skews")
+    parser.add_argument(
+        "--planted", type=int, default=PLANTED_SEEDS, help="cells of each floor with planted skews"
+    )
     parser.add_argument("--processes", type=int, default=PROCESSES)
     parser.add_argument("--csv", type=Path, help="also write the table, for docs/evidence/data")
     given = parser.parse_args(arguments)
@@ -209,8 +234,13 @@ def main(arguments: Sequence[str]) -> int:
     clean = [one for one in scores if one.planted_s == 0.0]
     planted = [one for one in scores if one.planted_s != 0.0]
     stated = sum(one.printed for one in planted)
-    print_line(f"\n{len(clean)} clean recordings: a skew printed in {sum(one.printed for one in clean)}")
-    print_line(f"{len(planted)} planted skews: {stated} printed, the others below {VISIBLE_SIGMAS:g} σ unless listed")
+    print_line(
+        f"\n{len(clean)} clean recordings: a skew printed in {sum(one.printed for one in clean)}"
+    )
+    print_line(
+        f"{len(planted)} planted skews: {stated} printed, the others below "
+        f"{VISIBLE_SIGMAS:g} σ unless listed"
+    )
     for one in wrong:
         print_line(f"WRONG: {one}, z {one.z:+.1f}")
     return int(bool(wrong))

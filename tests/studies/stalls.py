@@ -1,4 +1,5 @@
-"""How late a sleeper of the highest priority wakes: what the machine itself takes from every program on it.
+"""How late a sleeper of the highest priority wakes:
+what the machine itself takes from every program on it.
 
     sudo chrt -f 50 python -m tests.studies.stalls 3600 > stalls.txt
 

@@ -1,7 +1,8 @@
 """Simulated cells that are recorded in blocks, with the gains after each move and each block.
 
-Blocks are without load, loaded, loaded, without load, and so on, of random moves (tests/ident/pieces.py). A fit that
-grows gives the quick estimate after each move, and that of `ml` after each block.
+Blocks are without load, loaded, loaded, without load, and so on, of random moves
+(tests/ident/pieces.py). A fit that grows gives the quick estimate after each move, and that of `ml`
+after each block.
 """
 
 from __future__ import annotations
@@ -50,10 +51,13 @@ class Look:
     @property
     def z(self) -> tuple[float, ...]:
         """Error of each gain in its σ."""
-        return tuple(error / std for error, std in zip(self.error_percent, self.std_percent, strict=True))
+        return tuple(
+            error / std for error, std in zip(self.error_percent, self.std_percent, strict=True)
+        )
 
 
-QUICK, ML = "quick", "ml"
+QUICK = "quick"
+ML = "ml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +86,9 @@ def looks_of(unit: CellUnit) -> list[Look]:
     fit = GrowingFit(truth.model, conditioning, (MOUNTED,))
     looks = []
 
-    def look(estimator: str, gains: FloatArray, std: FloatArray, block: int, block_s: float) -> None:
+    def look(
+        estimator: str, gains: FloatArray, std: FloatArray, block: int, block_s: float
+    ) -> None:
         error_percent = 100.0 * (gains / truth.gains - 1.0)
         std_percent = 100.0 * std / np.abs(gains)
         looks.append(

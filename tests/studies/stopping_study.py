@@ -1,10 +1,12 @@
-"""Does it bias the gains, or make their σ too small, to stop recording when every σ is at its target?
+"""Does it bias the gains, or make their σ too small,
+to stop recording when every σ is at its target?
 
     python -m tests.studies.stopping_study --arm three --minutes 30
 
-Each cell has noise and moves of its own (stopping_cells.py). σ is judged after each move or block, and the first
-look at which every σ is at the target ends the recording. A σ that happens to be small ends it too early. What is
-finished is not done again; `--shard 2/4` takes every fourth cell from the second on.
+Each cell has noise and moves of its own (stopping_cells.py). σ is judged after each move or block,
+and the first look at which every σ is at the target ends the recording. A σ that happens to be
+small ends it too early. What is finished is not done again; `--shard 2/4` takes every fourth cell
+from the second on.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ TABLE = Path(__file__).parents[2] / "docs" / "evidence" / "data" / "stopping.csv
 TARGETS_PERCENT = (5.0, 2.5, 1.25)
 
 Stop = Callable[[Sequence[Look], float], Look | None]
-"""The look at which a cell's recording ends, for its looks in order and the target [%]; None where it goes on."""
+"""The look at which a cell's recording ends, for its looks in order and the target [%];
+None where it goes on.
+"""
 
 
 def at_target(look: Look, target_percent: float) -> bool:
@@ -52,9 +56,13 @@ def ml_after_each_block(looks: Sequence[Look], target_percent: float) -> Look | 
 
 
 def ml_twice(looks: Sequence[Look], target_percent: float) -> Look | None:
-    """Stop at the second of two ends of blocks in a row at which every σ of `ml` is at the target."""
+    """Stop at the second of two ends of blocks in a row at which every σ of `ml` is at the
+    target.
+    """
     pairs = pairwise(ends(looks))
-    return next((b for a, b in pairs if at_target(a, target_percent) and at_target(b, target_percent)), None)
+    return next(
+        (b for a, b in pairs if at_target(a, target_percent) and at_target(b, target_percent)), None
+    )
 
 
 def ends(looks: Sequence[Look]) -> list[Look]:
@@ -67,8 +75,13 @@ RULES: dict[str, Stop] = {
     "ml, each block": ml_after_each_block,
     "ml, two blocks in a row": ml_twice,
 }
-FIXED = {"quick, each move": (QUICK, "quick, length fixed before"), "ml, each block": (ML, "ml, length fixed before")}
-"""For a rule its estimator, and the name of recordings that all last as long as the median one by this rule."""
+FIXED = {
+    "quick, each move": (QUICK, "quick, length fixed before"),
+    "ml, each block": (ML, "ml, length fixed before"),
+}
+"""For a rule its estimator, and the name of recordings that all last as long as the median one by
+this rule.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,20 +135,24 @@ def stops_of(cells: Sequence[Sequence[Look]], target_percent: float) -> dict[str
 
 
 def at_median(cells: Sequence[Sequence[Look]], stops: Sequence[Look], estimator: str) -> list[Look]:
-    """Look at each cell where the median one of some recordings ends; cells without gains there are left out."""
+    """Look at each cell where the median one of some recordings ends;
+    cells without gains there are left out.
+    """
     in_order = sorted(look.recorded_s for look in stops)
     median_s = in_order[(len(in_order) - 1) // 2]
     looks = []
     for own in cells:
-        looks += [look for look in own if look.estimator == estimator and look.recorded_s == median_s]
+        looks += [
+            look for look in own if look.estimator == estimator and look.recorded_s == median_s
+        ]
     return looks
 
 
 def table(looks_of_arm: dict[str, list[list[Look]]]) -> str:
     """A line for each arm, target and rule."""
     lines = [
-        "| arm | target σ % | stopped by | cells | recorded, s (5, 50, 95 %) | mean error % | error / σ, rms | "
-        "95 % intervals that hold the truth, % |",
+        "| arm | target σ % | stopped by | cells | recorded, s (5, 50, 95 %) | mean error % | "
+        "error / σ, rms | 95 % intervals that hold the truth, % |",
         "|" + "---|" * 8,
     ]
     for arm, cells in looks_of_arm.items():
@@ -154,10 +171,14 @@ def table(looks_of_arm: dict[str, list[list[Look]]]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record the cells that are missing, and print the table of all that are there."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.stopping_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.stopping_study", description=__doc__
+    )
     parser.add_argument("--arm", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--cells", type=int, help="of each arm; 100 of three axes, 50 of six")
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on")
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no cell is begun")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
@@ -170,7 +191,10 @@ def main(arguments: list[str] | None = None) -> int:
         begun_s = time.process_time()
         rows = rows_of_unit(options.out, unit, Look, fingerprint_of(unit), looks_of)
         worst = max(rows[-1].std_percent)
-        return f"{unit.name}: worst sigma {worst:.2f} % at the end, {time.process_time() - begun_s:.0f} s"
+        return (
+            f"{unit.name}: worst sigma {worst:.2f} % at the end, "
+            f"{time.process_time() - begun_s:.0f} s"
+        )
 
     looks_of_arm = {}
     is_all = set(options.arm) == set(ARMS)

@@ -1,6 +1,8 @@
-"""The simulated cells of the studies: each seed has a truth of its own, drawn around the clean cell.
+"""The simulated cells of the studies:
+each seed has a truth of its own, drawn around the clean cell.
 
-Nothing that records or fits reads a truth: the simulator is built from it, and the scoring is given `Truth`.
+Nothing that records or fits reads a truth: the simulator is built from it, and the scoring is given
+`Truth`.
 """
 
 from __future__ import annotations
@@ -25,8 +27,10 @@ class World:
 
     Attributes:
         noise_factor: of the current noise, against the clean cell.
-        disturbance_percent: torque disturbance inside the position loop, root mean square in percent of rated torque.
-        friction_percent: standard deviation of each axis' friction from run to run, in percent; within a run it stays.
+        disturbance_percent: torque disturbance inside the position loop, root mean square in
+            percent of rated torque.
+        friction_percent: standard deviation of each axis' friction from run to run, in percent;
+            within a run it stays.
     """
 
     noise_factor: float
@@ -41,9 +45,12 @@ WORLDS = {
     "loop8": World(1.0, 8.0),
     "runs": World(1.59, 0.0, 2.0),
 }
-"""The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md), the quiet one 0.4 %.
+"""The first leaves a relative error of 3.5 % without any effect (docs/evidence/estimators.md),
+the quiet one 0.4 %.
 
-The last has the noise of the first, and friction that differs from run to run, as temperature and remounting do it."""
+The last has the noise of the first, and friction that differs from run to run, as temperature and
+remounting do it.
+"""
 CORRELATION_S = (0.002, 0.050)
 """Range of the disturbance's correlation time, drawn for each axis, logarithmically uniform [s]."""
 GAIN_SPREAD = 0.10
@@ -58,7 +65,9 @@ PAYLOAD_CENTRE_M = 0.010
 PAYLOAD_INERTIA_SPREAD = 0.20
 CAD_CENTRE_STD_M = 0.001
 CAD_INERTIA_STD = 0.03
-"""How far the CAD model of a payload is off, standard deviations: mounted 1 mm beside the drawing, simple solids."""
+"""How far the CAD model of a payload is off, standard deviations:
+mounted 1 mm beside the drawing, simple solids.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +76,10 @@ class PayloadTruth:
 
     Attributes:
         mass_kg: true, and as weighed: a wrong weight is no business of these studies.
-        parameters: the ten true inertial parameters in the frame of the last joint, by LINK_PARAMETERS.
-        cad: the ten as a CAD model gives them: the weighed mass, centre and inertia with the errors stated above.
+        parameters: the ten true inertial parameters in the frame of the last joint, by
+            LINK_PARAMETERS.
+        cad: the ten as a CAD model gives them: the weighed mass, centre and inertia with the errors
+            stated above.
     """
 
     mass_kg: float
@@ -131,7 +142,8 @@ def study_cell(seed: int, noise_factor: float = 1.0, disturbance_percent: float 
     bare = load_simulation(path)
     # The fourth stream draws the drawing of a payload (`truth_of`).
     axes_rng, links_rng, payload_rng, loop_rng = (
-        np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(part,))) for part in (0, 1, 2, 4)
+        np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(part,)))
+        for part in (0, 1, 2, 4)
     )
     low, high = np.log(CORRELATION_S)
     correlation_s = np.exp(loop_rng.uniform(float(low), float(high), len(bare.axes)))
@@ -169,12 +181,15 @@ def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:
     Args:
         cell: drawn.
         payload: name of the mounted body, or None.
-        run: each run of a cell has a noise of its own, and a friction where it differs from run to run.
+        run: each run of a cell has a noise of its own, and a friction where it differs from run to
+            run.
     """
     body = None if payload is None else cell.bodies[payload]
     rng = np.random.default_rng(np.random.SeedSequence(cell.seed, spawn_key=(5, run)))
     factors = 1.0 + 0.01 * cell.friction_percent * rng.standard_normal(len(cell.bare.axes))
-    axes = tuple(_rubbing(axis, float(factor)) for axis, factor in zip(cell.bare.axes, factors, strict=True))
+    axes = tuple(
+        _rubbing(axis, float(factor)) for axis, factor in zip(cell.bare.axes, factors, strict=True)
+    )
     return replace(cell.bare, axes=axes, payload=body, seed=1000 * cell.seed + run)
 
 
@@ -221,7 +236,8 @@ def truth_from(document: dict[str, Any]) -> Truth:
 
 
 def declared_payload(name: str) -> Payload:
-    """Return a payload as a log of the study declares it: the weighed mass of the disc alone, of the plate nothing.
+    """Return a payload as a log of the study declares it:
+    the weighed mass of the disc alone, of the plate nothing.
 
     The plate's mass is what the study looks for (paper, Tables 7 and 8).
     """
@@ -237,7 +253,9 @@ def study_masses() -> dict[str, float]:
 
 
 def link_parameters(body: Body) -> dict[str, float]:
-    """The ten inertial parameters of a body in the frame that it is fixed to, by LINK_PARAMETERS."""
+    """The ten inertial parameters of a body in the frame that it is fixed to,
+    by LINK_PARAMETERS.
+    """
     xx, xy, xz, yy, yz, zz = body.inertia_kg_m2
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     parts = pin.Inertia(body.mass_kg, np.array(body.centre_m), inertia).toDynamicParameters()
@@ -263,7 +281,9 @@ def _drawn_axis(axis: AxisSpec, rng: np.random.Generator, noise_factor: float) -
 
 
 def _drawn_body(body: Body, rng: np.random.Generator) -> Body:
-    """The same mass, mounted a little elsewhere, and of another shape as far as its inertia goes."""
+    """The same mass, mounted a little elsewhere,
+    and of another shape as far as its inertia goes.
+    """
     centre = np.array(body.centre_m) + PAYLOAD_CENTRE_M * rng.uniform(-1.0, 1.0, 3)
     scale = 1.0 + PAYLOAD_INERTIA_SPREAD * float(rng.uniform(-1.0, 1.0))
     return replace(body, centre_m=_triple(centre), inertia_kg_m2=_scaled_inertia(body, scale))

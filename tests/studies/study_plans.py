@@ -39,8 +39,11 @@ class PlanTask:
 
 def make_plan(task: PlanTask) -> str:
     """Make a plan unless the same one is there; return what was done."""
-    cell, path = load_cell(CELL), task.path
-    fingerprint = digest(digest_of_source("daq.workflow.plan", PLANNING), cell.digest, task.seed, task.duration_s)
+    cell = load_cell(CELL)
+    path = task.path
+    fingerprint = digest(
+        digest_of_source("daq.workflow.plan", PLANNING), cell.digest, task.seed, task.duration_s
+    )
     if is_finished(path, fingerprint):
         return f"plan {path.stem}: kept"
     path.parent.mkdir(parents=True, exist_ok=True)

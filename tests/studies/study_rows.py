@@ -1,7 +1,9 @@
-"""Units of work of a resumable study: each leaves a CSV file of its rows, and is not done again while it is the same.
+"""Units of work of a resumable study: each leaves a CSV file of its rows,
+and is not done again while it is the same.
 
-A row is a frozen dataclass of texts, numbers, flags and tuples of these. The files of all units together are the
-study's table; pieces of a study run apart (`Shard`), and each ends at its time (`work_off`).
+A row is a frozen dataclass of texts, numbers, flags and tuples of these. The files of all units
+together are the study's table; pieces of a study run apart (`Shard`), and each ends at its time
+(`work_off`).
 """
 
 from __future__ import annotations
@@ -58,7 +60,10 @@ def with_tuples(document: dict[str, Any]) -> dict[str, Any]:
     """Fields of a row that was read back from JSON, with tuples in the place of lists."""
     fields_of_row: dict[str, Any] = {}
     for name, value in document.items():
-        fields_of_row[name] = tuple(value) if isinstance(value, list) else value
+        if isinstance(value, list):
+            fields_of_row[name] = tuple(value)
+        else:
+            fields_of_row[name] = value
     return fields_of_row
 
 
@@ -84,7 +89,11 @@ def rows_path(out: Path, unit: Unit) -> Path:
 
 
 def rows_of_unit(
-    out: Path, unit: AnyUnit, kind: type[Row], fingerprint: str, make: Callable[[AnyUnit], Sequence[Row]]
+    out: Path,
+    unit: AnyUnit,
+    kind: type[Row],
+    fingerprint: str,
+    make: Callable[[AnyUnit], Sequence[Row]],
 ) -> tuple[Row, ...]:
     """Rows of a unit, which is done unless its file is there with this fingerprint."""
     path = rows_path(out, unit)
@@ -98,7 +107,9 @@ def rows_of_unit(
 def finished_rows(
     out: Path, units: Iterable[AnyUnit], kind: type[Row], fingerprint_of: Callable[[AnyUnit], str]
 ) -> tuple[Row, ...]:
-    """Rows of all units that are done: a file of another fingerprint is of another state of the code."""
+    """Rows of all units that are done: a file of another fingerprint is of another state of the
+    code.
+    """
     rows: list[Row] = []
     for unit in units:
         path = rows_path(out, unit)

@@ -1,4 +1,6 @@
-"""Pairs of recordings: each is in one pair, and z has the root mean square that its errors were drawn with."""
+"""Pairs of recordings: each is in one pair, and z has the root mean square that its errors were
+drawn with.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ def test_each_recording_is_in_one_pair() -> None:
 def test_z_shows_how_much_sigma_is_too_small(too_small: float) -> None:
     scores = _scores(4000, too_small, common=3.0)
     rms, error = rms_interval(pair_z(disjoint_pairs(scores)))
-    assert rms == pytest.approx(np.full(2, too_small), rel=0.05)  # what all have in common does not show
+    # What all have in common does not show
+    assert rms == pytest.approx(np.full(2, too_small), rel=0.05)
     assert error == pytest.approx(rms / np.sqrt(2 * 2000), rel=0.1)  # as of a normal distribution
     plain, _ = rms_interval(pair_z(disjoint_pairs(scores), plain=True))
     assert plain == pytest.approx(np.ones(2), rel=0.05)

@@ -1,4 +1,6 @@
-"""Tables of the session study: a way that failed counts as missed, and has no part in the errors."""
+"""Tables of the session study: a way that failed counts as missed,
+and has no part in the errors.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,9 @@ from tests.studies.stopping_study import (
 from tests.studies.study_rows import from_csv, to_csv
 
 
-def _look(seed: int, estimator: str, block: int, std: float, *, error: float = 0.0, into_s: float = 8.0) -> Look:
+def _look(
+    seed: int, estimator: str, block: int, std: float, *, error: float = 0.0, into_s: float = 8.0
+) -> Look:
     """One gain at its σ, the other at half of it."""
     return Look(
         seed=seed,
@@ -75,7 +77,9 @@ def test_the_figures_are_over_all_gains_and_cells() -> None:
     assert found.error_percent == 0.0
     # z is 1 and −2 in the first cell, 3 and −6 in the second.
     assert found.z_rms == pytest.approx(np.sqrt(50.0 / 4.0))
-    assert found.z_rms_se == pytest.approx(np.std([2.5, 22.5], ddof=1) / np.sqrt(2) / (2.0 * found.z_rms))
+    assert found.z_rms_se == pytest.approx(
+        np.std([2.5, 22.5], ddof=1) / np.sqrt(2) / (2.0 * found.z_rms)
+    )
     assert found.coverage_percent == 25.0
 
 
@@ -86,4 +90,6 @@ def test_the_looks_come_back_from_their_table_by_cell() -> None:
     assert [len(cell) for cell in by_cell(back)] == [6, 3]
     assert CellUnit("three", 7).name == "three-007"
     lines = table({"three": by_cell(back)}).splitlines()
-    assert [line for line in lines if f"| {TARGETS_PERCENT[-1]:g} | ml, each block | 2 of 2 |" in line]
+    assert [
+        line for line in lines if f"| {TARGETS_PERCENT[-1]:g} | ml, each block | 2 of 2 |" in line
+    ]

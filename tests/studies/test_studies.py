@@ -1,4 +1,6 @@
-"""The tools of the studies: what is kept comes back, shards are the whole, blind cells are what they say."""
+"""The tools of the studies: what is kept comes back, shards are the whole,
+blind cells are what they say.
+"""
 
 from __future__ import annotations
 
@@ -36,13 +38,27 @@ from tests.studies.followed_cell import follow, without_rest
 from tests.studies.kept_rows import pack, unpack
 from tests.studies.planted_mistakes import Mistake, Planted, judge_mistake, plant, tilted
 from tests.studies.raw_runs import read_runs, write_runs
-from tests.studies.regions import PARTS, independent_sums, judge_rise, region_of, split_by_region, two_sides
+from tests.studies.regions import (
+    PARTS,
+    independent_sums,
+    judge_rise,
+    region_of,
+    split_by_region,
+    two_sides,
+)
 from tests.studies.robot_tables import write_tables
 from tests.studies.side_by_side import Shard
 from tests.studies.study_cells import CORRELATION_S, WORLDS, declared_payload, spec_of, world_cell
 from tests.studies.study_plans import CELL
 from tests.studies.study_rows import finished_rows, from_csv, rows_of_unit, to_csv, work_off
-from tests.studies.warm_up_study import BARE_THEN_LOADED, BLOCK_S, CHANGE_S, GUIDED, PAUSE_S, start_times_s
+from tests.studies.warm_up_study import (
+    BARE_THEN_LOADED,
+    BLOCK_S,
+    CHANGE_S,
+    GUIDED,
+    PAUSE_S,
+    start_times_s,
+)
 
 
 @settings(max_examples=25)
@@ -54,11 +70,15 @@ def test_the_shards_of_a_study_have_every_task_once(count: int, tasks: int) -> N
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
-def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_declares(robot: StudiedRobot) -> None:
+def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_declares(
+    robot: StudiedRobot,
+) -> None:
     cell = load_cell(CHECKOUT / f"configs/cells/{robot.cell}.yaml")
     simulation = CHECKOUT / f"configs/simulation/{robot.simulation}.yaml"
     assert robot.second not in {payload.name for payload in cell.payloads}
-    first, second = (load_simulation(simulation, name).payload for name in (cell.payloads[0].name, robot.second))
+    first, second = (
+        load_simulation(simulation, name).payload for name in (cell.payloads[0].name, robot.second)
+    )
     assert first is not None
     assert second is not None
     assert first.mass_kg == cell.payloads[0].mass_kg
@@ -94,7 +114,7 @@ def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
     row = {"robot": "arm", "floor_percent": 3.0, "payload_std_percent": 0.2}
     errors = ({"J1": -0.5, "J2": 0.1}, 0.3), ({"J1": 0.2, "J2": 1.0}, -0.5)
     rows = [
-        {**row, "seed": seed, "gain_error_percent": gains, "gain_std_percent": {"J1": 0.3, "J2": 0.3},
+        {**row, "seed": seed, "gain_error_percent": gains, "gain_std_percent": {"J1": 0.3, "J2": 0.3},  # noqa: E501
          "payload_error_percent": payload}
         for seed, (gains, payload) in enumerate(errors, start=1)
     ]  # fmt: skip
@@ -113,14 +133,16 @@ def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
 
 def test_the_tables_of_robots_show_identified_gains_and_masses(tmp_path: Path) -> None:
     masses = {f"{role}_{what}": value for role, kg in (("first_payload", 10.0), ("payload", 4.0))
-              for what, value in (("kg", kg), ("error_percent", -1.0), ("std_percent", 0.5))}  # fmt: skip
+              for what, value in (("kg", kg), ("error_percent", -1.0), ("std_percent", 0.5))}  # fmt: skip  # noqa: E501
     row = {
-        "robot": "arm", "seed": 1, "floor_percent": 3.0, "gain_unit": {"J1": "Nm/A"}, "nameplate_gain": {"J1": -20.0},
-        "true_gain": {"J1": -25.0}, "gain_error_percent": {"J1": 4.0}, "gain_std_percent": {"J1": 2.6},
+        "robot": "arm", "seed": 1, "floor_percent": 3.0, "gain_unit": {"J1": "Nm/A"}, "nameplate_gain": {"J1": -20.0},  # noqa: E501
+        "true_gain": {"J1": -25.0}, "gain_error_percent": {"J1": 4.0}, "gain_std_percent": {"J1": 2.6},  # noqa: E501
     }  # fmt: skip
     rows = [row | masses, {**row, **masses, "seed": 2, "gain_error_percent": {"J1": 0.0}}]
     write_tables(tmp_path, [figures(rows)], rows)
-    last = {path.stem: path.read_text(encoding="utf-8").splitlines()[-1] for path in tmp_path.iterdir()}
+    last = {
+        path.stem: path.read_text(encoding="utf-8").splitlines()[-1] for path in tmp_path.iterdir()
+    }
     # -25 + 4 % is -26: 30 % more than the nameplate says, and 2.6 % of -25 are 2.5 % of -26.
     assert last["robots-gains"] == "arm,J1,Nm/A,-20,-26,2.50,30.00,4.00"
     assert last["robots-payloads"] == "arm,10,9.9,0.50,1.00,4,3.96,0.50,1.00"
@@ -144,16 +166,25 @@ def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
     write_runs(tmp_path / "runs.npz", [raw])
     (back,) = read_runs(tmp_path / "runs.npz")
     assert (back.name, back.payload, back.began_s) == (raw.name, raw.payload, raw.began_s)
-    for name in ("position_counts", "demand_counts", "current_raw", "limited", "move", "ampere_per_unit"):
+    for name in (
+        "position_counts",
+        "demand_counts",
+        "current_raw",
+        "limited",
+        "move",
+        "ampere_per_unit",
+    ):
         np.testing.assert_array_equal(getattr(back, name), getattr(raw, name))
 
 
 def test_a_cell_follows_a_demand_without_any_rest() -> None:
-    cell, spec = load_cell(CELL), spec_of(world_cell(7, "loop3"), None, 0)
+    cell = load_cell(CELL)
+    spec = spec_of(world_cell(7, "loop3"), None, 0)
     demand = without_rest(cell, spec.start_rad, np.random.default_rng(1), 0.5)
     raw = follow(cell, spec, demand, "bare-1", None)
     recorded = run_of(raw, cell).position_rad
-    asked = demand.position_rad[demand.first + 1 :][: len(recorded)]  # a sample is read at the end of its cycle
+    # A sample is read at the end of its cycle
+    asked = demand.position_rad[demand.first + 1 :][: len(recorded)]
     assert 490 <= len(recorded) <= 500
     assert np.max(np.abs(demand_rad(raw, cell) - asked)) < 1e-3
     assert np.max(np.abs(recorded - asked)) < 0.05
@@ -165,7 +196,9 @@ def test_cells_of_one_seed_have_one_truth_in_every_world() -> None:
     assert len({cell.urdf for cell in cells}) == 1
     assert len({tuple(axis.gain_nm_per_a for axis in cell.axes) for cell in cells}) == 1
     for cell, world in zip(cells, WORLDS.values(), strict=True):
-        assert {axis.torque_disturbance_percent for axis in cell.axes} == {world.disturbance_percent}
+        assert {axis.torque_disturbance_percent for axis in cell.axes} == {
+            world.disturbance_percent
+        }
         times_s = [axis.disturbance_correlation_s for axis in cell.axes]
         assert CORRELATION_S[0] <= min(times_s) < max(times_s) <= CORRELATION_S[1]
 
@@ -176,7 +209,9 @@ def test_friction_differs_from_run_to_run_in_one_world_alone() -> None:
     for run in range(24):
         assert spec_of(world_cell(7, "measurement"), None, run).axes == plain.axes
         own = spec_of(world_cell(7, "runs"), None, run)
-        ratios += [one.coulomb_nm / same.coulomb_nm for one, same in zip(own.axes, plain.axes, strict=True)]
+        ratios += [
+            one.coulomb_nm / same.coulomb_nm for one, same in zip(own.axes, plain.axes, strict=True)
+        ]
     assert np.std(ratios) == pytest.approx(0.02, rel=0.25)  # of 144 draws
 
 
@@ -204,7 +239,11 @@ def test_the_confusion_table_counts_every_true_and_every_false_effect_once() -> 
     counts: dict[tuple[str, str], int] = {}
     for line in lines[2:]:
         row, *texts = (text.strip() for text in line.strip("|").split("|"))
-        counts |= {(row, column): int(text) for column, text in zip(columns[1:], texts, strict=True) if text}
+        counts |= {
+            (row, column): int(text)
+            for column, text in zip(columns[1:], texts, strict=True)
+            if text
+        }
     assert counts == {
         ("spring", "spring"): 1,
         ("stribeck", "nonlinear-viscous"): 1,
@@ -230,7 +269,9 @@ class SomeRow:
     names: tuple[str, ...]
 
 
-ROW = SomeRow('a "quoted" name, with a comma', -3, 0.25, True, (1.5, float("inf")), (True, False), ())
+ROW = SomeRow(
+    'a "quoted" name, with a comma', -3, 0.25, True, (1.5, float("inf")), (True, False), ()
+)
 
 
 def test_the_rows_of_a_study_come_back_from_their_table() -> None:
@@ -253,7 +294,9 @@ def test_a_unit_is_done_again_only_where_what_it_depends_on_differs(tmp_path: Pa
     assert finished_rows(tmp_path, units, SomeRow, lambda _: "a") == ()
 
 
-def test_rows_carried_to_another_machine_are_finished_there_for_the_same_code_alone(tmp_path: Path) -> None:
+def test_rows_carried_to_another_machine_are_finished_there_for_the_same_code_alone(
+    tmp_path: Path,
+) -> None:
     made = tmp_path / "made" / "loop8" / "clean-00.json"
     made.parent.mkdir(parents=True)
     made.write_text('{"case": "clean-00"}')
@@ -284,7 +327,9 @@ def test_blocks_of_a_guided_session_begin_after_each_change_of_the_payload() -> 
 def test_no_unit_is_begun_after_its_minutes() -> None:
     lines: list[str] = []
     units = [NamedUnit(str(number)) for number in range(5)]
-    assert work_off(units, lambda unit: unit.name, 2.0, lambda: 50.0 * len(lines), lines.append) == 2
+    assert (
+        work_off(units, lambda unit: unit.name, 2.0, lambda: 50.0 * len(lines), lines.append) == 2
+    )
     assert lines == ["0", "1", "2"]
 
 
@@ -333,7 +378,9 @@ def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
 
 def test_a_side_in_one_long_stretch_is_a_run_of_its_own() -> None:
     run = _circling_run(axes=6)
-    (rest,), (unseen,) = two_sides([run], [np.arange(4000) >= 3000], model_of(load_cell(CELL)), ROWS)
+    (rest,), (unseen,) = two_sides(
+        [run], [np.arange(4000) >= 3000], model_of(load_cell(CELL)), ROWS
+    )
     # 15 s are a run, 5 s are a part of one.
     assert (len(rest.time_s), len(unseen.time_s)) == (3000, 4000)
     assert rest.time_s[-1] == run.time_s[2999]
@@ -376,13 +423,17 @@ def test_a_planted_mistake_changes_what_it_says_alone() -> None:
     cell = load_cell(CELL)
     ((moved,), same) = plant([run], cell, Planted(Mistake.ZERO, 1, 0.02), seed=1)
     assert same is cell
-    np.testing.assert_allclose(moved.position_rad - run.position_rad, np.tile([0.0, 0.02], (4000, 1)), atol=1e-15)
+    np.testing.assert_allclose(
+        moved.position_rad - run.position_rad, np.tile([0.0, 0.02], (4000, 1)), atol=1e-15
+    )
     ((late,), _) = plant([run], cell, Planted(Mistake.ENCODER, 0, 0.005), seed=1)
     np.testing.assert_allclose(late.position_rad[1:, 0], run.position_rad[:-1, 0], atol=1e-9)
     np.testing.assert_array_equal(late.position_rad[:, 1], run.position_rad[:, 1])
     np.testing.assert_array_equal(late.current_a, run.current_a)
     ((delayed,), _) = plant([run], cell, Planted(Mistake.CURRENT, 1, 0.0025), seed=1)
-    np.testing.assert_allclose(delayed.current_a[1:, 1], run.current_a[1:, 1] - 2.0 * 0.0025, atol=1e-9)
+    np.testing.assert_allclose(
+        delayed.current_a[1:, 1], run.current_a[1:, 1] - 2.0 * 0.0025, atol=1e-9
+    )
     np.testing.assert_array_equal(delayed.position_rad, run.position_rad)
     ((untouched,), tilt) = plant([run], cell, Planted(Mistake.GRAVITY, -1, radians(1.0)), seed=1)
     assert untouched is run
@@ -399,11 +450,17 @@ def test_a_tilt_keeps_the_size_of_gravity(heading: float, angle: float) -> None:
     assert turned @ gravity / (gravity @ gravity) == pytest.approx(np.cos(angle))
 
 
-def _evidence_of(effects: tuple[PlacedEffect, ...], values: list[float], std: list[float]) -> Evidence:
-    """What `judge_mistake` reads of an evidence: two fixed gains, and the coefficients of effects."""
+def _evidence_of(
+    effects: tuple[PlacedEffect, ...], values: list[float], std: list[float]
+) -> Evidence:
+    """What `judge_mistake` reads of an evidence:
+    two fixed gains, and the coefficients of effects.
+    """
     unknowns = tuple(column for placed in effects for column in placed.columns)
     covariance = np.diag([0.0, 0.0, *np.square(std)])
-    estimate = SimpleNamespace(unknowns=unknowns, parameters=np.array(values), covariance=covariance, gains=np.ones(2))
+    estimate = SimpleNamespace(
+        unknowns=unknowns, parameters=np.array(values), covariance=covariance, gains=np.ones(2)
+    )
     return cast(Evidence, SimpleNamespace(effects=effects, declared=0, estimate=estimate))
 
 

@@ -2,10 +2,10 @@
 
     python -m tests.studies.tls_study
 
-Twelve clean cells, then a cell for each undeclared effect of the effects study, which the model of the fit lacks, then
-cells with an undeclared effect on every axis. All estimators see the same rows. Run by `make tls-study`; the runs of
-the first two are those of `make coverage-study`, and all are kept in out/coverage-cases. Writes
-docs/evidence/data/tls-model-errors.csv.
+Twelve clean cells, then a cell for each undeclared effect of the effects study, which the model of
+the fit lacks, then cells with an undeclared effect on every axis. All estimators see the same rows.
+Run by `make tls-study`; the runs of the first two are those of `make coverage-study`, and all are
+kept in out/coverage-cases. Writes docs/evidence/data/tls-model-errors.csv.
 """
 
 from __future__ import annotations
@@ -37,7 +37,14 @@ from tests.studies.study_plans import CELL
 TABLE = Path("docs/evidence/data/tls-model-errors.csv")
 CLEAN_CELLS = 12
 CROWDED_CELLS = 6
-ON_EVERY_AXIS = ("nonlinear-viscous", "stribeck", "load-friction", "coupling", "position-friction", "cogging")
+ON_EVERY_AXIS = (
+    "nonlinear-viscous",
+    "stribeck",
+    "load-friction",
+    "coupling",
+    "position-friction",
+    "cogging",
+)
 """Effects of J1 to J6 in the cells that have one on every axis."""
 WORLD = "measurement"
 ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
@@ -100,18 +107,31 @@ def errors_of(task: CaseTask) -> CellErrors:
         title=title,
         relative_error_percent=estimates["ml"].relative_error(system).total,
         gain_errors_percent={
-            name: 100.0 * np.abs(estimate.gains / true_gains - 1.0) for name, estimate in estimates.items()
+            name: 100.0 * np.abs(estimate.gains / true_gains - 1.0)
+            for name, estimate in estimates.items()
         },
         tls_shift_sigmas=shift / estimates["ml"].gains_std,
         tls_shift_percent=100.0 * shift / np.abs(estimates["ml"].gains),
-        scores={name: (estimate.gains - true_gains) / estimate.gains_std for name, estimate in estimates.items()},
+        scores={
+            name: (estimate.gains - true_gains) / estimate.gains_std
+            for name, estimate in estimates.items()
+        },
         parameters_over_noise=parameters_over_noise(system),
     )
 
 
-def table(clean: Sequence[CellErrors], bent: Sequence[CellErrors], crowded: Sequence[CellErrors]) -> str:
-    """Mean and largest gain errors as a Markdown table: a row for the clean cells, for each effect, for all effects."""
-    headings = ("undeclared effect", "fit %", *(f"{name}, mean / max %" for name in ESTIMATORS), "tls − ml, max σ / %")
+def table(
+    clean: Sequence[CellErrors], bent: Sequence[CellErrors], crowded: Sequence[CellErrors]
+) -> str:
+    """Mean and largest gain errors as a Markdown table:
+    a row for the clean cells, for each effect, for all effects.
+    """
+    headings = (
+        "undeclared effect",
+        "fit %",
+        *(f"{name}, mean / max %" for name in ESTIMATORS),
+        "tls − ml, max σ / %",
+    )
     lines = ["| " + " | ".join(headings) + " |", "|---" * len(headings) + "|"]
     groups = [(f"none, {len(clean)} cells", list(clean))]
     groups += [(cell.title, [cell]) for cell in bent]
@@ -140,19 +160,27 @@ def main(arguments: list[str] | None = None) -> int:
     clean_tasks = [CaseTask(options.out, "clean", number) for number in range(CLEAN_CELLS)]
     bent_tasks = [CaseTask(options.out, "after-loop", number) for number in range(len(EFFECTS))]
     crowded_tasks = [CrowdedTask(options.out, "clean", number) for number in range(CROWDED_CELLS)]
-    found = list(side_by_side(errors_of, [*clean_tasks, *bent_tasks, *crowded_tasks], options.processes))
+    found = list(
+        side_by_side(errors_of, [*clean_tasks, *bent_tasks, *crowded_tasks], options.processes)
+    )
     clean = found[:CLEAN_CELLS]
     bent = found[CLEAN_CELLS:-CROWDED_CELLS]
     text = table(clean, bent, found[-CROWDED_CELLS:])
     print_line(text)
-    means = {name: float(np.mean([cell.gain_errors_percent[name] for cell in clean])) for name in ESTIMATORS}
+    means = {
+        name: float(np.mean([cell.gain_errors_percent[name] for cell in clean]))
+        for name in ESTIMATORS
+    }
     print_line(f"clean cells: tls / ml = {means['tls'] / means['ml']:.2f}")
     for name in ("ml", "tls"):
         scores = np.concatenate([cell.scores[name] for cell in clean])
-        print_line(f"clean cells: error / σ of {name}, root mean square {np.sqrt(np.mean(scores**2)):.2f}")
+        print_line(
+            f"clean cells: error / σ of {name}, root mean square {np.sqrt(np.mean(scores**2)):.2f}"
+        )
     ratios = np.concatenate([cell.parameters_over_noise for cell in found])
     print_line(
-        f"smallest singular values without and with the currents: ratio {ratios.min():.1f} to {ratios.max():.1f}"
+        f"smallest singular values without and with the currents: ratio {ratios.min():.1f} to "
+        f"{ratios.max():.1f}"
     )
     options.table.write_text(as_csv(text), encoding="utf-8")
     return 0

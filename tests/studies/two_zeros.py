@@ -3,8 +3,9 @@
     python -m tests.studies.two_zeros                                 two robots, seeds 1 to 4
     python -m tests.studies.two_zeros --only KR270 --seeds 1          some of them
 
-The runs are those of the geometry study (`make geometry-study`), made if they are not there. Each unit is one line:
-what was planted, what the check beside the fit has named, and how far each value is from the truth, in σ.
+The runs are those of the geometry study (`make geometry-study`), made if they are not there. Each
+unit is one line: what was planted, what the check beside the fit has named, and how far each value
+is from the truth, in σ.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ def with_zeros(run: Run, off_deg: dict[int, float]) -> Run:
 
 def planted_text(off_deg: dict[int, float]) -> str:
     """What was planted: `J2 +2, J3 -3`."""
-    return ", ".join(f"J{axis + 1} {angle_deg:+g}" for axis, angle_deg in off_deg.items()) or "nothing"
+    return (
+        ", ".join(f"J{axis + 1} {angle_deg:+g}" for axis, angle_deg in off_deg.items()) or "nothing"
+    )
 
 
 def study(task: RunsOfRobot, off_deg: dict[int, float]) -> str:
@@ -65,13 +68,21 @@ def study(task: RunsOfRobot, off_deg: dict[int, float]) -> str:
             named.append(f"J{found.axis + 1} {value_deg:+.2f} ± {std_deg:.2f}° (z {z:+.1f})")
         else:
             named.append(f"{found.effect.name} on J{found.axis + 1}, which is right")
-    verdict = "all" if right == set(off_deg) and len(named) == len(right) else "NOT ALL"
-    return f"{task.robot}-{task.seed}, {planted_text(off_deg)}: {verdict} named: {', '.join(named) or 'nothing'}"
+    if right == set(off_deg) and len(named) == len(right):
+        verdict = "all"
+    else:
+        verdict = "NOT ALL"
+    return (
+        f"{task.robot}-{task.seed}, {planted_text(off_deg)}: {verdict} named: "
+        f"{', '.join(named) or 'nothing'}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study; return 0."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", nargs="+", choices=STUDIED, default=list(ROBOTS), metavar="ROBOT")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4])
     parser.add_argument("--out", type=Path, default=OUT)

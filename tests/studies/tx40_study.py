@@ -1,9 +1,10 @@
 """Closing the loop on the real TX-40, nested: effects are chosen without the runs that score them.
 
-Run by `make tx40-study`; needs the recording in ../shared/data or $DRIVEGAIN_DATA. The run is cut into blocks of 0.5 s;
-each quarter of them, every fourth block, is left out in turn. The rest is a run of its own: it is fitted, the loop is
-closed on it with folds of its own blocks, and only then the left-out blocks are predicted. A row whose filter window
-touches a block of the other side belongs to neither.
+Run by `make tx40-study`; needs the recording in ../shared/data or $DRIVEGAIN_DATA. The run is cut
+into blocks of 0.5 s; each quarter of them, every fourth block, is left out in turn. The rest is a
+run of its own: it is fitted, the loop is closed on it with folds of its own blocks, and only then
+the left-out blocks are predicted. A row whose filter window touches a block of the other side
+belongs to neither.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ def main() -> int:
     data = data_folder() / "tx40"
     if not data.is_dir():
         print_line(
-            f"found no {data}; expected the TX-40's recording there, or DRIVEGAIN_DATA to name the folder above it"
+            f"found no {data}; expected the TX-40's recording there, or DRIVEGAIN_DATA to name the "
+            "folder above it"
         )
         return 2
     recording = tx40(data_folder())
@@ -37,7 +39,10 @@ def main() -> int:
     (run,) = recording.runs
     (fold_of,) = recording.part_of
     block = stretches(run, recording.stretch_s)
-    valid = np.ones_like(run.position_rad, dtype=np.bool_) if run.valid is None else run.valid
+    if run.valid is None:
+        valid = np.ones_like(run.position_rad, dtype=np.bool_)
+    else:
+        valid = run.valid
     model = model_of(cell)
     n = len(cell.axes)
     gains = recording.gains
@@ -57,7 +62,9 @@ def main() -> int:
         size += squares(start.holdout, start.estimate)[0]
         before += squares(start.holdout, start.estimate)[1]
         after += squares(end.holdout, end.estimate)[1]
-        names = ", ".join(f"{placed.effect.name} on {cell.axis_names[placed.axis]}" for placed in end.effects)
+        names = ", ".join(
+            f"{placed.effect.name} on {cell.axis_names[placed.axis]}" for placed in end.effects
+        )
         print_line(f"fold {fold + 1}: {names or 'nothing'}")
     print_line("\n| | " + " | ".join(cell.axis_names) + " | mean | total |\n|" + "---|" * (n + 3))
     print_line(_row("nothing added", of_squares(size, before)))

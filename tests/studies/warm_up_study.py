@@ -1,13 +1,15 @@
-"""How far friction that falls while the arm warms up bends the gains, by the order of blocks and by the model.
+"""How far friction that falls while the arm warms up bends the gains,
+by the order of blocks and by the model.
 
     python -m tests.studies.warm_up_study --seeds 1 2 3
     python -m tests.studies.warm_up_study --shard 1/2 --minutes 30      goes on where it ended
 
-Each cell is simulated twice with the same noise, moves and times: with friction that falls on all axes, and with
-friction that stays. The difference of the gains is what the warm-up does. *Bare, then loaded* is how it is done step by
-step. *Guided* is the order that cancels drift (`daq.jobs.block_order`), up to the seventh block. Both have three bare
-and three loaded blocks in the fit. Each is fitted with one friction for all blocks, and with `friction_by_payload`.
-Layout: out/warm-up-study/<cell>.csv.
+Each cell is simulated twice with the same noise, moves and times: with friction that falls on all
+axes, and with friction that stays. The difference of the gains is what the warm-up does. *Bare,
+then loaded* is how it is done step by step. *Guided* is the order that cancels drift
+(`daq.jobs.block_order`), up to the seventh block. Both have three bare and three loaded blocks in
+the fit. Each is fitted with one friction for all blocks, and with `friction_by_payload`. Layout:
+out/warm-up-study/<cell>.csv.
 """
 
 from __future__ import annotations
@@ -70,7 +72,8 @@ class Row:
     named: tuple[str, ...]  #: what the search found in the cell that warms up
     std_percent: float  #: σ of the worst gain after the search
     steady_std_percent: float  #: σ of the worst gain of the fit where friction stays
-    error_percent: float  #: largest error of a gain where the friction falls, of the fit without a search
+    #: largest error of a gain where the friction falls, of the fit without a search
+    error_percent: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,14 +104,20 @@ def start_times_s(roles: Sequence[BlockRole]) -> tuple[float, ...]:
     return tuple(times)
 
 
-def simulated(drawn: StudyCell, cell: Cell, roles: Sequence[BlockRole], minutes: float | None) -> list[Run]:
-    """The blocks of a session; friction falls with a time constant of so many minutes, or stays for None."""
+def simulated(
+    drawn: StudyCell, cell: Cell, roles: Sequence[BlockRole], minutes: float | None
+) -> list[Run]:
+    """The blocks of a session; friction falls with a time constant of so many minutes,
+    or stays for None.
+    """
     runs = []
     for number, (role, began_s) in enumerate(zip(roles, start_times_s(roles), strict=True)):
         is_loaded = role is not BlockRole.BARE
         spec = spec_of(drawn, PAYLOAD if is_loaded else None, number)
         if minutes is not None:
-            spec = replace(spec, effects=tuple(warm_up(axis, minutes) for axis in range(len(spec.axes))))
+            spec = replace(
+                spec, effects=tuple(warm_up(axis, minutes) for axis in range(len(spec.axes)))
+            )
         plan = kept_plan(_plan_task(number), cell)
         payload = declared_payload(PAYLOAD) if is_loaded else None
         raw = simulate_run(cell, spec, plan, f"block-{number + 1}", payload, began_s)
@@ -161,7 +170,9 @@ class _Gains:
 
 
 def _gains(cell: Cell, runs: Sequence[Run], roles: Sequence[BlockRole]) -> _Gains:
-    fit_runs = [run for run, role in zip(runs, roles, strict=True) if role is not BlockRole.HELD_OUT]
+    fit_runs = [
+        run for run, role in zip(runs, roles, strict=True) if role is not BlockRole.HELD_OUT
+    ]
     unseen = [run for run, role in zip(runs, roles, strict=True) if role is BlockRole.HELD_OUT]
     found = identify(model_of(cell), fit_runs, cell.conditioning)
     end = find_effects(gather(found, fit_runs, unseen), np.random.default_rng(0))[-1].after
@@ -201,16 +212,22 @@ def fingerprint_of(unit: WarmingCell) -> str:
 def summary(rows: Sequence[Row]) -> str:
     """A line for each time constant, order and friction: the means over the cells."""
     lines = [
-        "| time constant, min | order | friction | cells | bent by % | after the search: bent by % | "
-        "largest error % | σ where friction stays % |",
+        "| time constant, min | order | friction | cells | bent by % | after the search: bent by % "
+        "| largest error % | σ where friction stays % |",
         "|" + "---|" * 8,
     ]
     constants_min = sorted({row.time_constant_min for row in rows})
     for order in ORDERS:
         for friction in FRICTIONS:
             own = [row for row in rows if (row.order, row.friction) == (order, friction)]
-            by_constant = ([row for row in own if row.time_constant_min == one] for one in constants_min)
-            lines += [_line(f"{of_one[0].time_constant_min:g}", of_one) for of_one in by_constant if of_one]
+            by_constant = (
+                [row for row in own if row.time_constant_min == one] for one in constants_min
+            )
+            lines += [
+                _line(f"{of_one[0].time_constant_min:g}", of_one)
+                for of_one in by_constant
+                if of_one
+            ]
             if own:
                 lines.append(_line("all", own))
     return "\n".join(lines)
@@ -228,9 +245,13 @@ def _line(name: str, rows: Sequence[Row]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Make what is missing, and print the table of what is there."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.warm_up_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.warm_up_study", description=__doc__
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
-    parser.add_argument("--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on")
+    parser.add_argument(
+        "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
+    )
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no cell is begun")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
@@ -240,7 +261,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     def done(unit: WarmingCell) -> str:
         rows = rows_of_unit(options.out, unit, Row, fingerprint_of(unit), study)
-        return "; ".join(f"{unit.name}, {row.order}: bent by {row.bent_percent:.2f} %" for row in rows)
+        return "; ".join(
+            f"{unit.name}, {row.order}: bent by {row.bent_percent:.2f} %" for row in rows
+        )
 
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
     rows = finished_rows(options.out, units, Row, fingerprint_of)

@@ -2,8 +2,9 @@
 
     python -m tests.studies.weigh_study --cells 100 --arm tx40
 
-Each cell has noise, motions and a body of its own (tests/ident/weighed.py). Its figures are kept in out/weigh/<arm>/,
-and a cell that is there is not computed again, so that the study may be interrupted.
+Each cell has noise, motions and a body of its own (tests/ident/weighed.py). Its figures are kept in
+out/weigh/<arm>/, and a cell that is there is not computed again, so that the study may be
+interrupted.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ def cell_figures(arm: str, seed: int) -> dict[str, dict[str, list[float]]]:
 
 def errors(cell: WeighedCell, body: WeighedBody) -> dict[str, list[float]]:
     """Errors and their σ, and the mass."""
-    mass, first = cell.body[-1], cell.body[6:9]
+    mass = cell.body[-1]
+    first = cell.body[6:9]
     centre, std = body.centre_m
     return {
         "error": [body.mass_kg - mass, *(centre - first / mass).tolist()],
@@ -58,17 +60,25 @@ def table(cells: list[dict[str, Any]]) -> str:
         shown: FloatArray = np.column_stack((100.0 * error[:, :1] / mass, 1000.0 * error[:, 1:]))
         z = error / std
         for index, quantity in enumerate(QUANTITIES):
-            rms, inside = np.sqrt(np.mean(shown[:, index] ** 2)), np.mean(np.abs(z[:, index]) < 1.96)
+            rms = np.sqrt(np.mean(shown[:, index] ** 2))
+            inside = np.mean(np.abs(z[:, index]) < 1.96)
             unit = "%" if index == 0 else "mm"
             spread = np.sqrt(np.mean(z[:, index] ** 2))
-            lines.append(f"| {way} | {quantity} | {rms:.2f} {unit} | {spread:.2f} | {100.0 * inside:.0f} % |")
-        lines.append(f"| {way} | pooled | | {np.sqrt(np.mean(z**2)):.2f} | {100.0 * np.mean(np.abs(z) < 1.96):.1f} % |")
+            lines.append(
+                f"| {way} | {quantity} | {rms:.2f} {unit} | {spread:.2f} | {100.0 * inside:.0f} % |"
+            )
+        lines.append(
+            f"| {way} | pooled | | {np.sqrt(np.mean(z**2)):.2f} | "
+            f"{100.0 * np.mean(np.abs(z) < 1.96):.1f} % |"
+        )
     return "\n".join(lines)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Compute the cells that are missing and print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.weigh_study", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.weigh_study", description=__doc__
+    )
     parser.add_argument("--cells", type=int, default=100)
     parser.add_argument("--arm", choices=tuple(ARMS), default="tx40")
     parser.add_argument("--out", type=Path, default=OUT)

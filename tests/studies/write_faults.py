@@ -1,12 +1,14 @@
-"""Kills and failures at every changing system call of the verbs that write gains, and what the disk has afterwards.
+"""Kills and failures at every changing system call of the verbs that write gains,
+and what the disk has afterwards.
 
     python -m tests.studies.write_faults [--minutes 60] [--tables docs/evidence/data]      goes on where it ended
 
-One unit is one changing call of one verb: a kill (SIGKILL) before it, and EIO, ENOSPC, EROFS and EDQUOT, once and from
-that call on. After each of them: the controller's file is the old one or the new one, the audit log holds, each
-sentence that was printed is true, the exit code is right; then the same command, or `history --add` where the write was
-done, ends with 0, and so does `history --verify`. Nothing is drawn at random: every call is taken.
-"""
+One unit is one changing call of one verb: a kill (SIGKILL) before it, and EIO, ENOSPC, EROFS and
+EDQUOT, once and from that call on. After each of them: the controller's file is the old one or the
+new one, the audit log holds, each sentence that was printed is true, the exit code is right; then
+the same command, or `history --add` where the write was done, ends with 0, and so does `history
+--verify`. Nothing is drawn at random: every call is taken.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ MODULE = "tests.studies.write_faults"
 VERBS = ("apply", "rollback")
 ERRORS = (errno.EIO, errno.ENOSPC, errno.EROFS, errno.EDQUOT)
 KILL = "SIGKILL"
-MEMORY = Path("/dev/shm")  #: A disk in memory, where there is one: the flushes of a real one take most of the time
+#: A disk in memory, where there is one: the flushes of a real one take most of the time
+MEMORY = Path("/dev/shm")
 ENDS = (AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED)
 
 
@@ -90,7 +93,9 @@ class FaultCount:
 
 
 class Scene:
-    """A cell in a folder, as a verb finds it before each case; the verb is run in forks of this process."""
+    """A cell in a folder, as a verb finds it before each case;
+    the verb is run in forks of this process.
+    """
 
     def __init__(self, folder: Path, verb: str) -> None:
         self.verb = verb
@@ -126,7 +131,9 @@ class Scene:
     @property
     def command(self) -> list[str]:
         """The command line that writes."""
-        return self._apply if self.verb == "apply" else ["rollback", str(self.cell)]
+        if self.verb == "apply":
+            return self._apply
+        return ["rollback", str(self.cell)]
 
     def restore(self) -> None:
         """Put everything back, as it was before the verb."""
@@ -143,7 +150,11 @@ class Scene:
         name = path.name.removesuffix(" (deleted)")
         if path.is_dir():
             return f"folder {name}"
-        for ending, kind in ((".lock", "lock"), (".jsonl", "audit log"), (".head", "note of the audit log")):
+        for ending, kind in (
+            (".lock", "lock"),
+            (".jsonl", "audit log"),
+            (".head", "note of the audit log"),
+        ):
             if name.endswith(ending):
                 return kind
         is_copy = name.endswith(".tmp")
@@ -159,7 +170,10 @@ class Scene:
         said = self._said.read_text(encoding="utf-8", errors="replace")
         messages = messages_of(said)
         facts = self._facts(before)
-        states = [*self._bad_states(facts), wrong_code(found.code, " ".join(messages.split()), facts)]
+        states = [
+            *self._bad_states(facts),
+            wrong_code(found.code, " ".join(messages.split()), facts),
+        ]
         states += self._bad_follow_up(facts)
         return FaultRow(
             verb=unit.verb,
@@ -196,7 +210,10 @@ class Scene:
             yield "the audit log does not hold"
         earlier = 1 if self.verb == "rollback" else 0
         for action in facts.ended[earlier:]:
-            expected = Content.OLD if action == AuditAction.FAILED.value else Content.NEW
+            if action == AuditAction.FAILED.value:
+                expected = Content.OLD
+            else:
+                expected = Content.NEW
             if facts.content is not expected:
                 yield f"the audit log says {action}"
 
@@ -238,14 +255,27 @@ class Scene:
 
 
 def messages_of(said: str) -> str:
-    """What was printed without the table and the diff of the gains, whose lines claim nothing about files."""
-    kept = [line for line in said.splitlines() if not line.startswith(("+", "-", " ", "@@", "J", "axis", "*", "─"))]
+    """What was printed without the table and the diff of the gains,
+    whose lines claim nothing about files.
+    """
+    kept = [
+        line
+        for line in said.splitlines()
+        if not line.startswith(("+", "-", " ", "@@", "J", "axis", "*", "─"))
+    ]
     return "\n".join(kept)
 
 
 def faults_of(call: str) -> list[tuple[int | None, bool]]:
-    """Faults of a call: error, None for a kill, and whether it lasts. A kill at a close is one at the next call."""
-    kills: list[tuple[int | None, bool]] = [] if call == "close" else [(None, False)]
+    """Faults of a call: error, None for a kill, and whether it lasts.
+
+    A kill at a close is one at the next call.
+    """
+    kills: list[tuple[int | None, bool]]
+    if call == "close":
+        kills = []
+    else:
+        kills = [(None, False)]
     return [*kills, *[(error, is_lasting) for error in ERRORS for is_lasting in (False, True)]]
 
 
@@ -258,7 +288,10 @@ def counts(rows: Sequence[FaultRow]) -> list[FaultCount]:
     """Exact counts by verb, call and error."""
     groups: dict[tuple[str, str, str], list[FaultRow]] = {}
     for row in rows:
-        error = f"{row.error} from then on" if row.is_lasting else row.error
+        if row.is_lasting:
+            error = f"{row.error} from then on"
+        else:
+            error = row.error
         groups.setdefault((row.verb, row.call, error), []).append(row)
     found = []
     for (verb, call, error), of_group in groups.items():
@@ -280,7 +313,9 @@ def counts(rows: Sequence[FaultRow]) -> list[FaultCount]:
 def main(arguments: list[str] | None = None) -> int:
     """Take the calls that were not taken yet; 1 where a sentence was false or a state bad."""
     parser = argparse.ArgumentParser(
-        prog=f"python -m {MODULE}", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=f"python -m {MODULE}",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--verbs", nargs="+", choices=VERBS, default=list(VERBS))
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no call is begun")
@@ -300,7 +335,13 @@ def main(arguments: list[str] | None = None) -> int:
             scene = Scene(Path(folder).resolve(), verb)
 
             def done(unit: CallUnit, scene: Scene = scene) -> str:
-                found = rows_of_unit(options.out, unit, FaultRow, digest(source, unit), lambda one: rows_at(scene, one))
+                found = rows_of_unit(
+                    options.out,
+                    unit,
+                    FaultRow,
+                    digest(source, unit),
+                    lambda one: rows_at(scene, one),
+                )
                 rows.extend(found)
                 wrong = sum(bool(row.false_sentences or row.bad_states) for row in found)
                 return f"{unit.name} {unit.call} of {unit.file}: {len(found)} faults, {wrong} wrong"
@@ -309,7 +350,10 @@ def main(arguments: list[str] | None = None) -> int:
             left += work_off(list(scene.units()), done, minutes, time.monotonic, print_line)
     for row in rows:
         for text in (*row.false_sentences, *row.bad_states):
-            print_line(f"{row.verb} {row.number} {row.call} {row.file} {row.error} {row.is_lasting}: {text}")
+            print_line(
+                f"{row.verb} {row.number} {row.call} {row.file} {row.error} "
+                f"{row.is_lasting}: {text}"
+            )
     table = counts(rows)
     wrong = sum(bool(row.false_sentences or row.bad_states) for row in rows)
     print_line(f"{len(rows)} cases, {wrong} of them wrong; {left} calls were not begun")

@@ -1,6 +1,7 @@
 """Whether what a command says of a write is what is on the disk.
 
-Every sentence that claims something about files must be known here: a claim without a rule is a finding too.
+Every sentence that claims something about files must be known here: a claim without a rule is a
+finding too.
 """
 
 from __future__ import annotations
@@ -66,11 +67,15 @@ def _subject_as_before(found: re.Match[str], facts: Facts) -> bool:
 
 def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
     backup = facts.controller.parent / found["backup"]
-    return facts.content is Content.NEW and facts.after.get(backup) == facts.before[facts.controller]
+    return (
+        facts.content is Content.NEW and facts.after.get(backup) == facts.before[facts.controller]
+    )
 
 
 def _is_any(_: re.Match[str], __: Facts) -> bool:
-    """Hold for a sentence that says itself that it does not know, or that speaks of what a reader may do."""
+    """Hold for a sentence that says itself that it does not know,
+    or that speaks of what a reader may do.
+    """
     return True
 
 
@@ -85,7 +90,11 @@ RULES = (
     Rule(r"the audit log may lack the entry that it is (applied|rolled back)", _is_new),
     Rule(r"the audit log may lack the entry that it is (failed|refused)", _is_old),
     Rule(r"Written to \S+, backup (?P<backup>\S+); audit log", _written_with_backup),
-    Rule(r"Restored \S+ to \S+; the replaced content is in (?P<backup>\S+?)\.(\s|$)", _written_with_backup),
+    Rule(
+        r"Restored \S+ to \S+; the replaced content is in "
+        r"(?P<backup>\S+?)\.(\s|$)",
+        _written_with_backup,
+    ),
     Rule(r"was written before that, completely", _is_new),
     Rule(r"whether \S+ has the new content is not known", _is_any),
     Rule(r"a file system that completes what it began", _is_any),
@@ -93,7 +102,8 @@ RULES = (
     Rule(r"`drivegain rollback \S+` undoes it", _is_any),
 )
 CLAIMS = re.compile(
-    r"\b(written|unchanged|as it was|as before|restored|rolled back|kept|complete|completely|lacks|does not have|not "
+    r"\b(written|unchanged|as it was|as before|restored|rolled "
+    r"back|kept|complete|completely|lacks|does not have|not "
     r"known|was changed|undone|lost|saved|replaced)\b",
     re.IGNORECASE,
 )
@@ -101,7 +111,9 @@ CLAIMS = re.compile(
 
 
 def false_sentences(said: str, facts: Facts) -> tuple[str, ...]:
-    """Return the sentences that are not true, and those that claim something that no rule judges."""
+    """Return the sentences that are not true, and those that claim something that no rule
+    judges.
+    """
     text = " ".join(said.split())
     found = []
     for rule in RULES:
@@ -115,7 +127,10 @@ def false_sentences(said: str, facts: Facts) -> tuple[str, ...]:
 
 
 def wrong_code(code: int | None, said: str, facts: Facts) -> str:
-    """Return what is wrong with an exit code; empty where it is right. A killed process has none."""
+    """Return what is wrong with an exit code; empty where it is right.
+
+    A killed process has none.
+    """
     if code is None:
         return ""
     if code == 0 and facts.content is not Content.NEW:

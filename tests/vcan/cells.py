@@ -1,4 +1,6 @@
-"""The demo cell on vcan0, with its amplifiers in a process of their own, and what the verbs say of it."""
+"""The demo cell on vcan0, with its amplifiers in a process of their own,
+and what the verbs say of it.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,12 @@ from tests.vcan.run import INTERFACE
 CONFIGURATIONS = Path(__file__).parents[2] / "configs"
 SIMULATION = "clean"
 ATTEMPTS = 10
-"""A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the recorder, and the run is
-ended or marked invalid as at a real cell. One records again."""
+"""A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the
+recorder, and the run is ended or marked invalid as at a real cell. One records again.
+"""
 MAX_SUBSTEPS = 100
-POSITION_CUTOFF, DECIMATION_CUTOFF = 0.2, 0.1
+POSITION_CUTOFF = 0.2
+DECIMATION_CUTOFF = 0.1
 """Fraction of the sampling rate."""
 
 
@@ -32,7 +36,9 @@ ON_THE_KERNEL = f"bus:\n  interface: socketcan\n  channel: {INTERFACE}\n  bitrat
 
 
 def write_cell(folder: Path, period_us: int, pacing: str, bus: str = ON_THE_KERNEL) -> Path:
-    """A folder with the demo cell's file, its bus vcan0 or another one, and a copy of its controller's file."""
+    """A folder with the demo cell's file, its bus vcan0 or another one,
+    and a copy of its controller's file.
+    """
     shutil.copy(CONFIGURATIONS / "controllers" / "demo.yaml", folder / "controller.yaml")
     text = (CONFIGURATIONS / "cells" / "demo.yaml").read_text(encoding="utf-8")
     text = text.replace("../robots", str(CONFIGURATIONS / "robots"))
@@ -40,15 +46,21 @@ def write_cell(folder: Path, period_us: int, pacing: str, bus: str = ON_THE_KERN
     bus += f"sync:\n  period_us: {period_us}\n  pacing: {pacing}\n"
     # There is nothing above half the rate, and the filters need room below that.
     rate_hz = 1e6 / period_us
-    text = text.replace("position_cutoff_hz: 40.0", f"position_cutoff_hz: {POSITION_CUTOFF * rate_hz}")
-    text = text.replace("decimation_cutoff_hz: 20.0", f"decimation_cutoff_hz: {DECIMATION_CUTOFF * rate_hz}")
+    text = text.replace(
+        "position_cutoff_hz: 40.0", f"position_cutoff_hz: {POSITION_CUTOFF * rate_hz}"
+    )
+    text = text.replace(
+        "decimation_cutoff_hz: 20.0", f"decimation_cutoff_hz: {DECIMATION_CUTOFF * rate_hz}"
+    )
     path = folder / "cell.yaml"
     path.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL), encoding="utf-8")
     return path
 
 
 def write_simulation(folder: Path, period_us: int) -> Path:
-    """The clean cell's truth at another sync period; the mechanics are computed as finely as before, or nearly so."""
+    """The clean cell's truth at another sync period;
+    the mechanics are computed as finely as before, or nearly so.
+    """
     text = (CONFIGURATIONS / "simulation" / f"{SIMULATION}.yaml").read_text(encoding="utf-8")
     text = text.replace("tx40-plant.urdf", str(CONFIGURATIONS / "simulation" / "tx40-plant.urdf"))
     text = re.sub(r"sync_period_us: \d+", f"sync_period_us: {period_us}", text)
@@ -62,13 +74,17 @@ def write_simulation(folder: Path, period_us: int) -> Path:
 def simulated(
     simulation: Path, payload: str | None = None, buses: Mapping[str, Sequence[int]] | None = None
 ) -> Iterator[None]:
-    """`drivegain simulate` on vcan0, or on several interfaces with their nodes, until the block ends."""
+    """`drivegain simulate` on vcan0, or on several interfaces with their nodes,
+    until the block ends.
+    """
     command = [sys.executable, "-m", "daq", "simulate", str(simulation), "--interface", "socketcan"]
     for channel, nodes in (buses or {}).items():
         command += ["--bus", f"{channel}={','.join(map(str, nodes))}"]
     command += ["--channel", INTERFACE, *(() if payload is None else ("--payload", payload))]
     folder = CONFIGURATIONS.parent
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder
+    ) as process:
         try:
             if process.stdout is None or "amplifiers" not in process.stdout.readline():
                 raise RuntimeError(f"no simulated cell: {process.communicate()[1]}")

@@ -1,6 +1,8 @@
-"""Fixtures of all tests on the kernel's CAN: they are marked `vcan`, and skipped where there is no vcan0.
+"""Fixtures of all tests on the kernel's CAN:
+they are marked `vcan`, and skipped where there is no vcan0.
 
-Beside each module listens a process of its own, and every log that the module made is compared with what it heard.
+Beside each module listens a process of its own, and every log that the module made is compared with
+what it heard.
 """
 
 from __future__ import annotations
@@ -17,14 +19,18 @@ from tests.vcan.log_reader import read_recorded
 from tests.vcan.run import INTERFACE
 
 SECOND_BUS_NS = 10_000_000
-"""SYNC is sent on one bus after the other, by a process that may have to wait between; cycles last 40 ms there."""
+"""SYNC is sent on one bus after the other, by a process that may have to wait between;
+cycles last 40 ms there.
+"""
 WITHOUT_CAN = ("test_run.py", "test_judgement.py")
 _FIGURES = pytest.StashKey[list[str]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Make the marker known."""
-    config.addinivalue_line("markers", f"vcan: needs the kernel's CAN as {INTERFACE} (make test-vcan)")
+    config.addinivalue_line(
+        "markers", f"vcan: needs the kernel's CAN as {INTERFACE} (make test-vcan)"
+    )
     config.stash[_FIGURES] = []
 
 
@@ -36,10 +42,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if here in item.path.parents and item.path.name not in WITHOUT_CAN:
             item.add_marker("vcan")
             if absent:
-                item.add_marker(pytest.mark.skip(reason=f"no {INTERFACE} in this kernel; `make test-vcan` brings one"))
+                item.add_marker(
+                    pytest.mark.skip(
+                        reason=f"no {INTERFACE} in this kernel; `make test-vcan` brings one"
+                    )
+                )
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
     """Print what was measured."""
     if config.stash[_FIGURES]:
         terminalreporter.section(f"measured on {INTERFACE}")
@@ -55,33 +67,57 @@ def figure(pytestconfig: pytest.Config) -> Iterator[Callable[[str], None]]:
 
 @pytest.fixture(scope="module", autouse=True)
 def listener(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None]
+    request: pytest.FixtureRequest,
+    tmp_path_factory: pytest.TempPathFactory,
+    figure: Callable[[str], None],
 ) -> Iterator[None]:
-    """Compares every log of a module with an independent listener, bit for bit; `BUSES` of the module has the nodes."""
+    """Compares every log of a module with an independent listener, bit for bit;
+    `BUSES` of the module has the nodes.
+    """
     buses: Mapping[str, Sequence[int]] = getattr(request.module, "BUSES", {INTERFACE: range(1, 7)})
-    if request.path.name in WITHOUT_CAN or not all((Path("/sys/class/net") / name).exists() for name in buses):
+    if request.path.name in WITHOUT_CAN or not all(
+        (Path("/sys/class/net") / name).exists() for name in buses
+    ):
         yield
         return
     base = tmp_path_factory.getbasetemp()
-    before, folder = set(_logs(base)), tmp_path_factory.mktemp("heard")
+    before = set(_logs(base))
+    folder = tmp_path_factory.mktemp("heard")
     with ExitStack() as stack:
         for name in buses:
             stack.enter_context(listening(name, folder / name))
         yield
     made = [path for path in _logs(base) if path not in before]
-    problems, values, flagged = [], 0, 0
+    problems = []
+    values = 0
+    flagged = 0
     for name, nodes in buses.items():
         frames = heard(folder / name)
         for path in made:
             if (log := read_recorded(path)) is not None:
                 axes = {node - 1: node for node in nodes}
-                found = compare(log, frames, axes, same_sync_ns=SAME_SYNC_NS if len(buses) == 1 else SECOND_BUS_NS)
-                values, flagged = values + found.values, flagged + found.flagged
-                problems += [f"{path.relative_to(base)}, {name}: {line}" for line in found.violations]
+                found = compare(
+                    log,
+                    frames,
+                    axes,
+                    same_sync_ns=SAME_SYNC_NS if len(buses) == 1 else SECOND_BUS_NS,
+                )
+                values = values + found.values
+                flagged = flagged + found.flagged
+                problems += [
+                    f"{path.relative_to(base)}, {name}: {line}" for line in found.violations
+                ]
     if made:
-        figure(f"{request.path.stem}: {len(made)} logs, {values} values bit for bit as on the bus, {flagged} missing")
+        figure(
+            f"{request.path.stem}: {len(made)} logs, {values} values bit for bit as on the bus, "
+            f"{flagged} missing"
+        )
     assert not problems, "\n".join(problems[:20])
 
 
 def _logs(base: Path) -> list[Path]:
-    return sorted(path for path in base.rglob("*.mcap*") if path.is_file() and path.suffix in (".mcap", ".part"))
+    return sorted(
+        path
+        for path in base.rglob("*.mcap*")
+        if path.is_file() and path.suffix in (".mcap", ".part")
+    )

@@ -1,4 +1,5 @@
-"""First process of the guest kernel that `tests.vcan.run` boots: a root that forgets, vcan, the command, power off.
+"""First process of the guest kernel that `tests.vcan.run` boots:
+a root that forgets, vcan, the command, power off.
 
 It runs by its path, before there is any environment, so it imports the standard library alone.
 """
@@ -82,7 +83,9 @@ def _run(job: dict[str, Any]) -> int:
             check=False,
         )
     termios.tcdrain(console)
-    return done.returncode if done.returncode >= 0 else 128 - done.returncode
+    if done.returncode >= 0:
+        return done.returncode
+    return 128 - done.returncode
 
 
 def _load(module: Path) -> None:
@@ -91,7 +94,10 @@ def _load(module: Path) -> None:
 
 
 def _mount(source: str, target: str, kind: str, options: str = "") -> None:
-    _done(_LIBC.mount(source.encode(), target.encode(), kind.encode(), 0, options.encode()), f"mounting {target}")
+    _done(
+        _LIBC.mount(source.encode(), target.encode(), kind.encode(), 0, options.encode()),
+        f"mounting {target}",
+    )
 
 
 def _done(result: int, what: str) -> None:

@@ -1,8 +1,9 @@
-"""Compare a log with what a listener heard on the bus: no value that was not there, no loss that is not counted.
+"""Compare a log with what a listener heard on the bus:
+no value that was not there, no loss that is not counted.
 
-It shares no code with the product (log_reader.py), and knows of the stream only what a log promises: a sample belongs
-to one SYNC, its values are those of the TPDOs between this SYNC and the next, and `missing` marks the axes without an
-answer.
+It shares no code with the product (log_reader.py), and knows of the stream only what a log
+promises: a sample belongs to one SYNC, its values are those of the TPDOs between this SYNC and the
+next, and `missing` marks the axes without an answer.
 """
 
 from __future__ import annotations
@@ -17,22 +18,27 @@ from numpy.typing import NDArray
 from tests.vcan.listener import Frame
 from tests.vcan.log_reader import Recorded
 
-SYNC, TPDO1 = 0x080, 0x180
+SYNC = 0x080
+TPDO1 = 0x180
 FEEDBACK = Struct("<ihH")
 """Position, current and statusword of the shipped profiles' TPDO1."""
 DEMO = {axis: axis + 1 for axis in range(6)}
 """Node id by axis of the demo cell."""
-EARLIEST_S, LATEST_S = 0.1, 3.0
-"""The log's first SYNC is at most so long before or after the start of the run that the log states."""
+EARLIEST_S = 0.1
+LATEST_S = 3.0
+"""The log's first SYNC is at most so long before or after the start of the run that the log
+states.
+"""
 SAME_SYNC_NS = 1_000_000
 """The recorder converts the kernel's stamps to another clock, to some tens of microseconds."""
 EQUALLY_GOOD_NS = 50_000
 TWICE = "answers twice"
 """In the reason of a log that no fit accepts, because more answers came than SYNCs were sent.
 
-A recorder whose own SYNC does not come back to it cannot see an answer that the bus carried before that SYNC, and that
-came in after it. If all answers of some cycles were late, their values are one cycle off, and the surplus answer at the
-end shows it (`drivers.stream.answers`). A log without a verdict has not come to that end.
+A recorder whose own SYNC does not come back to it cannot see an answer that the bus carried before
+that SYNC, and that came in after it. If all answers of some cycles were late, their values are one
+cycle off, and the surplus answer at the end shows it (`drivers.stream.answers`). A log without a
+verdict has not come to that end.
 """
 
 
@@ -68,23 +74,28 @@ def compare(
         frames: what a listener heard, in the order of the bus.
         nodes: node id by axis.
         foreign_syncs: places in `frames` of SYNCs of another device, which need no sample.
-        same_sync_ns: largest difference between the times of a sample and of its SYNC; on a second bus SYNC is later.
-        in_order: the stamps of the bus are not punctual, but no SYNC is lost: samples and SYNCs are paired by their
-            order, and by their times only if they do not agree so.
+        same_sync_ns: largest difference between the times of a sample and of its SYNC; on a second
+            bus SYNC is later.
+        in_order: the stamps of the bus are not punctual, but no SYNC is lost: samples and SYNCs are
+            paired by their order, and by their times only if they do not agree so.
         clock_steps_ns: by how much the recorder's wall clock may have been off at its start.
     """
     syncs = [place for place, frame in enumerate(frames) if frame.identifier == SYNC]
     best: Comparison | None = None
     times_ns = np.array([frames[place].time_ns for place in syncs], dtype=np.int64)
     foreign = set(foreign_syncs)
-    for own in _all_alignments(log, frames, nodes, syncs, times_ns, foreign, same_sync_ns, in_order, clock_steps_ns):
+    for own in _all_alignments(
+        log, frames, nodes, syncs, times_ns, foreign, same_sync_ns, in_order, clock_steps_ns
+    ):
         found = _compare(log, frames, nodes, syncs, own, foreign, in_order)
         if best is None or found.badness < best.badness:
             best = found
         if best.badness == (0, 0):
             return best
     if best is None:
-        best = Comparison(len(log.cycle), violations=["no SYNC on the bus near the start of the run"])
+        best = Comparison(
+            len(log.cycle), violations=["no SYNC on the bus near the start of the run"]
+        )
     return best
 
 
@@ -102,7 +113,9 @@ def _all_alignments(
     for step_ns in clock_steps_ns:
         started_ns = log.started_ns - step_ns
         if in_order:
-            yield from _in_order(log, frames, nodes, syncs, _first_syncs(times_ns, started_ns), foreign)
+            yield from _in_order(
+                log, frames, nodes, syncs, _first_syncs(times_ns, started_ns), foreign
+            )
         yield from _alignments(log, times_ns, started_ns, same_sync_ns)
 
 
@@ -121,16 +134,25 @@ def _in_order(
     firsts: Sequence[int],
     foreign: set[int],
 ) -> Iterator[list[int]]:
-    """Yield by sample the SYNC behind which its values are: the next one, or one after SYNCs of another device."""
+    """Yield by sample the SYNC behind which its values are:
+    the next one, or one after SYNCs of another device.
+    """
     ends = [*syncs[1:], len(frames)]
-    windows = [_answers(frames[begin + 1 : end], set(nodes.values())) for begin, end in zip(syncs, ends, strict=True)]
+    windows = [
+        _answers(frames[begin + 1 : end], set(nodes.values()))
+        for begin, end in zip(syncs, ends, strict=True)
+    ]
     for first in firsts:
         if not _agrees(log, 0, nodes, windows[first]):
             continue
         own = [first]
         for number in range(1, len(log.cycle)):
             place = own[-1] + 1
-            while place < len(syncs) and syncs[place] in foreign and not _agrees(log, number, nodes, windows[place]):
+            while (
+                place < len(syncs)
+                and syncs[place] in foreign
+                and not _agrees(log, number, nodes, windows[place])
+            ):
                 place += 1
             if place >= len(syncs):
                 break
@@ -138,20 +160,28 @@ def _in_order(
         yield own + [-1] * (len(log.cycle) - len(own))
 
 
-def _agrees(log: Recorded, number: int, nodes: Mapping[int, int], window: Mapping[int, Sequence[bytes]]) -> bool:
+def _agrees(
+    log: Recorded, number: int, nodes: Mapping[int, int], window: Mapping[int, Sequence[bytes]]
+) -> bool:
     """Return whether the values of a sample are among the answers to a SYNC."""
     for axis, node in nodes.items():
         values = tuple(int(value) for value in log.values[number, axis])
-        if not log.missing[number] >> axis & 1 and FEEDBACK.pack(*values) not in window.get(node, ()):
+        if not log.missing[number] >> axis & 1 and FEEDBACK.pack(*values) not in window.get(
+            node, ()
+        ):
             return False
     return True
 
 
-def _alignments(log: Recorded, sync_ns: NDArray[np.int64], started_ns: int, same_sync_ns: int) -> list[list[int]]:
-    """Return by sample the SYNC of its time (-1: none), for each first SYNC that fits the time stamps best.
+def _alignments(
+    log: Recorded, sync_ns: NDArray[np.int64], started_ns: int, same_sync_ns: int
+) -> list[list[int]]:
+    """Return by sample the SYNC of its time (-1:
+    none), for each first SYNC that fits the time stamps best.
 
-    A log counts its time from its first SYNC, whose own time it does not have. No two SYNCs have equal jitter behind
-    them: the steps between the samples show which SYNC was first, unless there are very few.
+    A log counts its time from its first SYNC, whose own time it does not have. No two SYNCs have
+    equal jitter behind them: the steps between the samples show which SYNC was first, unless there
+    are very few.
     """
     since_ns = log.time_ns - log.time_ns[0]
     tried = []
@@ -160,7 +190,9 @@ def _alignments(log: Recorded, sync_ns: NDArray[np.int64], started_ns: int, same
         above = np.clip(np.searchsorted(sync_ns, wanted), 1, max(1, len(sync_ns) - 1))
         above = np.minimum(above, len(sync_ns) - 1)
         below = np.maximum(above - 1, 0)
-        nearest = np.where(abs(sync_ns[above] - wanted) < abs(sync_ns[below] - wanted), above, below)
+        nearest = np.where(
+            abs(sync_ns[above] - wanted) < abs(sync_ns[below] - wanted), above, below
+        )
         off_ns = abs(sync_ns[nearest] - wanted)
         own = np.where(off_ns <= same_sync_ns, nearest, -1)
         tried.append((float(np.percentile(off_ns, 90)), [int(place) for place in own]))
@@ -188,16 +220,29 @@ def _compare(
         following = next((other for other in own[number + 1 :] if other >= 0), place + 1)
         between = [syncs[other] for other in range(place + 1, min(following, len(syncs)))]
         gap = number + 1 < len(own) and log.cycle[number + 1] - log.cycle[number] > 1
-        if number + 1 < len(own) and not gap and (unexplained := [one for one in between if one not in foreign]):
-            say(f"{name}: {len(unexplained)} SYNCs after it without a sample, and no gap in the cycles")
+        if (
+            number + 1 < len(own)
+            and not gap
+            and (unexplained := [one for one in between if one not in foreign])
+        ):
+            say(
+                f"{name}: {len(unexplained)} SYNCs after it without a sample, and no gap in "
+                "the cycles"
+            )
         if log.valid and gap:
             say(f"{name}: a gap after it in a valid log")
-        end = syncs[following] if following < len(syncs) else len(frames)
+        if following < len(syncs):
+            end = syncs[following]
+        else:
+            end = len(frames)
         window = _answers(frames[syncs[place] + 1 : end], set(nodes.values()))
         near: dict[int, list[bytes]] = {}
         if doubtful:
             begin = syncs[max(0, place - 1)]
-            after = syncs[following + 1] if following + 1 < len(syncs) else len(frames)
+            if following + 1 < len(syncs):
+                after = syncs[following + 1]
+            else:
+                after = len(frames)
             near = _answers(frames[begin:after], set(nodes.values()))
         for axis, node in nodes.items():
             _compare_axis(log, found, number, axis, window.get(node, []), near.get(node, []))
@@ -214,7 +259,12 @@ def _answers(frames: Sequence[Frame], nodes: set[int]) -> dict[int, list[bytes]]
 
 
 def _compare_axis(
-    log: Recorded, found: Comparison, number: int, axis: int, window: Sequence[bytes], near: Sequence[bytes]
+    log: Recorded,
+    found: Comparison,
+    number: int,
+    axis: int,
+    window: Sequence[bytes],
+    near: Sequence[bytes],
 ) -> None:
     name = f"cycle {log.cycle[number]}, axis {axis + 1}"
     values = tuple(int(value) for value in log.values[number, axis])
@@ -224,7 +274,9 @@ def _compare_axis(
         if log.valid:
             found.violations.append(f"{name}: missing in a valid log")
         if number and values != tuple(int(value) for value in log.values[number - 1, axis]):
-            found.violations.append(f"{name}: {values} is marked missing and does not repeat the value before")
+            found.violations.append(
+                f"{name}: {values} is marked missing and does not repeat the value before"
+            )
         return
     if values not in answers and FEEDBACK.pack(*values) in near:
         found.neighbours += 1

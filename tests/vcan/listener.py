@@ -3,9 +3,10 @@
     python listener.py INTERFACE FILE     (writes "ready" when it listens; SIGTERM ends it)
     python listener.py HOST:PORT FILE     (the same on channel can0 of a socketcand hub, with the hub's stamps)
 
-It shares no code with the recorder, so that a mistake of the recorder's capture or stream shows as a difference between
-log and file. As a program it needs the standard library alone and starts within a tenth of a second.
-"""
+It shares no code with the recorder, so that a mistake of the recorder's capture or stream shows as
+a difference between log and file. As a program it needs the standard library alone and starts
+within a tenth of a second.
+"""  # noqa: E501
 
 from __future__ import annotations
 
@@ -25,13 +26,21 @@ from typing import NamedTuple
 SO_TIMESTAMPNS, SO_RCVBUFFORCE, SO_RXQ_OVFL = 35, 33, 40  # asm-generic/socket.h
 CAN_ERR_FLAG = 0x2000_0000  # linux/can.h
 KEPT = tuple((base, 0xC000_0780) for base in range(0, 0x780, 0x80))
-"""struct can_filter, identifier and mask: base data frames below 780h; tests flood the bus with 7F0h."""
+"""struct can_filter, identifier and mask: base data frames below 780h;
+tests flood the bus with 7F0h.
+"""
 BUFFER_BYTES = 8 << 20
 RECORD = struct.Struct("=qIB8s")
-"""Time stamp [ns since 1970], identifier, bytes of data, eight bytes; a stamp of 0: so many frames were lost."""
+"""Time stamp [ns since 1970], identifier, bytes of data, eight bytes; a stamp of 0:
+so many frames were lost.
+"""
 IDLE_S = 0.05
 HUB_CHANNEL = "can0"
-HUB_FRAME = re.compile(rb"< frame ([0-9A-F]{3}) ([0-9]+)\.([0-9]{6}) ([0-9A-F]{0,16}) >", re.IGNORECASE)
+HUB_FRAME = re.compile(
+    rb"< frame ([0-9A-F]{3}) ([0-9]+)\.([0-9]{6}) "
+    rb"([0-9A-F]{0,16}) >",
+    re.IGNORECASE,
+)
 """Base frames of the socketcand protocol, whose stamps have microseconds."""
 RECEIVE_BYTES = 1 << 20
 
@@ -48,7 +57,9 @@ class Frame(NamedTuple):
 def listening(interface: str, path: Path) -> Iterator[None]:
     """Listen in a process of its own until the block ends; the file is complete then."""
     command = [sys.executable, "-I", "-S", str(Path(__file__).resolve()), interface, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
         try:
             if process.stdout is None or process.stdout.readline() != "ready\n":
                 raise RuntimeError(f"nothing listens on {interface}")
@@ -67,7 +78,9 @@ def heard(path: Path) -> list[Frame]:
     """
     data = path.read_bytes()
     frames = []
-    for time_ns, identifier, length, payload in RECORD.iter_unpack(data[: len(data) // RECORD.size * RECORD.size]):
+    for time_ns, identifier, length, payload in RECORD.iter_unpack(
+        data[: len(data) // RECORD.size * RECORD.size]
+    ):
         if time_ns == 0:
             raise RuntimeError(f"the listener lost {identifier} frames")
         frames.append(Frame(time_ns, identifier, payload[:length]))
@@ -84,7 +97,10 @@ def main(interface: str, path: str) -> None:
     if ":" in interface:
         listen_to_hub(interface, path, ended)
         return
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as end, Path(path).open("wb") as file:
+    with (
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as end,
+        Path(path).open("wb") as file,
+    ):
         filters = b"".join(struct.pack("=II", *one) for one in KEPT)
         end.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
         end.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
@@ -113,7 +129,11 @@ def connect_to_hub(address: str) -> socket.socket:
     host, _, port = address.rpartition(":")
     end = socket.create_connection((host, int(port)), timeout=10.0)
     end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    for command, answer in (("", "< hi >"), (f"< open {HUB_CHANNEL} >", "< ok >"), ("< rawmode >", "< ok >")):
+    for command, answer in (
+        ("", "< hi >"),
+        (f"< open {HUB_CHANNEL} >", "< ok >"),
+        ("< rawmode >", "< ok >"),
+    ):
         end.sendall(command.encode("ascii"))
         found = end.recv(len(answer), socket.MSG_WAITALL).decode("ascii", "replace")
         if found != answer:
@@ -149,7 +169,11 @@ def listen_to_hub(address: str, path: str, ended: list[int]) -> None:
                 frames, rest = frames_of_hub(rest + chunk)
                 for one in frames:
                     if one.identifier < KEPT[-1][0] + 0x80:
-                        file.write(RECORD.pack(one.time_ns, one.identifier, len(one.data), one.data.ljust(8, b"\0")))
+                        file.write(
+                            RECORD.pack(
+                                one.time_ns, one.identifier, len(one.data), one.data.ljust(8, b"\0")
+                            )
+                        )
                 file.flush()
                 continue  # more may wait
             if last:

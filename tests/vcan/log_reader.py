@@ -1,7 +1,9 @@
-"""Samples of a log by the `mcap` package and the layout of its schema, without any code of the product.
+"""Samples of a log by the `mcap` package and the layout of its schema,
+without any code of the product.
 
-A message of /cell/samples is `drivegain_msgs/msg/AxisSamples` in CDR: four bytes of encapsulation, then the fields in
-order, each aligned to its own size from behind the encapsulation. The definition is in the log itself.
+A message of /cell/samples is `drivegain_msgs/msg/AxisSamples` in CDR: four bytes of encapsulation,
+then the fields in order, each aligned to its own size from behind the encapsulation. The definition
+is in the log itself.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 SAMPLES_TOPIC = "/cell/samples"
-RUN, STATISTICS = "drivegain.run", "drivegain.statistics"
+RUN = "drivegain.run"
+STATISTICS = "drivegain.statistics"
 ENCAPSULATION_BYTES = 4
 UNFINISHED = ".part"
 

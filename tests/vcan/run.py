@@ -1,9 +1,10 @@
-"""Run a command where the kernel has vcan0 and vcan1: here if this kernel can, else in a guest (User-Mode Linux).
+"""Run a command where the kernel has vcan0 and vcan1:
+here if this kernel can, else in a guest (User-Mode Linux).
 
     python -m tests.vcan.run COMMAND ...
 
-In the guest the host's whole file system is there to read; what the command writes is forgotten, except in the folder
-that DRIVEGAIN_VCAN_OUT names. Output and exit code are the command's own.
+In the guest the host's whole file system is there to read; what the command writes is forgotten,
+except in the folder that DRIVEGAIN_VCAN_OUT names. Output and exit code are the command's own.
 """
 
 from __future__ import annotations
@@ -54,12 +55,16 @@ def _make_interface(name: str) -> bool:
     """Whether this kernel, and what we may do with it, gave us an interface of that name."""
     if shutil.which("ip") is None or os.geteuid() != 0:
         return False
-    add = subprocess.run(["ip", "link", "add", name, "type", "vcan"], capture_output=True, check=False)
+    add = subprocess.run(
+        ["ip", "link", "add", name, "type", "vcan"], capture_output=True, check=False
+    )
     return add.returncode == 0 and subprocess.call(["ip", "link", "set", name, "up"]) == 0
 
 
 def _in_guest(kernel: str, command: Sequence[str]) -> int:
-    release = subprocess.run([kernel, "--version"], capture_output=True, text=True, check=True).stdout.strip()
+    release = subprocess.run(
+        [kernel, "--version"], capture_output=True, text=True, check=True
+    ).stdout.strip()
     modules = Path("/usr/lib/uml/modules") / release / "kernel"
     if not modules.is_dir():
         return _say(f"no modules of {kernel} at {modules}: {PACKAGES}")
@@ -78,7 +83,9 @@ def _in_guest(kernel: str, command: Sequence[str]) -> int:
         code = folder / "code"
         if code.exists():
             return int(code.read_text(encoding="ascii"))
-        return _say(f"the guest ended before the command did; it said:\n{_tail(folder / 'console')}")
+        return _say(
+            f"the guest ended before the command did; it said:\n{_tail(folder / 'console')}"
+        )
 
 
 def _boot(kernel: str, folder: Path) -> None:
@@ -111,10 +118,14 @@ def _boot(kernel: str, folder: Path) -> None:
             stderr=console,
             pass_fds=(console.fileno(), write_end),
             # Its memory is a file: in RAM where there is a place for that.
-            env={**os.environ, "TMPDIR": "/dev/shm" if os.access("/dev/shm", os.W_OK) else tempfile.gettempdir()},
+            env={
+                **os.environ,
+                "TMPDIR": "/dev/shm" if os.access("/dev/shm", os.W_OK) else tempfile.gettempdir(),
+            },
             start_new_session=True,
         )
-        # One processor is all that this kernel uses: changing it between system calls costs a third of its speed.
+        # One processor is all that this kernel uses: changing it between system calls costs a third
+        # of its speed.
         processors = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(process.pid, {processors[process.pid % len(processors)]})
         _go_first(process.pid)
@@ -124,7 +135,10 @@ def _boot(kernel: str, folder: Path) -> None:
             os.killpg(process.pid, signal.SIGKILL)
             raise SystemExit(128 + number)
 
-        before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+        before = {
+            number: signal.signal(number, end)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        }
         try:
             while data := os.read(read_end, 65536):
                 sys.stdout.buffer.write(data)
@@ -137,11 +151,12 @@ def _boot(kernel: str, folder: Path) -> None:
 
 
 def _go_first(pid: int) -> None:
-    """The guest's clock goes on while the host gives its time to others, and SYNC would come late: it goes first.
+    """The guest's clock goes on while the host gives its time to others, and SYNC would come late:
+    it goes first.
 
-    Where we may ask for that. As a real-time process it would stand still for 50 ms of each second that it is busy
-    (sched_rt_runtime_us), which is five cycles at 100 Hz; and a niceness counts within its own session alone, except
-    where the session has one (autogroup).
+    Where we may ask for that. As a real-time process it would stand still for 50 ms of each second
+    that it is busy (sched_rt_runtime_us), which is five cycles at 100 Hz; and a niceness counts
+    within its own session alone, except where the session has one (autogroup).
     """
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, pid, HIGHEST_PRIORITY)

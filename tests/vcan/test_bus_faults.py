@@ -1,7 +1,7 @@
 """Bus-off, error passive and an interface that goes down, on the kernel's CAN while the axes move.
 
-The amplifiers are on vcan1, the recorder on vcan0, and a wire between them that can be cut: what breaks the recorder's
-end must not break the amplifiers', which have to stop by themselves.
+The amplifiers are on vcan1, the recorder on vcan0, and a wire between them that can be cut: what
+breaks the recorder's end must not break the amplifiers', which have to stop by themselves.
 """
 
 from __future__ import annotations
@@ -32,14 +32,20 @@ from tests.vcan.cells import simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE, SECOND_INTERFACE
 
 PERIOD_US = 40_000
-"""Two capture processes, the recorder, the cell and the wire between them share the one processor of the guest."""
+"""Two capture processes, the recorder, the cell and the wire between them share the one processor
+of the guest.
+"""
 STRIKE = 20
 """SYNCs after the first set-point; the move takes some fifty."""
 PATIENCE_S = 120.0
 NODES = range(1, 7)
-SYNC, RPDO, SDO_REQUEST, SDO_ANSWER = 0x080, 0x200, 0x600, 0x580
+SYNC = 0x080
+RPDO = 0x200
+SDO_REQUEST = 0x600
+SDO_ANSWER = 0x580
 NEW_SETPOINT = 0x10
-CAN_ERR_FLAG, CAN_ERR_CRTL, CAN_ERR_BUSOFF = 0x2000_0000, 0x004, 0x040  # linux/can.h, linux/can/error.h
+# linux/can.h, linux/can/error.h
+CAN_ERR_FLAG, CAN_ERR_CRTL, CAN_ERR_BUSOFF = 0x2000_0000, 0x004, 0x040
 PASSIVE = 0x30  # CAN_ERR_CRTL_RX_PASSIVE | CAN_ERR_CRTL_TX_PASSIVE, in the second byte
 IFF_UP, SIOCGIFFLAGS, SIOCSIFFLAGS = 0x1, 0x8913, 0x8914  # linux/if.h, linux/sockios.h
 _FLAGS = struct.Struct("16sh14x")
@@ -91,7 +97,12 @@ class Wire:
                         raise
                     continue
                 identifier, _, data = _FRAME.unpack(passed)
-                if end is near and syncs < 0 and identifier & 0x780 == RPDO and data[0] & NEW_SETPOINT:
+                if (
+                    end is near
+                    and syncs < 0
+                    and identifier & 0x780 == RPDO
+                    and data[0] & NEW_SETPOINT
+                ):
                     syncs = 0
                 elif end is near and syncs >= 0 and identifier == SYNC:
                     syncs += 1
@@ -123,17 +134,35 @@ class Ended:
 
 def record(folder: Path, strike: Callable[[Wire], None]) -> Ended:
     """One recording, struck in the middle of its first move."""
-    cell, simulation = write_cell(folder, PERIOD_US, "timed"), write_simulation(folder, PERIOD_US)
-    plan, out = folder / "plan.yaml", folder / "run.mcap"
+    cell = write_cell(folder, PERIOD_US, "timed")
+    simulation = write_simulation(folder, PERIOD_US)
+    plan = folder / "plan.yaml"
+    out = folder / "run.mcap"
     plan.write_text(PLAN, encoding="utf-8")
-    command = [sys.executable, "-m", "daq", "record", str(cell), str(plan), "--out", str(out), "--enable-motion"]
+    command = [
+        sys.executable,
+        "-m",
+        "daq",
+        "record",
+        str(cell),
+        str(plan),
+        "--out",
+        str(out),
+        "--enable-motion",
+    ]
     command += ["--operator", "test", "--speed", "0.2"]
     wire = Wire(strike)
-    with simulated(simulation, buses={SECOND_INTERFACE: NODES}), raw(INTERFACE) as near, raw(SECOND_INTERFACE) as far:
+    with (
+        simulated(simulation, buses={SECOND_INTERFACE: NODES}),
+        raw(INTERFACE) as near,
+        raw(SECOND_INTERFACE) as far,
+    ):
         thread = threading.Thread(target=wire.run, args=(near, far), name="wire")
         thread.start()
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            )
         finally:
             wire.end()
             thread.join()
@@ -143,11 +172,15 @@ def record(folder: Path, strike: Callable[[Wire], None]) -> Ended:
         assert main(["salvage", f"{out}.part", "--out", str(folder / "saved.mcap")]) == ExitCode.OK
         out = folder / "saved.mcap"
     log = read_log(out)
-    return Ended(done.returncode, done.stderr, log, int((log.samples.time_ns > wire.struck_ns).sum()), states)
+    return Ended(
+        done.returncode, done.stderr, log, int((log.samples.time_ns > wire.struck_ns).sum()), states
+    )
 
 
 def at_rest(end: socket.socket) -> list[State]:
-    """States of the axes when none has power any more; SYNC lets their time pass, and no command reaches them."""
+    """States of the axes when none has power any more;
+    SYNC lets their time pass, and no command reaches them.
+    """
     deadline = time.monotonic() + PATIENCE_S / 4
     while True:
         states = states_after(end, 10)
@@ -198,7 +231,9 @@ def goes_down(wire: Wire) -> None:
 def set_link(*, up: bool) -> None:
     """As `ip link set vcan0 up` and `down`, without the time that a process takes to start."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
-        flags = _FLAGS.unpack(fcntl.ioctl(any_socket, SIOCGIFFLAGS, _FLAGS.pack(INTERFACE.encode(), 0)))[1]
+        flags = _FLAGS.unpack(
+            fcntl.ioctl(any_socket, SIOCGIFFLAGS, _FLAGS.pack(INTERFACE.encode(), 0))
+        )[1]
         wanted = flags | IFF_UP if up else flags & ~IFF_UP
         fcntl.ioctl(any_socket, SIOCSIFFLAGS, _FLAGS.pack(INTERFACE.encode(), wanted))
 
@@ -211,7 +246,9 @@ def link() -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("strike", "words"), [(bus_off, "bus-off"), (goes_down, "interface is down")], ids=["bus-off", "interface down"]
+    ("strike", "words"),
+    [(bus_off, "bus-off"), (goes_down, "interface is down")],
+    ids=["bus-off", "interface down"],
 )
 @pytest.mark.usefixtures("link")
 def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
@@ -221,17 +258,27 @@ def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
     assert ended.code == ExitCode.DEVICE_FAULT, ended.output
     assert words in ended.output
     assert "NOT CONFIRMED WITHOUT POWER" in ended.output  # they could not be reached
-    assert [event.text for event in ended.log.events if event.kind is EventKind.BUS_LOST and words in event.text]
+    assert [
+        event.text
+        for event in ended.log.events
+        if event.kind is EventKind.BUS_LOST and words in event.text
+    ]
     kinds = [event.kind for event in ended.log.events]
     assert EventKind.STOP_UNCONFIRMED in kinds
     assert EventKind.MOVE_END not in kinds
     assert ended.states == ([State.SWITCH_ON_DISABLED] * len(NODES),) * 2
-    figure(f"{words}: reported {ended.after_cycles} cycles after it happened; the axes stopped by their own 1016h")
+    figure(
+        f"{words}: reported {ended.after_cycles} cycles after it happened; the axes stopped by "
+        "their own 1016h"
+    )
 
 
-def test_error_passive_is_reported_and_the_run_goes_on(tmp_path: Path, figure: Callable[[str], None]) -> None:
+def test_error_passive_is_reported_and_the_run_goes_on(
+    tmp_path: Path, figure: Callable[[str], None]
+) -> None:
     ended = record(tmp_path, error_passive)
-    # The run goes on to its end; a frame that was lost on the way makes it unfit, and nothing else may.
+    # The run goes on to its end; a frame that was lost on the way makes it unfit, and nothing else
+    # may.
     counted = ended.log.statistics
     assert ended.code == (ExitCode.OK if counted.valid else ExitCode.DATA_UNFIT), ended.output
     assert counted.valid or reports_only_losses(counted.reason), counted.reason

@@ -58,7 +58,10 @@ def bus() -> Iterator[SocketcanBus]:
 @pytest.fixture
 def spare() -> Iterator[str]:
     """An interface that may be set down."""
-    if subprocess.call(["ip", "link", "add", SPARE, "type", "vcan"], stderr=subprocess.DEVNULL) != 0:
+    if (
+        subprocess.call(["ip", "link", "add", SPARE, "type", "vcan"], stderr=subprocess.DEVNULL)
+        != 0
+    ):
         pytest.skip("only root may add an interface")
     subprocess.check_call(["ip", "link", "set", SPARE, "up"])
     yield SPARE
@@ -73,16 +76,22 @@ def received(bus: can.BusABC) -> CapturedMessage:
 
 def is_there(process: int) -> bool:
     try:
-        return Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(") ")[2][0] != "Z"
+        return (
+            Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(") ")[2][0] != "Z"
+        )
     except (FileNotFoundError, ProcessLookupError):
         return False
 
 
-def test_stamps_are_the_kernels_own_in_whole_nanoseconds(bus: SocketcanBus, wire: socket.socket) -> None:
-    begin_wall_ns, begin_ns = time.time_ns(), time.monotonic_ns()
+def test_stamps_are_the_kernels_own_in_whole_nanoseconds(
+    bus: SocketcanBus, wire: socket.socket
+) -> None:
+    begin_wall_ns = time.time_ns()
+    begin_ns = time.monotonic_ns()
     for number in range(500):
         wire.send(FRAME.pack(0x181, 8, number.to_bytes(8, "little")))
-    sent_wall_ns, sent_ns = time.time_ns(), time.monotonic_ns()
+    sent_wall_ns = time.time_ns()
+    sent_ns = time.monotonic_ns()
     messages = [received(bus) for _ in range(500)]
     assert [int.from_bytes(message.data, "little") for message in messages] == list(range(500))
     for stamps, begin, sent in (
@@ -91,17 +100,21 @@ def test_stamps_are_the_kernels_own_in_whole_nanoseconds(bus: SocketcanBus, wire
     ):
         assert all(type(stamp) is int for stamp in stamps)
         assert stamps == sorted(stamps)
-        # When the kernel got them, not when they were read; the clocks are compared to a fraction of a millisecond.
+        # When the kernel got them, not when they were read; the clocks are compared to a fraction
+        # of a millisecond.
         assert begin - 1_000_000 <= stamps[0]
         assert stamps[-1] <= sent + 1_000_000
     assert all(message.local and message.is_rx for message in messages)
 
 
-def test_our_own_sync_comes_back_with_its_time_and_nothing_else_does(bus: SocketcanBus, wire: socket.socket) -> None:
+def test_our_own_sync_comes_back_with_its_time_and_nothing_else_does(
+    bus: SocketcanBus, wire: socket.socket
+) -> None:
     bus.send(can.Message(arbitration_id=0x201, is_extended_id=False, data=b"12"))
     bus.send(can.Message(arbitration_id=0x080, is_extended_id=False))
     wire.send(FRAME.pack(0x181, 0, bytes(8)))
-    sync, other = received(bus), received(bus)
+    sync = received(bus)
+    other = received(bus)
     assert (sync.arbitration_id, sync.is_rx) == (0x080, False)
     assert (other.arbitration_id, other.is_rx) == (0x181, True)
     assert sync.monotonic_ns <= other.monotonic_ns
@@ -132,7 +145,9 @@ def test_what_a_full_buffer_drops_is_counted_to_the_frame(wire: socket.socket) -
 
 
 def test_the_capture_ends_with_a_parent_that_is_killed(figure: Callable[[str], None]) -> None:
-    with subprocess.Popen([sys.executable, "-c", HOLDER, INTERFACE], stdout=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, INTERFACE], stdout=subprocess.PIPE, text=True
+    ) as parent:
         assert parent.stdout is not None
         capture = int(parent.stdout.readline())
         assert is_there(capture)
@@ -142,7 +157,10 @@ def test_the_capture_ends_with_a_parent_that_is_killed(figure: Callable[[str], N
         while is_there(capture) and time.monotonic() < begun + WAIT_S:
             os.sched_yield()
         assert not is_there(capture)
-        figure(f"capture process gone {1e3 * (time.monotonic() - begun):.0f} ms after its parent was killed")
+        figure(
+            f"capture process gone {1e3 * (time.monotonic() - begun):.0f} ms after its parent "
+            "was killed"
+        )
 
 
 def test_an_interface_that_goes_down_is_named(spare: str, figure: Callable[[str], None]) -> None:
@@ -186,10 +204,15 @@ def test_bus_off_is_reported(wire: socket.socket) -> None:
         link.close()
 
 
-def test_a_recording_that_follows_the_kernels_sync_loses_nothing(tmp_path: Path, figure: Callable[[str], None]) -> None:
-    cell, simulation = write_cell(tmp_path, PERIOD_US, "timed"), write_simulation(tmp_path, PERIOD_US)
+def test_a_recording_that_follows_the_kernels_sync_loses_nothing(
+    tmp_path: Path, figure: Callable[[str], None]
+) -> None:
+    cell = write_cell(tmp_path, PERIOD_US, "timed")
+    simulation = write_simulation(tmp_path, PERIOD_US)
     text = cell.read_text(encoding="utf-8")
-    cell.write_text(text.replace("pacing: timed\n", "pacing: timed\n  producer: kernel\n"), encoding="utf-8")
+    cell.write_text(
+        text.replace("pacing: timed\n", "pacing: timed\n  producer: kernel\n"), encoding="utf-8"
+    )
     plan = tmp_path / "plan.yaml"
     how = ("--duration", "10", "--exchanges", "1", "--seed", "3", "--condition", "1e9")
     say("plan", str(cell), "--out", str(plan), *how)

@@ -1,4 +1,6 @@
-"""Drives of makers' data sheets (`canopen.LocalNode`) on the kernel's CAN: found, set up, moved and restored."""
+"""Drives of makers' data sheets (`canopen.LocalNode`) on the kernel's CAN:
+found, set up, moved and restored.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from tests.vcan.devices import devices
 from tests.vcan.run import INTERFACE
 
 NODES = (1, 2)
-POSITION, STATUSWORD = 0x6064, 0x6041
+POSITION = 0x6064
+STATUSWORD = 0x6041
 
 
 @pytest.mark.parametrize(("file", "profile"), MAKES.items())
@@ -45,12 +48,21 @@ def test_a_drive_of_this_data_sheet_is_found_set_up_moved_and_restored(
                 ]
                 network.prepare()
                 assert [objects.settings(node) for node in NODES] != before
-                # Each SYNC waits for the answers to the one before: a drive in Python keeps no time.
-                samples = list(execute(network, SyncStream(network, LockstepSync(PERIOD_NS)), (MOVE,), permission()))
+                # Each SYNC waits for the answers to the one before: a drive in Python keeps no
+                # time.
+                samples = list(
+                    execute(
+                        network, SyncStream(network, LockstepSync(PERIOD_NS)), (MOVE,), permission()
+                    )
+                )
             assert not any(sample.missing for sample in samples)
             assert samples[-1].position_counts == MOVE.target_counts
-            assert [_signed(objects.read(node, POSITION, 0)) for node in NODES] == list(MOVE.target_counts)
-            assert {decode(objects.read(node, STATUSWORD, 0) or 0) for node in NODES} == {State.SWITCH_ON_DISABLED}
+            assert [_signed(objects.read(node, POSITION, 0)) for node in NODES] == list(
+                MOVE.target_counts
+            )
+            assert {decode(objects.read(node, STATUSWORD, 0) or 0) for node in NODES} == {
+                State.SWITCH_ON_DISABLED
+            }
             assert [objects.settings(node) for node in NODES] == before
         finally:
             objects.close()

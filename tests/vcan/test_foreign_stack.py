@@ -1,6 +1,8 @@
-"""Our driver against drives on a CANopen stack that is not ours (npm `canopen`), over the kernel's CAN.
+"""Our driver against drives on a CANopen stack that is not ours (npm `canopen`),
+over the kernel's CAN.
 
-Driver and simulated cell could agree on a mistake; these drives have another project's CANopen stack.
+Driver and simulated cell could agree on a mistake; these drives have another project's CANopen
+stack.
 """
 
 from __future__ import annotations
@@ -43,18 +45,29 @@ AXES = tuple(Axis(f"F{node}", node, PROFILE, Identity(0x5A, 0x40200, 77)) for no
 def drives() -> Iterator[None]:
     """A process a drive, ready to answer."""
     node = shutil.which("node")
-    environment = {**os.environ, "NODE_PATH": os.environ.get("NODE_PATH", str(FOLDER / "node_modules"))}
+    environment = {
+        **os.environ,
+        "NODE_PATH": os.environ.get("NODE_PATH", str(FOLDER / "node_modules")),
+    }
     probe = "require('canopen'); require('socketcan')"
     if (
         node is None
-        or subprocess.run([node, "-e", probe], env=environment, capture_output=True, check=False).returncode
+        or subprocess.run(
+            [node, "-e", probe], env=environment, capture_output=True, check=False
+        ).returncode
     ):
         pytest.skip(f"no node with the packages of {FOLDER}: npm ci --prefix tests/vcan/foreign")
     with ExitStack() as stack:
         for number in NODES:
             command = [node, str(FOLDER / "device.js"), INTERFACE, str(number)]
             process = stack.enter_context(
-                subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+                subprocess.Popen(
+                    command,
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                )
             )
             stack.callback(process.terminate)
             assert process.stdout is not None
@@ -72,9 +85,13 @@ def test_they_are_found_with_identity_name_and_state() -> None:
         assert node.state is State.SWITCH_ON_DISABLED
 
 
-def test_they_are_mapped_started_streamed_from_and_given_back(figure: Callable[[str], None]) -> None:
+def test_they_are_mapped_started_streamed_from_and_given_back(
+    figure: Callable[[str], None],
+) -> None:
     with CanopenNetwork(ADDRESS, AXES) as network:
-        before = [read_pdo_record(network.link.objects(node), PdoDirection.TPDO, 0) for node in NODES]
+        before = [
+            read_pdo_record(network.link.objects(node), PdoDirection.TPDO, 0) for node in NODES
+        ]
         network.prepare()
         assert network.ampere_per_unit() == (0.002, 0.002)
         begun = time.monotonic()
@@ -85,19 +102,29 @@ def test_they_are_mapped_started_streamed_from_and_given_back(figure: Callable[[
         statistics = stream.statistics
         assert {network.link.nmt[node] for node in NODES} == {5}
     positions = np.array([sample.position_counts for sample in samples])
-    assert (statistics.missing, statistics.late, statistics.duplicate, statistics.surplus, statistics.wrong_length) == (
+    assert (
+        statistics.missing,
+        statistics.late,
+        statistics.duplicate,
+        statistics.surplus,
+        statistics.wrong_length,
+    ) == (
         0,
         0,
         0,
         0,
         0,
     )
-    # The shaft turns STEP counts a SYNC: a sample that is repeated, left out or of another SYNC would show.
+    # The shaft turns STEP counts a SYNC: a sample that is repeated, left out or of another SYNC
+    # would show.
     assert (np.diff(positions, axis=0) == STEP).all()
     assert {sample.current_raw for sample in samples} == {(-11, -12)}
-    assert {decode(word) for sample in samples for word in sample.statusword} == {State.SWITCH_ON_DISABLED}
+    assert {decode(word) for sample in samples for word in sample.statusword} == {
+        State.SWITCH_ON_DISABLED
+    }
     figure(
-        f"foreign stack: {CYCLES} cycles of {len(NODES)} drives in {seconds:.2f} s, {statistics.frames} answers, 0 lost"
+        f"foreign stack: {CYCLES} cycles of {len(NODES)} drives in {seconds:.2f} s, "
+        f"{statistics.frames} answers, 0 lost"
     )
     with CanopenNetwork(ADDRESS, AXES) as network:
         for node, record in zip(NODES, before, strict=True):
@@ -114,5 +141,12 @@ def test_the_mapping_is_that_of_the_driver_while_it_is_used() -> None:
         for axis in AXES:
             record = read_pdo_record(network.link.objects(axis.node_id), PdoDirection.TPDO, 0)
             assert record is not None
-            words = tuple(entry.index << 16 | entry.subindex << 8 | entry.bits for entry in feedback_entries(axis))
-            assert (record.cob_id, record.transmission, record.entries) == (0x180 + axis.node_id, 1, words)
+            words = tuple(
+                entry.index << 16 | entry.subindex << 8 | entry.bits
+                for entry in feedback_entries(axis)
+            )
+            assert (record.cob_id, record.transmission, record.entries) == (
+                0x180 + axis.node_id,
+                1,
+                words,
+            )

@@ -1,4 +1,6 @@
-"""A scan on the kernel's CAN beside a node that answers SDO requests badly: it ends in time and reports every node."""
+"""A scan on the kernel's CAN beside a node that answers SDO requests badly:
+it ends in time and reports every node.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ SOUND_S = 1.0  #: For the sound nodes, in a guest whose host gives its time to o
 BOUND_S = WAIT_S + NODE_S + SCAN_POLICY.attempts * SCAN_POLICY.transfer_s + SOUND_S
 
 
-@pytest.mark.parametrize(("answer", "problem"), HOSTILE, ids=[answer.__name__ for answer, _ in HOSTILE])
+@pytest.mark.parametrize(
+    ("answer", "problem"), HOSTILE, ids=[answer.__name__ for answer, _ in HOSTILE]
+)
 def test_a_scan_ends_within_its_bound_and_reports_every_node(
     answer: Answer, problem: str, figure: Callable[[str], None]
 ) -> None:
@@ -30,9 +34,9 @@ def test_a_scan_ends_within_its_bound_and_reports_every_node(
         found = scan(BusAddress("socketcan", INTERFACE), wait_s=WAIT_S)
         lasted_s = time.monotonic() - begun_s
     assert [node.node_id for node in found] == [1, 2, 3]
-    assert [(node.identity is not None, node.device_name, node.problems) for node in found[::2]] == [
-        (True, "axis", ())
-    ] * 2
+    assert [
+        (node.identity is not None, node.device_name, node.problems) for node in found[::2]
+    ] == [(True, "axis", ())] * 2
     assert any(re.search(problem, text) for text in found[1].problems), found[1].problems
     assert lasted_s < BOUND_S
     figure(f"hostile SDO server, {answer.__name__}: scan in {lasted_s:.1f} s")

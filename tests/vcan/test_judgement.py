@@ -1,4 +1,6 @@
-"""The comparison of a log with a bus, on frames and logs that are made up; this part needs no CAN."""
+"""The comparison of a log with a bus, on frames and logs that are made up;
+this part needs no CAN.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1, compare
 from tests.vcan.listener import Frame
 from tests.vcan.log_reader import Recorded
 
-CYCLES, AXES, PERIOD_NS = 40, 2, 20_000_000
+CYCLES = 40
+AXES = 2
+PERIOD_NS = 20_000_000
 NODES = {0: 1, 1: 2}
 START_NS = 1_700_000_000_000_000_000
 LEAD_NS = 123_456_789  #: From the start of the run to its first SYNC
@@ -27,11 +31,18 @@ def value(cycle: int, axis: int) -> tuple[int, int, int]:
 def made() -> tuple[Recorded, list[list[Frame]]]:
     """A sound log, and the frames of each cycle on the bus."""
     random = Random(7)
-    times = [START_NS + LEAD_NS + number * PERIOD_NS + random.randrange(3_000_000) for number in range(-FIRST, CYCLES)]
+    times = [
+        START_NS + LEAD_NS + number * PERIOD_NS + random.randrange(3_000_000)
+        for number in range(-FIRST, CYCLES)
+    ]
     bus = []
     for number, time_ns in enumerate(times):
         answers = [
-            Frame(time_ns + 300_000 * (axis + 1), TPDO1 + NODES[axis], FEEDBACK.pack(*value(number - FIRST, axis)))
+            Frame(
+                time_ns + 300_000 * (axis + 1),
+                TPDO1 + NODES[axis],
+                FEEDBACK.pack(*value(number - FIRST, axis)),
+            )
             for axis in range(AXES)
         ]
         bus.append([Frame(time_ns, SYNC, b""), *answers])
@@ -39,7 +50,10 @@ def made() -> tuple[Recorded, list[list[Frame]]]:
     log = Recorded(
         np.arange(CYCLES),
         START_NS + own - own[0],
-        np.array([[value(cycle, axis) for axis in range(AXES)] for cycle in range(CYCLES)], dtype=np.int64),
+        np.array(
+            [[value(cycle, axis) for axis in range(AXES)] for cycle in range(CYCLES)],
+            dtype=np.int64,
+        ),
         np.zeros(CYCLES, dtype=np.int64),
         START_NS,
         valid=True,
@@ -81,7 +95,9 @@ def test_a_log_that_is_shifted_by_a_cycle_is_found() -> None:
 def test_a_loss_that_is_not_counted_is_found() -> None:
     log, bus = made()
     del bus[FIRST + 9][2]
-    assert violations(log, bus) == ["cycle 9, axis 2: no answer on the bus, and it is not marked missing"]
+    assert violations(log, bus) == [
+        "cycle 9, axis 2: no answer on the bus, and it is not marked missing"
+    ]
     log.values[9, 1] = log.values[8, 1]
     log.missing[9] = 0b10
     assert violations(replace(log, valid=False), bus) == []
@@ -106,7 +122,9 @@ def test_a_short_answer_is_none() -> None:
     log, bus = made()
     cut = bus[FIRST + 3][1]
     bus[FIRST + 3][1] = cut._replace(data=cut.data[:-1])
-    assert violations(log, bus) == ["cycle 3, axis 1: no answer on the bus, and it is not marked missing"]
+    assert violations(log, bus) == [
+        "cycle 3, axis 1: no answer on the bus, and it is not marked missing"
+    ]
 
 
 def without(log: Recorded, cycle: int) -> Recorded:
@@ -125,7 +143,9 @@ def renumbered(log: Recorded) -> Recorded:
     return replace(log, cycle=np.arange(len(log.cycle)))
 
 
-@pytest.mark.parametrize(("change", "expected"), [(lambda log: log, 0), (renumbered, 1)], ids=["gap", "no gap"])
+@pytest.mark.parametrize(
+    ("change", "expected"), [(lambda log: log, 0), (renumbered, 1)], ids=["gap", "no gap"]
+)
 def test_a_cycle_that_is_left_out_needs_a_gap_in_the_numbers(
     change: Callable[[Recorded], Recorded], expected: int
 ) -> None:
@@ -141,4 +161,6 @@ def test_a_sample_without_a_sync_is_found() -> None:
 
 def test_a_log_of_another_time_has_no_bus() -> None:
     log, bus = made()
-    assert violations(replace(log, started_ns=0), bus) == ["no SYNC on the bus near the start of the run"]
+    assert violations(replace(log, started_ns=0), bus) == [
+        "no SYNC on the bus near the start of the run"
+    ]

@@ -1,4 +1,6 @@
-"""The whole main job over the kernel's CAN: scan, record without and with the payload, fit, apply."""
+"""The whole main job over the kernel's CAN:
+scan, record without and with the payload, fit, apply.
+"""
 
 from __future__ import annotations
 
@@ -57,10 +59,21 @@ def _in_time(log: Path) -> bool:
 def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None]) -> Job:
     """The job up to the calibration."""
     folder = tmp_path_factory.mktemp("job")
-    cell, simulation = write_cell(folder, PERIOD_US, "timed"), write_simulation(folder, PERIOD_US)
-    plan, calibration = folder / "plan.yaml", folder / "calibration.yaml"
+    cell = write_cell(folder, PERIOD_US, "timed")
+    simulation = write_simulation(folder, PERIOD_US)
+    plan = folder / "plan.yaml"
+    calibration = folder / "calibration.yaml"
     started = time.monotonic()
-    arguments = ["--duration", str(SECONDS), "--exchanges", "5", "--seed", "3", "--condition", "1e6"]
+    arguments = [
+        "--duration",
+        str(SECONDS),
+        "--exchanges",
+        "5",
+        "--seed",
+        "3",
+        "--condition",
+        "1e6",
+    ]
     say("plan", str(cell), "--out", str(plan), *arguments)
     planned = time.monotonic()
     recorded: dict[str, dict[str, Any]] = {}
@@ -70,7 +83,10 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
         with simulated(simulation, payload):
             nodes = say("scan", str(cell))["nodes"]
             mass = str(load_cell(cell).payloads[0].mass_kg)
-            mounted = [] if payload is None else ["--payload", payload, "--mass", mass]
+            if payload is None:
+                mounted = []
+            else:
+                mounted = ["--payload", payload, "--mass", mass]
             for attempt in range(1, ATTEMPTS + 1):
                 log = folder / f"{name}-{attempt}.mcap"
                 begun = time.monotonic()
@@ -78,7 +94,9 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
                 recorded[name] = {**one, "seconds": time.monotonic() - begun, "attempt": attempt}
                 if one["valid"] and _in_time(log):
                     break
-                figure(f"{name}, attempt {attempt}: {one['reason'] or 'a step off by half a period'}")
+                figure(
+                    f"{name}, attempt {attempt}: {one['reason'] or 'a step off by half a period'}"
+                )
             assert one["valid"], f"{name}: {one['reason']}"
     fitting = time.monotonic()
     logs = [str(one["log"]) for one in recorded.values()]
@@ -92,16 +110,25 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
         )
     spec = load_simulation(simulation)
     truth = dict(
-        zip((gain["axis"] for gain in fitted["gains"]), (axis.gain_nm_per_a for axis in spec.axes), strict=True)
+        zip(
+            (gain["axis"] for gain in fitted["gains"]),
+            (axis.gain_nm_per_a for axis in spec.axes),
+            strict=True,
+        )
     )
     for gain in fitted["gains"]:
         error = 100.0 * (gain["value"] / truth[gain["axis"]] - 1.0)
-        figure(f"{gain['axis']}: gain {gain['value']:.4g}, error {error:+.2f} %, σ {gain['std_percent']:.2f} %")
+        figure(
+            f"{gain['axis']}: gain {gain['value']:.4g}, error {error:+.2f} %, σ "
+            f"{gain['std_percent']:.2f} %"
+        )
     return Job(folder, nodes, recorded, fitted, truth)
 
 
 def test_scan_sees_the_six_amplifiers(job: Job) -> None:
-    found = [(node["node_id"], node["axis"], node["verdict"], node["enabled"]) for node in job.nodes]
+    found = [
+        (node["node_id"], node["axis"], node["verdict"], node["enabled"]) for node in job.nodes
+    ]
     assert found == [(number, f"J{number}", "ok", False) for number in range(1, 7)]
 
 
@@ -120,7 +147,8 @@ def test_the_gains_are_those_of_the_simulated_cell(job: Job) -> None:
 
 
 def test_the_gains_are_written_into_the_controllers_file(job: Job) -> None:
-    calibration, cell = str(job.folder / "calibration.yaml"), str(job.folder / "cell.yaml")
+    calibration = str(job.folder / "calibration.yaml")
+    cell = str(job.folder / "cell.yaml")
     controller = job.folder / "controller.yaml"
     before = controller.read_text(encoding="utf-8")
     say("apply", calibration, "--cell", cell)

@@ -1,4 +1,6 @@
-"""A recorder, or its capture process, that is stopped while the axes move; a flooded bus with a deaf node."""
+"""A recorder, or its capture process, that is stopped while the axes move;
+a flooded bus with a deaf node.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,11 @@ PERIOD_US = 20_000
 CYCLE_S = PERIOD_US * 1e-6
 PATIENCE_S = 120.0
 SO_TIMESTAMPNS, SO_RCVBUFFORCE = 35, 33  # asm-generic/socket.h
-SYNC, EMCY, TPDO1, RPDO1, HEARTBEAT = 0x080, 0x080, 0x180, 0x200, 0x700
+SYNC = 0x080
+EMCY = 0x080
+TPDO1 = 0x180
+RPDO1 = 0x200
+HEARTBEAT = 0x700
 STRIKE = 150  #: SYNCs from power-on to a fault, in the first move
 CLOSING_S = 13.0  #: The time limit of 10 s, and the end of a program in the guest
 LOWEST_RECORDER = 112
@@ -57,10 +63,12 @@ while True:
 
 @dataclass
 class Heard:
-    """SYNC, EMCY, TPDO1, RPDO1 and heartbeats on the bus with the kernel's times, in a thread of its own.
+    """SYNC, EMCY, TPDO1, RPDO1 and heartbeats on the bus with the kernel's times,
+    in a thread of its own.
 
     Attributes:
-        frames: time [ns since 1970], identifier and low byte of a controlword of each; RPDO1 has the target before it.
+        frames: time [ns since 1970], identifier and low byte of a controlword of each; RPDO1 has
+            the target before it.
         moves: is set by the first new set-point.
     """
 
@@ -85,11 +93,17 @@ class Heard:
 
     def last_s(self, after_ns: int, before_ns: int, wanted: Callable[[int], bool]) -> float:
         """Time from one moment to the last frame before another whose identifier is wanted [s]."""
-        times = [at_ns for at_ns, number, _ in self.frames if after_ns < at_ns < before_ns and wanted(number)]
+        times = [
+            at_ns
+            for at_ns, number, _ in self.frames
+            if after_ns < at_ns < before_ns and wanted(number)
+        ]
         return (max(times, default=after_ns) - after_ns) * 1e-9
 
     def stop_s(self, after_ns: int) -> float:
-        """Time from one moment to the first command without power for the axes [s]; infinite without one."""
+        """Time from one moment to the first command without power for the axes [s];
+        infinite without one.
+        """
         times = [
             at_ns
             for at_ns, number, word in self.frames
@@ -101,10 +115,17 @@ class Heard:
 @contextmanager
 def listening() -> Iterator[Heard]:
     heard = Heard()
-    filters = ((SYNC, 0xC000_0780), (TPDO1, 0xC000_0780), (RPDO1, 0xC000_0780), (HEARTBEAT, 0xC000_0780))
+    filters = (
+        (SYNC, 0xC000_0780),
+        (TPDO1, 0xC000_0780),
+        (RPDO1, 0xC000_0780),
+        (HEARTBEAT, 0xC000_0780),
+    )
     with raw(INTERFACE) as end:
         end.setsockopt(
-            socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(struct.pack("=II", *each) for each in filters)
+            socket.SOL_CAN_RAW,
+            socket.CAN_RAW_FILTER,
+            b"".join(struct.pack("=II", *each) for each in filters),
         )
         end.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 4 << 20)
         end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -138,24 +159,40 @@ class Recording:
 
     def captures(self) -> list[int]:
         """Process ids of its capture processes."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text(encoding="ascii")
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text(
+            encoding="ascii"
+        )
         return [int(word) for word in children.split()]
 
 
 @contextmanager
 def recording(folder: Path, faults: str = "") -> Iterator[Recording]:
-    cell, simulation = write_cell(folder, PERIOD_US, "timed"), write_simulation(folder, PERIOD_US)
+    cell = write_cell(folder, PERIOD_US, "timed")
+    simulation = write_simulation(folder, PERIOD_US)
     if faults:
         text = simulation.read_text(encoding="utf-8")
         simulation.write_text(f"{text}\nfaults:\n{faults}", encoding="utf-8")
     plan = folder / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
-    command = [sys.executable, "-m", "daq", "record", str(cell), str(plan), "--out", str(folder / "run.mcap")]
+    command = [
+        sys.executable,
+        "-m",
+        "daq",
+        "record",
+        str(cell),
+        str(plan),
+        "--out",
+        str(folder / "run.mcap"),
+    ]
     command += ["--enable-motion", "--operator", "test", "--speed", "0.2"]
     with simulated(simulation), listening() as heard:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         try:
-            assert heard.moves.wait(PATIENCE_S), process.communicate()[1] if process.poll() is not None else "no motion"
+            assert heard.moves.wait(PATIENCE_S), (
+                process.communicate()[1] if process.poll() is not None else "no motion"
+            )
             time.sleep(0.5)
             yield Recording(process, heard)
         finally:
@@ -163,24 +200,33 @@ def recording(folder: Path, faults: str = "") -> Iterator[Recording]:
             process.communicate()
 
 
-def test_sync_and_heartbeat_end_when_the_recorder_hangs(tmp_path: Path, figure: Callable[[str], None]) -> None:
+def test_sync_and_heartbeat_end_when_the_recorder_hangs(
+    tmp_path: Path, figure: Callable[[str], None]
+) -> None:
     with recording(tmp_path) as run:
         stopped_ns = run.send(signal.SIGSTOP)
         time.sleep(5.0)
         resumed_ns = run.send(signal.SIGCONT)
         sync_s = run.heard.last_s(stopped_ns, resumed_ns, lambda number: number == SYNC)
-        beat_s = run.heard.last_s(stopped_ns, resumed_ns, lambda number: number >= HEARTBEAT + LOWEST_RECORDER)
+        beat_s = run.heard.last_s(
+            stopped_ns, resumed_ns, lambda number: number >= HEARTBEAT + LOWEST_RECORDER
+        )
         said, _ = run.end()
         assert run.process.returncode == ExitCode.DEVICE_FAULT, said
         with raw(INTERFACE) as end:
             assert at_rest(end) == [State.SWITCH_ON_DISABLED] * len(NODES)
-        figure(f"recorder stopped for 5 s: last SYNC after {sync_s:.3f} s, last heartbeat after {beat_s:.3f} s")
+        figure(
+            f"recorder stopped for 5 s: last SYNC after {sync_s:.3f} s, last heartbeat after "
+            f"{beat_s:.3f} s"
+        )
         assert sync_s < 0.5
         assert beat_s < 0.1
 
 
 @pytest.mark.parametrize("whole", [True, False], ids=["recorder", "capture process"])
-def test_a_short_stop_loses_nothing(tmp_path: Path, whole: bool, figure: Callable[[str], None]) -> None:
+def test_a_short_stop_loses_nothing(
+    tmp_path: Path, whole: bool, figure: Callable[[str], None]
+) -> None:
     name = "recorder" if whole else "capture process"
     for attempt in range(1, ATTEMPTS + 1):  # on a busy host the simulated amplifiers may be late
         folder = tmp_path / str(attempt)
@@ -200,14 +246,19 @@ def test_a_short_stop_loses_nothing(tmp_path: Path, whole: bool, figure: Callabl
         if found.statistics.valid:
             break
     lost = found.statistics.reason or "nothing lost"
-    figure(f"{name} stopped for 30, 100, 300 ms: {len(found.samples.cycle)} samples, {lost}, attempt {attempt}")
+    figure(
+        f"{name} stopped for 30, 100, 300 ms: {len(found.samples.cycle)} samples, {lost}, "
+        f"attempt {attempt}"
+    )
     assert found.statistics.valid
 
 
 @contextmanager
 def flooded(identifier: str = "7F0", rate_hz: int = FLOOD_HZ) -> Iterator[None]:
     """Flood the bus with frames that have this identifier."""
-    with subprocess.Popen([sys.executable, "-S", "-c", FLOOD, INTERFACE, str(rate_hz), identifier]) as flooding:
+    with subprocess.Popen(
+        [sys.executable, "-S", "-c", FLOOD, INTERFACE, str(rate_hz), identifier]
+    ) as flooding:
         try:
             yield
         finally:
@@ -216,7 +267,8 @@ def flooded(identifier: str = "7F0", rate_hz: int = FLOOD_HZ) -> Iterator[None]:
 
 @pytest.mark.parametrize(
     ("identifier", "rate_hz"),
-    # Recorder and listener count surplus PDOs one by one: more of them starve the one processor of a guest.
+    # Recorder and listener count surplus PDOs one by one: more of them starve the one processor of
+    # a guest.
     [("7F0", FLOOD_HZ), ("481", 1000)],
     ids=["unused identifier", "surplus PDOs"],
 )
@@ -233,10 +285,14 @@ def test_ctrl_c_stops_the_axes_on_a_flooded_bus(
             stop_s = run.heard.stop_s(asked_ns)
             with raw(INTERFACE) as end:
                 states = states_after(end, 1)
-        if run.process.returncode == ExitCode.INTERRUPTED:  # a busy host may starve all amplifiers before
+        # A busy host may starve all amplifiers before
+        if run.process.returncode == ExitCode.INTERRUPTED:
             break
     name = f"flood of {rate_hz} frames/s {identifier}h"
-    figure(f"{name}: stop {1e3 * stop_s:.0f} ms after Ctrl-C, ended after {closing_s:.1f} s, attempt {attempt}")
+    figure(
+        f"{name}: stop {1e3 * stop_s:.0f} ms after Ctrl-C, ended after {closing_s:.1f} s, "
+        f"attempt {attempt}"
+    )
     assert run.process.returncode == ExitCode.INTERRUPTED, said
     assert "emergency" not in said
     assert stop_s < max(2 * CYCLE_S, 0.05)
@@ -256,13 +312,17 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path: Path, figure: Callable[[str], No
         assert closing_s < CLOSING_S / 4
 
 
-def test_a_fault_stops_the_axes_on_a_flooded_bus(tmp_path: Path, figure: Callable[[str], None]) -> None:
+def test_a_fault_stops_the_axes_on_a_flooded_bus(
+    tmp_path: Path, figure: Callable[[str], None]
+) -> None:
     fault = f"  - {{fault: emergency, axis: J3, at_cycle: {STRIKE}, emcy_code: 0x2310}}\n"
     with recording(tmp_path, fault) as run, flooded():
         said, _ = run.end()
         emcy_ns = min(at_ns for at_ns, number, _ in run.heard.frames if number == EMCY + 3)
         stop_s = run.heard.stop_s(emcy_ns)
-        figure(f"flood of {FLOOD_HZ} frames/s: stop {1e3 * stop_s:.0f} ms after the EMCY of an axis")
+        figure(
+            f"flood of {FLOOD_HZ} frames/s: stop {1e3 * stop_s:.0f} ms after the EMCY of an axis"
+        )
         assert run.process.returncode == ExitCode.DEVICE_FAULT, said
         assert "emergency stop" not in said
         assert stop_s < max(2 * CYCLE_S, 0.05)
@@ -274,15 +334,22 @@ def test_a_deaf_node_on_a_flooded_bus_is_named_within_the_time_limit(
     for attempt in range(1, ATTEMPTS + 1):
         folder = tmp_path / str(attempt)
         folder.mkdir()
-        with recording(folder, f"  - {{fault: silent, axis: J3, at_cycle: {STRIKE}}}\n") as run, flooded():
+        with (
+            recording(folder, f"  - {{fault: silent, axis: J3, at_cycle: {STRIKE}}}\n") as run,
+            flooded(),
+        ):
             said, _ = run.end()
             answered_ns = max(at_ns for at_ns, number, _ in run.heard.frames if number == TPDO1 + 3)
-            stop_s, closing_s = run.heard.stop_s(answered_ns), (time.time_ns() - answered_ns) * 1e-9
+            stop_s = run.heard.stop_s(answered_ns)
+            closing_s = (time.time_ns() - answered_ns) * 1e-9
         # A flooded guest on a busy host may starve the other amplifiers, too, before J3 is deaf.
         if not re.search("no (axis answered|answer from J1)", said):
             break
     stop_ms = 1e3 * stop_s
-    figure(f"flood, J3 deaf: stop {stop_ms:.0f} ms after its last answer, end {closing_s:.1f} s, attempt {attempt}")
+    figure(
+        f"flood, J3 deaf: stop {stop_ms:.0f} ms after its last answer, end {closing_s:.1f} s, "
+        f"attempt {attempt}"
+    )
     assert run.process.returncode == ExitCode.DEVICE_FAULT, said
     assert "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop" in said
     assert stop_s < 6 * CYCLE_S + 0.05  # four cycles without an answer are tolerated

@@ -1,4 +1,6 @@
-"""A cell on two buses of the kernel: one plant behind vcan0 and vcan1, scanned, recorded, and cut in half."""
+"""A cell on two buses of the kernel: one plant behind vcan0 and vcan1, scanned, recorded,
+and cut in half.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +32,17 @@ pytestmark = pytest.mark.skipif(
 
 
 class SyncTimes:
-    """When SYNC passed an interface, by the kernel; a socket for SYNC alone costs the guest little."""
+    """When SYNC passed an interface, by the kernel;
+    a socket for SYNC alone costs the guest little.
+    """
 
     def __init__(self, interface: str) -> None:
         self._interface = interface
         self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
 
     def __enter__(self) -> Self:
-        wanted = struct.pack("=II", 0x080, 0xC000_07FF)  # struct can_filter: base data frames of that identifier
+        # struct can_filter: base data frames of that identifier
+        wanted = struct.pack("=II", 0x080, 0xC000_07FF)
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, wanted)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 8 << 20)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -72,8 +77,12 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_scan_reports_the_bus_of_each_node(cell: Path) -> None:
-    found = [(node["bus"], node["node_id"], node["verdict"]) for node in say("scan", str(cell))["nodes"]]
-    assert found == [("left", node, "ok") for node in LEFT] + [("right", node, "ok") for node in RIGHT]
+    found = [
+        (node["bus"], node["node_id"], node["verdict"]) for node in say("scan", str(cell))["nodes"]
+    ]
+    assert found == [("left", node, "ok") for node in LEFT] + [
+        ("right", node, "ok") for node in RIGHT
+    ]
 
 
 def test_a_run_is_complete_and_its_syncs_are_near_together(
@@ -96,8 +105,9 @@ def test_a_run_is_complete_and_its_syncs_are_near_together(
     middle = apart_us[len(apart_us) // 2]
     assert apart_us[0] > 0
     figure(
-        f"two buses: {done['samples']} samples, {done['lost_cycles']} cycles lost, attempt {attempt}; "
-        f"SYNCs {middle:.0f} µs apart (median; {apart_us[len(apart_us) * 99 // 100]:.0f} µs at 99 %)"
+        f"two buses: {done['samples']} samples, {done['lost_cycles']} cycles lost, attempt "
+        f"{attempt}; SYNCs {middle:.0f} µs apart (median; "
+        f"{apart_us[len(apart_us) * 99 // 100]:.0f} µs at 99 %)"
     )
 
 

@@ -1,6 +1,7 @@
 """Gates of the fit: its cell and configuration, the errors on the torques, and the hold-out.
 
-A gate is a generator of findings over a `GateContext`; `daq.writeback.gates.table` lists all of them.
+A gate is a generator of findings over a `GateContext`; `daq.writeback.gates.table` lists all of
+them.
 """
 
 from __future__ import annotations
@@ -18,9 +19,14 @@ from ident.plausible import format_at_limit
 
 NOISE = 1.01
 AXIS_NOISE = 1.02
-"""Share of the nameplate's error that a calibration may have, in total and on an axis: where the nameplate is true, the
-two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`)."""
-CORRECTED_BY = {"zero-off": "zero-offset", "gravity-tilted": "gravity-direction", "position-late": "late-position"}
+"""Share of the nameplate's error that a calibration may have, in total and on an axis:
+where the nameplate is true, the two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`).
+"""
+CORRECTED_BY = {
+    "zero-off": "zero-offset",
+    "gravity-tilted": "gravity-direction",
+    "position-late": "late-position",
+}
 """Diagnosis of the description, and the effect that corrects it in a calibration."""
 NEVER_CORRECTED = frozenset({"gravity-turned", "position-reversed", "zero-turned"})
 """Diagnoses of a description that is so far off that nothing in a calibration corrects it."""
@@ -45,12 +51,15 @@ def cell(context: GateContext) -> Iterator[GateFinding]:
             "calibration",
             f"one of another robot with the cell name {found!r}: {found_text(differences)}",
             f"{expected_text(differences)}, as in the cell file",
-            "give the cell file of the robot that was calibrated; of a cell that was changed since, record again",
+            "give the cell file of the robot that was calibrated; of a cell that was changed "
+            "since, record again",
         )
 
 
 def configuration(context: GateContext) -> Iterator[GateFinding]:
-    """Refuse after a change of URDF, drive profile or cell file since the recording, in what a recording depends on."""
+    """Refuse after a change of URDF, drive profile or cell file since the recording,
+    in what a recording depends on.
+    """
     if context.cell is None or context.request.accepts_changed_configuration:
         return
     found = context.calibration.recording_configuration_sha256
@@ -64,15 +73,17 @@ def configuration(context: GateContext) -> Iterator[GateFinding]:
             "calibration",
             f"recorded with cell configuration {found[:12] or 'unknown'}…",
             f"{expected[:12]}…, the cell's configuration now",
-            "fit the same logs with this cell file (--cell), record again, or see what changed since and accept it "
-            "with --configuration-changed",
+            "fit the same logs with this cell file (--cell), record again, or see what changed "
+            "since and accept it with --configuration-changed",
         )
 
 
 def description(context: GateContext) -> Iterator[GateFinding]:
-    """Refuse gains of a robot that its fit found described wrongly (zero, mounting, time stamps, length of a link).
+    """Refuse gains of a robot that its fit found described wrongly (zero, mounting, time stamps,
+    length of a link).
 
-    A calibration that corrects the description itself, as `drivegain residual` does, has the right gains.
+    A calibration that corrects the description itself, as `drivegain residual` does, has the right
+    gains.
     """
     calibration = context.calibration
     for diagnosis in uncorrected_description(calibration):
@@ -89,18 +100,22 @@ def encoders(context: GateContext) -> Iterator[GateFinding]:
     if not misfit.described <= limit:
         yield (
             "calibration",
-            f"encoders that miss the loops by {misfit_text(misfit.described, misfit.unit)}, which {UNEXPLAINED}",
+            f"encoders that miss the loops by {misfit_text(misfit.described, misfit.unit)}, which "
+            f"{UNEXPLAINED}",
             f"at most {misfit_text(limit, misfit.unit)} (`max_encoder_misfit_mrad`)",
             LOOK_FOR,
         )
 
 
 def uncorrected_description(calibration: Calibration) -> tuple[Diagnosis, ...]:
-    """Diagnoses of the robot's description that a fit has made and its calibration does not correct."""
+    """Diagnoses of the robot's description that a fit has made and its calibration does not
+    correct.
+    """
     held_out = {source.name for source in calibration.sources if source.role == "holdout"}
     found: list[Diagnosis] = []
     for diagnosis in calibration.diagnoses:
-        # What a held-out run alone shows has changed after the fit: its error is judged by another gate.
+        # What a held-out run alone shows has changed after the fit: its error is judged by another
+        # gate.
         is_of_holdout = bool(diagnosis.runs) and held_out.issuperset(diagnosis.runs)
         if not is_of_holdout and _is_uncorrected(diagnosis, calibration):
             found.append(diagnosis)
@@ -108,7 +123,9 @@ def uncorrected_description(calibration: Calibration) -> tuple[Diagnosis, ...]:
 
 
 def _is_uncorrected(diagnosis: Diagnosis, calibration: Calibration) -> bool:
-    """Whether a diagnosis says that the description is wrong, and nothing in the calibration corrects that."""
+    """Whether a diagnosis says that the description is wrong,
+    and nothing in the calibration corrects that.
+    """
     if diagnosis.name in NEVER_CORRECTED:
         return True
     misfit = calibration.encoder_misfit
@@ -137,7 +154,9 @@ def finite_errors(context: GateContext) -> Iterator[GateFinding]:
 
 
 def error(context: GateContext) -> Iterator[GateFinding]:
-    """Bound the relative error of the torques, on the held-out run if there is one; in total, and on each axis."""
+    """Bound the relative error of the torques, on the held-out run if there is one;
+    in total, and on each axis.
+    """
     calibration = context.calibration
     policy = context.policy
     if not _errors_are_finite(calibration):
@@ -148,7 +167,8 @@ def error(context: GateContext) -> Iterator[GateFinding]:
     if not judged.total <= policy.max_error_percent:
         yield (
             "calibration",
-            f"a relative error of {format_at_limit(judged.total, policy.max_error_percent, 1)} % of the torques",
+            f"a relative error of {format_at_limit(judged.total, policy.max_error_percent, 1)} % "
+            "of the torques",
             f"at most {policy.max_error_percent:g} %",
             "the model does not describe this robot: check drive train, roles, payload and units",
         )
@@ -160,7 +180,8 @@ def error(context: GateContext) -> Iterator[GateFinding]:
                 name,
                 f"a relative error of {percent} % of this axis's torque",
                 f"at most {policy.max_axis_error_percent:g} %",
-                "the model does not describe this axis: check its drive train, drive, current and direction",
+                "the model does not describe this axis: check its drive train, drive, current and "
+                "direction",
             )
     for count in sorted({len(one.axes) for one in (trained, held) if one is not None}):
         if count < len(names):
@@ -184,7 +205,8 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
             yield (
                 "calibration",
                 "no held-out run",
-                "a run that tests the gains, as the cell requires (`holdout: required`, or `by: job`)",
+                "a run that tests the gains, as the cell requires (`holdout: required`, or "
+                "`by: job`)",
                 "fit the logs again, with --holdout for a run that the fit does not use",
             )
         return
@@ -201,19 +223,21 @@ def holdout(context: GateContext) -> Iterator[GateFinding]:
             "calibration",
             f"{held.total:.2f} % of the torques of the held-out run",
             f"less than the {nameplate.total:.2f} % that the nameplate leaves",
-            "the nameplate is better than this calibration: was the payload as declared in every run?",
+            "the nameplate is better than this calibration: was the payload as declared in "
+            "every run?",
         )
     names = context.axis_names
     missing = (math.nan,) * (len(names) - len(nameplate.axes))
     for name, left, before in zip(names, held.axes, (*nameplate.axes, *missing), strict=False):
-        # NaN on the left is an axis at rest, which has its own gate; NaN of the nameplate alone is no figure to beat.
+        # NaN on the left is an axis at rest, which has its own gate; NaN of the nameplate alone is
+        # no figure to beat.
         if not math.isnan(left) and not left <= AXIS_NOISE * before:
             yield (
                 name,
                 f"{left:.2f} % of this axis's torque in the held-out run",
                 f"less than the {before:.2f} % that the nameplate leaves",
-                "the nameplate is better than this gain: did the drive, or the scale of its current, change between "
-                "the runs?",
+                "the nameplate is better than this gain: did the drive, or the scale of its "
+                "current, change between the runs?",
             )
 
 
@@ -224,7 +248,10 @@ def holdout_log(context: GateContext) -> Iterator[GateFinding]:
         return
     has_error = calibration.holdout_error_percent is not None
     if has_error != any(source.role == "holdout" for source in calibration.sources):
-        found = "an error on held-out data, and no log of them" if has_error else "a held-out log, and no error on it"
+        if has_error:
+            found = "an error on held-out data, and no log of them"
+        else:
+            found = "a held-out log, and no error on it"
         yield "calibration", found, "both or neither", "fit the logs again"
 
 
@@ -247,7 +274,8 @@ def effect(context: GateContext) -> Iterator[GateFinding]:
         if not one.is_confirmed:
             yield (
                 f"effect {one.name} on {one.axis}",
-                f"{one.error_after_percent:.2f} % on held-out data with it, {one.error_before_percent:.2f} % without",
+                f"{one.error_after_percent:.2f} % on held-out data with it, "
+                f"{one.error_before_percent:.2f} % without",
                 "an effect that lowers it",
                 "fit without this effect",
             )

@@ -59,7 +59,8 @@ class GateContext:
 
     request: Request  #: calibration, policy, time, and what the operator states
     edit: Edit  #: planned change of the target
-    cell: Cell | None = None  #: as it is now; None for a library without one, where nothing is compared with it
+    #: as it is now; None for a library without one, where nothing is compared with it
+    cell: Cell | None = None
 
     @property
     def calibration(self) -> Calibration:

@@ -1,4 +1,6 @@
-"""Gates of the logs behind a calibration: whole, fresh, of these drives, and with a payload weighed twice."""
+"""Gates of the logs behind a calibration:
+whole, fresh, of these drives, and with a payload weighed twice.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ _LONGEST_DAYS = 1e5  #: Some 270 years: no log is so old
 
 
 def sources(context: GateContext) -> Iterator[GateFinding]:
-    """Require logs with their digests and recording data, for every axis (not those of an earlier drivegain)."""
+    """Require logs with their digests and recording data,
+    for every axis (not those of an earlier drivegain).
+    """
     if not context.calibration.sources:
         yield "calibration", "no logs it rests on", "at least one", "fit from logs of this cell"
     for source in context.calibration.sources:
@@ -31,7 +35,10 @@ def sources(context: GateContext) -> Iterator[GateFinding]:
         unfinished = source.name.endswith(_UNFINISHED)
         if unfinished or not _SHA256.fullmatch(source.sha256):
             digest = f"no SHA-256 digest ({source.sha256[:20]!r})"
-            found = "a recording that was never finished" if unfinished else digest
+            if unfinished:
+                found = "a recording that was never finished"
+            else:
+                found = digest
             yield name, found, "a finished, valid log", "record it again and fit"
         if context.cell is None:
             continue
@@ -60,12 +67,17 @@ def _incomplete(recording: Recording, name: str, axes: int) -> Iterator[GateFind
     shares = [percent for percent in recording.saturated_percent if not 0.0 <= percent <= 100.0]
     counts = [count for count in (recording.lost_cycles, *recording.missing) if count < 0]
     if shares or counts:
-        found = f"{shares[0]:g} % of saturated samples" if shares else f"a loss of {counts[0]} samples"
+        if shares:
+            found = f"{shares[0]:g} % of saturated samples"
+        else:
+            found = f"a loss of {counts[0]} samples"
         yield name, found, "shares from 0 to 100 %, and counts of 0 or more", "fit the logs again"
 
 
 def roles(context: GateContext) -> Iterator[GateFinding]:
-    """Require two logs in the fit, one with a payload; each recording once, with the role `fit` or `holdout`."""
+    """Require two logs in the fit, one with a payload;
+    each recording once, with the role `fit` or `holdout`.
+    """
     logs = context.calibration.sources
     if context.cell is None or not logs:
         return
@@ -117,7 +129,8 @@ def losses(context: GateContext) -> Iterator[GateFinding]:
         if not source.partial and (recording.lost_cycles or any(recording.missing)):
             yield (
                 name,
-                f"{recording.lost_cycles} SYNC cycles lost, {sum(recording.missing)} answers missing",
+                f"{recording.lost_cycles} SYNC cycles lost, {sum(recording.missing)} "
+                "answers missing",
                 "a recording without losses",
                 "record it again, with less load on the bus and the computer, and fit",
             )
@@ -131,7 +144,10 @@ def age(context: GateContext) -> Iterator[GateFinding]:
     expected = f"recorded within the last {_span(longest)}"
     for _, recording, name in _recordings(context):
         if recording.recorded_s is None:
-            remedy = "record with drivegain, or allow it with `max_age_days: null` in the cell's `policy: {apply: ...}`"
+            remedy = (
+                "record with drivegain, or allow it with `max_age_days: null` in the cell's "
+                "`policy: {apply: ...}`"
+            )
             yield name, "no date: it was imported", expected, remedy
             continue
         # In numbers, not in dates: a hand-made date may be one that no calendar has.
@@ -147,7 +163,8 @@ def age(context: GateContext) -> Iterator[GateFinding]:
         else:
             found = f"recorded {_span(-days)} from now"
             remedy = (
-                "set the clocks of this computer and of the recorder; if a log was recorded under a wrong date, it "
+                "set the clocks of this computer and of the recorder; if a log was recorded under "
+                "a wrong date, it "
             )
             remedy += "keeps that date: record again and fit"
         yield name, found, expected, remedy
@@ -155,13 +172,18 @@ def age(context: GateContext) -> Iterator[GateFinding]:
 
 def _span(days: float) -> str:
     """In hours where days would be a small fraction."""
-    return f"{round(days, 1):g} days" if days >= 1.0 else f"{24.0 * days:.2g} hours"
+    if days >= 1.0:
+        return f"{round(days, 1):g} days"
+    return f"{24.0 * days:.2g} hours"
 
 
 def serials(context: GateContext) -> Iterator[GateFinding]:
     """Require the drives of the cell file, and the same drives in all logs of the fit."""
     axes = context.axis_names
-    of_cell = {} if context.cell is None else {axis.name: axis.identity for axis in context.cell.axes}
+    if context.cell is None:
+        of_cell = {}
+    else:
+        of_cell = {axis.name: axis.identity for axis in context.cell.axes}
     declared = {name: identity.serial for name, identity in of_cell.items() if identity is not None}
     recordings = list(_recordings(context))
     for _, recording, name in recordings:
@@ -170,14 +192,20 @@ def serials(context: GateContext) -> Iterator[GateFinding]:
             if wanted is not None and serial != wanted:
                 yield (
                     f"{name}, axis {axis}",
-                    "a drive that reported no serial number" if serial is None else f"serial number {serial}",
+                    "a drive that reported no serial number"
+                    if serial is None
+                    else f"serial number {serial}",
                     f"{wanted}, the drive of this axis in the cell file",
-                    "was the drive exchanged? then record again with it; else correct the cell file",
+                    "was the drive exchanged? then record again with it; else correct the "
+                    "cell file",
                 )
     for index, axis in enumerate(axes):
         logs: dict[int, str] = {}
         for source, recording, _ in recordings:
-            serial = recording.serials[index] if index < len(recording.serials) else None
+            if index < len(recording.serials):
+                serial = recording.serials[index]
+            else:
+                serial = None
             if serial is not None:
                 logs.setdefault(serial, source.name)
         if len(logs) > 1:
@@ -205,7 +233,9 @@ def saturation(context: GateContext) -> Iterator[GateFinding]:
 
 
 def mass(context: GateContext) -> Iterator[GateFinding]:
-    """Require a mass entered twice, and in the fit and the cell file as it is now, alike within the tolerance."""
+    """Require a mass entered twice, and in the fit and the cell file as it is now,
+    alike within the tolerance.
+    """
     if context.cell is None:
         return
     payloads = context.cell.payloads
@@ -222,9 +252,12 @@ def mass(context: GateContext) -> Iterator[GateFinding]:
         if fitted_kg is None or not entered:
             yield (
                 subject,
-                "no mass" if fitted_kg is None else f"{fitted_kg:g} kg, entered once (in the cell file)",
+                "no mass"
+                if fitted_kg is None
+                else f"{fitted_kg:g} kg, entered once (in the cell file)",
                 "the same mass entered a second time, from the scale",
-                f"weigh it and give --payload-mass {source.payload}=KG, or `record --mass KG` the next time",
+                f"weigh it and give --payload-mass {source.payload}=KG, or `record --mass KG` the "
+                "next time",
             )
             continue
         within_kg = tolerance_kg(payloads, source.payload)
@@ -234,25 +267,32 @@ def mass(context: GateContext) -> Iterator[GateFinding]:
                     subject,
                     f"{other_kg:g} kg entered the second time",
                     f"{fitted_kg:g} kg within {within_kg:g} kg, as fitted",
-                    "weigh it again, correct the wrong one of the two, and fit: all gains scale with this mass",
+                    "weigh it again, correct the wrong one of the two, and fit: all gains scale "
+                    "with this mass",
                 )
 
 
 def _mass_now(
     subject: str, payload: str, fitted_kg: float | None, payloads: tuple[WeighedPayload, ...]
 ) -> Iterator[GateFinding]:
-    """Compare with the cell file of now: a mass that was corrected there means that the fit used a wrong one."""
+    """Compare with the cell file of now: a mass that was corrected there means that the fit used a
+    wrong one.
+    """
     declared = [one for one in payloads if one.name == payload]
     if not declared:
         names = ", ".join(one.name for one in payloads) or "none"
         remedy = "give it back its name in the cell file, with its mass"
         yield subject, "no such payload in the cell file now", f"one of the cell's: {names}", remedy
-    elif fitted_kg is not None and not any(agree(one.mass_kg, fitted_kg, one.mass_tolerance_kg) for one in declared):
+    elif fitted_kg is not None and not any(
+        agree(one.mass_kg, fitted_kg, one.mass_tolerance_kg) for one in declared
+    ):
         yield (
             subject,
             f"fitted with {fitted_kg:g} kg",
-            f"{declared[0].mass_kg:g} kg within {declared[0].mass_tolerance_kg:g} kg, as in the cell file now",
-            "fit the logs again with --cell, or correct the cell file: all gains scale with this mass",
+            f"{declared[0].mass_kg:g} kg within {declared[0].mass_tolerance_kg:g} kg, as in the "
+            "cell file now",
+            "fit the logs again with --cell, or correct the cell file: all gains scale with "
+            "this mass",
         )
 
 

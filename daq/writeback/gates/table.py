@@ -15,7 +15,8 @@ from ident.calibration import Calibration
 _LIMITS = ApplyPolicy()
 
 
-Check = Callable[[GateContext], Iterator[GateFinding]]  #: Yields one finding for each reason to refuse
+#: Yields one finding for each reason to refuse
+Check = Callable[[GateContext], Iterator[GateFinding]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,23 +26,30 @@ class GateRow:
     gate: Gate  #: its name in messages, in the audit and in `--json`
     checks: tuple[Check, ...]  #: the condition in code; two where the gate compares two things
     remedy: str  #: what to do
-    limit: str = ""  #: default limit with its key in `policy: {apply: ...}`; empty where there is none
+    #: default limit with its key in `policy: {apply: ...}`; empty where there is none
+    limit: str = ""
 
     @property
     def text(self) -> str:
         """The condition in words: the first paragraph of each check's docstring."""
-        return " ".join((check.__doc__ or "").partition("\n\n")[0] for check in self.checks)
+        first_paragraphs = [(check.__doc__ or "").partition("\n\n")[0] for check in self.checks]
+        return " ".join(" ".join(first_paragraphs).split())
 
 
 GATES: tuple[GateRow, ...] = (
     GateRow(Gate.NOT_IDENTIFIED, (target.identified,), "fit with a loaded run and free gains"),
     GateRow(Gate.CELL, (fit.cell,), "use its own `--cell`"),
-    GateRow(Gate.CONFIGURATION, (fit.configuration,), "record again, or review and pass `--configuration-changed`"),
+    GateRow(
+        Gate.CONFIGURATION,
+        (fit.configuration,),
+        "record again, or review and pass `--configuration-changed`",
+    ),
     GateRow(
         Gate.DESCRIPTION,
         (fit.description, fit.encoders),
         "correct the cell file and fit again, or let `drivegain residual` correct it",
-        f"`max_encoder_misfit_mrad: {_LIMITS.max_encoder_misfit_mrad:g}` of encoders that nothing explains",
+        f"`max_encoder_misfit_mrad: {_LIMITS.max_encoder_misfit_mrad:g}` of encoders that "
+        "nothing explains",
     ),
     GateRow(Gate.NOT_FINITE, (fit.finite_errors, target.finite_gains), "fit again"),
     GateRow(Gate.HOLDOUT_STILL, (fit.holdout_motion,), "hold out a run in which all axes move"),
@@ -49,14 +57,15 @@ GATES: tuple[GateRow, ...] = (
         Gate.ERROR,
         (fit.error,),
         "check drive train, roles, payload, units",
-        f"`max_error_percent: {_LIMITS.max_error_percent:g}`, "
-        f"`max_axis_error_percent: {_LIMITS.max_axis_error_percent:g}`",
+        f"`max_error_percent: {_LIMITS.max_error_percent:g}`, `max_axis_error_percent: "
+        f"{_LIMITS.max_axis_error_percent:g}`",
     ),
     GateRow(
         Gate.HOLDOUT,
         (fit.holdout, fit.holdout_log),
         "was the payload as declared in every run, and each drive the same?",
-        f"{fit.NOISE:g} × theirs, {fit.AXIS_NOISE:g} × on an axis; `holdout: optional`, `required` with `by: job`",
+        f"{fit.NOISE:g} × theirs, {fit.AXIS_NOISE:g} × on an axis; `holdout: optional`, `required` "
+        "with `by: job`",
     ),
     GateRow(Gate.EFFECT, (fit.effect,), "fit without this effect"),
     GateRow(Gate.UNIT, (target.unit,), "fit again with `--cell`"),
@@ -69,7 +78,12 @@ GATES: tuple[GateRow, ...] = (
         "record again; set the clocks",
         f"`max_age_days: {_LIMITS.max_age_days:g}`, `null` for any",
     ),
-    GateRow(Gate.SERIAL, (logs.serials,), "record again with the present drive", "`identity.serial` of the axis"),
+    GateRow(
+        Gate.SERIAL,
+        (logs.serials,),
+        "record again with the present drive",
+        "`identity.serial` of the axis",
+    ),
     GateRow(
         Gate.SATURATED,
         (logs.saturation,),
@@ -77,7 +91,11 @@ GATES: tuple[GateRow, ...] = (
         f"`max_saturated_percent: {_LIMITS.max_saturated_percent:g}`",
     ),
     GateRow(Gate.MASS, (logs.mass,), "weigh it again", "`mass_tolerance_kg` of the payload"),
-    GateRow(Gate.BASE, (target.base,), "review the target and a dry run, then pass the `--base` that it prints"),
+    GateRow(
+        Gate.BASE,
+        (target.base,),
+        "review the target and a dry run, then pass the `--base` that it prints",
+    ),
     GateRow(
         Gate.SIGNATURE,
         (target.signature,),
@@ -95,7 +113,8 @@ GATES: tuple[GateRow, ...] = (
         Gate.CHANGE,
         (target.change_bound,),
         "check scale of the current (RMS or peak), mass of the payload",
-        f"`max_change_percent: {_LIMITS.max_change_percent:g}`; per axis in the gain's unit `max_change: {{J4: 2.0}}`",
+        f"`max_change_percent: {_LIMITS.max_change_percent:g}`; per axis in the gain's unit "
+        f"`max_change: {{J4: 2.0}}`",
     ),
     GateRow(
         Gate.NAMEPLATE,
@@ -121,7 +140,10 @@ def check_calibration(calibration: Calibration) -> tuple[GateFinding, ...]:
     """Check what refuses a calibration on every cell and target; none where that passes."""
     request = Request(calibration, datetime.now(UTC))
     context = GateContext(request, Edit(subject="", before=None, after=b""))
-    return tuple(finding for check in OF_CALIBRATION for finding in check(context))
+    found: list[GateFinding] = []
+    for check in OF_CALIBRATION:
+        found.extend(check(context))
+    return tuple(found)
 
 
 def check_gates(context: GateContext) -> tuple[Refusal, ...]:
@@ -131,4 +153,9 @@ def check_gates(context: GateContext) -> tuple[Refusal, ...]:
         UsageError: the value of --base is no digest.
         ConfigurationInconsistent: a signer's public key is none.
     """
-    return tuple(Refusal(row.gate, *finding) for row in GATES for check in row.checks for finding in check(context))
+    return tuple(
+        Refusal(row.gate, *finding)
+        for row in GATES
+        for check in row.checks
+        for finding in check(context)
+    )

@@ -1,4 +1,6 @@
-"""Gates of the target: each gain beside the current gain, the content to be replaced, and who approved it."""
+"""Gates of the target: each gain beside the current gain, the content to be replaced,
+and who approved it.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,10 @@ from ident.calibration import Gain
 from ident.plausible import format_at_limit
 
 _SPELLING = 1e-9  #: Two spellings of one number are one number
-_CURRENT_SCALE = "check scale and amplitude (RMS or peak) of the current in the drive profile, and the payload's mass"
+_CURRENT_SCALE = (
+    "check scale and amplitude (RMS or peak) of the current in the drive profile, and the "
+    "payload's mass"
+)
 
 
 def finite_gains(context: GateContext) -> Iterator[GateFinding]:
@@ -41,7 +46,10 @@ def uncertainty(context: GateContext) -> Iterator[GateFinding]:
         if not change.std_percent <= bound:
             remedy = "record longer or more exciting moves, or a heavier payload"
             if not context.calibration.effects:
-                remedy = f"look for what the model lacks with `drivegain residual`, as it is in σ; or {remedy}"
+                remedy = (
+                    "look for what the model lacks with `drivegain residual`, as it is in σ; "
+                    f"or {remedy}"
+                )
             found = f"σ {format_at_limit(change.std_percent, bound, 2)} %"
             yield change.axis, found, f"at most {bound:g} %", remedy
 
@@ -69,7 +77,9 @@ def change_bound(context: GateContext) -> Iterator[GateFinding]:
         bound = policy.max_change.get(change.axis)
         difference = change.new - change.compared_gain
         if bound is not None and not abs(difference) <= bound:
-            found = f"{format_at_limit(difference, bound, 4, '+g')} {change.unit} from the current gain"
+            found = (
+                f"{format_at_limit(difference, bound, 4, '+g')} {change.unit} from the current gain"
+            )
             yield change.axis, found, f"at most ±{bound:g} {change.unit}", _CURRENT_SCALE
 
 
@@ -90,12 +100,15 @@ def same_nameplate(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a comparison with another nameplate than the cell's."""
     for gain, axis in _axes_of_cell(context):
         # A nameplate that is no number has a gate of its own.
-        if math.isfinite(gain.nameplate) and not math.isclose(gain.nameplate, axis.nameplate_gain, rel_tol=_SPELLING):
+        if math.isfinite(gain.nameplate) and not math.isclose(
+            gain.nameplate, axis.nameplate_gain, rel_tol=_SPELLING
+        ):
             yield (
                 gain.axis,
                 f"compared with a nameplate of {gain.nameplate:g}",
                 f"{axis.nameplate_gain:g} {axis.gain_unit}, the cell's",
-                "fit the logs again with --cell: bounds and hold-out are compared with the nameplate",
+                "fit the logs again with --cell: bounds and hold-out are compared with the "
+                "nameplate",
             )
 
 
@@ -121,7 +134,9 @@ def _keeps_sign(change: GainChange) -> bool:
 
 
 def _others_text(change: GainChange) -> str:
-    """Return the current gain, where the controller was read, and the nameplate, each with its word."""
+    """Return the current gain, where the controller was read, and the nameplate,
+    each with its word.
+    """
     nameplate = f"nameplate {change.nameplate_gain:g}"
     if change.compared_with is GainOrigin.NAMEPLATE:
         return nameplate
@@ -129,17 +144,26 @@ def _others_text(change: GainChange) -> str:
 
 
 def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, CellAxis]]:
-    declared = {} if context.cell is None else {axis.name: axis for axis in context.cell.axes}
+    if context.cell is None:
+        declared = {}
+    else:
+        declared = {axis.name: axis for axis in context.cell.axes}
     for gain in context.calibration.gains:
         if gain.axis in declared:
             yield gain, declared[gain.axis]
 
 
 def base(context: GateContext) -> Iterator[GateFinding]:
-    """Require the content that the target had at the recording, or after the last write; or that of `--base`."""
+    """Require the content that the target had at the recording, or after the last write;
+    or that of `--base`.
+    """
     edit = context.edit
     base = context.request.base
-    reviewed, after_digest = (None, None) if base is None else parse_base(base, edit.before or b"")
+    if base is None:
+        reviewed = None
+        after_digest = None
+    else:
+        reviewed, after_digest = parse_base(base, edit.before or b"")
     if edit.keeps_all:
         return
     if reviewed is None:
@@ -156,15 +180,17 @@ def base(context: GateContext) -> Iterator[GateFinding]:
             edit.subject,
             f"a change to {short_digest(edit.after)}…",
             f"to {after_digest}…, as --base says",
-            "the calibration, the keys or the factors have changed since the dry run: take a new one",
+            "the calibration, the keys or the factors have changed since the dry run: take "
+            "a new one",
         )
 
 
 def signature(context: GateContext) -> Iterator[GateFinding]:
     """Require signatures of others than the operator; `--by` must be a signer or the login.
 
-    Names are compared without case and blanks, and however they are encoded (NFKC). The operator's name must be a
-    signer's, or the login: a look-alike of their own name would make two persons of one.
+    Names are compared without case and blanks, and however they are encoded (NFKC). The operator's
+    name must be a signer's, or the login: a look-alike of their own name would make two persons of
+    one.
 
     Raises:
         ConfigurationInconsistent: a public key of the policy is none.
@@ -173,9 +199,14 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
     request = context.request
     if not policy.signatures:
         return
-    subject = "calibration" if request.file is None else str(request.file)
+    if request.file is None:
+        subject = "calibration"
+    else:
+        subject = str(request.file)
     try:
-        signed = () if request.file is None else signers_of(request.file, policy.signers, request.signed)
+        signed = (
+            () if request.file is None else signers_of(request.file, policy.signers, request.signed)
+        )
     except SignatureInvalid as error:
         yield error.subject, error.found, error.expected, error.remedy
         return
@@ -195,14 +226,17 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
         may = ", ".join(_others(tuple(policy.signers), applying)) or "no one else"
         yield (
             subject,
-            f"{counted(len(others), 'signature')} ({', '.join(others) or 'none'}), not counting the operator's",
+            f"{counted(len(others), 'signature')} ({', '.join(others) or 'none'}), not counting "
+            "the operator's",
             f"{policy.signatures} of: {may}",
             "have them review the calibration and sign it with `drivegain sign`",
         )
 
 
 def _as_read(name: str) -> str:
-    """Map all spellings that look alike to one: case, blanks around, composed or not, wide or narrow."""
+    """Map all spellings that look alike to one:
+    case, blanks around, composed or not, wide or narrow.
+    """
     folded = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
     return " ".join(folded.split())
 

@@ -71,33 +71,56 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
     """In folders with blanks in their names."""
-    cells, controllers = tmp_path / "the cells", tmp_path / "controllers"
+    cells = tmp_path / "the cells"
+    controllers = tmp_path / "controllers"
     cells.mkdir()
     controllers.mkdir()
-    text = (CONFIGS / "cells" / "demo.yaml").read_text().replace("../robots", str(CONFIGS / "robots"))
+    text = (
+        (CONFIGS / "cells" / "demo.yaml").read_text().replace("../robots", str(CONFIGS / "robots"))
+    )
     cell = cells / "cell.yaml"
     cell.write_text(text)
     shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controllers / "demo.yaml")
     calibration = recorded(demo_calibration(), datetime.now(UTC))
-    save_calibration(replace(calibration, configuration_sha256=load_cell(cell).digest), tmp_path / "calibration.yaml")
+    save_calibration(
+        replace(calibration, configuration_sha256=load_cell(cell).digest),
+        tmp_path / "calibration.yaml",
+    )
     return Bench(cell, controllers / "demo.yaml", tmp_path / "calibration.yaml")
 
 
 @pytest.mark.parametrize(
     ("order", "words"),
     [
-        (("cell", "controller"), ("controllers/demo.yaml", "no calibration", "`drivegain fit` wrote")),
-        (("cell", "cell"), ("cell.yaml", "found:    a cell file", "expected: a calibration of version")),
+        (
+            ("cell", "controller"),
+            ("controllers/demo.yaml", "no calibration", "`drivegain fit` wrote"),
+        ),
+        (
+            ("cell", "cell"),
+            ("cell.yaml", "found:    a cell file", "expected: a calibration of version"),
+        ),
         (
             ("calibration", "cell"),
-            ("calibration.yaml", "found:    a calibration", "expected: a cell file", "CELL comes first"),
+            (
+                "calibration.yaml",
+                "found:    a calibration",
+                "expected: a cell file",
+                "CELL comes first",
+            ),
         ),
-        (("controller", "calibration"), ("demo.yaml", "file of another kind, with controller", "CELL comes first")),
+        (
+            ("controller", "calibration"),
+            ("demo.yaml", "file of another kind, with controller", "CELL comes first"),
+        ),
         (
             ("cell", "calibration", "--to", "calibration"),
             ("drives.J1.gain", "no key 'drives'", "the controller's file?"),
         ),
-        (("cell", "calibration", "--to", "cell"), ("drives.J1.gain", "no key 'drives'", "the controller's file?")),
+        (
+            ("cell", "calibration", "--to", "cell"),
+            ("drives.J1.gain", "no key 'drives'", "the controller's file?"),
+        ),
     ],
 )
 def test_exchanged_files_are_named_and_stay_as_they_are(
@@ -113,20 +136,26 @@ def test_exchanged_files_are_named_and_stay_as_they_are(
     assert not bench.audit.exists()
 
 
-def test_a_dry_run_is_a_table_a_diff_and_no_trace(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_is_a_table_a_diff_and_no_trace(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = bench.controller.read_bytes()
     assert bench.apply() == ExitCode.OK
     shown = capsys.readouterr().out
     fourth = next(line for line in shown.splitlines() if line.startswith("J4"))
     # Old, new ± σ, σ %, change %, change in σ with its mark, nameplate, distance from it.
-    assert " ".join(fourth.split()) == "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 59.7 * -11.52 -20.1 Nm/A"
+    assert " ".join(fourth.split()) == (
+        "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 59.7 * -11.52 -20.1 Nm/A"
+    )
     assert "+    gain: -9.2100" in shown
     assert "nothing was written" in shown
     assert bench.controller.read_bytes() == before
     assert not bench.audit.exists()
 
 
-def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_shows_writes_and_rolls_back(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = bench.controller.read_bytes()
     assert bench.apply("--json") == ExitCode.OK
     dry = json.loads(capsys.readouterr().out)
@@ -136,7 +165,9 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
 
     assert bench.apply("--yes", "--base", "0" * 64) == ExitCode.CALIBRATION_REFUSED
     assert "--base" in capsys.readouterr().err
-    assert bench.apply("--yes", "--max-change-percent", "10", "--json") == ExitCode.CALIBRATION_REFUSED
+    assert (
+        bench.apply("--yes", "--max-change-percent", "10", "--json") == ExitCode.CALIBRATION_REFUSED
+    )
     outcome = capsys.readouterr()
     assert {refusal["gate"] for refusal in json.loads(outcome.out)["refusals"]} == {"change"}
     assert "J4" in outcome.err
@@ -180,10 +211,16 @@ def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
     digests = demo_calibration().sources
     logs = begun.details["logs"]
     assert isinstance(logs, list)
-    assert [(log["name"], log["sha256"]) for log in logs] == [(one.name, one.sha256) for one in digests]
+    assert [(log["name"], log["sha256"]) for log in logs] == [
+        (one.name, one.sha256) for one in digests
+    ]
     changes = begun.details["changes"]
     assert isinstance(changes, list)
-    assert [(change["axis"], change["old"], change["new"]) for change in changes][3] == ("J4", -11.52, -9.21)
+    assert [(change["axis"], change["old"], change["new"]) for change in changes][3] == (
+        "J4",
+        -11.52,
+        -9.21,
+    )
     reported = begun.details["calibration"]
     assert isinstance(reported, dict)
     assert reported["file"] == str(bench.calibration)
@@ -200,9 +237,13 @@ def test_another_configuration_is_refused_until_someone_says_so(
     assert bench.apply("--yes", "--configuration-changed") == ExitCode.OK
 
 
-def test_the_mass_may_be_entered_at_the_write_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_mass_may_be_entered_at_the_write_back(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     once = with_recordings(recorded(demo_calibration(), datetime.now(UTC)), entered_kg=None)
-    save_calibration(replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration)
+    save_calibration(
+        replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration
+    )
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--payload-mass disc=KG" in capsys.readouterr().err
     assert bench.apply("--yes", "--payload-mass", "disc=4.61") == ExitCode.CALIBRATION_REFUSED
@@ -218,7 +259,9 @@ def test_what_is_no_mass_of_a_payload_is_refused(text: str) -> None:
         entered_masses([text], demo_calibration())
 
 
-def test_options_may_be_tighter_than_the_cell_and_not_wider(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_may_be_tighter_than_the_cell_and_not_wider(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     policy = ApplyPolicy(max_change_percent=20.0)
     assert tightened(policy, None, 40.0, None) == replace(policy, max_nameplate_percent=40.0)
     assert tightened(policy, 20.0, None, 0.5) == replace(policy, max_std_percent=0.5)
@@ -250,11 +293,16 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
     audit = tmp_path / "elsewhere.jsonl"
     assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
     assert "No audit log has this rollback" not in capsys.readouterr().out
-    assert [entry.action for entry in read(audit)] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert [entry.action for entry in read(audit)] == [
+        AuditAction.ROLLBACK_BEGUN,
+        AuditAction.ROLLED_BACK,
+    ]
     assert main(["rollback"]) == ExitCode.USAGE
 
 
-def test_without_room_for_the_audit_nothing_is_written(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_room_for_the_audit_nothing_is_written(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = bench.controller.read_bytes()
     os.mkfifo(bench.audit)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
@@ -269,11 +317,17 @@ def test_no_one_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Pa
     assert bench.apply("--yes") == ExitCode.OK
     assert bench.rollback("--audit", str(other)) == ExitCode.USAGE
     assert not other.exists()
-    assert bench.actions() == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
+    assert bench.actions() == [
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+        AuditAction.CALIBRATION_ENTERED,
+    ]
 
 
 @pytest.mark.parametrize("spoil", ["an end cut off", "one line cut", "emptied", "deleted"])
-def test_an_audit_that_lost_a_write_is_noticed(bench: Bench, capsys: pytest.CaptureFixture[str], spoil: str) -> None:
+def test_an_audit_that_lost_a_write_is_noticed(
+    bench: Bench, capsys: pytest.CaptureFixture[str], spoil: str
+) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
     lines = bench.audit.read_bytes().splitlines(keepends=True)
@@ -295,7 +349,9 @@ def test_an_audit_that_lost_a_rollback_is_noticed(bench: Bench) -> None:
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
 
 
-def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(bench: Bench) -> None:
+def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(
+    bench: Bench,
+) -> None:
     shared = "\nhistory: {audit: shared.jsonl, store: %s.sqlite}\n"
     other = bench.cell.with_name("other.yaml")
     text = bench.cell.read_text()
@@ -306,10 +362,14 @@ def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(
         made = recorded(demo_calibration(), datetime.now(UTC))
         gains = tuple(replace(gain, value=gain.value * factor) for gain in made.gains)
         save_calibration(
-            replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains), bench.calibration
+            replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains),
+            bench.calibration,
         )
         base = () if factor == 1.0 else ("--base", sha256(bench.controller.read_bytes()))
-        assert main(["apply", str(bench.calibration), "--cell", str(file), "--yes", *base]) == ExitCode.OK
+        assert (
+            main(["apply", str(bench.calibration), "--cell", str(file), "--yes", *base])
+            == ExitCode.OK
+        )
     for file in (bench.cell, other):
         assert main(["history", str(file), "--verify"]) == ExitCode.OK
     assert main(["rollback", "--cell", str(other)]) == ExitCode.OK
@@ -405,14 +465,19 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
         found: dict[str, object] = json.loads(capsys.readouterr().out)["changes"][3]
         return found
 
-    assert fourth()["change_sigmas"] == pytest.approx(-2.31 / (DISPERSION * 0.03684))  # entered by hand: exact
+    # Entered by hand: exact
+    assert fourth()["change_sigmas"] == pytest.approx(-2.31 / (DISPERSION * 0.03684))
     assert bench.apply("--yes") == ExitCode.OK
     known = decode_calibration(bench.calibration.read_bytes(), "")
     gain = known.gains[3]
     moved = replace(gain, value=gain.value * 1.015)
-    save_calibration(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    save_calibration(
+        replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration
+    )
     found = fourth()
-    assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01)
+    assert found["change_sigmas"] == pytest.approx(
+        0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01
+    )
     assert found["significant"] is False  # 3.7 σ would be, were the number exact
     assert bench.apply() == ExitCode.OK
     shown = capsys.readouterr().out
@@ -420,7 +485,9 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     assert "No gain has changed by more than noise: the largest change is J4 +1.5 % (" in shown
     assert "Nothing needs to be written." in shown
     far = replace(gain, value=gain.value * 1.1)
-    save_calibration(replace(known, gains=(*known.gains[:3], far, *known.gains[4:])), bench.calibration)
+    save_calibration(
+        replace(known, gains=(*known.gains[:3], far, *known.gains[4:])), bench.calibration
+    )
     assert bench.apply() == ExitCode.OK
     assert "Nothing needs to be written" not in capsys.readouterr().out
 
@@ -433,7 +500,8 @@ def _shown_base(shown: str) -> str:
 def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, fitted = bench.controller.read_bytes(), bench.calibration.read_bytes()
+    before = bench.controller.read_bytes()
+    fitted = bench.calibration.read_bytes()
     assert bench.apply() == ExitCode.OK
     base = _shown_base(capsys.readouterr().out)
     assert bench.apply("--json") == ExitCode.OK
@@ -441,9 +509,13 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     # Another calibration under the same name.
     known = decode_calibration(fitted, "")
     moved = replace(known.gains[3], value=known.gains[3].value * 1.01)
-    save_calibration(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    save_calibration(
+        replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration
+    )
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
-    assert "the keys or the factors have changed since the dry run" in " ".join(capsys.readouterr().err.split())
+    assert ("the keys or the factors have changed since the dry run") in " ".join(
+        capsys.readouterr().err.split()
+    )
     assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
     assert _shown_base(capsys.readouterr().out) != base
     bench.calibration.write_bytes(fitted)
@@ -452,7 +524,10 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     swapped = cell.replace("[drives.J1.gain, drives.J2.gain,", "[drives.J2.gain, drives.J1.gain,")
     assert swapped != cell
     bench.cell.write_text(swapped)
-    assert bench.apply("--yes", "--base", base, "--configuration-changed") == ExitCode.CALIBRATION_REFUSED
+    assert (
+        bench.apply("--yes", "--base", base, "--configuration-changed")
+        == ExitCode.CALIBRATION_REFUSED
+    )
     bench.cell.write_text(cell)
     # Another file.
     bench.controller.write_bytes(before + b"# seen by K.\n")
@@ -490,7 +565,10 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
     assert bench.actions()[-1] is AuditAction.NOTHING_TO_DO
     assert bench.apply() == ExitCode.OK
     assert bench.actions().count(AuditAction.NOTHING_TO_DO) == 1
-    assert bench.apply("--configuration-changed", "--max-std-percent", "0.01") == ExitCode.CALIBRATION_REFUSED
+    assert (
+        bench.apply("--configuration-changed", "--max-std-percent", "0.01")
+        == ExitCode.CALIBRATION_REFUSED
+    )
 
 
 @pytest.mark.parametrize("place", ["controller", "cell", "calibration", "store", "notes"])
@@ -498,11 +576,13 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
 def test_no_other_file_becomes_an_audit(
     bench: Bench, capsys: pytest.CaptureFixture[str], place: str, refused: bool
 ) -> None:
-    notes, store = bench.cell.with_name("notes.txt"), bench.cell.with_name("cell.history.sqlite")
+    notes = bench.cell.with_name("notes.txt")
+    store = bench.cell.with_name("cell.history.sqlite")
     notes.write_text("the robot was moved\non Monday\n")
     audit = {"store": store, "notes": notes}.get(place) or getattr(bench, place)
     bench.cell.write_text(
-        bench.cell.read_text() + f"history: {{store: {json.dumps(str(store))}, audit: {json.dumps(str(audit))}}}\n"
+        bench.cell.read_text() + f"history: {{store: {json.dumps(str(store))}, audit: "
+        f"{json.dumps(str(audit))}}}\n"
     )
     paths = [bench.controller, bench.cell, bench.calibration, notes]
     before = [path.read_bytes() for path in paths]
@@ -518,14 +598,20 @@ def test_a_rollback_writes_into_no_other_file(bench: Bench) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     link = bench.controller.with_name("audit.jsonl")
     link.hardlink_to(bench.cell)
-    cell, written = bench.cell.read_bytes(), bench.controller.read_bytes()
+    cell = bench.cell.read_bytes()
+    written = bench.controller.read_bytes()
     for audit in (bench.controller, link):
-        assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) != ExitCode.OK
+        assert (
+            main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) != ExitCode.OK
+        )
     assert (bench.cell.read_bytes(), bench.controller.read_bytes()) == (cell, written)
 
 
 def test_whatever_the_history_does_a_write_is_not_called_undone(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def broken(*_: object, **__: object) -> None:
         raise UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed")
@@ -544,7 +630,10 @@ def _linked(bench: Bench, target: Path) -> None:
 
 
 def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -> None:
-    before = bench.controller.read_bytes() if bench.controller.exists() else b""
+    if bench.controller.exists():
+        before = bench.controller.read_bytes()
+    else:
+        before = b""
     capsys.readouterr()
     for code in (bench.apply(), bench.apply("--yes"), bench.rollback()):
         assert code == ExitCode.CALIBRATION_REFUSED
@@ -581,7 +670,8 @@ def test_another_user_s_link_to_the_cell_file_is_refused(
     bench: Bench, tmp_path: Path, folder: bool, behind: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     link = bench.controller.parent if folder else bench.controller
-    moved, alias = tmp_path / "moved", tmp_path / "alias"
+    moved = tmp_path / "moved"
+    alias = tmp_path / "alias"
     link.rename(moved)
     if behind:
         alias.symlink_to(moved)
@@ -595,7 +685,9 @@ def test_another_user_s_link_to_the_cell_file_is_refused(
     _all_refused(bench, "user 4711 has made", capsys)
 
 
-def test_links_of_the_cell_file_in_a_circle_are_called_so(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_links_of_the_cell_file_in_a_circle_are_called_so(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     bench.controller.unlink()
     bench.controller.symlink_to(bench.controller)
     _all_refused(bench, "round in a circle", capsys)
@@ -618,15 +710,28 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
 
 
 @pytest.mark.parametrize("closed", [False, True], ids=["full disk", "closed pipe"])
-def test_an_output_that_fails_after_a_write_says_what_was_written(bench: Bench, closed: bool) -> None:
+def test_an_output_that_fails_after_a_write_says_what_was_written(
+    bench: Bench, closed: bool
+) -> None:
     # The table of `apply` is printed before the write: without --json nothing would be written.
-    for arguments in (["apply", str(bench.calibration), "--yes", "--json"], ["rollback"]):
+    apply = ["apply", str(bench.calibration), "--yes", "--json"]
+    commands = [apply, ["rollback"]]
+    if closed:  # that is seen before the write
+        assert bench.apply("--yes") == ExitCode.OK
+        commands.remove(apply)
+    for arguments in commands:
         before = bench.controller.read_bytes()
-        reading, writing = os.pipe() if closed else (None, os.open("/dev/full", os.O_WRONLY))
+        if closed:
+            reading, writing = os.pipe()
+        else:
+            reading = None
+            writing = os.open("/dev/full", os.O_WRONLY)
         if reading is not None:
             os.close(reading)
         command = [sys.executable, "-m", "daq", *arguments, "--cell", str(bench.cell)]
-        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(
+            command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False
+        )
         os.close(writing)
         assert bench.controller.read_bytes() != before
         assert done.returncode == ExitCode.UNEXPECTED
@@ -635,9 +740,39 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(bench: Bench, 
         assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
 
 
+def test_a_report_that_nobody_can_read_is_no_report_of_a_write(bench: Bench) -> None:
+    before = bench.controller.read_bytes()
+    arguments = ["apply", str(bench.calibration), "--yes", "--json", "--cell", str(bench.cell)]
+    command = [sys.executable, "-m", "daq", *arguments]
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert done.returncode == ExitCode.UNEXPECTED
+    assert "whose other end is closed" in done.stderr
+    assert "nothing was written" in done.stderr
+    assert bench.controller.read_bytes() == before
+    # A reader that is there, or a file, takes the report.
+    report = bench.cell.with_name("report.json")
+    with report.open("w") as file:
+        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == ExitCode.OK
+    assert json.loads(report.read_text())
+    assert bench.controller.read_bytes() != before
+
+
 def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:
     before = bench.controller.read_bytes()
-    command = [sys.executable, "-m", "daq", "apply", str(bench.calibration), "--yes", "--cell", str(bench.cell)]
+    command = [
+        sys.executable,
+        "-m",
+        "daq",
+        "apply",
+        str(bench.calibration),
+        "--yes",
+        "--cell",
+        str(bench.cell),
+    ]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == ExitCode.UNEXPECTED
@@ -645,11 +780,15 @@ def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:
     assert bench.controller.read_bytes() == before
 
 
-def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_that_fails_says_which_were_written_before(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert bench.apply("--yes") == ExitCode.OK
-    plot, folder = bench.cell.with_name("gains.svg"), bench.cell.with_name("none")
+    plot = bench.cell.with_name("gains.svg")
+    folder = bench.cell.with_name("none")
     assert (
-        main(["history", str(bench.cell), "--plot", str(plot), "--csv", str(folder / "x.csv")]) == ExitCode.UNEXPECTED
+        main(["history", str(bench.cell), "--plot", str(plot), "--csv", str(folder / "x.csv")])
+        == ExitCode.UNEXPECTED
     )
     shown = capsys.readouterr().err
     assert f"kept:     {plot} was written before that" in shown
@@ -658,7 +797,9 @@ def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsy
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("place", ["daq.writeback.target.record_write", "daq.writeback.file_target.replace_file"])
+@pytest.mark.parametrize(
+    "place", ["daq.writeback.target.record_write", "daq.writeback.file_target.replace_file"]
+)
 def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_whole(
     bench: Bench,
     number: signal.Signals,
@@ -683,14 +824,21 @@ def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_who
         shown = capsys.readouterr().err
         assert f"interrupted: {bench.controller} was written" in shown
         assert shown.count("\n") == 1
-    assert bench.actions()[:3] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
+    assert bench.actions()[:3] == [
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+        AuditAction.CALIBRATION_ENTERED,
+    ]
     assert bench.actions()[3:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_before_the_write_says_that_nothing_was_changed(
-    bench: Bench, number: signal.Signals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    bench: Bench,
+    number: signal.Signals,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     before = bench.controller.read_bytes()
     monkeypatch.setattr("daq.writeback.target.propose", lambda *_: signal.raise_signal(number))
@@ -754,11 +902,22 @@ def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixt
 def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) -> None:
     file = bench.controller.with_name("é😀.yaml")
     bench.controller.rename(file)
-    command = [sys.executable, "-m", "daq", "apply", str(bench.calibration), "--cell", str(bench.cell), "--to"]
+    command = [
+        sys.executable,
+        "-m",
+        "daq",
+        "apply",
+        str(bench.calibration),
+        "--cell",
+        str(bench.cell),
+        "--to",
+    ]
     shown = []
     for more in ([], ["--json"]):
         environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-        done = subprocess.run([*command, str(file), *more], capture_output=True, env=environment, check=False)
+        done = subprocess.run(
+            [*command, str(file), *more], capture_output=True, env=environment, check=False
+        )
         assert (done.returncode, done.stderr) == (ExitCode.OK, b"")
         shown.append(done.stdout.decode("ascii"))
     assert "-9.210 \\u00b1 0.037" in shown[0]

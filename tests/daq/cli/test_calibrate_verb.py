@@ -29,7 +29,9 @@ def looks(tmp_path: Path) -> Looks:
     return Looks(Feed(tmp_path / "cell.yaml"), story, block=LOOK.block)
 
 
-def test_a_look_is_printed_where_the_errors_go_now(looks: Looks, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_look_is_printed_where_the_errors_go_now(
+    looks: Looks, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A progress bar replaces the stream while it is shown."""
     looks.show(LOOK)
     looks.show(replace(LOOK, move=4))
@@ -49,7 +51,9 @@ def test_a_look_that_comes_after_its_block_does_not_disturb_the_operator(
     assert capsys.readouterr().err == ""
 
 
-def test_what_is_missing_is_printed_once_in_a_block(looks: Looks, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_missing_is_printed_once_in_a_block(
+    looks: Looks, capsys: pytest.CaptureFixture[str]
+) -> None:
     waiting = replace(LOOK, gains=[], missing="no payload")
     for move in (1, 2, 3):
         looks.show(replace(waiting, move=move))
@@ -60,7 +64,9 @@ def test_a_check_that_fails_says_what_to_do(capsys: pytest.CaptureFixture[str]) 
     refused = BusError("virtual:127.0.0.1:29536", "Connection refused")
     refused.__cause__ = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
     with pytest.raises(typer.Exit) as ended:
-        show_check((CheckLine("cell file", "6 axes"), CheckLine("disk, interlock, drives", "", refused)))
+        show_check(
+            (CheckLine("cell file", "6 axes"), CheckLine("disk, interlock, drives", "", refused))
+        )
     assert ended.value.exit_code == ExitCode.CONFIGURATION
     first, failed, *parts = capsys.readouterr().out.splitlines()
     assert first == "✓ cell file: 6 axes"

@@ -53,7 +53,9 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
             assert set(option.help.split()) <= set(output.split())  # no word is cut
 
 
-def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_shows_every_verb_with_its_whole_summary(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["--help"]) == 0
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     for verb in VERBS:
@@ -71,7 +73,9 @@ def test_an_earlier_name_is_the_same_verb_and_is_not_listed(
     assert capsys.readouterr().out == shown
     assert f"`{earlier}`, goes on working" in _squeezed_lines(shown)
     assert main(["--help"]) == 0
-    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")}
+    listed = {
+        line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")
+    }
     assert name in listed
     assert earlier not in listed
 
@@ -89,7 +93,9 @@ def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str])
         assert named == [verb.name for verb in BY_JOB[job]]
 
 
-def test_an_example_chooses_none_of_several_cell_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_example_chooses_none_of_several_cell_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It would be the first by name, and a copied `apply` would write to that one."""
     monkeypatch.chdir(tmp_path)
     for name in ("lathe", "saw"):
@@ -103,7 +109,9 @@ def test_an_example_uses_the_cell_file_of_the_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert cell_here() == Path("press-4/cells/press-4.yaml")
-    (example,) = [re.findall(r"init (\S+)", verb.example)[0] for verb in VERBS if verb.name == "init"]
+    (example,) = [
+        re.findall(r"init (\S+)", verb.example)[0] for verb in VERBS if verb.name == "init"
+    ]
     assert main(["init", "other-cells/lathe"]) == 0
     assert main(["init", example]) == 0
     assert cell_here().is_file()
@@ -135,7 +143,11 @@ def test_an_option_without_its_value_is_an_error_of_the_usual_form(
         if verb.kinds:
             names.append(one.name)
             parsed = parsed.commands[one.name]
-        options = [param for param in parsed.params if param.param_type_name == "option" and not param.is_flag]
+        options = [
+            param
+            for param in parsed.params
+            if param.param_type_name == "option" and not param.is_flag
+        ]
         takes_json = any("--json" in param.opts for param in parsed.params)
         for option in (max(param.opts, key=len) for param in options):
             assert main([*names, option]) == ExitCode.USAGE
@@ -162,7 +174,9 @@ def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) 
     assert "--help` explains it" in said
 
 
-def test_a_calibration_is_no_log_but_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_calibration_is_no_log_but_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), file)
     assert main(["info", str(file)]) == ExitCode.DATA_UNFIT
@@ -193,7 +207,10 @@ def test_examples_name_files_that_other_examples_make() -> None:
 
 @pytest.mark.parametrize("width", [40, 78])
 def test_a_command_that_is_broken_into_lines_is_the_same_to_a_shell(width: int) -> None:
-    command = "drivegain record cells/a.yaml plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion"
+    command = (
+        "drivegain record cells/a.yaml plan.yaml --out loaded.mcap --payload disc --mass "
+        "4.59 --enable-motion"
+    )
     lines = continued(command, width, indent="  ")
     assert max(map(len, lines)) <= width + 2
     assert shlex.split("\n".join(lines).replace("\\\n", " ")) == command.split()
@@ -203,11 +220,24 @@ def test_a_command_that_is_broken_into_lines_is_the_same_to_a_shell(width: int) 
 def test_the_table_of_exit_codes_is_that_of_the_code(checkout: Path) -> None:
     page = (checkout / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ([\d to]+) \|", page, re.MULTILINE)
-    named = [code for row in rows for first, _, last in [row.partition(" to ")] for code in _span(first, last)]
+    named = [
+        code
+        for row in rows
+        for first, _, last in [row.partition(" to ")]
+        for code in _span(first, last)
+    ]
     assert sorted(named) == sorted(code.value for code in ExitCode)
     for code in ExitCode:
         word = {ExitCode.OK: "ok"}.get(code, code.name.lower().replace("_", " ").split()[-1])
         assert word in page or code in range(10, 15)
+
+
+def test_the_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    listed = said[said.index("Exit codes:") :].replace("10 to 14", "10 11 12 13 14")
+    numbers = {int(number) for number in re.findall(r"\d+", listed)}
+    assert numbers == {code.value for code in ExitCode}
 
 
 def _span(first: str, last: str) -> range:
@@ -228,18 +258,25 @@ def test_a_misspelt_verb_is_put_right(capsys: pytest.CaptureFixture[str]) -> Non
 def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) -> None:
     heavy = ("matplotlib", "pinocchio", "numba", "scipy", "canopen")
     code = (
-        f"import sys; import daq.cli.app; daq.cli.app.main({arguments!r});"
-        f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+        f"import sys; import daq.cli.app; daq.cli.app.main({arguments!r});print([name for name in "
+        f"{heavy!r} if name in sys.modules], file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=checkout, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=checkout, check=True
+    )
     assert done.stderr == "[]\n"
 
 
 def test_what_was_written_is_reported_line_by_line(tmp_path: Path) -> None:
     out = io.StringIO()
     (tmp_path / "[s] pictures").mkdir()
-    say_written(Console(file=out, soft_wrap=True), None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures")
-    assert out.getvalue().splitlines() == ["Written: cali\\x1b.yaml", f"Written: {tmp_path}/[s] pictures/"]
+    say_written(
+        Console(file=out, soft_wrap=True), None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures"
+    )
+    assert out.getvalue().splitlines() == [
+        "Written: cali\\x1b.yaml",
+        f"Written: {tmp_path}/[s] pictures/",
+    ]
 
 
 def _squeezed(text: str) -> str:
@@ -257,7 +294,9 @@ def _squeezed(text: str) -> str:
         (["record", "a", "b", "--out", "c", "--mass", "heavy"], "'--mass'"),
     ],
 )
-def test_wrong_usage_is_exit_code_2(arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_usage_is_exit_code_2(
+    arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(arguments) == 2
     output = capsys.readouterr()
     assert output.out == ""
@@ -280,10 +319,17 @@ def log(checkout: Path, tmp_path: Path) -> Path:
         CellEvent(START_NS, None, EventKind.MOVE_START, 1, ""),
         CellEvent(START_NS, 2, EventKind.EMCY, 0x2310, "\x1b[2Jcurrent"),
     )
-    return write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(500)]), events)
+    return write(
+        tmp_path / "a.mcap",
+        demo_content(checkout, DISC),
+        samples([[k] * 6 for k in range(500)]),
+        events,
+    )
 
 
-def test_info_json_is_one_object_and_nothing_else(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_json_is_one_object_and_nothing_else(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["info", str(log), "--json"]) == 0
     output = capsys.readouterr()
     assert output.err == ""
@@ -296,7 +342,9 @@ def test_info_json_is_one_object_and_nothing_else(log: Path, capsys: pytest.Capt
     assert len(found["sha256"]) == len(found["cell_sha256"]) == 64
 
 
-def test_info_as_text_cannot_command_the_terminal(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_as_text_cannot_command_the_terminal(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["info", str(log)]) == 0
     text = capsys.readouterr().out
     assert "loaded" in text
@@ -304,7 +352,9 @@ def test_info_as_text_cannot_command_the_terminal(log: Path, capsys: pytest.Capt
     assert "\\x1b[2Jcurrent" in text
 
 
-def test_info_of_a_damaged_log_is_exit_code_4(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_a_damaged_log_is_exit_code_4(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 1
     log.write_bytes(data)
@@ -315,28 +365,38 @@ def test_info_of_a_damaged_log_is_exit_code_4(log: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("more", [[], ["--json"]])
-def test_an_output_that_cannot_be_written_is_reported(log: Path, checkout: Path, more: list[str]) -> None:
+def test_an_output_that_cannot_be_written_is_reported(
+    log: Path, checkout: Path, more: list[str]
+) -> None:
     command = [sys.executable, "-m", "daq", "info", str(log), *more]
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False
+        )
     assert done.returncode == ExitCode.UNEXPECTED
     assert "no space left" in done.stderr
     assert not re.search("Traceback|Exception", done.stderr)
 
 
 @pytest.mark.parametrize("more", [[], ["--json"]])
-def test_a_reader_that_has_seen_enough_is_no_error_to_report(log: Path, checkout: Path, more: list[str]) -> None:
+def test_a_reader_that_has_seen_enough_is_no_error_to_report(
+    log: Path, checkout: Path, more: list[str]
+) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     try:
         command = [sys.executable, "-m", "daq", "info", str(log), *more]
-        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
+        done = subprocess.run(
+            command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False
+        )
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (ExitCode.UNEXPECTED, "")
 
 
-def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_makes_a_cell_that_can_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "new" / "press-4"
     assert main(["init", str(folder)]) == 0
     printed = capsys.readouterr()
@@ -349,7 +409,9 @@ def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.Captu
     assert cell.controller_path == folder / "controllers/press-4.yaml"
     assert cell.controller_path.is_file()
     description = folder / "imports/press-4.yaml"
-    assert (description.parent / load_import(description).cell).resolve() == folder / "cells/press-4.yaml"
+    assert (
+        description.parent / load_import(description).cell
+    ).resolve() == folder / "cells/press-4.yaml"
     for path in folder.rglob("*.yaml"):
         head = re.match(r"(#.*\n)+", path.read_text(encoding="utf-8"))
         assert head, path
@@ -365,7 +427,9 @@ def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.Captu
 def test_init_for_the_simulated_cell_changes_bus_and_sampling_alone(tmp_path: Path) -> None:
     for folder, option in (("real", []), ("simulated", ["--simulated"])):
         assert main(["init", str(tmp_path / folder / "press-4"), *option]) == 0
-    real, simulated = (tmp_path / folder / "press-4/cells/press-4.yaml" for folder in ("real", "simulated"))
+    real, simulated = (
+        tmp_path / folder / "press-4/cells/press-4.yaml" for folder in ("real", "simulated")
+    )
     cell = load_cell(simulated)
     assert [(bus.interface, bus.channel, bus.host, bus.port) for bus in cell.buses] == [
         ("socketcand", "can0", "127.0.0.1", 29536)

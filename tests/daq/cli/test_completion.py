@@ -28,7 +28,12 @@ class Shell:
         script.chmod(0o755)
         environment = {
             **os.environ,
-            **{"PATH": f"{folder}:{os.environ['PATH']}", "PYTHONPATH": str(checkout), "PS1": "READY ", "TERM": "dumb"},
+            **{
+                "PATH": f"{folder}:{os.environ['PATH']}",
+                "PYTHONPATH": str(checkout),
+                "PS1": "READY ",
+                "TERM": "dumb",
+            },
         }
         self.terminal, inner = pty.openpty()
         self.process = subprocess.Popen(
@@ -84,17 +89,29 @@ def test_bash_completes_verbs_options_and_names_of_files(shell: Shell, tmp_path:
 @pytest.mark.parametrize("shell_name", ["bash", "zsh", "fish"])
 def test_each_shell_has_its_script_and_every_verb(shell_name: str, checkout: Path) -> None:
     run = [sys.executable, "-m", "daq"]
-    environment = {**os.environ, "PYTHONPATH": str(checkout), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(checkout),
+        "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1",
+    }
     script = subprocess.run(
-        [*run, "--show-completion", shell_name], capture_output=True, text=True, env=environment, check=True
+        [*run, "--show-completion", shell_name],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
     )
     assert "drivegain" in script.stdout
     asked = {
         **environment,
-        **{"_DRIVEGAIN_COMPLETE": f"complete_{shell_name}", "COMP_WORDS": "drivegain ", "COMP_CWORD": "1"},
+        **{
+            "_DRIVEGAIN_COMPLETE": f"complete_{shell_name}",
+            "COMP_WORDS": "drivegain ",
+            "COMP_CWORD": "1",
+        },
         **{"_TYPER_COMPLETE_ARGS": "drivegain ", "_TYPER_COMPLETE_FISH_ACTION": "get-args"},
     }
     found = subprocess.run(run, capture_output=True, text=True, env=asked, check=True).stdout
-    assert set(re.findall(r"^\W*([a-z-]+)", found.replace("_arguments '*: :((", ""), re.MULTILINE)) >= {
-        verb.name for verb in VERBS
-    }
+    assert set(
+        re.findall(r"^\W*([a-z-]+)", found.replace("_arguments '*: :((", ""), re.MULTILINE)
+    ) >= {verb.name for verb in VERBS}

@@ -24,7 +24,15 @@ from drivers.canopen.parameters import Saving
 from drivers.canopen.sdo import ObjectAccess
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import ACTOR, NOW, apply_in_drives, entered_gain, on_its_own_bus, saved_gain, simulated
+from tests.daq.drives import (
+    ACTOR,
+    NOW,
+    apply_in_drives,
+    entered_gain,
+    on_its_own_bus,
+    saved_gain,
+    simulated,
+)
 
 
 @pytest.fixture
@@ -40,10 +48,20 @@ def simulation(cell: Cell) -> Iterator[SimulatedCell]:
 
 def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
     assert cell.history is not None
-    rollback_drives(cell, now=NOW, actor=ACTOR, saving=Saving.KNOWN, audit=cell.history.audit, yes=yes, json=as_json)
+    rollback_drives(
+        cell,
+        now=NOW,
+        actor=ACTOR,
+        saving=Saving.KNOWN,
+        audit=cell.history.audit,
+        yes=yes,
+        json=as_json,
+    )
 
 
-def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
+def test_look_write_and_go_back(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
+) -> None:
     apply_in_drives(cell)
     shown = capsys.readouterr().out
     assert "current gain" in shown
@@ -74,7 +92,11 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     assert cell.history is not None
     entered = AuditAction.CALIBRATION_ENTERED
     assert [(entry.action, entry.who, entry.subject) for entry in read(cell.history.audit)] == [
-        (action, "Kim (login kim)", "history of demo" if action is entered else "drives of cell demo")
+        (
+            action,
+            "Kim (login kim)",
+            "history of demo" if action is entered else "drives of cell demo",
+        )
         for action in (
             AuditAction.APPLY_BEGUN,
             AuditAction.APPLIED,
@@ -98,9 +120,14 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     assert [event.target for event in history.events] == ["drives of cell demo"] * 2
     assert history.in_force() is None
     # The two entries that record how the writes ended.
-    assert {event.audit for event in history.events} == {entry.sha256 for entry in read(cell.history.audit)[1::3]}
+    assert {event.audit for event in history.events} == {
+        entry.sha256 for entry in read(cell.history.audit)[1::3]
+    }
     _back(cell)
-    assert read_history(ledger).in_force() == hashlib.sha256(encode_calibration(demo_calibration())).hexdigest()
+    assert (
+        read_history(ledger).in_force()
+        == hashlib.sha256(encode_calibration(demo_calibration())).hexdigest()
+    )
 
 
 @pytest.mark.usefixtures("simulation")
@@ -122,16 +149,27 @@ def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]
         document = json.loads(text)
         DriveRollback.model_validate_json(text)
         assert (document["source"], document["restored"]) == (written["record"], yes)
-        assert document["changes"][3] == {"axis": "J4", "object": "2003h:01", "old": -9210.0, "new": -11520.0}
+        assert document["changes"][3] == {
+            "axis": "J4",
+            "object": "2003h:01",
+            "old": -9210.0,
+            "new": -11520.0,
+        }
 
 
 @pytest.mark.parametrize("yes", [False, True])
 @pytest.mark.parametrize("as_json", [False, True])
 def test_a_failed_check_is_reported_and_nothing_written(
-    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], yes: bool, as_json: bool
+    cell: Cell,
+    simulation: SimulatedCell,
+    capsys: pytest.CaptureFixture[str],
+    yes: bool,
+    as_json: bool,
 ) -> None:
     calibration = demo_calibration()
-    far = replace(calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:]))
+    far = replace(
+        calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:])
+    )
     with pytest.raises(CalibrationRefused, match="J1: found σ"):
         apply_in_drives(cell, calibration=far, yes=yes, as_json=as_json)
     shown = capsys.readouterr().out
@@ -141,7 +179,10 @@ def test_a_failed_check_is_reported_and_nothing_written(
 
 
 def test_an_interrupt_puts_back_what_was_written(
-    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cell: Cell,
+    simulation: SimulatedCell,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     check = ObjectAccess.read
     reads = 0
@@ -159,7 +200,9 @@ def test_an_interrupt_puts_back_what_was_written(
     with pytest.raises(typer.Exit) as caught:
         apply_in_drives(cell, yes=True)
     assert caught.value.exit_code == 130
-    assert "interrupted: kept: the previous values are restored in J1, J2, J3" in capsys.readouterr().err
+    assert (
+        "interrupted: kept: the previous values are restored in J1, J2, J3"
+    ) in capsys.readouterr().err
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
 
 

@@ -43,7 +43,9 @@ def test_codes_of_the_standards_and_of_makers(
     assert (document["code"], document["standard"]) == (read_code(code), standard)
     assert words in document["text"]
     assert document["remedy"] == for_command_line(remedy_of(read_code(code)))
-    assert document["remedy"].endswith("then reset the fault with `drivegain scan CELL --reset-faults`")
+    assert document["remedy"].endswith(
+        "then reset the fault with `drivegain scan CELL --reset-faults`"
+    )
 
 
 @pytest.mark.parametrize("code", ["", "8g11", "12345", "-1", "0x", "eight"])

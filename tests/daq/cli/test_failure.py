@@ -32,7 +32,9 @@ def _all(root: type[Exception]) -> Iterator[type[Exception]]:
         yield from _all(child)
 
 
-@pytest.mark.parametrize("kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(
+    "kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__
+)
 def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Exception]) -> None:
     error = kind.__new__(kind)
     error.args = ("J3 (node 3): evidence",)
@@ -42,11 +44,17 @@ def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Excep
         object.__setattr__(error, "address", "socketcan:can0")
     failure = ErrorParts.of(error)
     assert all((failure.error, failure.found, failure.expected, failure.do))
-    assert all(label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do"))
+    assert all(
+        label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do")
+    )
 
 
-@pytest.mark.parametrize("kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__)
-def test_an_error_of_the_demonstration_names_no_verb_that_needs_a_cell_file(kind: type[Exception]) -> None:
+@pytest.mark.parametrize(
+    "kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__
+)
+def test_an_error_of_the_demonstration_names_no_verb_that_needs_a_cell_file(
+    kind: type[Exception],
+) -> None:
     error = kind.__new__(kind)
     error.args = (f"J3 (node 3): fault; {remedy_of(0x8611)}",)
     for name in ("subject", "found", "expected", "remedy", "address"):
@@ -58,7 +66,9 @@ def test_an_error_of_the_demonstration_names_no_verb_that_needs_a_cell_file(kind
 
 @pytest.mark.parametrize("verb", ["scan", "monitor"])
 @pytest.mark.parametrize("kind", [*_all(DriverError)], ids=lambda kind: kind.__name__)
-def test_no_verb_that_asks_the_drives_advises_to_run_itself(kind: type[Exception], verb: str) -> None:
+def test_no_verb_that_asks_the_drives_advises_to_run_itself(
+    kind: type[Exception], verb: str
+) -> None:
     error = kind.__new__(kind)
     error.args = ("J3 (node 3): evidence",)
     for name in ("address", "found", "remedy"):
@@ -71,7 +81,10 @@ def test_no_verb_that_asks_the_drives_advises_to_run_itself(kind: type[Exception
 
 
 def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
-    advice = [*ADVICE.values(), *(one for within in ADVICE_WITHIN.values() for one in within.values())]
+    advice = [
+        *ADVICE.values(),
+        *(one for within in ADVICE_WITHIN.values() for one in within.values()),
+    ]
     for expected, remedy in advice:
         for verb, rest in re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}"):
             assert main([verb, "--help"]) == 0
@@ -91,7 +104,9 @@ def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> No
         (errno.EACCES, "no permission", "NET_RAW"),
     ],
 )
-def test_an_error_of_the_operating_system_is_explained(number: int, found: str, remedy: str) -> None:
+def test_an_error_of_the_operating_system_is_explained(
+    number: int, found: str, remedy: str
+) -> None:
     with pytest.raises(BusError) as caught, bus_errors("socketcan:can0"):
         raise OSError(number, os.strerror(number))
     failure = ErrorParts.of(caught.value)
@@ -112,7 +127,12 @@ def test_a_refused_connection_names_the_command_that_starts_a_cell(
     capsys.readouterr()
     assert main(["scan", str(cell)]) == ExitCode.DEVICE_FAULT
     said = capsys.readouterr().err
-    assert re.search(r"^found: .*connection refused.*\nexpected: .*\ndo: .*drivegain simulate demo", said, re.MULTILINE)
+    assert re.search(
+        r"^found: .*connection refused.*\nexpected: .*\ndo: .*drivegain "
+        r"simulate demo",
+        said,
+        re.MULTILINE,
+    )
     assert "Errno" not in said
 
 
@@ -129,7 +149,9 @@ def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) ->
     stop.add_note("while stopping: J3 (node 3) does not answer")
     assert "axes" not in json_tree(ErrorParts.of(stop).document())
     stop.add_note("not confirmed without power: J3 (node 3)")
-    assert ErrorParts.of(stop).document().axes == "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+    assert ErrorParts.of(stop).document().axes == (
+        "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
+    )
 
 
 def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_cause() -> None:
@@ -162,8 +184,14 @@ def test_an_error_that_cannot_be_printed_keeps_its_exit_code(
             full.close()
 
 
-def test_an_error_of_a_verb_is_an_object_under_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["scan", "none.yaml"], ["info", str(tmp_path / "none.mcap")], ["explain-emcy", "x"]):
+def test_an_error_of_a_verb_is_an_object_under_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (
+        ["scan", "none.yaml"],
+        ["info", str(tmp_path / "none.mcap")],
+        ["explain-emcy", "x"],
+    ):
         code = main([*arguments, "--json"])
         output = capsys.readouterr()
         document: dict[str, Any] = json.loads(output.err)

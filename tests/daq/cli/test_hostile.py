@@ -70,11 +70,17 @@ def test_hostile_counts_are_a_value_error(key: str, value: str) -> None:
         statistics_from_record({**record, key: value})
 
 
-@pytest.mark.parametrize("number", ["0", "-1e-9", "NaN", "Infinity", "1" + 400 * "0", "true", "null", '"1"'])
+@pytest.mark.parametrize(
+    "number", ["0", "-1e-9", "NaN", "Infinity", "1" + 400 * "0", "true", "null", '"1"']
+)
 def test_a_hostile_quantum_is_a_value_error(number: str) -> None:
     text = '{"axes": [{"name": "J1", "current_per_unit": %s}]}'
     assert readback_from_bytes((text % "0.002").encode()).axes[0].current_per_unit == 0.002
-    with pytest.raises(ValueError, match=r"current_per_unit is .+, expected .*(number|greater than 0)"):
+    with pytest.raises(
+        ValueError,
+        match=r"current_per_unit is .+, expected "
+        r".*(number|greater than 0)",
+    ):
         readback_from_bytes((text % number).encode())
 
 
@@ -95,7 +101,9 @@ def test_info_refuses_the_counts_that_a_fit_refuses(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     genuine = statistics_record
-    monkeypatch.setattr("daq.log.writer.statistics_record", lambda given: {**genuine(given), **statistics})
+    monkeypatch.setattr(
+        "daq.log.writer.statistics_record", lambda given: {**genuine(given), **statistics}
+    )
     log = write(tmp_path / "a.mcap", demo_content(checkout), samples([[k] * 6 for k in range(300)]))
     assert main(["info", str(log), "--json"]) == ExitCode.DATA_UNFIT
     output = capsys.readouterr()
@@ -112,7 +120,9 @@ def test_very_many_unknown_keys_are_counted_and_not_all_explained() -> None:
         read_model(parse_yaml(f"name: x\n{keys}".encode(), "file.yaml"), Small)
 
 
-def test_a_disk_that_is_full_from_the_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_full_from_the_start_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     full = OSError(28, os.strerror(28))
     path = tmp_path / "run.mcap"
 
@@ -132,7 +142,10 @@ def test_a_disk_that_is_full_from_the_start_leaves_nothing(tmp_path: Path, monke
         return FullStream()
 
     monkeypatch.setattr(Path, "open", open_part)
-    with pytest.raises(OutputFailed, match="no space left"), LogWriter(path, content(2), joints, lambda: 0):
+    with (
+        pytest.raises(OutputFailed, match="no space left"),
+        LogWriter(path, content(2), joints, lambda: 0),
+    ):
         pytest.fail("the writer opened on a full disk")
     assert list(tmp_path.iterdir()) == []
 
@@ -141,7 +154,8 @@ def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[
     error = DriveFault(3, "fault")
     error.add_note("while stopping: node 3: object 6041h:00: no answer")
     show_failure(ErrorParts.of(error), json_wanted=False)
-    assert "emergency stop" not in capsys.readouterr().err  # it was stopped, and confirmed by other means
+    # It was stopped, and confirmed by other means
+    assert "emergency stop" not in capsys.readouterr().err
     error.add_note("not confirmed without power: node 3")
     show_failure(ErrorParts.of(error), json_wanted=False)
     output = capsys.readouterr().err
@@ -196,5 +210,8 @@ def test_one_name_for_two_outputs_is_refused_before_any_log_is_read(
 def test_a_missing_folder_is_named_before_any_log_is_read(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([verb, str(tmp_path / "no.mcap"), "--out", str(tmp_path / "missing/c.yaml")]) == ExitCode.UNEXPECTED
+    assert (
+        main([verb, str(tmp_path / "no.mcap"), "--out", str(tmp_path / "missing/c.yaml")])
+        == ExitCode.UNEXPECTED
+    )
     assert "no such folder" in capsys.readouterr().err

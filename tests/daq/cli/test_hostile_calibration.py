@@ -1,4 +1,6 @@
-"""A calibration with the right digests and nonsense in it: every verb that reads one refuses it, by the key."""
+"""A calibration with the right digests and nonsense in it:
+every verb that reads one refuses it, by the key.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ NONSENSE: dict[str, dict[str, Any]] = {
     "huge gain": {"gains": (replace(_demo.gains[0], value=1e300), *_demo.gains[1:])},
     "negative sigma": {"gains": (replace(_demo.gains[0], std=-1.0), *_demo.gains[1:])},
     "gain not a number": {"gains": (replace(_demo.gains[0], value=float("nan")), *_demo.gains[1:])},
-    "infinite nameplate": {"gains": (replace(_demo.gains[0], nameplate=float("inf")), *_demo.gains[1:])},
+    "infinite nameplate": {
+        "gains": (replace(_demo.gains[0], nameplate=float("inf")), *_demo.gains[1:])
+    },
     "negative error": {"relative_error_percent": RelativeError((-1.0,) * 6, -1.0)},
     "negative condition": {"condition": -1.0},
     "negative residual": {"current_residual": (-1.0,) * 6},
@@ -59,12 +63,15 @@ def test_nonsense_is_refused_by_every_verb_before_anything_is_written(
     cell: Path, changes: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration: Calibration = replace(_demo, **{"filter": FILTER, **changes})
-    path, out = cell.parent / "calibration.yaml", cell.parent / "out"
+    path = cell.parent / "calibration.yaml"
+    out = cell.parent / "out"
     path.write_bytes(encode_calibration(calibration))  # which computes the digests of this content
     controller = load_cell(cell).controller_path
     assert controller is not None
-    before, kept = controller.read_bytes(), sorted(cell.parent.iterdir())
-    file, fitted = str(cell), str(path)
+    before = controller.read_bytes()
+    kept = sorted(cell.parent.iterdir())
+    file = str(cell)
+    fitted = str(path)
     verbs = [
         ["apply", file, fitted, "--yes"],
         ["history", file, "--add", fitted],
@@ -76,7 +83,8 @@ def test_nonsense_is_refused_by_every_verb_before_anything_is_written(
         ["export", "urdf", file, fitted, "--out", str(out)],
     ]
     for verb in verbs:
-        code, said = main(verb), capsys.readouterr().err
+        code = main(verb)
+        said = capsys.readouterr().err
         assert code == ExitCode.DATA_UNFIT, (verb, said)
         assert _key(changes) in said, (verb, said)
     assert controller.read_bytes() == before

@@ -1,4 +1,6 @@
-"""Symbolic links in every path that a verb writes to: circles and other users' links, refused by name."""
+"""Symbolic links in every path that a verb writes to:
+circles and other users' links, refused by name.
+"""
 
 from __future__ import annotations
 
@@ -50,20 +52,30 @@ def make_circle(path: Path) -> None:
     path.symlink_to(other)
 
 
-@pytest.mark.parametrize("name", [*CONFIGURED, "../controllers/demo.yaml", "demo.yaml", "calibration-1.yaml"])
-def test_links_in_a_circle_are_refused_by_every_verb(cell: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "name", [*CONFIGURED, "../controllers/demo.yaml", "demo.yaml", "calibration-1.yaml"]
+)
+def test_links_in_a_circle_are_refused_by_every_verb(
+    cell: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     calibration = calibration_for(cell)
     make_circle(Path(os.path.normpath(cell.parent / name)))
-    file, fitted = str(cell), str(calibration)
+    file = str(cell)
+    fitted = str(calibration)
     verbs = [["apply", file, fitted, "--yes"], ["rollback", file], ["history", file, "--verify"]]
-    verbs += [["recalibrate", file, "--dry-run"], ["schedule", file], ["validate", fitted, "no.mcap"]]
+    verbs += [
+        ["recalibrate", file, "--dry-run"],
+        ["schedule", file],
+        ["validate", fitted, "no.mcap"],
+    ]
     if name in CONFIGURED:
         verbs += [
             ["history", file, "--rebuild"],
             ["certificate", fitted, "--cell", file, "--out", str(cell.parent / "out")],
         ]
     for verb in verbs[:-1] if name == "demo.yaml" else verbs:
-        code, said = main(verb), capsys.readouterr().err
+        code = main(verb)
+        said = capsys.readouterr().err
         if "calibration" in name and verb[0] in ("rollback", "history", "recalibrate", "schedule"):
             continue
         assert code in REFUSED, (verb, code, said)
@@ -80,8 +92,11 @@ def test_an_output_in_a_circle_is_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 @pytest.mark.parametrize("name", CONFIGURED)
-def test_the_link_of_another_user_is_followed_nowhere(cell: Path, tmp_path: Path, name: str) -> None:
-    link, target = cell.parent / name, tmp_path / "elsewhere"
+def test_the_link_of_another_user_is_followed_nowhere(
+    cell: Path, tmp_path: Path, name: str
+) -> None:
+    link = cell.parent / name
+    target = tmp_path / "elsewhere"
     target.touch()
     link.symlink_to(target)
     assert load_cell(cell).name == "demo"
@@ -95,7 +110,8 @@ def test_the_link_of_another_user_is_followed_nowhere(cell: Path, tmp_path: Path
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 def test_no_entry_goes_through_another_users_link(tmp_path: Path) -> None:
     """`rollback --to FILE --audit AUDIT` names an audit log that no cell file has judged."""
-    link, target = tmp_path / "audit.jsonl", tmp_path / "elsewhere"
+    link = tmp_path / "audit.jsonl"
+    target = tmp_path / "elsewhere"
     target.touch()
     link.symlink_to(target)
     append(link, AuditAction.PROPOSED, at=NOW, who="K.", subject="x", details={})
@@ -108,7 +124,8 @@ def test_no_entry_goes_through_another_users_link(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 def test_a_fleet_does_not_replace_what_another_users_link_leads_to(tmp_path: Path) -> None:
-    link, target = tmp_path / "demo.json", tmp_path / "elsewhere"
+    link = tmp_path / "demo.json"
+    target = tmp_path / "elsewhere"
     target.touch()
     link.symlink_to(target)
     _check_replaceable(link)
@@ -120,10 +137,16 @@ def test_a_fleet_does_not_replace_what_another_users_link_leads_to(tmp_path: Pat
 
 
 def _outputs() -> Iterator[tuple[str, list[str]]]:
-    """Yield a name and the words of a command line for each place that a verb writes to, PIPE for that place."""
-    for verb in (verb for verb in VERBS if verb.name != "console"):  # which shows the report of a folder
+    """Yield a name and the words of a command line for each place that a verb writes to,
+    PIPE for that place.
+    """
+    # `console` only shows a folder's report.
+    for verb in (verb for verb in VERBS if verb.name != "console"):
         for kind in verb.kinds or (verb,):
-            words = [verb.name, kind.name] if verb.kinds else [verb.name]
+            if verb.kinds:
+                words = [verb.name, kind.name]
+            else:
+                words = [verb.name]
             params = kind.command().params
             for one in params:
                 if "Path" in str(one.type_descriptor.annotation) and one.name in WRITTEN:
@@ -150,7 +173,11 @@ def _link_of_another_user(place: Path) -> None:
 @pytest.mark.parametrize("line", OUTPUTS)
 @pytest.mark.parametrize(
     ("make", "found"),
-    [(_link_of_another_user, "user 4711"), (os.mkfifo, "no regular file"), (_device, "no regular file")],
+    [
+        (_link_of_another_user, "user 4711"),
+        (os.mkfifo, "no regular file"),
+        (_device, "no regular file"),
+    ],
     ids=["link", "pipe", "device"],
 )
 def test_no_verb_writes_to_a_place_that_another_user_chose_nor_to_a_device(
@@ -163,23 +190,36 @@ def test_no_verb_writes_to_a_place_that_another_user_chose_nor_to_a_device(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shipped = Path(__file__).parents[3] / "configs"
-    place, elsewhere = tmp_path / "place.png", tmp_path / "elsewhere"
+    place = tmp_path / "place.png"
+    elsewhere = tmp_path / "elsewhere"
     elsewhere.touch()
     make(place)
     calibration = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), calibration)
     before = place.lstat()
-    files = {"PIPE": place, "configs/cells/demo.yaml": shipped / "cells" / "demo.yaml", "calibration.yaml": calibration}
-    assert main([str(files.get(word, word)) for word in OUTPUTS[line]]) not in (ExitCode.OK, ExitCode.UNEXPECTED)
+    files = {
+        "PIPE": place,
+        "configs/cells/demo.yaml": shipped / "cells" / "demo.yaml",
+        "calibration.yaml": calibration,
+    }
+    assert main([str(files.get(word, word)) for word in OUTPUTS[line]]) not in (
+        ExitCode.OK,
+        ExitCode.UNEXPECTED,
+    )
     assert found in " ".join(capsys.readouterr().err.split())
     after = place.lstat()
-    assert (after.st_ino, after.st_mode, elsewhere.stat().st_size) == (before.st_ino, before.st_mode, 0)
+    assert (after.st_ino, after.st_mode, elsewhere.stat().st_size) == (
+        before.st_ino,
+        before.st_mode,
+        0,
+    )
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 def test_nothing_is_written_through_a_link_that_comes_later(tmp_path: Path) -> None:
     """Between the command line and the write, and in the folders that it names."""
-    link, target = tmp_path / "report.html", tmp_path / "elsewhere"
+    link = tmp_path / "report.html"
+    target = tmp_path / "elsewhere"
     target.write_bytes(b"mine")
     link.symlink_to(target)
     replace_file(link, b"mine, new")
@@ -192,7 +232,8 @@ def test_nothing_is_written_through_a_link_that_comes_later(tmp_path: Path) -> N
 def test_a_link_into_a_folder_that_everybody_may_write_is_followed_for_an_own_file_in_a_sticky_one(
     tmp_path: Path,
 ) -> None:
-    link, folder = tmp_path / "out.yaml", tmp_path / "open"
+    link = tmp_path / "out.yaml"
+    folder = tmp_path / "open"
     folder.mkdir()
     link.symlink_to(folder / "gains.yaml")
     (folder / "gains.yaml").touch()
@@ -216,7 +257,8 @@ def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 def test_a_demonstration_follows_no_link_in_a_folder_that_another_user_made(tmp_path: Path) -> None:
-    mark, target = tmp_path / MARK, tmp_path / "elsewhere"
+    mark = tmp_path / MARK
+    target = tmp_path / "elsewhere"
     target.write_bytes(b"mine")
     mark.symlink_to(target)
     os.lchown(mark, 4711, 4711)
@@ -225,7 +267,9 @@ def test_a_demonstration_follows_no_link_in_a_folder_that_another_user_made(tmp_
     assert target.read_bytes() == b"mine"
 
 
-def test_a_log_does_not_begin_under_the_name_of_a_link_that_leads_nowhere(tmp_path: Path, checkout: Path) -> None:
+def test_a_log_does_not_begin_under_the_name_of_a_link_that_leads_nowhere(
+    tmp_path: Path, checkout: Path
+) -> None:
     """Its last step, the rename, would find the name taken."""
     (tmp_path / "a.mcap").symlink_to(tmp_path / "gone.mcap")
     with pytest.raises(UsageError, match="found a file of that name; expected none"):

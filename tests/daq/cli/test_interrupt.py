@@ -47,7 +47,9 @@ def _write_undisturbed(done: list[str]) -> None:
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_interrupts_once_and_again_after_the_stop_had_its_time(number: signal.Signals) -> None:
+def test_a_signal_interrupts_once_and_again_after_the_stop_had_its_time(
+    number: signal.Signals,
+) -> None:
     before = [signal.getsignal(each) for each in SIGNALS]
     now_s = 100.0
     with interruptible(lambda: now_s):
@@ -131,15 +133,25 @@ def interrupt(event, given):
 sys.addaudithook(interrupt)
 from daq.cli import main
 sys.exit(main(["explain-emcy", "--help"]))
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (ExitCode.INTERRUPTED, "", "interrupted\n")
+"""  # noqa: E501
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (
+        ExitCode.INTERRUPTED,
+        "",
+        "interrupted\n",
+    )
 
 
-def test_an_interrupted_plan_says_how_to_get_what_it_had(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupted_plan_says_how_to_get_what_it_had(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with pytest.raises(KeyboardInterrupt), say_how_to_resume([0, 8, 16], 3000):
         raise KeyboardInterrupt
-    assert capsys.readouterr().err == "16 of 3000 exchanges were tried; --exchanges 16 writes their plan\n"
+    assert capsys.readouterr().err == (
+        "16 of 3000 exchanges were tried; --exchanges 16 writes their plan\n"
+    )
     with pytest.raises(KeyboardInterrupt), say_how_to_resume([0], 3000):
         raise KeyboardInterrupt
     assert capsys.readouterr().err == ""

@@ -26,7 +26,13 @@ from daq.config.cell_buses import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.feed import Feed, RunFacts
-from daq.report.bus_views import MonitorReport, PredictionState, monitor_report, monitor_view, prediction_view
+from daq.report.bus_views import (
+    MonitorReport,
+    PredictionState,
+    monitor_report,
+    monitor_view,
+    prediction_view,
+)
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock, bus_taken
 from daq.workflow.events import explain_error_code, notice_of
@@ -129,7 +135,9 @@ def _watch(
     cell: Cell = CELL,
 ) -> CellWatch:
     network = cast(CanopenNetwork, Network(_link(bus), drive_axes(CELL)))
-    return CellWatch(cell_file, cell, network, feed or Feed(cell_file, stop=None), calibration, None)
+    return CellWatch(
+        cell_file, cell, network, feed or Feed(cell_file, stop=None), calibration, None
+    )
 
 
 def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[int, can.Message]]:
@@ -141,15 +149,21 @@ def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[in
     return frames
 
 
-def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(bus: QuietBus) -> None:
+def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(
+    bus: QuietBus,
+) -> None:
     monitor = _monitor(bus)
     start = bus.clock.now_ns
     for cycle in range(500):
-        bus.coming += _answers(start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle in (200, 201) else None)
+        bus.coming += _answers(
+            start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle in (200, 201) else None
+        )
     reading = monitor.watch(5.005)
     assert bus.sent == []
     assert reading.source is ReadingSource.OVERHEARD
-    assert [axis.position_counts for axis in reading.axes] == [1000 * node + 499 for node in range(1, 7)]
+    assert [axis.position_counts for axis in reading.axes] == [
+        1000 * node + 499 for node in range(1, 7)
+    ]
     assert [axis.current_raw for axis in reading.axes] == [-1, -2, -3, -4, -5, -6]
     assert [axis.lost for axis in reading.axes] == [0, 0, 2, 0, 0, 0]
     assert reading.sync_hz == pytest.approx(100, rel=0.01)
@@ -157,7 +171,9 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(b
     assert reading.axes[2].rate_hz == pytest.approx(498 / 5.005, rel=1e-6)
     # SYNC and six answers in 10 ms, by the count that a recording is refused with.
     profiles = [axis.profile for axis in CELL.axes if axis.profile is not None]
-    assert bus_loads_percent(CELL, reading)[0] == pytest.approx(answer_us(profiles, 1_000_000) / 100.0, rel=0.01)
+    assert bus_loads_percent(CELL, reading)[0] == pytest.approx(
+        answer_us(profiles, 1_000_000) / 100.0, rel=0.01
+    )
 
 
 def test_each_overheard_cycle_is_a_sample_and_a_gap_is_counted(bus: QuietBus) -> None:
@@ -166,11 +182,14 @@ def test_each_overheard_cycle_is_a_sample_and_a_gap_is_counted(bus: QuietBus) ->
     monitor.period_ns = 10_000_000
     start = bus.clock.now_ns
     for cycle in (*range(20), *range(25, 40)):  # five SYNCs that this program missed
-        frames = _answers(start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle == 30 else None)
+        frames = _answers(
+            start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle == 30 else None
+        )
         frames[0][1].timestamp = 1.7e9 + 0.01 * cycle
         bus.coming += frames
     monitor.watch(0.5)
-    assert [sample.cycle for sample in samples] == [*range(20), *range(25, 39)]  # the last may still be answered
+    # The last may still be answered
+    assert [sample.cycle for sample in samples] == [*range(20), *range(25, 39)]
     assert [sample.cycle for sample in samples if sample.missing] == [30]
     assert samples[25].missing == 0b100
     for sample in samples:
@@ -185,15 +204,22 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
     monitor.watch(QUIET_S - 0.01)
     assert bus.sent == []
     reading = monitor.watch(9.5 * ABANDONED_S)
-    assert {message.arbitration_id for message in bus.sent} == {0x600 + node for node in range(1, 7)}
+    assert {message.arbitration_id for message in bus.sent} == {
+        0x600 + node for node in range(1, 7)
+    }
     assert {message.data[0] for message in bus.sent} == {0x40}
     assert reading.source is ReadingSource.ASKED
-    assert all(8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0 for axis in reading.axes)
+    assert all(
+        8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0
+        for axis in reading.axes
+    )
     assert not any(axis.heard for axis in reading.axes)
 
 
 def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every request is answered at once; still a reading is asked for ten times a second and no more."""
+    """Every request is answered at once;
+    still a reading is asked for ten times a second and no more.
+    """
     samples: list[Sample] = []
     monitor = _monitor(bus, samples)
     monitor.watch(QUIET_S)
@@ -252,7 +278,9 @@ def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6), st.integers(0, 5))
-def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(joints: list[float], unknown: int) -> None:
+def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(
+    joints: list[float], unknown: int
+) -> None:
     motor = CELL.ratio @ (np.array(joints) - [axis.zero_offset_rad for axis in CELL.axes])
     counts: list[int | None] = [round(turn * 65536 / (2 * np.pi)) for turn in motor]
     reading = _reading(counts)
@@ -260,7 +288,9 @@ def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(joints: 
     counts[unknown] = None
     shown = joint_positions(CELL, _reading(counts))
     # Motor 6 turns with joints 5 and 6: without motor 5 neither of the two is known (paper eq. 24).
-    assert {number for number, value in enumerate(shown) if value is None} == ({4, 5} if unknown == 4 else {unknown})
+    assert {number for number, value in enumerate(shown) if value is None} == (
+        {4, 5} if unknown == 4 else {unknown}
+    )
 
 
 def _reading(counts: list[int | None]) -> CellReading:
@@ -275,7 +305,9 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
     ampere = (0.002, None, None, None, None, None)
-    report = monitor_report(CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,)))
+    report = monitor_report(
+        CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,))
+    )
     Console(file=out, width=100).print(monitor_view(report))
     text = out.getvalue()
     assert "+0.010 A" in text
@@ -298,14 +330,21 @@ def test_what_is_not_known_is_shown_as_that() -> None:
 def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The demo cell on a bus of this test, without other traffic: a short silence will do."""
     monkeypatch.setattr("drivers.stream.monitor.QUIET_S", 0.1)
-    text = (CHECKOUT / "configs/cells/demo.yaml").read_text().replace("../robots", str(CHECKOUT / "configs/robots"))
+    text = (
+        (CHECKOUT / "configs/cells/demo.yaml")
+        .read_text()
+        .replace("../robots", str(CHECKOUT / "configs/robots"))
+    )
     path = tmp_path / "cell.yaml"
     path.write_text(text.replace("channel: demo", "channel: monitored"))
     return path
 
 
-def test_a_simulated_cell_is_shown_and_left_as_it_was(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bus, witness = open_bus(ADDRESS), open_bus(ADDRESS)
+def test_a_simulated_cell_is_shown_and_left_as_it_was(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus = open_bus(ADDRESS)
+    witness = open_bus(ADDRESS)
     try:
         simulated = SimulatedCell(load_simulation(shipped_simulation("clean")), bus)
         with simulated:
@@ -319,21 +358,29 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(cell: Path, capsys: pytest
         bus.shutdown()
         witness.shutdown()
     assert simulated.cycles == 0
-    aborted = 0x80  # where an answer comes too late on a loaded machine, the client ends the transfer, and nothing else
+    # Where an answer comes too late on a loaded machine, the client ends the transfer, and nothing
+    # else
+    aborted = 0x80
     masters = {one for one in asked if one[0] < 0x700 and one[1] != aborted}
     assert masters == {(0x600 + node, 0x40) for node in range(1, 7)}
     assert document["source"] == "asked"
     declared: Cell = load_cell(cell)
     for axis, expected in zip(document["axes"], [0.0, 0.0, 90.0, 0.0, 0.0, 0.0], strict=True):
         assert axis["position"] == pytest.approx(expected, abs=1e-2)
-        assert (axis["state"], axis["enabled"], axis["silent"]) == ("SWITCH ON DISABLED", False, False)
+        assert (axis["state"], axis["enabled"], axis["silent"]) == (
+            "SWITCH ON DISABLED",
+            False,
+            False,
+        )
         assert axis["current_a"] is not None
         assert axis["rate_hz"] > 0
     assert [axis["axis"] for axis in document["axes"]] == list(declared.axis_names)
     assert document["bus_load_percent"] > 0
 
 
-def test_a_cell_that_is_not_there_is_a_device_fault(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_that_is_not_there_is_a_device_fault(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["monitor", str(cell), "--once", "--interval", "0.1"]) == ExitCode.DEVICE_FAULT
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
@@ -344,7 +391,10 @@ def test_a_node_that_aborts_is_not_called_silent(
     cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither its position nor its answers are lost, and the reason is shown."""
-    with open_bus(ADDRESS) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated:
+    with (
+        open_bus(ADDRESS) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
+    ):
         node = simulated.nodes[2]
         sound = node.read
 
@@ -362,7 +412,9 @@ def test_a_node_that_aborts_is_not_called_silent(
     assert refusing["current_a"] is not None
     assert refusing["refused"] == [{"object": "6041h:00", "abort_code": 0x06020000}]
     assert refusing["remark"].startswith("answers with abort 0x06020000 for 6041h:00")
-    assert "J3 answers with abort 0x06020000 for 6041h:00" in _view(MonitorReport.model_validate(document))
+    assert ("J3 answers with abort 0x06020000 for 6041h:00") in _view(
+        MonitorReport.model_validate(document)
+    )
     assert document["axes"][1]["refused"] == []
 
 
@@ -408,7 +460,10 @@ def test_a_node_that_answers_after_400_ms_is_called_slow(
 def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
     cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with open_bus(ADDRESS) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated:
+    with (
+        open_bus(ADDRESS) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
+    ):
         prompt = simulated.nodes[0].request
 
         def late(data: bytes) -> None:
@@ -437,7 +492,9 @@ def _answering(
     own: Callable[[bytes], bytes | None],
     slow: dict[int, int] | None = None,
 ) -> None:
-    """Let all nodes answer with 0 or with an answer of their own, one of them later by so many nanoseconds."""
+    """Let all nodes answer with 0 or with an answer of their own,
+    one of them later by so many nanoseconds.
+    """
 
     def answer(msg: can.Message, timeout: float | None = None) -> None:
         data = bytes(msg.data)
@@ -466,7 +523,9 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     said = []
     for recorder in (False, True):
         out = io.StringIO()
-        report = monitor_report(CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder))
+        report = monitor_report(
+            CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder)
+        )
         Console(file=out, width=200).print(monitor_view(report))
         said.append(out.getvalue())
     assert "another master" in said[0]
@@ -481,7 +540,9 @@ RATED_CURRENT = bytes((0x75, 0x60))  #: Index of 6075h, as a request has it
 def test_a_recorder_that_comes_while_the_axes_are_queried_hears_no_further_request(
     bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A recorder takes the lock, listens for 0.2 s, and refuses a bus on which it hears a request."""
+    """A recorder takes the lock, listens for 0.2 s,
+    and refuses a bus on which it hears a request.
+    """
     scaled: list[bytes] = []
 
     def note(data: bytes) -> None:
@@ -500,17 +561,24 @@ PREDICTED_HZ = 250.0
 
 
 def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
-    """Let all motors move under SYNC with the currents of a known calibration, the fourth times a factor."""
-    calibration, model = predicting_calibration(), model_of(CELL)
+    """Let all motors move under SYNC with the currents of a known calibration,
+    the fourth times a factor.
+    """
+    calibration = predicting_calibration()
+    model = model_of(CELL)
     time_s = np.arange(round(seconds * PREDICTED_HZ)) / PREDICTED_HZ
     omega: FloatArray = 2.0 * np.pi * np.linspace(0.5, 1.0, 6)
     phase = omega * time_s[:, None]
-    motion = Motion(0.5 * np.sin(phase), 0.5 * omega * np.cos(phase), -0.5 * omega**2 * np.sin(phase))
+    motion = Motion(
+        0.5 * np.sin(phase), 0.5 * omega * np.cos(phase), -0.5 * omega**2 * np.sin(phase)
+    )
     current = predict_current(calibration, model, planned(motion, PREDICTED_HZ, None))
     current[:, 3] *= factor
     run = replace(facts(CELL, Path("run.mcap")), rate_hz=PREDICTED_HZ)
     # Fine enough that an acceleration shows no count; 16 bits hold the currents.
-    run = replace(run, rad_per_count=[1e-7] * 6, current_per_unit=(np.abs(current).max(axis=0) / 3e4).tolist())
+    run = replace(
+        run, rad_per_count=[1e-7] * 6, current_per_unit=(np.abs(current).max(axis=0) / 3e4).tolist()
+    )
     counts = np.rint(motion.position_rad / 1e-7).astype(int)
     raw = np.rint(current / run.current_per_unit).astype(int)
     start = bus.clock.now_ns
@@ -537,15 +605,26 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     assert report.recorder
     assert report.prediction == PredictionState(payload=None, remark="")
     predictions = [axis.prediction for axis in report.axes if axis.prediction is not None]
-    assert [found.conspicuous for found in predictions] == [False, False, False, factor > 1.0, False, False]
+    assert [found.conspicuous for found in predictions] == [
+        False,
+        False,
+        False,
+        factor > 1.0,
+        False,
+        False,
+    ]
     for number, found in enumerate(predictions):
         wrong = factor > 1.0 and number == 3
         assert found.residual_rms is not None and found.band is not None
         assert found.outside_share > 0.8 if wrong else found.residual_rms < 0.1 * found.band
         if found.predicted is not None:
-            assert found.measured == pytest.approx(found.predicted * (factor if wrong else 1.0), abs=0.01)
+            assert found.measured == pytest.approx(
+                found.predicted * (factor if wrong else 1.0), abs=0.01
+            )
     out = io.StringIO()
-    Console(file=out, width=80, force_terminal=True, color_system="standard").print(monitor_view(report))
+    Console(file=out, width=80, force_terminal=True, color_system="standard").print(
+        monitor_view(report)
+    )
     coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
     off = report.axes[0].model_copy(update={"enabled": False})
@@ -559,8 +638,12 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     assert not any(axis.silent for axis in report.axes)  # they were not asked
 
 
-def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(bus: QuietBus, tmp_path: Path) -> None:
-    """Its drives' current has no known scale: what is predicted has no measured current beside it."""
+def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(
+    bus: QuietBus, tmp_path: Path
+) -> None:
+    """Its drives' current has no known scale:
+    what is predicted has no measured current beside it.
+    """
     bus.clock.now_ns += 300_000_000
     _moving(bus, 4.0, 1.0)
     bus.clock.now_ns -= 300_000_000  # it begins within the first reading
@@ -584,7 +667,10 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
 
     def answer(msg: can.Message, timeout: float | None = None) -> None:
         index = int.from_bytes(msg.data[1:3], "little")
-        value = values.get(index, 0) if msg.arbitration_id == 0x603 else 0
+        if msg.arbitration_id == 0x603:
+            value = values.get(index, 0)
+        else:
+            value = 0
         reply = bytes((0x43, *msg.data[1:4])) + value.to_bytes(4, "little")
         bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
 
@@ -597,12 +683,21 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     assert report.prediction is not None
     assert "10 positions a second are too few" in report.prediction.remark
     assert [axis.prediction for axis in report.axes] == [None] * 6
-    assert [axis.fault is not None for axis in report.axes] == [False, False, True, False, False, False]
+    assert [axis.fault is not None for axis in report.axes] == [
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
     fault = report.axes[2].fault
     assert fault is not None and fault.model_dump() == asdict(explain_error_code(0x7305))
     out = io.StringIO()
     Console(file=out, width=200).print(monitor_view(report))
-    assert "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder" in out.getvalue()
+    assert (
+        "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder"
+    ) in out.getvalue()
     # A console gets it too, however late it comes.
     assert [(event["axis"], event["code"]) for event in feed._events] == [(2, 0x7305)]
     bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
@@ -610,13 +705,16 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
     (notice,) = (one for one in monitor_report(CELL, watch.read(0.5)).notices if one.alarm)
     assert notice.model_dump() == asdict(notice_of(EventKind.EMCY, 0x3210, "J2", notice.text))
-    assert notice.text.startswith("EMCY 3210h") and notice.remedy == for_command_line(remedy_of(0x3210))
+    assert notice.text.startswith("EMCY 3210h") and notice.remedy == for_command_line(
+        remedy_of(0x3210)
+    )
 
 
 def test_each_reading_publishes_the_load_of_the_buses(
     bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    feed, loads = Feed(tmp_path / "cell.yaml", stop=None), list[dict[str, float]]()
+    feed = Feed(tmp_path / "cell.yaml", stop=None)
+    loads = list[dict[str, float]]()
     monkeypatch.setattr(feed, "measured", loads.append)
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
     watch.listen(QUIET_S)

@@ -98,7 +98,11 @@ def test_runs_of_a_folder_are_the_valid_ones_of_this_cell(cell: Cell, make_log: 
 
 
 def test_logs_that_take_long_to_read_are_not_read_for_a_hint(
-    cell: Cell, made: Plan, make_log: LogMaker, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell: Cell,
+    made: Plan,
+    make_log: LogMaker,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("daq.cli.next_step.LARGEST_FOLDER_BYTES", 10)
     written("plan.yaml", made, 0.6, seed=1)
@@ -106,7 +110,9 @@ def test_logs_that_take_long_to_read_are_not_read_for_a_hint(
     assert runs_in(Path(), "demo") is None
     say_after_record(CELL, cell, Path("plan.yaml"), bare, loaded=False)
     assert "--payload" in words(capsys.readouterr().err)  # the run with the payload is never wrong
-    say_after_record(CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True)
+    say_after_record(
+        CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True
+    )
     assert capsys.readouterr().err == ""  # of the others nothing is known
 
 
@@ -135,18 +141,30 @@ def test_each_plan_is_followed_by_the_run_that_is_missing(
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     assert words(capsys.readouterr().err)[1:] == loaded
 
-    say_after_record(CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True)
-    assert words(capsys.readouterr().err)[1:] == ["fit", "bare.mcap", "loaded.mcap", "--out", "calibration.yaml"]
+    say_after_record(
+        CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True
+    )
+    assert words(capsys.readouterr().err)[1:] == [
+        "fit",
+        "bare.mcap",
+        "loaded.mcap",
+        "--out",
+        "calibration.yaml",
+    ]
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     held_out = ["record", str(CELL), "plan-2.yaml", "--out", "held-out.mcap", *weighed]
     assert words(capsys.readouterr().err)[1:] == held_out
 
     Path("calibration.yaml").touch()
-    say_after_record(CELL, cell, Path("plan-2.yaml"), make_log("held-out.mcap", loaded=True), loaded=True)
+    say_after_record(
+        CELL, cell, Path("plan-2.yaml"), make_log("held-out.mcap", loaded=True), loaded=True
+    )
     search = words(capsys.readouterr().err)
     assert search[1:5] == ["residual", "bare.mcap", "loaded.mcap", "--holdout"]
     assert search[5:] == ["held-out.mcap", "--out", "calibration-2.yaml", "--report", "report"]
-    say_after_record(CELL, cell, Path("plan-2.yaml"), make_log("more.mcap", loaded=True), loaded=True)
+    say_after_record(
+        CELL, cell, Path("plan-2.yaml"), make_log("more.mcap", loaded=True), loaded=True
+    )
     assert capsys.readouterr().err == ""  # it is not plain which of them is held out
 
 
@@ -167,7 +185,9 @@ def test_a_run_with_load_that_was_first_is_followed_by_one_without(
     cell: Cell, made: Plan, make_log: LogMaker, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written("plan.yaml", made, 0.6, seed=1)
-    say_after_record(CELL, cell, Path("plan.yaml"), make_log("first.mcap", loaded=True), loaded=True)
+    say_after_record(
+        CELL, cell, Path("plan.yaml"), make_log("first.mcap", loaded=True), loaded=True
+    )
     assert "--payload" not in words(capsys.readouterr().err)
 
 
@@ -176,7 +196,10 @@ def test_the_search_does_not_replace_the_file_of_the_fit(
 ) -> None:
     log = make_log("bare.mcap")
     fitted = replace(demo_calibration(), diagnoses=())
-    for written_by_fit, expected in ((Path("calibration.yaml"), "calibration-2.yaml"), (None, "calibration-2.yaml")):
+    for written_by_fit, expected in (
+        (Path("calibration.yaml"), "calibration-2.yaml"),
+        (None, "calibration-2.yaml"),
+    ):
         Path("calibration.yaml").touch()
         say_after_fit(fitted, [log], written_by_fit)
         search = words(capsys.readouterr().err)
@@ -190,7 +213,9 @@ def test_a_calibration_is_followed_by_its_dry_run(
     file = calibration_for(CELL)
     say_after_calibration(load_calibration(file), file, [log], None)
     assert words(capsys.readouterr().err) == ["drivegain", "apply", str(CELL), str(file)]
-    fixed = replace(demo_calibration(), gains=tuple(replace(gain, std=0.0) for gain in demo_calibration().gains))
+    fixed = replace(
+        demo_calibration(), gains=tuple(replace(gain, std=0.0) for gain in demo_calibration().gains)
+    )
     assert fixed.gains_fixed
     say_after_calibration(fixed, Path("calibration.yaml"), [log], CELL)
     assert capsys.readouterr().err == ""
@@ -199,7 +224,9 @@ def test_a_calibration_is_followed_by_its_dry_run(
 def test_other_moves_come_before_a_search_and_a_write_where_a_gain_is_not_seen(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    unseen = Diagnosis("gain-unseen", (), ("J1",), "a gain of -63 ± 63", "a gain", "record faster moves")
+    unseen = Diagnosis(
+        "gain-unseen", (), ("J1",), "a gain of -63 ± 63", "a gain", "record faster moves"
+    )
     found = replace(demo_calibration(), diagnoses=(unseen,))
     say_after_fit(found, [], None)
     say_after_calibration(found, Path("calibration.yaml"), [], CELL)
@@ -208,7 +235,14 @@ def test_other_moves_come_before_a_search_and_a_write_where_a_gain_is_not_seen(
     assert "drivegain" not in said
 
 
-ZERO_OFF = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off by +2.00 ± 0.10 °", "that of the URDF", "correct it")
+ZERO_OFF = Diagnosis(
+    "zero-off",
+    (),
+    ("J2",),
+    "the zero of J2 off by +2.00 ± 0.10 °",
+    "that of the URDF",
+    "correct it",
+)
 OTHER_BODY = Diagnosis("payload-differs", ("loaded",), (), "a body", "another", "was it turned?")
 LARGE = RelativeError((40.0,) * 6, 40.0)
 CORRECTED = AcceptedEffect("zero-offset", "J2", {}, (), 6.0, 3.0)
@@ -218,17 +252,29 @@ REFUTED = AcceptedEffect("stribeck", "J2", {}, (), 3.0, 6.0)
 @pytest.mark.parametrize(
     ("changed", "printed", "expected"),
     [
-        ({"diagnoses": (ZERO_OFF,), "effects": (CORRECTED,)}, None, "Next: correct the description as CHECK says"),
+        (
+            {"diagnoses": (ZERO_OFF,), "effects": (CORRECTED,)},
+            None,
+            "Next: correct the description as CHECK says",
+        ),
         ({"diagnoses": (OTHER_BODY,)}, None, "Next: find the cause of what CHECK says"),
         ({}, (OTHER_BODY,), "Next: find the cause of what CHECK says"),
-        ({"effects": (REFUTED,)}, None, "`drivegain apply` refuses this calibration: effect stribeck on J2"),
+        (
+            {"effects": (REFUTED,)},
+            None,
+            "`drivegain apply` refuses this calibration: effect stribeck on J2",
+        ),
         ({"diagnoses": (ZERO_OFF,), "effects": (CORRECTED,)}, (), "Next: drivegain apply"),
         (
             {"recording_configuration_sha256": "c" * 64},
             None,
             "refuses this calibration: calibration: recorded with cell",
         ),
-        ({"relative_error_percent": LARGE, "holdout_error_percent": LARGE}, None, "a relative error of 40.0 %"),
+        (
+            {"relative_error_percent": LARGE, "holdout_error_percent": LARGE},
+            None,
+            "a relative error of 40.0 %",
+        ),
     ],
     ids=[
         "a description that the fit corrects",
@@ -258,7 +304,9 @@ def test_a_calibration_that_the_cell_of_the_logs_refuses_is_not_applied_next(
     cell: Cell, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The certificate of the same search says that it must not be written."""
-    doubtful = load_calibration(calibration_for(CELL, relative_error_percent=LARGE, holdout_error_percent=LARGE))
+    doubtful = load_calibration(
+        calibration_for(CELL, relative_error_percent=LARGE, holdout_error_percent=LARGE)
+    )
     shutil.rmtree("configs")
     assert say_after_calibration(doubtful, Path("calibration.yaml"), [], None, described=cell)
     assert "`drivegain apply` refuses this calibration" in capsys.readouterr().err
@@ -277,19 +325,35 @@ def test_a_search_that_wrote_nothing_names_itself_only_where_nothing_is_to_be_co
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_a_new_cell_file_is_edited_first_unless_it_is_of_the_simulated_cell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], simulated: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    simulated: bool,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["init", "saw", *(["--simulated"] if simulated else [])]) == 0
     first, last = capsys.readouterr().err.splitlines()
-    assert first.startswith("The cell is that of the demonstration" if simulated else "Edit saw/cells/saw.yaml first")
+    assert first.startswith(
+        "The cell is that of the demonstration" if simulated else "Edit saw/cells/saw.yaml first"
+    )
     assert next_step(last) == "scan"
 
 
 def test_a_replaced_file_is_named_and_an_unrelated_one_is_not(
     cell: Cell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = ["plan", str(CELL), "--out", "plan.yaml", "--duration", "15", "--exchanges", "0", "--sigma", "9"]
+    plan = [
+        "plan",
+        str(CELL),
+        "--out",
+        "plan.yaml",
+        "--duration",
+        "15",
+        "--exchanges",
+        "0",
+        "--sigma",
+        "9",
+    ]
     assert main(plan) == 0
     assert "Replaced" not in capsys.readouterr().err
     os.utime("plan.yaml", (1_700_000_000, 1_700_000_000))

@@ -1,4 +1,6 @@
-"""No verb waits for a pipe, a device or a socket: each file that it reads is refused unless it is a regular one."""
+"""No verb waits for a pipe, a device or a socket:
+each file that it reads is refused unless it is a regular one.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +44,16 @@ def _command_lines() -> Iterator[tuple[str, list[str]]]:
     """Yield a name and the words of each command line, with PIPE for one file that it reads."""
     for verb in VERBS:
         for kind in verb.kinds or (verb,):
-            words = [verb.name, kind.name] if verb.kinds else [verb.name]
+            if verb.kinds:
+                words = [verb.name, kind.name]
+            else:
+                words = [verb.name]
             params = kind.command().params
             for one in params:
-                if "Path" in str(one.type_descriptor.annotation) and one.name not in WRITTEN | OTHERS:
+                if (
+                    "Path" in str(one.type_descriptor.annotation)
+                    and one.name not in WRITTEN | OTHERS
+                ):
                     yield f"{' '.join(words)} {one.name}", [*words, *arguments(kind, params, one)]
 
 
@@ -53,8 +61,15 @@ def arguments(kind: Verb, params: list[Any], one: Any) -> Iterator[str]:
     """Yield the words for one argument, PIPE, and for those that the verb requires beside it."""
     for param in params:
         if param is one or param.required:
-            value = "PIPE" if param is one else VALID.get(param.name, "absent")
-            yield from (value,) if param.param_type_name == "argument" else (max(param.opts, key=len), value)
+            if param is one:
+                value = "PIPE"
+            else:
+                value = VALID.get(param.name, "absent")
+            yield from (
+                (value,)
+                if param.param_type_name == "argument"
+                else (max(param.opts, key=len), value)
+            )
     if kind.name == "log":
         yield "--csv"  # one of two kinds of table
 
@@ -100,7 +115,9 @@ def test_no_verb_waits_for_a_pipe(
     assert "Traceback" not in "".join(capsys.readouterr())
 
 
-@pytest.mark.parametrize("verb", [["info"], ["fit"], ["export", "bag"], ["export", "log", "--csv"], ["salvage"]])
+@pytest.mark.parametrize(
+    "verb", [["info"], ["fit"], ["export", "bag"], ["export", "log", "--csv"], ["salvage"]]
+)
 def test_devices_and_sockets_are_refused_like_pipes(
     verb: list[str], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -108,5 +125,7 @@ def test_devices_and_sockets_are_refused_like_pipes(
     with socket.socket(socket.AF_UNIX) as bound:
         bound.bind(str(tmp_path / "socket"))
         for place in (Path("/dev/zero"), tmp_path / "socket", folder / "pipe"):
-            assert main([*verb, str(place), *(out if verb != ["info"] else ())]) == ExitCode.DATA_UNFIT
+            assert (
+                main([*verb, str(place), *(out if verb != ["info"] else ())]) == ExitCode.DATA_UNFIT
+            )
             assert "no regular file" in capsys.readouterr().err

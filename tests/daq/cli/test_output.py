@@ -189,7 +189,9 @@ def test_an_error_counts_where_a_result_is_lost(file: FakeFile, kind: OutputKind
     writer.close()
 
 
-def test_a_file_that_another_program_has_made_non_blocking_gets_everything(full_pipe: tuple[int, int]) -> None:
+def test_a_file_that_another_program_has_made_non_blocking_gets_everything(
+    full_pipe: tuple[int, int],
+) -> None:
     reading, writing = full_pipe
     os.set_blocking(writing, False)
     writer = OutputWriter(writing)
@@ -216,7 +218,9 @@ def _read_on(reading: int, ending: bytes) -> bytes:
     return taken.lstrip(b".")
 
 
-def test_journal_story_and_remarks_return_and_keep_their_order_with_results(full_pipe: tuple[int, int]) -> None:
+def test_journal_story_and_remarks_return_and_keep_their_order_with_results(
+    full_pipe: tuple[int, int],
+) -> None:
     def now() -> datetime:
         return datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -231,10 +235,18 @@ def test_journal_story_and_remarks_return_and_keep_their_order_with_results(full
             report_step("fifth")
         # As without any handler: pytest has installed its own.
         assert logging.lastResort is not None
-        logging.lastResort.handle(logging.makeLogRecord({"msg": "sixth", "levelno": logging.WARNING}))
+        logging.lastResort.handle(
+            logging.makeLogRecord({"msg": "sixth", "levelno": logging.WARNING})
+        )
         shown = _read_on(reading, b"sixth\n").decode().splitlines()
     assert json.loads(shown[0])["event"] == "first"
-    assert [line.strip() for line in shown[1:]] == ["second", "! third:", "fourth (0 s)", "fifth", "sixth"]
+    assert [line.strip() for line in shown[1:]] == [
+        "second",
+        "! third:",
+        "fourth (0 s)",
+        "fifth",
+        "sixth",
+    ]
 
 
 def test_a_journal_for_programs_says_what_it_lacks_as_an_event(full_pipe: tuple[int, int]) -> None:
@@ -263,7 +275,9 @@ def test_a_bar_is_not_drawn_while_the_terminal_is_stopped(monkeypatch: pytest.Mo
         ((_, writer),) = output._writers
         assert writer._waiting_bytes < 3 * PROGRESS_BYTES
         say("a remark", err=True)
-        threading.Thread(target=_drain, args=(operator_side, shown := bytearray()), daemon=True).start()
+        threading.Thread(
+            target=_drain, args=(operator_side, shown := bytearray()), daemon=True
+        ).start()
         termios.tcflow(session_side, termios.TCOON)
         _wait_for(lambda: b"a remark" in shown)
     os.close(session_side)
@@ -280,7 +294,9 @@ def _drain(descriptor: int, shown: bytearray) -> None:
     os.close(descriptor)
 
 
-def test_streams_in_memory_and_closed_ones_stay(monkeypatch: pytest.MonkeyPatch, capsys: object) -> None:
+def test_streams_in_memory_and_closed_ones_stay(
+    monkeypatch: pytest.MonkeyPatch, capsys: object
+) -> None:
     before = (sys.stdout, sys.stderr)
     with QueuedOutput():
         assert (sys.stdout, sys.stderr) == before
@@ -315,7 +331,9 @@ def test_the_word_of_an_interrupt_before_anything_runs_does_not_block(
 COMMAND = [sys.executable, "-m", "daq", "explain-emcy", "8611h", "--json"]
 
 
-def test_a_reader_that_comes_late_and_is_slow_gets_the_whole_result(full_pipe: tuple[int, int], checkout: Path) -> None:
+def test_a_reader_that_comes_late_and_is_slow_gets_the_whole_result(
+    full_pipe: tuple[int, int], checkout: Path
+) -> None:
     reading, writing = full_pipe
     with subprocess.Popen(COMMAND, stdout=writing, stderr=subprocess.PIPE, cwd=checkout) as process:
         assert process.stderr is not None
@@ -336,7 +354,9 @@ def test_a_result_that_nobody_takes_ends_with_a_signal(
     full_pipe: tuple[int, int], checkout: Path, number: signal.Signals
 ) -> None:
     _, writing = full_pipe
-    with subprocess.Popen(COMMAND, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout) as process:
+    with subprocess.Popen(
+        COMMAND, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout
+    ) as process:
         assert process.stderr is not None
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(2 * PATIENCE_S + 4.0)  # both streams have given up remarks
@@ -345,7 +365,9 @@ def test_a_result_that_nobody_takes_ends_with_a_signal(
         assert process.stderr.read() == "interrupted: the output was not read to its end\n"
 
 
-def test_a_defect_is_printed_and_ends_where_nobody_reads(full_pipe: tuple[int, int], checkout: Path) -> None:
+def test_a_defect_is_printed_and_ends_where_nobody_reads(
+    full_pipe: tuple[int, int], checkout: Path
+) -> None:
     """The traceback of an unexpected error, for a reader and for none."""
     script = """
 import sys
@@ -356,7 +378,9 @@ daq.cli.app._run = fail
 sys.exit(daq.cli.app.main())
 """
     command = [sys.executable, "-c", script, "explain-emcy"]
-    done = subprocess.run(command, stderr=full_pipe[1], cwd=checkout, timeout=PATIENCE_S + LONG_S, check=False)
+    done = subprocess.run(
+        command, stderr=full_pipe[1], cwd=checkout, timeout=PATIENCE_S + LONG_S, check=False
+    )
     assert done.returncode == ExitCode.UNEXPECTED
     read = subprocess.run(command, capture_output=True, text=True, cwd=checkout, check=False)
     assert read.returncode == ExitCode.UNEXPECTED

@@ -24,9 +24,15 @@ def cells(tmp_path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> di
     monkeypatch.setattr("daq.workflow.plan.slowed", lambda *_: None)
     folder = tmp_path / "cells"
     folder.mkdir()
-    text = (checkout / "configs/cells/demo.yaml").read_text().replace("../robots", str(checkout / "configs/robots"))
+    text = (
+        (checkout / "configs/cells/demo.yaml")
+        .read_text()
+        .replace("../robots", str(checkout / "configs/robots"))
+    )
     for pacing in ("lockstep", "timed"):
-        (folder / f"{pacing}.yaml").write_text(text.replace("pacing: lockstep", f"pacing: {pacing}"))
+        (folder / f"{pacing}.yaml").write_text(
+            text.replace("pacing: lockstep", f"pacing: {pacing}")
+        )
     return {pacing: str(folder / f"{pacing}.yaml") for pacing in ("lockstep", "timed")}
 
 
@@ -41,7 +47,10 @@ def _failing(error: DriverError, part: Path | None) -> object:
 
 @pytest.mark.parametrize(
     ("valid", "code", "said"),
-    [(True, ExitCode.OK, "complete"), (False, ExitCode.DATA_UNFIT, "INVALID: 2 missing answers; a fit will refuse it")],
+    [
+        (True, ExitCode.OK, "complete"),
+        (False, ExitCode.DATA_UNFIT, "INVALID: 2 missing answers; a fit will refuse it"),
+    ],
 )
 def test_a_recording_with_losses_is_reported_and_is_no_success(
     cells: dict[str, str],
@@ -52,11 +61,21 @@ def test_a_recording_with_losses_is_reported_and_is_no_success(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    counted = RunStatistics(1000, 0, (0, 2, 0, 0, 0, 0), valid, "" if valid else "2 missing answers")
-    monkeypatch.setattr(
-        "daq.workflow.record.record", lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics())
+    counted = RunStatistics(
+        1000, 0, (0, 2, 0, 0, 0, 0), valid, "" if valid else "2 missing answers"
     )
-    command = ["record", cells["lockstep"], "plan.yaml", "--out", str(tmp_path / "a.mcap"), "--enable-motion"]
+    monkeypatch.setattr(
+        "daq.workflow.record.record",
+        lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics()),
+    )
+    command = [
+        "record",
+        cells["lockstep"],
+        "plan.yaml",
+        "--out",
+        str(tmp_path / "a.mcap"),
+        "--enable-motion",
+    ]
     assert main(command) == code
     assert said in capsys.readouterr().out
     assert main([*command, "--json"]) == code
@@ -71,14 +90,19 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    out, part = tmp_path / name, tmp_path / f"{name}.part"
+    out = tmp_path / name
+    part = tmp_path / f"{name}.part"
     command = ["record", cells["lockstep"], "plan.yaml", "--out", str(out), "--enable-motion"]
-    monkeypatch.setattr("daq.workflow.record.record", _failing(DriveFault(3, "no heartbeat for 0.5 s"), part))
+    monkeypatch.setattr(
+        "daq.workflow.record.record", _failing(DriveFault(3, "no heartbeat for 0.5 s"), part)
+    )
     assert main(command) == ExitCode.DEVICE_FAULT
     first = " ".join(capsys.readouterr().err.split())
     assert f"kept: the samples recorded until then are in {part}" in first
     # The second attempt does not even reach the bus.
-    monkeypatch.setattr("daq.workflow.record.record", lambda *_, **__: pytest.fail("the recording began"))
+    monkeypatch.setattr(
+        "daq.workflow.record.record", lambda *_, **__: pytest.fail("the recording began")
+    )
     assert main(command) == ExitCode.USAGE
     second = " ".join(capsys.readouterr().err.split())
     assert "the rest of a recording" in second
@@ -90,13 +114,21 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
 
 
 def test_a_lost_sample_of_a_real_cell_does_not_name_lockstep(
-    cells: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cells: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     real = Path(cells["timed"]).with_name("real.yaml")
-    real.write_text(Path(cells["timed"]).read_text().replace("interface: virtual", "interface: socketcan"))
+    real.write_text(
+        Path(cells["timed"]).read_text().replace("interface: virtual", "interface: socketcan")
+    )
     error = SampleLost(7, (0,), ("J1 (node 1)",))
     monkeypatch.setattr("daq.workflow.record.record", _failing(error, None))
-    assert main(["record", str(real), "plan.yaml", "--out", str(tmp_path / "run.mcap")]) == ExitCode.DEVICE_FAULT
+    assert (
+        main(["record", str(real), "plan.yaml", "--out", str(tmp_path / "run.mcap")])
+        == ExitCode.DEVICE_FAULT
+    )
     output = " ".join(capsys.readouterr().err.split())
     assert "hint: check the load of bus and computer" in output
     assert "lockstep" not in output

@@ -55,7 +55,9 @@ def _node(node_id: int, statusword: int | None, serial: int | None = None) -> Fo
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width, soft_wrap=True).print(scan_table(scanned_nodes(cell, nodes, "demo")))
+    Console(file=out, width=width, soft_wrap=True).print(
+        scan_table(scanned_nodes(cell, nodes, "demo"))
+    )
     return out.getvalue()
 
 
@@ -72,13 +74,19 @@ def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
         (None, None),
     ],
 )
-def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled: bool | None) -> None:
+def test_an_enabled_axis_is_shouted(
+    cell: Cell, statusword: int | None, enabled: bool | None
+) -> None:
     nodes = (_node(1, 0x250), _node(2, statusword))
     rows = scanned_nodes(cell, nodes, "demo")
     assert [row.enabled for row in rows] == [False, enabled, None, None, None, None]
     in_fault = statusword in {0x0208, 0x020F}
     assert [row.in_fault for row in rows] == [False, in_fault, *[False] * 4]
-    assert [row.verdict for row in rows] == ["ok", "in fault" if in_fault else "ok", *["missing"] * 4]
+    assert [row.verdict for row in rows] == [
+        "ok",
+        "in fault" if in_fault else "ok",
+        *["missing"] * 4,
+    ]
     for width in (40, 80, 200):
         text = _shown(cell, nodes, width)
         assert ("ENABLED" in text) is bool(enabled)
@@ -95,8 +103,13 @@ def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None
         assert all(str(1000 + number) in text for number in range(1, 7))
 
 
-def test_a_virtual_bus_without_a_cell_names_the_simulation(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scan", str(checkout / "configs/cells/five-bar.yaml"), "--wait", "0.05"]) == ExitCode.DEVICE_FAULT
+def test_a_virtual_bus_without_a_cell_names_the_simulation(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["scan", str(checkout / "configs/cells/five-bar.yaml"), "--wait", "0.05"])
+        == ExitCode.DEVICE_FAULT
+    )
     said = capsys.readouterr().err
     assert "start `drivegain simulate five-bar`" in said
     assert "wiring" not in said
@@ -108,7 +121,10 @@ def test_a_scan_without_answers_does_not_advise_a_scan(
     configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
     file = configs / "cells/demo.yaml"
     file.write_text(file.read_text().replace("node_id: 6", "node_id: 66"))
-    with open_bus(bus_address(cell)) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus):
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
+    ):
         assert main(["scan", str(file), "--json"]) == ExitCode.DEVICE_FAULT
     failure = json.loads(capsys.readouterr().err)
     assert failure["kind"] == "NodeMissing"
@@ -120,7 +136,8 @@ def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
     real = replace(cell, buses=(replace(cell.buses[0], interface="socketcan"),))
     axes = drive_axes(real)
     assert "check power, wiring" in str(no_answer(real, axes, (), 0.5))
-    assert "check power, wiring" in str(no_answer(cell, axes[1:], (1,), 0.5))  # one answered: a cell is there
+    # One answered: a cell is there
+    assert "check power, wiring" in str(no_answer(cell, axes[1:], (1,), 0.5))
 
 
 def test_a_message_names_the_axis_first(cell: Cell) -> None:
@@ -133,7 +150,10 @@ def test_a_message_names_the_axis_first(cell: Cell) -> None:
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
     (row, *_) = scanned_nodes(cell, (_node(1, 0x237, serial=9),), "demo")
     assert (row.verdict, row.enabled) == ("other serial number", True)
-    assert row.remarks == ["serial number 1018h:04 is 9, the cell configuration expects 1001", OTHER_DRIVE]
+    assert row.remarks == [
+        "serial number 1018h:04 is 9, the cell configuration expects 1001",
+        OTHER_DRIVE,
+    ]
 
 
 def test_table_and_remarks_write_the_numbers_of_an_identity_alike(cell: Cell) -> None:
@@ -142,7 +162,10 @@ def test_table_and_remarks_write_the_numbers_of_an_identity_alike(cell: Cell) ->
     cells = _shown(cell, (other,), 200).split()
     for number, expected in (("0x2", "0x29a"), ("0x3", "0x40200"), ("4", "1001")):
         assert number in cells
-        assert any(f"is {number}, the cell configuration expects {expected}" in remark for remark in rows[0].remarks)
+        assert any(
+            f"is {number}, the cell configuration expects {expected}" in remark
+            for remark in rows[0].remarks
+        )
 
 
 def test_a_drive_without_the_declared_serial_number_is_not_said_to_have_zero(cell: Cell) -> None:
@@ -155,7 +178,9 @@ def test_a_drive_without_the_declared_serial_number_is_not_said_to_have_zero(cel
     ]
 
 
-@pytest.mark.parametrize("identity", [None, Identity(0x29A), Identity(0x29A, None, 1001), Identity(0x29A, 0x40200)])
+@pytest.mark.parametrize(
+    "identity", [None, Identity(0x29A), Identity(0x29A, None, 1001), Identity(0x29A, 0x40200)]
+)
 @pytest.mark.parametrize("reported", [Identity(0x29A, 0x40200, 1001), Identity(0x29A, None, 1001)])
 def test_a_field_that_is_left_out_of_an_identity_is_not_compared(
     cell: Cell, identity: Identity | None, reported: Identity
@@ -168,17 +193,24 @@ def test_a_field_that_is_left_out_of_an_identity_is_not_compared(
 
 
 def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
-    axes = tuple(replace(axis, identity=axis.identity and replace(axis.identity, serial=None)) for axis in cell.axes)
+    axes = tuple(
+        replace(axis, identity=axis.identity and replace(axis.identity, serial=None))
+        for axis in cell.axes
+    )
     (row, *_) = scanned_nodes(replace(cell, axes=axes), (_node(1, 0x250, serial=9),), "demo")
     assert (row.verdict, row.remarks) == ("ok", [])
 
 
 def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> None:
     shared = replace(_node(1, 0x250), shared="two answers to one request")
-    rows = scanned_nodes(cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"})
+    rows = scanned_nodes(
+        cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"}
+    )
     assert [row.verdict for row in rows[:2]] == ["two devices", "profile does not fit"]
     said = [str(part) for part in scan_view(scan_report(cell, rows, {}, (), ()))]
-    assert said[1].startswith("J1 (node 1): found two answers to one request; two devices have this node id")
+    assert said[1].startswith(
+        "J1 (node 1): found two answers to one request; two devices have this node id"
+    )
     assert said[2] == "J2 (node 2): found no object 6074h:00"
 
 
@@ -200,7 +232,14 @@ def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
         monkeypatch.setattr(server, "_read", read)
         assert main(["scan", str(checkout / "configs/cells/demo.yaml"), "--json"]) == ExitCode.OK
     rows = json.loads(capsys.readouterr().out)["nodes"]
-    assert [row["verdict"] for row in rows] == ["ok", "ok", "profile does not fit", "ok", "ok", "ok"]
+    assert [row["verdict"] for row in rows] == [
+        "ok",
+        "ok",
+        "profile does not fit",
+        "ok",
+        "ok",
+        "ok",
+    ]
     (remark,) = rows[2]["remarks"]
     assert "no object 6075h:00 (scale of the current)" in remark
 
@@ -233,7 +272,8 @@ def test_a_drive_with_a_vendor_alone_passes_a_cell_without_its_product_and_seria
         assert main(["scan", str(file)]) == ExitCode.OK
         assert "Next: drivegain calibrate" in capsys.readouterr().err
         file.write_text(declared)
-        # The scan has done its work: the exit code stays, and the text says that `record` will refuse.
+        # The scan has done its work: the exit code stays, and the text says that `record` will
+        # refuse.
         assert main(["scan", str(file)]) == ExitCode.OK
         shown = capsys.readouterr()
     assert "J5 (node 5): serial number 1018h:04 is not reported" in shown.out
@@ -272,9 +312,11 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
 def test_a_mistyped_nameplate_is_reported_with_its_line(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """25.65 of J3 is written as mNm: the motor's data in the drive and the current gain contradict it.
+    """25.65 of J3 is written as mNm: the motor's data in the drive and the current gain contradict
+    it.
 
-    The data of J1's motor are for amperes of the other amplitude, which is within the limit, and a warning.
+    The data of J1's motor are for amperes of the other amplitude, which is within the limit, and a
+    warning.
     """
     configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
     file = configs / "cells/demo.yaml"
@@ -284,7 +326,8 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     gains = np.array([np.sqrt(2.0) * cell.axes[0].nameplate_gain, 0.0, 25.65])
     constants = gains / np.abs(DriveTrain(cell.ratio).reduction[:3])
     first, third = (
-        replace(spec.axes[i], entered_torque_nm=constants[i] * spec.axes[i].rated_current_a) for i in (0, 2)
+        replace(spec.axes[i], entered_torque_nm=constants[i] * spec.axes[i].rated_current_a)
+        for i in (0, 2)
     )
     spec = replace(spec, axes=(first, spec.axes[1], third, *spec.axes[3:]))
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
@@ -294,7 +337,8 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
         assert main(["scan", str(file), "--json"]) == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
     assert (
-        f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while the current gain is 25.65 ("
+        f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while the current "
+        "gain is 25.65 ("
     ) in shown.out
     assert "Next" not in shown.err
     (by_drive,) = document["mistyped"]
@@ -304,20 +348,30 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     assert warning.split()[-1] in shown.out
 
 
-# -- a cell file that every other verb refuses -------------------------------------------------------------------------
+# -- a cell file that every other verb refuses
+# -------------------------------------------------------------------------
 
 
 def scan_edited(
-    checkout: Path, cell: Cell, folder: Path, edit: Callable[[str], str], capsys: pytest.CaptureFixture[str]
+    checkout: Path,
+    cell: Cell,
+    folder: Path,
+    edit: Callable[[str], str],
+    capsys: pytest.CaptureFixture[str],
 ) -> tuple[dict[str, Any], str]:
-    """JSON and text of a scan of the demo cell with an edited file, all of whose drives are on the bus."""
+    """JSON and text of a scan of the demo cell with an edited file,
+    all of whose drives are on the bus.
+    """
     configs = Path(shutil.copytree(checkout / "configs", folder / "configs"))
     file = configs / "cells/demo.yaml"
     before = file.read_text(encoding="utf-8")
     edited = edit(before)
     assert edited != before
     file.write_text(edited, encoding="utf-8")
-    with open_bus(bus_address(cell)) as bus, SimulatedCell(load_simulation(shipped_simulation("clean")), bus):
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
+    ):
         assert main(["scan", str(file), "--json"]) == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
         assert main(["scan", str(file)]) == ExitCode.OK
@@ -363,7 +417,9 @@ def test_a_wrong_number_elsewhere_keeps_no_drive_from_being_found(
     said: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    document, shown = scan_edited(checkout, cell, tmp_path, lambda text: text.replace(before, after, 1), capsys)
+    document, shown = scan_edited(
+        checkout, cell, tmp_path, lambda text: text.replace(before, after, 1), capsys
+    )
     assert [row["verdict"] for row in document["nodes"]] == ["ok"] * 6
     assert said in document["cell_fault"]
     assert "every other command refuses the cell file" in shown
@@ -411,7 +467,8 @@ def test_a_file_without_any_node_id_is_refused_as_before(
     assert "did you mean that?" in failure["found"]
 
 
-# -- while another program uses the bus --------------------------------------------------------------------------------
+# -- while another program uses the bus
+# --------------------------------------------------------------------------------
 
 
 def sent_requests(witness: can.BusABC) -> list[int]:
@@ -429,7 +486,11 @@ def test_a_scan_while_a_recorder_has_the_bus_is_refused_like_a_second_recording(
 ) -> None:
     file = str(checkout / "configs/cells/demo.yaml")
     spec = load_simulation(shipped_simulation("clean"))
-    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus), open_bus(bus_address(cell)) as witness:
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(spec, bus),
+        open_bus(bus_address(cell)) as witness,
+    ):
         with bus_lock(cell):
             assert main(["scan", file, "--json", *options]) == ExitCode.BUS_TAKEN
         failure = json.loads(capsys.readouterr().err)
@@ -445,7 +506,11 @@ def test_a_scan_beside_a_master_whose_lock_is_not_seen_sends_nothing(
     """A recorder in a container, on another computer, or of another maker."""
     over = threading.Event()
     spec = load_simulation(shipped_simulation("clean"))
-    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus), open_bus(bus_address(cell)) as master:
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(spec, bus),
+        open_bus(bus_address(cell)) as master,
+    ):
 
         def lead() -> None:
             while not over.wait(0.01):
@@ -481,9 +546,20 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The heartbeats of a cell in lockstep come as fast as its SYNC."""
-    file, plan, log = checkout / "configs/cells/demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    file = checkout / "configs/cells/demo.yaml"
+    plan = tmp_path / "plan.yaml"
+    log = tmp_path / "a.mcap"
     plan.write_text(PLAN, encoding="utf-8")
-    command = ["record", str(file), str(plan), "--out", str(log), "--enable-motion", "--speed", "0.05"]
+    command = [
+        "record",
+        str(file),
+        str(plan),
+        "--out",
+        str(log),
+        "--enable-motion",
+        "--speed",
+        "0.05",
+    ]
     ended: list[int] = []
     recorder = threading.Thread(target=lambda: ended.append(main(command)))
     spec = load_simulation(shipped_simulation("clean"))
@@ -491,8 +567,12 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
 
         def in_motion(link: Link) -> bool:
-            """Whether all axes have power, and all heartbeats that the link knows came since then."""
-            if not all(node.drive.state is PowerState.OPERATION_ENABLED for node in simulated.nodes):
+            """Whether all axes have power, and all heartbeats that the link knows came since
+            then.
+            """
+            if not all(
+                node.drive.state is PowerState.OPERATION_ENABLED for node in simulated.nodes
+            ):
                 for node in simulated.nodes:
                     link.count_beats(node.node_id)
                 return False
@@ -505,7 +585,8 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
         recorder.join()
     assert code == ExitCode.BUS_TAKEN
     assert [link.shared_id(node_id, 100) for node_id in range(1, 7)] == [""] * 6
-    # All moves were made; on a busy machine an answer of the simulated cell may be late, which is counted.
+    # All moves were made; on a busy machine an answer of the simulated cell may be late, which is
+    # counted.
     assert ended[0] in (ExitCode.OK, ExitCode.DATA_UNFIT)
     kinds = [event.kind for event in read_log(log).events]
     assert kinds.count(EventKind.MOVE_END) == 2

@@ -46,7 +46,9 @@ def test_each_bus_has_its_nodes() -> None:
 def test_what_is_said_wrongly_of_a_bus_is_refused(said: tuple[str, ...], message: str) -> None:
     with pytest.raises(UsageError) as caught:
         nodes_on_buses(said, (1, 2, 3, 4))
-    assert message in f"{caught.value.subject} {caught.value.found}; expected: {caught.value.expected}"
+    assert message in (
+        f"{caught.value.subject} {caught.value.found}; expected: {caught.value.expected}"
+    )
 
 
 def test_the_part_of_a_cell_file_can_be_pasted() -> None:
@@ -56,12 +58,20 @@ def test_the_part_of_a_cell_file_can_be_pasted() -> None:
         for name, some in zip(("can0", "can1"), nodes, strict=True)
     )
     _, pasted, axes, _ = how_to_reach(hub, 2000).split("\n\n")
-    keys = {"interface": "socketcand", "host": "127.0.0.1", "port": 4000, "bitrate_bit_s": 1_000_000}
+    keys = {
+        "interface": "socketcand",
+        "host": "127.0.0.1",
+        "port": 4000,
+        "bitrate_bit_s": 1_000_000,
+    }
     assert yaml.safe_load(pasted) == {
         "bus": [{"name": name, "channel": name, **keys} for name in ("can0", "can1")],
         "sync": {"period_us": 2000, "pacing": "lockstep"},
     }
-    assert axes.splitlines() == ["axes with node_id 1, 2: add bus: can0", "axes with node_id 3: add bus: can1"]
+    assert axes.splitlines() == [
+        "axes with node_id 1, 2: add bus: can0",
+        "axes with node_id 3: add bus: can1",
+    ]
     one = BusPart("can0", BusAddress("socketcan", "can0"), frozenset())
     _, pasted, _ = how_to_reach((one,), 1000).split("\n\n")
     assert yaml.safe_load(pasted) == {
@@ -76,7 +86,9 @@ def test_a_mechanism_that_does_not_close_is_refused_with_its_file(
     folder = checkout / "configs/simulation"
     (tmp_path / "five-bar-plant.urdf").write_bytes((folder / "five-bar-plant.urdf").read_bytes())
     text = (
-        (folder / "five-bar.yaml").read_text(encoding="utf-8").replace("directions: [x, y]", "directions: [x, y, rz]")
+        (folder / "five-bar.yaml")
+        .read_text(encoding="utf-8")
+        .replace("directions: [x, y]", "directions: [x, y, rz]")
     )
     (tmp_path / "five-bar.yaml").write_text(text, encoding="utf-8")
     assert main(["simulate", str(tmp_path / "five-bar.yaml"), "--interface", "virtual"]) == 6
@@ -96,7 +108,10 @@ def test_a_bus_that_fails_is_an_error_with_a_remedy(
             raise can.CanOperationError("the server closed the connection")
 
     monkeypatch.setattr("drivers.simulation.cell.SimulatedCell", Cell)
-    assert main(["simulate", "clean", "--interface", "virtual", "--channel", "failing"]) == ExitCode.DEVICE_FAULT
+    assert (
+        main(["simulate", "clean", "--interface", "virtual", "--channel", "failing"])
+        == ExitCode.DEVICE_FAULT
+    )
     said = capsys.readouterr().err
     assert "virtual:failing" in said
     assert "the server closed the connection" in said
@@ -125,7 +140,11 @@ def test_without_its_packages_the_extra_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(daq.simulation.simulation_file, "find_spec", lambda name: None if name == package else object())
+    monkeypatch.setattr(
+        daq.simulation.simulation_file,
+        "find_spec",
+        lambda name: None if name == package else object(),
+    )
     assert main(verb) == 6
     said = capsys.readouterr().err
     assert f"no package {package}" in said
@@ -148,11 +167,16 @@ def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
 
 
 def test_no_amplifiers_join_a_bus_on_which_a_recorder_moves_others(
-    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    checkout: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("daq.workflow.bus_lock.SHARED_FOLDERS", (tmp_path,))
     tmp_path.chmod(0o1777)
-    monkeypatch.setattr("drivers.canopen.bus.open_bus", lambda *_, **__: pytest.fail("the bus was opened"))
+    monkeypatch.setattr(
+        "drivers.canopen.bus.open_bus", lambda *_, **__: pytest.fail("the bus was opened")
+    )
     cell = load_cell(checkout / "configs/cells/demo.yaml")
     there = replace(cell, buses=(replace(cell.buses[0], interface="socketcan", channel="vcan9"),))
     with bus_lock(there):

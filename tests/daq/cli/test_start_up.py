@@ -17,7 +17,14 @@ NUMERICS = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
 """Libraries that only identification, simulation and pictures use."""
 
 UNUSED = {
-    "scan": ("scipy", "cryptography", "mcap", "rich.progress", "ident.estimators", "ident.discovery"),
+    "scan": (
+        "scipy",
+        "cryptography",
+        "mcap",
+        "rich.progress",
+        "ident.estimators",
+        "ident.discovery",
+    ),
     "info": (
         "scipy",
         "can",
@@ -29,7 +36,16 @@ UNUSED = {
         "rich.progress",
         "daq.writeback",
     ),
-    "history": ("scipy", "can", "canopen", "asyncio", "cryptography", "mcap", "rich.progress", "ident.discovery"),
+    "history": (
+        "scipy",
+        "can",
+        "canopen",
+        "asyncio",
+        "cryptography",
+        "mcap",
+        "rich.progress",
+        "ident.discovery",
+    ),
 }
 """Further modules that each of these verbs does without; `scan` alone opens a bus."""
 
@@ -46,9 +62,15 @@ for verb in VERBS:
 
 def _loaded(code: str, names: tuple[str, ...], checkout: Path) -> list[str]:
     """Return those of the modules that a process has loaded after running some code."""
-    last = f"import sys; print(*(name for name in {names!r} if name in sys.modules), file=sys.stderr)"
+    last = (
+        f"import sys; print(*(name for name in {names!r} if name in sys.modules), file=sys.stderr)"
+    )
     done = subprocess.run(
-        [sys.executable, "-c", f"{code}\n{last}"], capture_output=True, text=True, cwd=checkout, check=True
+        [sys.executable, "-c", f"{code}\n{last}"],
+        capture_output=True,
+        text=True,
+        cwd=checkout,
+        check=True,
     )
     return done.stderr.splitlines()[-1].split()
 
@@ -58,20 +80,34 @@ def test_no_help_waits_for_numerics_or_the_bus(checkout: Path) -> None:
 
 
 def test_an_error_as_text_waits_for_no_types_of_documents(checkout: Path) -> None:
-    assert _loaded("from daq.cli.app import main; main(['recrod'])", ("daq.report.document", "yaml"), checkout) == []
+    assert (
+        _loaded(
+            "from daq.cli.app import main; main(['recrod'])",
+            ("daq.report.document", "yaml"),
+            checkout,
+        )
+        == []
+    )
 
 
 @pytest.mark.parametrize("verb", UNUSED)
-def test_a_quick_verb_loads_only_libraries_that_it_uses(verb: str, checkout: Path, tmp_path: Path) -> None:
+def test_a_quick_verb_loads_only_libraries_that_it_uses(
+    verb: str, checkout: Path, tmp_path: Path
+) -> None:
     code = "from daq.cli.app import main\n"
     if verb == "scan":
         # No node answers on this bus: the table is printed, and then the error.
-        command, expected = ["scan", "configs/cells/demo.yaml", "--wait", "0.05"], ExitCode.DEVICE_FAULT
+        command = ["scan", "configs/cells/demo.yaml", "--wait", "0.05"]
+        expected = ExitCode.DEVICE_FAULT
     elif verb == "info":
-        log = write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(50)]))
-        command, expected = ["info", str(log)], ExitCode.OK
+        log = write(
+            tmp_path / "a.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(50)])
+        )
+        command = ["info", str(log)]
+        expected = ExitCode.OK
     else:
-        command, expected = ["history", str(_cell_with_history(checkout, tmp_path))], ExitCode.OK
+        command = ["history", str(_cell_with_history(checkout, tmp_path))]
+        expected = ExitCode.OK
     code += f"assert main({command!r}) == {int(expected)}\n"
     assert _loaded(code, (*NUMERICS, *UNUSED[verb]), checkout) == []
 

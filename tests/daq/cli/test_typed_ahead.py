@@ -1,4 +1,6 @@
-"""A question of a session is answered by what is typed behind it, not by keys that were pressed before."""
+"""A question of a session is answered by what is typed behind it,
+not by keys that were pressed before.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ SECONDS_TO_WAIT = 20.0  #: For what takes milliseconds
 
 
 class SessionSide:
-    """The session's side of a terminal, in the place of `sys.stdin`, which tells when a line is waited for."""
+    """The session's side of a terminal, in the place of `sys.stdin`,
+    which tells when a line is waited for.
+    """
 
     def __init__(self, side: TextIO) -> None:
         self.is_read = threading.Event()
@@ -47,7 +51,9 @@ class Terminal:
     session_side: SessionSide
 
     def press(self, keys: str) -> None:
-        """Type, and wait until the terminal shows it: then it is in the queue that the session reads."""
+        """Type, and wait until the terminal shows it:
+        then it is in the queue that the session reads.
+        """
         os.write(self.operator_side, keys.encode())
         shown = b""
         while len(shown) < len(keys.replace("\n", "\r\n")):
@@ -105,10 +111,14 @@ def test_the_lines_of_a_pipe_are_answers(monkeypatch: pytest.MonkeyPatch, tmp_pa
             ask("Anything else")
 
 
-def test_what_was_typed_before_a_stalled_screen_shows_the_question_does_not_answer_it(terminal: Terminal) -> None:
+def test_what_was_typed_before_a_stalled_screen_shows_the_question_does_not_answer_it(
+    terminal: Terminal,
+) -> None:
     answers: list[str] = []
     with full_pipe() as (reading, writing), printing_to(writing):
-        asking = threading.Thread(target=lambda: answers.append(ask("The robot moves now")), daemon=True)
+        asking = threading.Thread(
+            target=lambda: answers.append(ask("The robot moves now")), daemon=True
+        )
         asking.start()
         time.sleep(2 * SHOWN_WITHIN_S)
         terminal.press("\n")

@@ -1,4 +1,6 @@
-"""Text and numbers from an untrusted file: in tables, pictures and on the terminal they are only shown."""
+"""Text and numbers from an untrusted file:
+in tables, pictures and on the terminal they are only shown.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def test_bytes_of_a_name_that_are_no_characters_are_spelt_out() -> None:
 
 def _row(name: str, unit: str) -> FleetRow:
     gain = Gain(name, -3.5, 0.01, unit, -3.4)
-    return FleetRow(name, "0" * 64, (name,), (), Summary((gain,), (), 3.0, False, False), 1.0, file=Path(name))
+    return FleetRow(
+        name, "0" * 64, (name,), (), Summary((gain,), (), 3.0, False, False), 1.0, file=Path(name)
+    )
 
 
 @pytest.mark.parametrize("text", [*FORMULAS, "b\udcff"])
@@ -76,13 +80,20 @@ def _watched(path: Path, times: tuple[datetime, ...], unit: str = "Nm/A") -> tup
     ledger = ledger_in(path)
     for number, time in enumerate(times):
         made = replace(calibration_of(number), created=time.isoformat())
-        enter(ledger, recorded(replace(made, gains=tuple(replace(gain, unit=unit) for gain in made.gains)), time))
+        enter(
+            ledger,
+            recorded(
+                replace(made, gains=tuple(replace(gain, unit=unit) for gain in made.gains)), time
+            ),
+        )
     history = read_history(ledger)
     return watch(history.entries, history.acknowledgements)
 
 
 def test_the_table_of_a_history_has_no_formula(tmp_path: Path) -> None:
-    made = csv_text(_watched(tmp_path, (datetime(2026, 1, 5, tzinfo=UTC),), unit="=cmd|'/c calc'!A1"))
+    made = csv_text(
+        _watched(tmp_path, (datetime(2026, 1, 5, tzinfo=UTC),), unit="=cmd|'/c calc'!A1")
+    )
     for row in csv.DictReader(io.StringIO(made, newline="")):
         assert row["unit"] == "'=cmd|'/c calc'!A1"
         assert float(row["gain"])
@@ -96,7 +107,9 @@ def test_the_table_of_a_history_has_no_formula(tmp_path: Path) -> None:
         (datetime(1, 1, 1, 1, tzinfo=UTC), datetime(9999, 1, 1, tzinfo=UTC)),
     ],
 )
-def test_a_history_that_ends_with_the_calendar_is_drawn(times: tuple[datetime, ...], tmp_path: Path) -> None:
+def test_a_history_that_ends_with_the_calendar_is_drawn(
+    times: tuple[datetime, ...], tmp_path: Path
+) -> None:
     with warnings.catch_warnings(action="error"):
         drawn = plot_history(_watched(tmp_path, times)[:1], "svg", title="demo")
     assert drawn.startswith(b"<?xml")
@@ -108,7 +121,8 @@ def _proposal(folder: Path, unit: str) -> Proposal[FileEdit]:
     demo = demo_calibration()
     made = replace(demo, gains=tuple(replace(gain, unit=unit) for gain in demo.gains))
     return propose(
-        FileTarget(file, dict(zip(AXES, AXES, strict=True))), Request(made, datetime(2025, 1, 2, tzinfo=UTC))
+        FileTarget(file, dict(zip(AXES, AXES, strict=True))),
+        Request(made, datetime(2025, 1, 2, tzinfo=UTC)),
     )
 
 

@@ -1,6 +1,8 @@
-"""Compare a drive profile, and the PDOs of a recording with it, with the maker's data sheet (EDS or DCF, CiA 306).
+"""Compare a drive profile, and the PDOs of a recording with it,
+with the maker's data sheet (EDS or DCF, CiA 306).
 
-No verb needs data sheets. They serve the author of a profile, through the tests of the shipped profiles.
+No verb needs data sheets. They serve the author of a profile, through the tests of the shipped
+profiles.
 """
 
 from __future__ import annotations
@@ -15,18 +17,29 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable
 from canopen.objectdictionary.datatypes import INTEGER_TYPES, SIGNED_TYPES
 from canopen.objectdictionary.eds import import_eds
 
-from drivers.canopen.pdo import COMMAND, MOTION_PROFILE, PROFILE_DECELERATION, STATUSWORD, Direction, wanted_pdos
+from drivers.canopen.pdo import (
+    COMMAND,
+    MOTION_PROFILE,
+    PROFILE_DECELERATION,
+    STATUSWORD,
+    Direction,
+    wanted_pdos,
+)
 from drivers.canopen.setup import needs_of
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 
 LARGEST_BYTES = 4 * 2**20
 _READABLE = {"ro", "rw", "rwr", "rww", "const"}
-_EMPTY_FIELD = re.compile(r"^(?:PDOMapping|ObjectType|SubNumber)=[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+_EMPTY_FIELD = re.compile(
+    r"^(?:PDOMapping|ObjectType|SubNumber)=[ \t\r]*$", re.MULTILINE | re.IGNORECASE
+)
 """Fields of an object that real data sheets leave empty and canopen cannot read."""
 
 
 _OCTAL = re.compile(
-    r"^([A-Za-z]+[ \t]*=[ \t]*(?:\$NODEID[ \t]*\+[ \t]*)?)0([0-7]+)(?=[ \t]*(?:\+|\r?$))", re.MULTILINE | re.IGNORECASE
+    r"^([A-Za-z]+[ \t]*=[ \t]*(?:\$NODEID[ \t]*\+[ \t]*)?)0([0-7]+)(?=[ "
+    r"\t]*(?:\+|\r?$))",
+    re.MULTILINE | re.IGNORECASE,
 )
 """Octal numbers as CiA 306 has them, with a leading 0; canopen reads those of Python, with 0o."""
 
@@ -49,15 +62,20 @@ def data_sheet(text: bytes, name: str, node_id: int | None = None) -> ObjectDict
     try:
         sheet: ObjectDictionary = import_eds(StringIO(readable), node_id)
         _complete_compact_arrays(sheet, readable)
-    except Exception as error:  # canopen raises errors of many kinds for a file that is not a data sheet
-        raise ValueError(_message(name, f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}")) from error
+    # canopen raises errors of many kinds for a file that is not a data sheet.
+    except Exception as error:
+        raise ValueError(
+            _message(name, f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}")
+        ) from error
     if not any(index >= 0x1000 for index in sheet):
         raise ValueError(_message(name, "no objects"))
     return sheet
 
 
 def _complete_compact_arrays(sheet: ObjectDictionary, text: str) -> None:
-    """Add the elements behind the first of arrays by CompactSubObj; those that canopen makes lack PDOMapping."""
+    """Add the elements behind the first of arrays by CompactSubObj;
+    those that canopen makes lack PDOMapping.
+    """
     parser = RawConfigParser(inline_comment_prefixes=(";",), strict=False)
     parser.read_string(text)
     for section in parser.sections():
@@ -76,7 +94,9 @@ def _complete_compact_arrays(sheet: ObjectDictionary, text: str) -> None:
 
 
 def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, ...]:
-    """List the statements of a profile that the drive's data sheet contradicts; empty if the two agree."""
+    """List the statements of a profile that the drive's data sheet contradicts;
+    empty if the two agree.
+    """
     rated = profile.rated
     read = list(needs_of(profile))
     if rated is not None:
@@ -85,15 +105,23 @@ def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, 
         read.append(profile.torque)
     if profile.save is not None:
         read.append(profile.save.command)
-    mapped = {profile.position, profile.current, STATUSWORD, *COMMAND, *MOTION_PROFILE} - {PROFILE_DECELERATION}
+    mapped = {profile.position, profile.current, STATUSWORD, *COMMAND, *MOTION_PROFILE} - {
+        PROFILE_DECELERATION
+    }
     lacks_deceleration = sheet.get_variable(PROFILE_DECELERATION.index, 0) is None
     if not lacks_deceleration:
         mapped.add(PROFILE_DECELERATION)
         read.append(PROFILE_DECELERATION)
-    faults = [fault for entry in dict.fromkeys(read) for fault in _faults(entry, sheet, mapped=entry in mapped)]
+    faults = [
+        fault
+        for entry in dict.fromkeys(read)
+        for fault in _faults(entry, sheet, mapped=entry in mapped)
+    ]
     numbers = {way: [n for n in range(4) if way.value[0] + n in sheet] for way in Direction}
     try:
-        wanted_pdos(Axis("any", 1, profile), numbers, MOTION_PROFILE[2:] if lacks_deceleration else ())
+        wanted_pdos(
+            Axis("any", 1, profile), numbers, MOTION_PROFILE[2:] if lacks_deceleration else ()
+        )
     except ValueError as error:
         faults.append(str(error))
     return tuple(faults)
@@ -124,4 +152,7 @@ def _type_name(bits: int, signed: bool) -> str:
 
 
 def _message(name: str, found: str) -> str:
-    return f"{name}: found {found}; expected an electronic data sheet (EDS or DCF, CiA 306); is this the right file?"
+    return (
+        f"{name}: found {found}; expected an electronic data sheet (EDS or DCF, CiA 306); is "
+        "this the right file?"
+    )

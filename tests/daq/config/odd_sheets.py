@@ -1,8 +1,8 @@
 """Data sheets (EDS) that are odd as CiA 306 allows, written from a known object dictionary.
 
-Numbers are decimal, hexadecimal or octal; a default may depend on the node id, on either side of the plus; objects
-come in any order, between comments and empty lines; records lack sub-indices; arrays are written in full or by
-CompactSubObj, with names of some sub-indices.
+Numbers are decimal, hexadecimal or octal; a default may depend on the node id, on either side of
+the plus; objects come in any order, between comments and empty lines; records lack sub-indices;
+arrays are written in full or by CompactSubObj, with names of some sub-indices.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ def variables(draw: st.DrawFn, name: str) -> Variable:
     default: int | None = draw(st.integers(least, most - 127))
     if not of_node:
         default = draw(st.one_of(st.none(), st.just(default)))
-    return Variable(name, data_type, draw(st.sampled_from(ACCESS)), draw(st.booleans()), default, of_node)
+    return Variable(
+        name, data_type, draw(st.sampled_from(ACCESS)), draw(st.booleans()), default, of_node
+    )
 
 
 @st.composite
@@ -69,11 +71,19 @@ def entries(draw: st.DrawFn, index: int) -> Entry:
         named = {}
         names = draw(st.integers(0, size))
         for number in range(1, size + 1):
-            named[number] = f"Element {number}" if number <= names else ""
+            if number <= names:
+                named[number] = f"Element {number}"
+            else:
+                named[number] = ""
         elements = {}
         for number, own_name in named.items():
             elements[number] = Variable(
-                own_name, element.data_type, element.access, element.mappable, element.default, element.of_node
+                own_name,
+                element.data_type,
+                element.access,
+                element.mappable,
+                element.default,
+                element.of_node,
             )
         return Entry(name, 8, elements, compact=size)
     members = {0: count}
@@ -98,7 +108,9 @@ def sheets(draw: st.DrawFn, dictionary: dict[int, Entry]) -> str:
     lines = ["[FileInfo]", "EDSVersion=4.0", "[DeviceInfo]", "VendorName=; none"]
     for sections in draw(st.permutations(objects)):
         for section in sections:
-            lines += draw(st.sampled_from(([], [""], ["; a comment with [brackets] = and $NODEID"])))
+            lines += draw(
+                st.sampled_from(([], [""], ["; a comment with [brackets] = and $NODEID"]))
+            )
             lines += section
     return draw(st.sampled_from(LINE_ENDS)).join([*lines, ""])
 
@@ -127,7 +139,9 @@ def _sections(draw: st.DrawFn, index: int, entry: Entry) -> list[list[str]]:
         return [whole, names] if named else [whole]
     sections = [[*lines, f"SubNumber={number(draw, len(entry.variables))}"]]
     for subindex, variable in entry.variables.items():
-        name = draw(st.sampled_from((f"[{index:04X}sub{subindex:x}]", f"[{index:04X}Sub{subindex:X}]")))
+        name = draw(
+            st.sampled_from((f"[{index:04X}sub{subindex:x}]", f"[{index:04X}Sub{subindex:X}]"))
+        )
         sections.append([name, *_fields(draw, variable)])
     return sections
 
@@ -143,5 +157,7 @@ def _fields(draw: st.DrawFn, variable: Variable) -> list[str]:
         return lines
     value = number(draw, variable.default)
     if variable.of_node:
-        value = draw(st.sampled_from((f"$NODEID+{value}", f"{value}+$NODEID", f"$NodeID + {value}")))
+        value = draw(
+            st.sampled_from((f"$NODEID+{value}", f"{value}+$NODEID", f"$NodeID + {value}"))
+        )
     return [*lines, f"DefaultValue={value}"]

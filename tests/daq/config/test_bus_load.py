@@ -1,4 +1,6 @@
-"""How much of a bus a recording takes: by the standard, by real stuffing, and by what a move sends."""
+"""How much of a bus a recording takes:
+by the standard, by real stuffing, and by what a move sends.
+"""
 
 from __future__ import annotations
 
@@ -61,17 +63,23 @@ def _bits_on_the_wire(identifier: int, data: bytes) -> int:
     head = [0, *_digits(identifier, 11), 0, 0, 0, *_digits(len(data), 4)]
     head += [bit for byte in data for bit in _digits(byte, 8)]
     head += _digits(_crc(head), 15)
-    stuffed, run, last = 0, 0, -1
+    stuffed = 0
+    run = 0
+    last = -1
     for bit in head:
         run = run + 1 if bit == last else 1
         last = bit
         if run == 5:
-            stuffed, last, run = stuffed + 1, 1 - bit, 1
+            stuffed = stuffed + 1
+            last = 1 - bit
+            run = 1
     return len(head) + stuffed + 13
 
 
 def _answers_of_a_moving_arm(cycles: int, size: int) -> Iterator[int]:
-    """Bits of SYNC and six answers, cycle by cycle: positions within some turns, currents around their rated value."""
+    """Bits of SYNC and six answers, cycle by cycle:
+    positions within some turns, currents around their rated value.
+    """
     for cycle in range(cycles):
         bits = _bits_on_the_wire(0x080, b"")
         for axis in range(6):
@@ -84,7 +92,9 @@ def _answers_of_a_moving_arm(cycles: int, size: int) -> Iterator[int]:
 
 
 @pytest.mark.parametrize(("size", "mean", "worst"), [(6, 0.66, 0.75), (8, 0.76, 0.87)])
-def test_six_axes_at_a_kilohertz_take_what_was_measured(size: int, mean: float, worst: float) -> None:
+def test_six_axes_at_a_kilohertz_take_what_was_measured(
+    size: int, mean: float, worst: float
+) -> None:
     """The project's measured figures of one bus of 1 Mbit/s, and frames with real stuffing."""
     usual = (usual_bits(0) + 6 * usual_bits(size)) / 1000.0
     assert usual == pytest.approx(mean, abs=0.006)
@@ -102,11 +112,20 @@ def test_no_frame_is_longer_than_the_longest(identifier: int, data: bytes) -> No
 
 
 def test_the_longest_frame_is_nearly_reached() -> None:
-    """A stuff bit begins the next run: five equal bits, then four of each kind in turn (3Ch) are all doubled."""
-    assert max(_bits_on_the_wire(0x078, bytes((first, *[0x3C] * 7))) for first in range(256)) >= frame_bits(8) - 6
+    """A stuff bit begins the next run: five equal bits, then four of each kind in turn (3Ch)
+    are all doubled.
+    """
+    assert (
+        max(_bits_on_the_wire(0x078, bytes((first, *[0x3C] * 7))) for first in range(256))
+        >= frame_bits(8) - 6
+    )
 
 
-@given(st.integers(1, 12), st.sampled_from((125_000, 250_000, 500_000, 1_000_000)), st.integers(0, 5000))
+@given(
+    st.integers(1, 12),
+    st.sampled_from((125_000, 250_000, 500_000, 1_000_000)),
+    st.integers(0, 5000),
+)
 def test_the_shortest_period_is_just_allowed(axes: int, bitrate: int, longer_us: int) -> None:
     used = [PROFILE] * axes
     shortest = shortest_period_us(used, bitrate)
@@ -118,7 +137,8 @@ def test_the_shortest_period_is_just_allowed(axes: int, bitrate: int, longer_us:
 @given(st.integers(1, 11), st.integers(500, 20_000))
 def test_more_axes_and_shorter_periods_load_a_bus_more(axes: int, period_us: int) -> None:
     load = bus_load([PROFILE] * axes, BITRATE, period_us)
-    more, faster = bus_load([PROFILE] * (axes + 1), BITRATE, period_us), bus_load([PROFILE] * axes, BITRATE, 400)
+    more = bus_load([PROFILE] * (axes + 1), BITRATE, period_us)
+    faster = bus_load([PROFILE] * axes, BITRATE, 400)
     for other in (more, faster):
         assert (other.mean, other.worst, other.start) > (load.mean, load.worst, load.start)
     assert load.start > load.worst * 0.8
@@ -150,12 +170,18 @@ def test_a_current_of_32_bits_takes_a_second_frame() -> None:
     )
     assert split_answers(wide)
     assert not split_answers(PROFILE)
-    assert bus_load([wide], BITRATE, 1000).mean > bus_load([PROFILE], BITRATE, 1000).mean + usual_bits(2) / 1000 - 0.01
+    assert (
+        bus_load([wide], BITRATE, 1000).mean
+        > bus_load([PROFILE], BITRATE, 1000).mean + usual_bits(2) / 1000 - 0.01
+    )
 
 
 def test_a_move_sends_no_more_than_is_counted() -> None:
     network, bus = cell(2)
-    moves = (Move((1000, -1000), (20_000, 20_000), (100_000, 100_000)), Move((0, 0), (20_000,) * 2, (100_000,) * 2))
+    moves = (
+        Move((1000, -1000), (20_000, 20_000), (100_000, 100_000)),
+        Move((0, 0), (20_000,) * 2, (100_000,) * 2),
+    )
     with network:
         network.prepare()
         stream = SyncStream(network, LockstepSync(PERIOD_NS, clock=bus.clock))
@@ -177,10 +203,12 @@ def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of(
     assert bus.name == "demo"
     assert load.allowed
     assert 0.76 < load.mean < LARGEST_MEAN
-    # Six set-points of six bytes beside six answers: not within a millisecond of a wire of 1 Mbit/s.
+    # Six set-points of six bytes beside six answers: not within a millisecond of a wire of 1
+    # Mbit/s.
     assert load.start == pytest.approx(1.37, abs=0.01)
     assert load_lines(CELL) == (
-        "demo (virtual:demo): in lockstep; a real bus would be loaded by 77 % on average, 86 % at worst",
+        "demo (virtual:demo): in lockstep; a real bus would be loaded by 77 % on average, 86 "
+        "% at worst",
     )
     assert load_warnings(CELL) == ()
     files = bundle(shipped_configurations() / "cells/demo.yaml")
@@ -188,13 +216,19 @@ def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of(
     timed = text.replace("pacing: lockstep", "pacing: timed")
     (warning,) = load_warnings(cell_from_bundle({**files, "cell.yaml": timed.encode()}))
     assert warning.startswith("demo: when all its axes start, set-points and answers take 137 %")
-    two = cell_from_bundle({**files, "cell.yaml": on_two_buses(timed, "socketcand", "a", "b").encode()})
+    two = cell_from_bundle(
+        {**files, "cell.yaml": on_two_buses(timed, "socketcand", "a", "b").encode()}
+    )
     assert load_warnings(two) == ()
-    assert [line.partition(": ")[2] for line in load_lines(two)] == ["loaded by 41 % on average, 46 % at worst"] * 2
+    assert [line.partition(": ")[2] for line in load_lines(two)] == [
+        "loaded by 41 % on average, 46 % at worst"
+    ] * 2
 
 
 def test_torque_and_temperature_are_read_only_where_a_period_has_room_for_an_sdo() -> None:
-    """Six axes at 1 ms fill up to 87 % of a bus; a request and its answer take up to 27 % of such a period."""
+    """Six axes at 1 ms fill up to 87 % of a bus;
+    a request and its answer take up to 27 % of such a period.
+    """
     assert CELL.sync is not None
     timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
     assert not polling_fits(timed)

@@ -10,13 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.config.cell import PacingMode, model_of
+from daq.config.cell import PacingMode, joint_names, model_of
 from daq.config.cell_buses import bus_address, bus_parts, cell_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.config.drive import drive_from_text
 from daq.config.yaml_file import parse_yaml
 from daq.environment import shipped_configurations
-from daq.errors import ConfigurationError, ConfigurationInconsistent, ConfigurationMissing, SchemaMismatch
+from daq.errors import (
+    ConfigurationError,
+    ConfigurationInconsistent,
+    ConfigurationMissing,
+    SchemaMismatch,
+)
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.split_bus import SplitAddress
 from drivers.profiles.profile import Amplitude, ObjectEntry, TapPoint
@@ -71,8 +76,12 @@ def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
         drive_axes(cell)
 
 
-@pytest.mark.parametrize("kept", ["", "    identity: {vendor_id: 1}\n", "    identity: {vendor_id: 1, serial: 2}\n"])
-def test_an_axis_may_leave_its_identity_open_or_a_part_of_it(configurations: Path, kept: str) -> None:
+@pytest.mark.parametrize(
+    "kept", ["", "    identity: {vendor_id: 1}\n", "    identity: {vendor_id: 1, serial: 2}\n"]
+)
+def test_an_axis_may_leave_its_identity_open_or_a_part_of_it(
+    configurations: Path, kept: str
+) -> None:
     path = configurations / "cells/demo.yaml"
     text = path.read_text()
     path.write_text(re.sub(r"    identity: .*\n", kept, text))
@@ -83,9 +92,14 @@ def test_an_axis_may_leave_its_identity_open_or_a_part_of_it(configurations: Pat
 
 
 def test_limits_in_rad_are_recognised_without_limits_in_the_urdf(configurations: Path) -> None:
-    """On continuous joints no number of the URDF gives the unit away, but no axis can move more than a few degrees."""
-    urdf, path = configurations / "robots/tx40.urdf", configurations / "cells/demo.yaml"
-    urdf.write_text(re.sub(r"<limit [^>]*>", "", urdf.read_text()).replace('"revolute"', '"continuous"'))
+    """On continuous joints no number of the URDF gives the unit away,
+    but no axis can move more than a few degrees.
+    """
+    urdf = configurations / "robots/tx40.urdf"
+    path = configurations / "cells/demo.yaml"
+    urdf.write_text(
+        re.sub(r"<limit [^>]*>", "", urdf.read_text()).replace('"revolute"', '"continuous"')
+    )
     load_cell(path)
     text = path.read_text()
     in_rad = re.sub(r"position_deg: \[[^]]*\]", "position_deg: [-3.1, 3.1]", text)
@@ -108,11 +122,17 @@ def test_a_log_with_an_implausible_cell_can_be_read(configurations: Path) -> Non
         (b"payloads:", b"effects: [{name: sprung, axis: J1}]\npayloads:"),
     ):
         assert old in files["cell.yaml"]
-        assert cell_from_bundle({**files, "cell.yaml": files["cell.yaml"].replace(old, new, 1)}).name == "demo"
+        assert (
+            cell_from_bundle({**files, "cell.yaml": files["cell.yaml"].replace(old, new, 1)}).name
+            == "demo"
+        )
 
 
-def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(checkout: Path, tmp_path: Path) -> None:
-    cells, drives = tmp_path / "cells", tmp_path / "drives"
+def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(
+    checkout: Path, tmp_path: Path
+) -> None:
+    cells = tmp_path / "cells"
+    drives = tmp_path / "drives"
     cells.mkdir()
     drives.mkdir()
     configs = checkout / "configs"
@@ -133,7 +153,8 @@ def test_a_bundle_is_the_same_cell_without_its_files(checkout: Path) -> None:
     path = checkout / "configs/cells/demo.yaml"
     files = bundle(path)
     assert set(files) == {"cell.yaml", "robot.urdf", "drives/generic-cia402.yaml"}
-    cell, again = load_cell(path), cell_from_bundle({**files, "readback.json": b"{}"})
+    cell = load_cell(path)
+    again = cell_from_bundle({**files, "readback.json": b"{}"})
     assert again.digest == cell.digest
     assert again.axes == cell.axes
     assert again.urdf == cell.urdf
@@ -161,42 +182,111 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
         ("name: J2", "name: J1", "J1, used 2 times"),
         ("[-170, 170]", "[170, -170]", "lower limit first"),
         ("[-170, 170]", "[-2.967, 2.967]", "the numbers of the URDF in rad"),
-        ("[-170, 170]", "[-2.5, 2.5]", "the numbers of the URDF in rad; expected deg; multiply by 57.3"),
-        ("velocity_deg_s: 200", "velocity_deg_s: 5.2", r"velocity_deg_s: found 5.2 deg/s, the number .* rad/s"),
-        ("mass_kg: 4.59", "mass_kg: 4590", r"payloads.0..mass_kg: found 4590 kg; expected at most 2500 kg, or .*in g"),
-        ("-9.81]", "-9.81]\n  rated_payload_kg: 2.3", "found 4.59 kg; expected at most the 2.3 kg of `robot.rated"),
-        ("payloads:", "payloads:\n  - {name: ring, mounting: flange-b, mass_kg: 1686}", "367 times another payload"),
+        (
+            "[-170, 170]",
+            "[-2.5, 2.5]",
+            "the numbers of the URDF in rad; expected deg; multiply by 57.3",
+        ),
+        (
+            "velocity_deg_s: 200",
+            "velocity_deg_s: 5.2",
+            r"velocity_deg_s: found 5.2 deg/s, the "
+            r"number .* rad/s",
+        ),
+        (
+            "mass_kg: 4.59",
+            "mass_kg: 4590",
+            r"payloads.0..mass_kg: found 4590 kg; expected at most "
+            r"2500 kg, or .*in g",
+        ),
+        (
+            "-9.81]",
+            "-9.81]\n  rated_payload_kg: 2.3",
+            "found 4.59 kg; expected at most the 2.3 kg of `robot.rated",
+        ),
+        (
+            "payloads:",
+            "payloads:\n  - {name: ring, mounting: flange-b, mass_kg: 1686}",
+            "367 times another payload",
+        ),
         ("[-170, 170]", "[-17000, 17000]", "at most ±720 deg"),
         ("[-170, 170]", "[-0.05, 0.05]", "a range of at least 0.2 deg"),
         ("mass_kg: 4.59", "mass_kg: -4.59", "positive mass"),
         ("gain_nm_per_a: 25.65", "gain_nm_per_a: 0", "not zero"),
         ("-9.81]", "-9810]", "9810 m/s²"),
         ("mass_kg: 4.59", "mass_kg: 1.0e-9", "is this in t"),
-        ("mass_kg: 4.59", "mass_kg: 4.59\n    centre_m: [-20, 30, 50]", "61.64 m from the origin; .*in mm"),
-        ("mass_kg: 4.59", "mass_kg: 4.59\n    centre_m: [1.0e200, 0, 0]", "1e.200 m from the origin"),
         (
             "mass_kg: 4.59",
-            "mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: [6000, 0, 0, 6000, 0, 6000]",
-            r"inertia_kg_m2: found a radius of gyration √\(I/m\) of 36.* m; expected at most 5 m; is this in kg mm²",
+            "mass_kg: 4.59\n    centre_m: [-20, 30, 50]",
+            "61.64 m from the origin; .*in mm",
         ),
         (
             "mass_kg: 4.59",
-            "mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: [1.0e200, 0, 0, 1.0e200, 0, 1.0e200]",
+            "mass_kg: 4.59\n    centre_m: [1.0e200, 0, 0]",
+            "1e.200 m from the origin",
+        ),
+        (
+            "mass_kg: 4.59",
+            "mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: [6000, 0, 0, "
+            "6000, 0, 6000]",
+            r"inertia_kg_m2: found a radius of gyration √\(I/m\) of 36.* m; expected at most 5 m; "
+            r"is this in kg mm²",
+        ),
+        (
+            "mass_kg: 4.59",
+            "mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: [1.0e200, 0, 0, 1.0e200, "
+            "0, 1.0e200]",
             "radius of gyration",
         ),
         ("mass_kg: 4.59", "mass_kg: 4.59\n    known: {mx: 459}", "100 m from the origin"),
-        ("mass_kg: 4.59", "mass_kg: 4.59\n    known: {Ixx: 1.0e308}", r"known.Ixx: found a radius of gyration"),
-        ("velocity_deg_s: 200", "velocity_deg_s: 1.0e-322", "velocity_deg_s: .*expected 0.01 to 100000 deg/s"),
-        ("velocity_deg_s: 200", "velocity_deg_s: 1.0e15", "velocity_deg_s: .*expected 0.01 to 100000 deg/s"),
-        ("acceleration_deg_s2: 800", "acceleration_deg_s2: 1.0e308", r"acceleration_deg_s2: .*deg/s²"),
-        ("[32, 0, 0, 0, 0, 0]", "[1.0e-300, 0, 0, 0, 0, 0]", r"ratio\[0\]: found 1e-300, 0, .*0.01 to 1e.07"),
-        ("[32, 0, 0, 0, 0, 0]", "[1.0e200, 0, 0, 0, 0, 0]", r"ratio\[0\]: found 1e.200, 0, .*0.01 to 1e.07"),
+        (
+            "mass_kg: 4.59",
+            "mass_kg: 4.59\n    known: {Ixx: 1.0e308}",
+            r"known.Ixx: found a radius of gyration",
+        ),
+        (
+            "velocity_deg_s: 200",
+            "velocity_deg_s: 1.0e-322",
+            "velocity_deg_s: .*expected 0.01 to 100000 deg/s",
+        ),
+        (
+            "velocity_deg_s: 200",
+            "velocity_deg_s: 1.0e15",
+            "velocity_deg_s: .*expected 0.01 to 100000 deg/s",
+        ),
+        (
+            "acceleration_deg_s2: 800",
+            "acceleration_deg_s2: 1.0e308",
+            r"acceleration_deg_s2: .*deg/s²",
+        ),
+        (
+            "[32, 0, 0, 0, 0, 0]",
+            "[1.0e-300, 0, 0, 0, 0, 0]",
+            r"ratio\[0\]: found 1e-300, 0, .*0.01 to 1e.07",
+        ),
+        (
+            "[32, 0, 0, 0, 0, 0]",
+            "[1.0e200, 0, 0, 0, 0, 0]",
+            r"ratio\[0\]: found 1e.200, 0, .*0.01 to 1e.07",
+        ),
         ("[32, 0, 0, 0, 0, 0]", "[32, 1.0e-9, 0, 0, 0, 0]", "no smaller coupling than 1e-06"),
         ("gain_nm_per_a: 25.65", "gain_nm_per_a: 5.0e-324", "1e-05 to 1e.07 in size"),
         ("gain_nm_per_a: 25.65", "gain_nm_per_a: 1.0e100", "1e-05 to 1e.07 in size"),
-        ("payloads:", "effects: [{name: sprung, axis: J1}]\npayloads:", "no such effect; expected one of stribeck"),
-        ("payloads:", "effects: [{name: cogging, axis: J1, settings: {order: 2.5}}]\npayloads:", "2.5; .*whole number"),
-        ("payloads:", "effects: [{name: stribeck, axis: J1, settings: {gap: 1}}]\npayloads:", "found settings gap"),
+        (
+            "payloads:",
+            "effects: [{name: sprung, axis: J1}]\npayloads:",
+            "no such effect; expected one of stribeck",
+        ),
+        (
+            "payloads:",
+            "effects: [{name: cogging, axis: J1, settings: {order: 2.5}}]\npayloads:",
+            "2.5; .*whole number",
+        ),
+        (
+            "payloads:",
+            "effects: [{name: stribeck, axis: J1, settings: {gap: 1}}]\npayloads:",
+            "found settings gap",
+        ),
         ("payloads:", "effects: [{name: passive-spring, axis: J1}]\npayloads:", "without a motor"),
         (
             "payloads:",
@@ -207,12 +297,27 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
         ("[drives.J1.gain, ", "[", "5 keys"),
         ("tx40.urdf", "../simulation/demo.yaml", "a URDF of an arm"),
         ("sync:\n  period_us: 1000\n  pacing: lockstep ", "#", "sampling period"),
-        ("interface: virtual", "interface: socketcan", "lockstep on a bus of interface socketcan; expected timed"),
-        ("interface: virtual", "interface: pcan", "lockstep on a bus of interface pcan; expected timed"),
-        ("period_us: 1000", "period_us: 999", r"999, while drive generic-cia402 refreshes .* every 1000 µs; .*1000 or"),
+        (
+            "interface: virtual",
+            "interface: socketcan",
+            "lockstep on a bus of interface socketcan; expected timed",
+        ),
+        (
+            "interface: virtual",
+            "interface: pcan",
+            "lockstep on a bus of interface pcan; expected timed",
+        ),
+        (
+            "period_us: 1000",
+            "period_us: 999",
+            r"999, while drive generic-cia402 refreshes .* every "
+            r"1000 µs; .*1000 or",
+        ),
     ],
 )
-def test_a_cell_that_contradicts_itself_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
+def test_a_cell_that_contradicts_itself_is_refused(
+    configurations: Path, old: str, new: str, message: str
+) -> None:
     path = _spoil(configurations / "cells/demo.yaml", old, new)
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(path)
@@ -222,13 +327,21 @@ def test_axes_in_another_order_than_their_joints_are_refused(configurations: Pat
     urdf = configurations / "robots/tx40.urdf"
     text = urdf.read_text().replace('"J1"', '"J0"').replace('"J2"', '"J1"').replace('"J0"', '"J2"')
     urdf.write_text(text)
-    with pytest.raises(ConfigurationInconsistent, match=r"axes\[0\]\.name: found J2 as the joint of axis J1"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"axes\[0\]\.name: found J2 as the joint "
+        r"of axis J1",
+    ):
         load_cell(configurations / "cells/demo.yaml")
 
 
 def test_an_empty_urdf_is_no_robot(configurations: Path) -> None:
     (configurations / "robots/tx40.urdf").write_text(" \n")
-    with pytest.raises(ConfigurationInconsistent, match=r"robot\.urdf: found an empty file; expected a URDF of an arm"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"robot\.urdf: found an empty file; "
+        r"expected a URDF of an arm",
+    ):
         load_cell(configurations / "cells/demo.yaml")
 
 
@@ -240,12 +353,15 @@ def test_a_lead_that_no_screw_has_is_refused(configurations: Path, lead: str) ->
 
 
 @pytest.mark.parametrize(
-    ("interface", "pacing"), [("socketcand", "lockstep"), ("socketcan", "timed"), ("socketcand", "timed")]
+    ("interface", "pacing"),
+    [("socketcand", "lockstep"), ("socketcan", "timed"), ("socketcand", "timed")],
 )
 def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
     configurations: Path, interface: str, pacing: str
 ) -> None:
-    path = _spoil(configurations / "cells/demo.yaml", "interface: virtual", f"interface: {interface}")
+    path = _spoil(
+        configurations / "cells/demo.yaml", "interface: virtual", f"interface: {interface}"
+    )
     cell = load_cell(_spoil(path, "pacing: lockstep", f"pacing: {pacing}"))
     assert cell.sync is not None
     assert cell.sync.pacing is PacingMode(pacing)
@@ -254,10 +370,19 @@ def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("velocity_deg_s: 200", "velocity_deg: 200", r"axes\[0\].limits.velocity_deg: .*velocity_deg_s"),
+        (
+            "velocity_deg_s: 200",
+            "velocity_deg: 200",
+            r"axes\[0\].limits.velocity_deg: "
+            r".*velocity_deg_s",
+        ),
         ("velocity_deg_s: 200", "velocity_deg_s: -200", "greater than 0"),
         ("pacing: lockstep", "pacing: slowly", "'lockstep' or 'timed'"),
-        ("nameplate_gain_nm_per_a: 25.65", "gain_unit: Nm/A", "nameplate_gain together with gain_unit"),
+        (
+            "nameplate_gain_nm_per_a: 25.65",
+            "gain_unit: Nm/A",
+            "nameplate_gain together with gain_unit",
+        ),
         ("mounting: flange-a", "", r"payloads\[0\].mounting: found nothing"),
     ],
 )
@@ -282,7 +407,9 @@ def test_a_missing_file_is_named(configurations: Path, old: str, new: str, messa
         load_cell(configurations / "nowhere.yaml")
 
 
-def test_a_cell_file_copied_without_its_robot_says_which_file_to_copy(configurations: Path, tmp_path: Path) -> None:
+def test_a_cell_file_copied_without_its_robot_says_which_file_to_copy(
+    configurations: Path, tmp_path: Path
+) -> None:
     copied = tmp_path / "elsewhere" / "kr270.yaml"
     copied.parent.mkdir()
     shutil.copyfile(configurations / "cells/kr270.yaml", copied)
@@ -314,7 +441,10 @@ def test_a_wrong_drive_profile_is_refused(old: str, new: str) -> None:
 def two_buses(configurations: Path) -> Path:
     """The demo cell on two."""
     path = configurations / "cells/demo.yaml"
-    path.write_text(on_two_buses(path.read_text(encoding="utf-8"), "socketcan", "can0", "can1"), encoding="utf-8")
+    path.write_text(
+        on_two_buses(path.read_text(encoding="utf-8"), "socketcan", "can0", "can1"),
+        encoding="utf-8",
+    )
     return _spoil(path, "pacing: lockstep", "pacing: timed")
 
 
@@ -331,8 +461,12 @@ def test_a_cell_may_have_several_buses(two_buses: Path) -> None:
 
 def test_a_list_of_one_bus_is_one_bus(configurations: Path) -> None:
     path = configurations / "cells/demo.yaml"
-    listed = _spoil(path, "bus:\n  interface: virtual", "bus:\n  - name: main\n    interface: virtual")
-    cell = load_cell(_spoil(_spoil(listed, "  channel: demo", "    channel: demo"), "  bitrate", "    bitrate"))
+    listed = _spoil(
+        path, "bus:\n  interface: virtual", "bus:\n  - name: main\n    interface: virtual"
+    )
+    cell = load_cell(
+        _spoil(_spoil(listed, "  channel: demo", "    channel: demo"), "  bitrate", "    bitrate")
+    )
     assert cell_address(cell) == BusAddress("virtual", "demo")
     assert {axis.bus for axis in cell.axes} == {"main"}
 
@@ -340,22 +474,52 @@ def test_a_list_of_one_bus_is_one_bus(configurations: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("    bus: right\n", "", r"axes\[3\].bus: found nothing; expected the bus .* several: left, right"),
+        (
+            "    bus: right\n",
+            "",
+            r"axes\[3\].bus: found nothing; expected the bus .* several: "
+            r"left, right",
+        ),
         ("bus: right\n", "bus: middle\n", r"axes\[3\].bus: found middle, .* one of left, right"),
-        ("name: right", "name: left", r"bus\[1\].name: found left, used 2 times; expected each name once"),
-        ("channel: can1", "channel: can0", r"bus\[1\]: found socketcan can0, which bus left is too"),
-        ("node_id: 4", "node_id: 1", r"node_id: found 1, used 2 times; expected each node once, on all buses"),
+        (
+            "name: right",
+            "name: left",
+            r"bus\[1\].name: found left, used 2 times; expected each "
+            r"name once",
+        ),
+        (
+            "channel: can1",
+            "channel: can0",
+            r"bus\[1\]: found socketcan can0, which bus "
+            r"left is too",
+        ),
+        (
+            "node_id: 4",
+            "node_id: 1",
+            r"node_id: found 1, used 2 times; expected each node once, on "
+            r"all buses",
+        ),
         (
             "  - {name: right",
             "  - {name: spare, interface: pcan, channel: x}\n  - {name: right",
             "spare without an axi",
         ),
         ("pacing: timed", "pacing: lockstep", "lockstep on a bus of interface socketcan"),
-        ("pacing: timed", "pacing: timed\n  producer: J1", "J1, with 2 buses; expected recorder: one SYNC must"),
-        ("channel: can1", "channel: can1, bitrate_bit_s: 250000", r"load bus right by 1\d\d % .* at 250000 bit/s"),
+        (
+            "pacing: timed",
+            "pacing: timed\n  producer: J1",
+            "J1, with 2 buses; expected recorder: one SYNC must",
+        ),
+        (
+            "channel: can1",
+            "channel: can1, bitrate_bit_s: 250000",
+            r"load bus right by 1\d\d % .* at 250000 bit/s",
+        ),
     ],
 )
-def test_two_buses_that_contradict_each_other_are_refused(two_buses: Path, old: str, new: str, message: str) -> None:
+def test_two_buses_that_contradict_each_other_are_refused(
+    two_buses: Path, old: str, new: str, message: str
+) -> None:
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(_spoil(two_buses, old, new))
 
@@ -368,7 +532,9 @@ def test_two_buses_that_contradict_each_other_are_refused(two_buses: Path, old: 
         ("channel: can1", "channel: 1", r"demo.yaml:\d+: bus\[1\].channel: found integer 1"),
     ],
 )
-def test_a_misspelt_bus_of_several_is_refused_with_its_place(two_buses: Path, old: str, new: str, message: str) -> None:
+def test_a_misspelt_bus_of_several_is_refused_with_its_place(
+    two_buses: Path, old: str, new: str, message: str
+) -> None:
     with pytest.raises(SchemaMismatch, match=message):
         load_cell(_spoil(two_buses, old, new))
 
@@ -376,7 +542,12 @@ def test_a_misspelt_bus_of_several_is_refused_with_its_place(two_buses: Path, ol
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("  channel: demo", "  chanel: demo", r"demo.yaml:\d+: bus.chanel: found unknown key .*channel"),
+        (
+            "  channel: demo",
+            "  chanel: demo",
+            r"demo.yaml:\d+: bus.chanel: found unknown key "
+            r".*channel",
+        ),
         ("  channel: demo", "  name: x", "bus.name: found unknown key"),
     ],
 )
@@ -388,7 +559,9 @@ def test_a_misspelt_single_bus_is_refused_with_its_place(
 
 
 @pytest.mark.parametrize("store", ["demo.yaml", "../controllers/demo.yaml", "../cells/other.yaml"])
-def test_a_history_that_would_replace_another_file_is_refused(configurations: Path, store: str) -> None:
+def test_a_history_that_would_replace_another_file_is_refused(
+    configurations: Path, store: str
+) -> None:
     cell = configurations / "cells" / "demo.yaml"
     (configurations / "cells" / "other.yaml").hardlink_to(cell)
     with cell.open("a", encoding="utf-8") as stream:
@@ -404,7 +577,7 @@ GRIPPER = """
     <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
   <joint name="slide" type="prismatic"><parent link="left"/><child link="right"/>
     <axis xyz="0 1 0"/><limit lower="0" upper="0.05" velocity="1" effort="1"/></joint>
-</robot>"""
+</robot>"""  # noqa: E501
 
 
 @pytest.fixture
@@ -419,7 +592,8 @@ def test_joints_that_are_no_axes_are_held(with_gripper: Path) -> None:
     cell = load_cell(_spoil(with_gripper, "\naxes:", "\nhold: {swivel: 30, slide: 0.02}\naxes:"))
     robot = model_of(cell).robot
     assert [joint.name for joint in robot.joints] == [joint.name for joint in bare.joints]
-    flange, carrying = read_urdf((shipped_configurations() / "robots/tx40.urdf").read_text()), read_urdf(cell.urdf)
+    flange = read_urdf((shipped_configurations() / "robots/tx40.urdf").read_text())
+    carrying = read_urdf(cell.urdf)
     assert carrying.bodies[-1].mass_kg == pytest.approx(flange.bodies[-1].mass_kg + 0.3)
     assert '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.5235987755982988 0.0" />' in cell.urdf
     assert '<origin xyz="0.0 0.02 0.0"' in cell.urdf
@@ -431,9 +605,16 @@ def test_joints_that_are_no_axes_are_held(with_gripper: Path) -> None:
 @pytest.mark.parametrize(
     ("hold", "message"),
     [
-        ("", r"axes: found 6 axes; expected .*J6, swivel, slide.*hold: \{swivel: 0.0, slide: 0.0\}"),
+        (
+            "",
+            r"axes: found 6 axes; expected .*J6, swivel, slide.*hold: \{swivel: 0.0, "
+            r"slide: 0.0\}",
+        ),
         ("hold: {swivel: 0}", r"axes: found 6 axes; .*hold: \{slide: 0.0\}"),
-        ("hold: {swivel: 0, slide: 0, thumb: 0}", "hold: found no movable joint 'thumb'.*J6, swivel, slide"),
+        (
+            "hold: {swivel: 0, slide: 0, thumb: 0}",
+            "hold: found no movable joint 'thumb'.*J6, swivel, slide",
+        ),
         ("hold: {swivel: 0, slide: 0, J6: 0}", "hold.J6: found a joint that is also one of `axes`"),
         ("hold: {swivel: 90, slide: 0}", "hold.swivel: found 90 deg; expected -57.3 to 57.3 deg"),
         ("hold: {swivel: 0, slide: 20}", "hold.slide: found 20 m; expected 0 to 0.05 m"),
@@ -449,51 +630,101 @@ FOLLOWER = """
   <joint name="rod" type="revolute"><origin xyz="0 0 0.1"/><parent link="link6"/><child link="behind"/>
     <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/>
     <mimic joint="J5" multiplier="-1"/></joint>
-</robot>"""
+</robot>"""  # noqa: E501
 
 
-@pytest.mark.parametrize("hold", ["", "hold: {rod: 0.0}"], ids=["not held", "held"])
-@pytest.mark.parametrize("logged", [False, True], ids=["a file", "a log"])
-def test_a_joint_that_follows_an_axis_cannot_be_held(configurations: Path, hold: str, logged: bool) -> None:
+def test_a_joint_that_mimics_an_axis_follows_it(configurations: Path) -> None:
     _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
-    cell = _spoil(configurations / "cells/tx40.yaml", "\naxes:", f"\n{hold}\naxes:")
-    with pytest.raises(ConfigurationInconsistent, match=r"joint '?rod'? mimics .*J5.* \(multiplier -1\)") as refused:
+    cell = load_cell(configurations / "cells/tx40.yaml")
+    model = model_of(cell)
+    assert cell.place_names == cell.axis_names
+    assert [joint.name for joint in model.robot.places] == [
+        joint.name for joint in model.robot.axes
+    ]
+    assert joint_names(cell) == ("J1", "J2", "J3", "J4", "J5", "J6")
+    (coupling,) = model.robot.couplings
+    assert model.robot.joints[coupling.follower].name == "rod"
+    assert model.robot.joints[coupling.leader].name == "J5"
+    assert coupling.multiplier == -1.0
+
+
+def test_a_body_on_a_joint_that_follows_may_be_named(configurations: Path) -> None:
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    capsule = "{name: rod, link: rod, from_m: [0, 0, 0], to_m: [0, 0, 0.1], radius_m: 0.02}"
+    declared = f"\nclearance: {{capsules: [{capsule}]}}\naxes:"
+    cell = load_cell(_spoil(configurations / "cells/tx40.yaml", "\naxes:", declared))
+    assert cell.clearance is not None
+    (body,) = cell.clearance.capsules
+    assert body.name == "rod"
+    assert body.link == 6
+
+
+@pytest.mark.parametrize("logged", [False, True], ids=["a file", "a log"])
+def test_a_joint_that_follows_an_axis_cannot_be_held(configurations: Path, logged: bool) -> None:
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    cell = _spoil(configurations / "cells/tx40.yaml", "\naxes:", "\nhold: {rod: 0.0}\naxes:")
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"joint '?rod'? mimics .*J5.* "
+        r"\(multiplier -1\)",
+    ) as refused:
         if logged:
             cell_from_bundle(bundle(cell))
         else:
             load_cell(cell)
-    assert "`closures`" in str(refused.value)
-    assert "`hold` of" not in str(refused.value)
+    assert "no `hold` of it" in str(refused.value)
     assert "hold: {" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
     ("mimic", "advice"),
     [
-        ('<mimic joint="swivel"/>', r"slide mimics swivel .*; expected `hold` of swivel if that is no axis, and slide"),
-        ('<mimic joint="J6" multiplier="0"/>', "slide mimics J6 .*; expected `hold` of slide at its offset, 0 rad"),
+        (
+            '<mimic joint="swivel"/>',
+            r"slide mimics swivel .*; expected `hold` of swivel if that is "
+            r"no axis, and slide",
+        ),
+        (
+            '<mimic joint="J6" multiplier="0"/>',
+            "slide mimics J6 .*; expected `hold` of slide at its offset, 0 rad",
+        ),
     ],
     ids=["of a gripper", "that never moves"],
 )
-def test_a_joint_that_follows_no_axis_is_held_with_its_leader(with_gripper: Path, mimic: str, advice: str) -> None:
+def test_a_joint_that_follows_no_axis_is_held_with_its_leader(
+    with_gripper: Path, mimic: str, advice: str
+) -> None:
     slide = '<axis xyz="0 1 0"/><limit lower="0"'
     urdf = with_gripper.parent.parent / "robots/tx40.urdf"
     urdf.write_text(urdf.read_text().replace(slide, mimic + slide))
     with pytest.raises(ConfigurationInconsistent, match=advice):
         load_cell(with_gripper)
     follows = "swivel" in mimic
-    hold = "hold: {swivel: 0.5}" if follows else "hold: {swivel: 0.5, slide: 0.0}"
+    if follows:
+        hold = "hold: {swivel: 0.5}"
+    else:
+        hold = "hold: {swivel: 0.5, slide: 0.0}"
     cell = load_cell(_spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:"))
     assert model_of(cell).robot.joint_count == 6
 
 
 def test_a_base_that_floats_is_held_to_be_an_arm(configurations: Path) -> None:
-    world = '<link name="w"/><joint name="f" type="floating"><parent link="w"/><child link="base"/></joint></robot>'
+    world = (
+        '<link name="w"/><joint name="f" type="floating"><parent link="w"/><child '
+        'link="base"/></joint></robot>'
+    )
     _spoil(configurations / "robots/tx40.urdf", "</robot>", world)
     cell = configurations / "cells/tx40.yaml"
-    with pytest.raises(ConfigurationInconsistent, match=r"'f' is of type 'floating'.*`hold: \{JOINT: POSITION\}`"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"'f' is of type 'floating'.*`hold: "
+        r"\{JOINT: POSITION\}`",
+    ):
         load_cell(cell)
-    assert model_of(load_cell(_spoil(cell, "\naxes:", "\nhold: {f: 0.0}\naxes:"))).robot.joint_count == 6
+    assert (
+        model_of(load_cell(_spoil(cell, "\naxes:", "\nhold: {f: 0.0}\naxes:"))).robot.joint_count
+        == 6
+    )
 
 
 @pytest.mark.parametrize("text", ["<robot name='arm'>\n<link name='a'>", "no XML " * 2000])

@@ -1,4 +1,6 @@
-"""Closed chains in a cell file: bad descriptions are refused by name, and joints without a motor have names."""
+"""Closed chains in a cell file: bad descriptions are refused by name,
+and joints without a motor have names.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ from ident.model.bodies import LINK_PARAMETERS
 from ident.model.urdf import read_urdf
 from tests.conftest import CHECKOUT
 
-MOTORS, JOINTS = "motors: [crank-1, crank-2]", "crank-1, elbow-1, crank-2, elbow-2"
+MOTORS = "motors: [crank-1, crank-2]"
+JOINTS = "crank-1, elbow-1, crank-2, elbow-2"
 ASSEMBLY = "crank-1: 0, elbow-1: 0, crank-2: 0, elbow-2: 0"
 CLOSURE = "  - {name: tip, first: rod-1-tip, second: rod-2-tip, directions: [x, y]}\n"
 AGAIN = "  - {name: too, first: rod-2-tip, second: rod-1-tip, directions: [x, y]}\n"
@@ -43,55 +46,60 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
         pytest.param(
             ASSEMBLY,
             "crank-1: 90, elbow-1: 90, crank-2: 0, elbow-2: 0",
-            "11: closures: found closure 'tip' cannot close at the assembly pose: x 643 mm, y 243 mm apart where it is "
-            "declared; expected a pose of all joints at which the frames of every closure nearly coincide "
-            "(assembly_deg, assembly_mm)",
+            "11: closures: found closure 'tip' cannot close at the assembly pose: x 643 mm, y 243 "
+            "mm apart where it is declared; expected a pose of all joints at which the frames of "
+            "every closure nearly coincide (assembly_deg, assembly_mm)",
             id="cannot close",
         ),
         pytest.param(
             "mobility: 2",
             "mobility: 3",
-            "11: closures: found the closures leave 2 degrees of freedom at the assembly pose; expected 3 as declared: "
-            "is a closure missing, or does one hold a direction that must be free (`directions`)?",
+            "11: closures: found the closures leave 2 degrees of freedom at the assembly pose; "
+            "expected 3 as declared: is a closure missing, or does one hold a direction that must "
+            "be free (`directions`)?",
             id="mobility",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1]",
-            "11: closures: found the motors crank-1 do not move all 2 degrees of freedom that the closures leave; name "
-            "a joint that each motor drives, one for each degree of freedom at least (`motors`); expected a mechanism "
-            "that closes, and that its motors move",
+            "11: closures: found the motors crank-1 do not move all 2 degrees of freedom that the "
+            "closures leave; name a joint that each motor drives, one for each degree of freedom "
+            "at least (`motors`); expected a mechanism that closes, and that its motors move",
             id="too few motors",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1, crank-1]",
-            "11: closures: found two motors drive crank-1; expected a joint of its own for each (`motors`)",
+            "11: closures: found two motors drive crank-1; expected a joint of its own for each "
+            "(`motors`)",
             id="one joint twice",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1, crank-9]",
-            f"6: robot.motors[1]: found 'crank-9'; expected a joint of the URDF that moves: {JOINTS}",
+            "6: robot.motors[1]: found 'crank-9'; expected a joint of the URDF that "
+            f"moves: {JOINTS}",
             id="unknown motor",
         ),
         pytest.param(
             "second: rod-2-tip",
             "second: rod-2-tap",
-            "12: closures[0].second: found 'rod-2-tap'; expected a link of the URDF: base, crank-link-1, rod-1, plate, "
-            "rod-1-tip, crank-link-2, rod-2, rod-2-tip",
+            "12: closures[0].second: found 'rod-2-tap'; expected a link of the URDF: base, "
+            "crank-link-1, rod-1, plate, rod-1-tip, crank-link-2, rod-2, rod-2-tip",
             id="unknown link",
         ),
         pytest.param(
             "platform: plate",
             "platform: base",
-            "11: closures: found the platform 'base' does not move; expected the link that carries the payload",
+            "11: closures: found the platform 'base' does not move; expected the link that carries "
+            "the payload",
             id="fixed platform",
         ),
         pytest.param(
             "elbow-2: 0}",
             "elbow-3: 0}",
-            f"10: robot.assembly_deg.elbow-3: found no such joint; expected a joint of the URDF that moves: {JOINTS}",
+            "10: robot.assembly_deg.elbow-3: found no such joint; expected a joint of the URDF "
+            f"that moves: {JOINTS}",
             id="unknown joint of the assembly pose",
         ),
         pytest.param(
@@ -109,40 +117,44 @@ def _cell(folder: Path, *changes: tuple[str, str], name: str = "five-bar") -> Ce
         pytest.param(
             "- name: crank-2\n",
             "- name: elbow-1\n",
-            "6: robot.motors[1]: found crank-2 as the joint of axis elbow-1, and joint elbow-1 without a motor; "
-            "expected elbow-1, or another name of that axis (`axes[1].name`)",
+            "6: robot.motors[1]: found crank-2 as the joint of axis elbow-1, and joint elbow-1 "
+            "without a motor; expected elbow-1, or another name of that axis (`axes[1].name`)",
             id="axis named as a joint without a motor",
         ),
         pytest.param(
             CLOSURE,
             CLOSURE + AGAIN,
-            "13: closures[1]: found too, which closes rod-2-tip and rod-1-tip as tip does; expected each closure once",
+            "13: closures[1]: found too, which closes rod-2-tip and rod-1-tip as tip does; "
+            "expected each closure once",
             id="a closure twice",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1, elbow-2]",
-            "6: robot.motors[1]: found elbow-2 as the joint of axis crank-2, and joint crank-2 without a motor; "
-            "expected crank-2, or another name of that axis (`axes[1].name`)",
+            "6: robot.motors[1]: found elbow-2 as the joint of axis crank-2, and joint crank-2 "
+            "without a motor; expected crank-2, or another name of that axis (`axes[1].name`)",
             id="a joint without a motor among the motors",
         ),
         pytest.param(
             MOTORS,
             "motors: [crank-1, crank-2, elbow-1]",
-            "6: robot.motors: found 3 joints for 2 axes; expected the joint of each axis, in their order (crank-1, "
-            "crank-2)",
+            "6: robot.motors: found 3 joints for 2 axes; expected the joint of each axis, in their "
+            "order (crank-1, crank-2)",
             id="more motors than axes",
         ),
         pytest.param(
             "mass_tolerance_kg: 0.005\n",
             "mass_tolerance_kg: 0.005\n    known: {mx: 0.1}\n",
-            "45: payloads[0].known: found single parameters, and the link plate is not at the origin of its joint; "
-            "expected `centre_m` and `inertia_kg_m2`, in the frame of that link",
+            "45: payloads[0].known: found single parameters, and the link plate is not at the "
+            "origin of its joint; expected `centre_m` and `inertia_kg_m2`, in the frame of that "
+            "link",
             id="single parameters in the frame of a platform",
         ),
     ],
 )
-def test_a_bad_description_is_refused_by_name(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_a_bad_description_is_refused_by_name(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
     with pytest.raises(ConfigurationInconsistent) as refusal:
         _cell(tmp_path, (old, new))
     assert str(refusal.value) == f"{tmp_path}/cell.yaml:{message}; correct the cell file"
@@ -153,14 +165,20 @@ def test_a_coupled_drive_train_of_a_redundant_robot_is_refused(tmp_path: Path) -
     with pytest.raises(ConfigurationInconsistent) as refusal:
         _cell(tmp_path, ("- [0, 0, -5, 0]", "- [0, 1, -5, 0]"), name="dualv")
     assert str(refusal.value) == (
-        f"{tmp_path}/cell.yaml:20: drive_train.ratio[2]: found the motor of crank-3 also turns with crank-2; expected "
-        "zeros off the diagonal: 4 motors for 3 degrees of freedom; correct the cell file"
+        f"{tmp_path}/cell.yaml:20: drive_train.ratio[2]: found the motor of crank-3 also turns "
+        "with crank-2; expected zeros off the diagonal: 4 motors for 3 degrees of freedom; correct "
+        "the cell file"
     )
-    assert _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio[1, 0] == 10.0  # two motors, two degrees of freedom
+    # Two motors, two degrees of freedom
+    assert _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio[1, 0] == 10.0
 
 
 def test_motors_in_another_order_than_their_axes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationInconsistent, match=r"motors\[0\]: found crank-2 as the joint of axis crank-1"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"motors\[0\]: found crank-2 as the joint "
+        r"of axis crank-1",
+    ):
         _cell(tmp_path, (MOTORS, "motors: [crank-2, crank-1]"))
 
 
@@ -175,14 +193,22 @@ def test_a_joint_that_mimics_another_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_list_that_is_too_short_is_refused_in_words(tmp_path: Path) -> None:
-    with pytest.raises(SchemaMismatch, match=r"directions: found list \[\]; expected at least 1 item; "):
+    with pytest.raises(
+        SchemaMismatch,
+        match=r"directions: found list \[\]; expected at "
+        r"least 1 item; ",
+    ):
         _cell(tmp_path, ("directions: [x, y]", "directions: []"))
 
 
 def test_a_singular_start_is_refused(tmp_path: Path) -> None:
-    message = r"11: closures: found the assembly pose is close to a singularity: condition \d[\d.e+]+ of the closures; "
+    message = (
+        r"11: closures: found the assembly pose is close to a singularity: condition "
+        r"\d[\d.e+]+ of the closures; "
+    )
     with pytest.raises(
-        ConfigurationInconsistent, match=message + "expected below 500: give a pose inside the workspace"
+        ConfigurationInconsistent,
+        match=message + "expected below 500: give a pose inside the workspace",
     ):
         _cell(tmp_path, (ASSEMBLY, SINGULAR))
 
@@ -195,13 +221,18 @@ def test_degrees_of_a_prismatic_joint_are_refused(tmp_path: Path) -> None:
             ("assembly_deg: {\n", "assembly_deg: {\n    slide-x: 0,\n"),
             name="orthoglide",
         )
-    assert "robot.assembly_deg.slide-x: found joint slide-x, which is prismatic; expected a revolute joint" in str(
-        refusal.value
-    )
+    assert (
+        "robot.assembly_deg.slide-x: found joint slide-x, which is prismatic; expected a "
+        "revolute joint"
+    ) in str(refusal.value)
 
 
 def test_a_serial_robot_has_no_key_of_a_closed_chain(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationInconsistent, match=r"6: robot\.motors: found given without `closures`") as refusal:
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"6: robot\.motors: found given without "
+        r"`closures`",
+    ) as refusal:
         _cell(tmp_path, (CLOSURE, ""), ("closures:", "closures: []"))
     assert "found 3 faults" in str(refusal.value)
     assert "robot.platform" not in str(refusal.value)
@@ -222,9 +253,13 @@ def test_the_payload_of_a_serial_robot_may_hang_on_any_link_that_moves(tmp_path:
     assert carrier_text(cell).startswith("the joint J3, in which the link link3 is at (0, 0, 0) mm")
     assert differing_sections(cell, last) == ("robot.platform",)
     for name, found in (("base", "'base', which does not move"), ("hand", "'hand'")):
-        path.write_text(text.replace("robot:\n", f"robot:\n  platform: {name}\n", 1), encoding="utf-8")
+        path.write_text(
+            text.replace("robot:\n", f"robot:\n  platform: {name}\n", 1), encoding="utf-8"
+        )
         with pytest.raises(
-            ConfigurationInconsistent, match=rf"robot\.platform: found {found}; expected a link that mov"
+            ConfigurationInconsistent,
+            match=rf"robot\.platform: found {found}; expected a "
+            r"link that mov",
         ):
             load_cell(path)
 
@@ -255,17 +290,23 @@ def test_an_effect_is_declared_on_a_joint_without_a_motor(tmp_path: Path) -> Non
     assert placed.name_among(cell.place_names) == "passive-friction on elbow-2"
     wrong = declared.replace("elbow-2", "elbow-3")
     with pytest.raises(
-        ConfigurationInconsistent, match="'elbow-3'; expected one of crank-1, crank-2, elbow-1, elbow-2"
+        ConfigurationInconsistent,
+        match="'elbow-3'; expected one of crank-1, crank-2, elbow-1, elbow-2",
     ):
         _cell(tmp_path, ("conditioning:", wrong))
-    message = r"effects\[0\]\.axis: found a place that this effect cannot have; expected a joint .* without a motor"
+    message = (
+        r"effects\[0\]\.axis: found a place that this effect cannot have; expected a joint "
+        r".* without a motor"
+    )
     with pytest.raises(ConfigurationInconsistent, match=message):
         _cell(tmp_path, ("conditioning:", declared.replace("elbow-2", "crank-2")))
 
 
 def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None:
-    # The URDF's own joining of a body on a fixed joint must give the same as the cell file's conversion.
-    centre, inertia = (-0.02, 0.03, 0.05), (0.012, 0.001, -0.002, 0.014, 0.003, 0.017)
+    # The URDF's own joining of a body on a fixed joint must give the same as the cell file's
+    # conversion.
+    centre = (-0.02, 0.03, 0.05)
+    inertia = (0.012, 0.001, -0.002, 0.014, 0.003, 0.017)
     turned = '<origin xyz="0.45 0 0" rpy="0.3 -0.2 0.5"/>'
     urdf = (CHECKOUT / "configs/robots/five-bar.urdf").read_text(encoding="utf-8")
     head, tail = urdf.split('<joint name="plate-mount" type="fixed">')
@@ -295,9 +336,12 @@ def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None
 
 
 def test_a_capsule_hangs_on_the_joint_that_its_axis_drives(tmp_path: Path) -> None:
-    """The second crank of the five-bar is its third joint; a rod has no axis, and its joint's name."""
+    """The second crank of the five-bar is its third joint;
+    a rod has no axis, and its joint's name.
+    """
     capsules = "".join(
-        f"    - {{name: {name}, link: {link}, from_m: [0, 0, 0], to_m: [0.1, 0, 0], radius_m: 0.02}}\n"
+        f"    - {{name: {name}, link: {link}, from_m: [0, 0, 0], to_m: [0.1, 0, 0], "
+        f"radius_m: 0.02}}\n"
         for name, link in (("crank", "crank-2"), ("rod", "elbow-1"))
     )
     cell = _cell(tmp_path, ("drive_train:\n", f"clearance:\n  capsules:\n{capsules}drive_train:\n"))

@@ -21,8 +21,14 @@ OBJECTS = "[" + ", ".join(["{index: 0x2003, subindex: 1, type: i32, factor: 1000
 
 
 def _cell(folder: Path, controller: str) -> Cell:
-    text = (CONFIGS / "cells" / "demo.yaml").read_text(encoding="utf-8").replace("../robots", str(CONFIGS / "robots"))
-    (folder / "cell.yaml").write_text(text[: text.index("\ncontroller:")] + f"\ncontroller: {controller}\n")
+    text = (
+        (CONFIGS / "cells" / "demo.yaml")
+        .read_text(encoding="utf-8")
+        .replace("../robots", str(CONFIGS / "robots"))
+    )
+    (folder / "cell.yaml").write_text(
+        text[: text.index("\ncontroller:")] + f"\ncontroller: {controller}\n"
+    )
     return load_cell(folder / "cell.yaml")
 
 
@@ -31,7 +37,10 @@ def test_keys_may_have_a_factor_and_the_file_a_format(tmp_path: Path) -> None:
     assert cell.controller is not None
     assert (cell.controller.file, cell.controller.format) == ("robot.cfg", ControllerFormat.XML)
     assert cell.controller.keys == ("a", "b", "c", "d", "e", "f")
-    assert (cell.controller.factors, cell.controller.objects) == ((1.0, 1000.0, -1.0, 1.0, 1.0, 1.0), ())
+    assert (cell.controller.factors, cell.controller.objects) == (
+        (1.0, 1000.0, -1.0, 1.0, 1.0, 1.0),
+        (),
+    )
     assert cell.controller_path == tmp_path / "robot.cfg"
 
 
@@ -54,7 +63,10 @@ def test_objects_alone_and_beside_a_file(tmp_path: Path) -> None:
         (f"{{format: xml, objects: {OBJECTS}}}", "format only beside file"),
         ("{file: a.yaml, gains: [a, b]}", "2 keys; expected 6, one for each axis"),
         (f"{{file: a.yaml, format: toml, gains: {KEYS}}}", "controller.format"),
-        ("{file: a.yaml, gains: [a, b, c, d, e, {key: f, factor: 0.0}]}", "controller.gains[5].factor: found 0"),
+        (
+            "{file: a.yaml, gains: [a, b, c, d, e, {key: f, factor: 0.0}]}",
+            "controller.gains[5].factor: found 0",
+        ),
         ("{file: a.yaml, gains: [a, b, c, d, e, {key: f, unit: mNm}]}", "controller.gains[5].unit"),
         ("{file: a.yaml, gains: [a, b, c, d, e, {factor: 2.0}]}", "controller.gains[5].key"),
         ("{file: a.yaml, gains: [a, b, c, d, e, 7]}", "controller.gains[5]"),
@@ -63,14 +75,20 @@ def test_objects_alone_and_beside_a_file(tmp_path: Path) -> None:
         (f"{{objects: {OBJECTS.replace('i32', 'i8')}}}", "type"),
     ],
 )
-def test_what_fits_no_cell_is_refused_with_its_place(tmp_path: Path, controller: str, says: str) -> None:
+def test_what_fits_no_cell_is_refused_with_its_place(
+    tmp_path: Path, controller: str, says: str
+) -> None:
     with pytest.raises(ConfigurationError) as caught:
         _cell(tmp_path, controller)
     assert says in str(caught.value)
 
 
 def test_a_cell_without_a_bus_has_no_objects(tmp_path: Path) -> None:
-    text = (CONFIGS / "cells" / "tx40.yaml").read_text(encoding="utf-8").replace("../robots", str(CONFIGS / "robots"))
+    text = (
+        (CONFIGS / "cells" / "tx40.yaml")
+        .read_text(encoding="utf-8")
+        .replace("../robots", str(CONFIGS / "robots"))
+    )
     (tmp_path / "cell.yaml").write_text(text + f"\ncontroller: {{objects: {OBJECTS}}}\n")
     with pytest.raises(ConfigurationError, match="objects of drives that no bus leads to"):
         load_cell(tmp_path / "cell.yaml")

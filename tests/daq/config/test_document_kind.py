@@ -1,4 +1,6 @@
-"""A file in the place of another is called what it is, in one line, by every reader of documents."""
+"""A file in the place of another is called what it is, in one line,
+by every reader of documents.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,15 @@ import pytest
 from daq.config.cell_file import load_cell
 from daq.config.drive import drive_from_text
 from daq.config.import_description import load_import
-from daq.config.yaml_file import FORMATS, KEYS, DocumentKind, kind_of_file, kind_of_head, kind_of_tree, parse_yaml
+from daq.config.yaml_file import (
+    FORMATS,
+    KEYS,
+    DocumentKind,
+    kind_of_file,
+    kind_of_head,
+    kind_of_tree,
+    parse_yaml,
+)
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import DaqError
 from daq.log.reader import read_log
@@ -94,18 +104,33 @@ def test_a_file_in_the_place_of_another_is_called_what_it_is(
 
 def test_shipped_files_are_of_one_kind_each() -> None:
     """A kind that is recognised by keys must not take the files of another."""
-    folders = {"cells": DocumentKind.CELL, "drives": DocumentKind.DRIVE_PROFILE, "imports": DocumentKind.IMPORT}
+    folders = {
+        "cells": DocumentKind.CELL,
+        "drives": DocumentKind.DRIVE_PROFILE,
+        "imports": DocumentKind.IMPORT,
+    }
     for folder, kind in folders.items():
         for path in (CONFIGS / folder).glob("*.yaml"):
             assert kind_of_file(path) is kind, path
 
 
 def test_what_is_no_document_of_ours_has_no_kind(tmp_path: Path) -> None:
-    assert set(KEYS) | set(FORMATS.values()) | {DocumentKind.LOG, DocumentKind.URDF} == set(DocumentKind)
+    assert set(KEYS) | set(FORMATS.values()) | {DocumentKind.LOG, DocumentKind.URDF} == set(
+        DocumentKind
+    )
     assert kind_of_file(tmp_path) is None
     assert kind_of_file(tmp_path / "missing.yaml") is None
-    for text in (b"drives: {J1: {gain: 1.0}}", b"- 1\n- 2", b"a: [", b"<html>", b"", b"format: [1]"):
+    for text in (
+        b"drives: {J1: {gain: 1.0}}",
+        b"- 1\n- 2",
+        b"a: [",
+        b"<html>",
+        b"",
+        b"format: [1]",
+    ):
         (tmp_path / "file").write_bytes(text)
         assert kind_of_file(tmp_path / "file") is None
-    assert kind_of_head(b'\xef\xbb\xbf<?xml version="1.0"?>\n<robot name="arm">') is DocumentKind.URDF
+    assert (
+        kind_of_head(b'\xef\xbb\xbf<?xml version="1.0"?>\n<robot name="arm">') is DocumentKind.URDF
+    )
     assert kind_of_tree(parse_yaml(b"format: drivegain-plan", "plan").tree) is DocumentKind.PLAN

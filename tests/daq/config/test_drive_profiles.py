@@ -1,4 +1,6 @@
-"""The shipped drive profiles: strict data, in agreement with the makers' data sheets, and right to the ampere."""
+"""The shipped drive profiles: strict data, in agreement with the makers' data sheets,
+and right to the ampere.
+"""
 
 from __future__ import annotations
 
@@ -65,12 +67,13 @@ def sheet(shared_data: Path, name: str) -> ObjectDictionary:
     return data_sheet(path.read_bytes(), name)
 
 
-# -- the files ---------------------------------------------------------------------------------------------------------
+# -- the files
+# ---------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def test_every_make_of_the_issue_has_a_profile() -> None:
     assert set(NAMES) == {
-        "generic-cia402", "maxon-epos4", "elmo-gold", "nanotec", "copley", "technosoft-ipos", "beckhoff-ax2000",
+        "generic-cia402", "maxon-epos4", "elmo-gold", "nanotec", "copley", "technosoft-ipos", "beckhoff-ax2000",  # noqa: E501
         "beckhoff-el72x1", "schunk-pilz-prbt",
     }  # fmt: skip
 
@@ -81,7 +84,7 @@ def test_a_shipped_profile_is_whole_and_every_fact_has_a_source(name: str) -> No
     assert profile.name == name
     slow = {name for name in ("torque", "temperature") if getattr(profile, name) is not None}
     assert {fact.about for fact in profile.facts} == slow | {
-        "position", "current", "current_scale", "amplitude", "tap", "saturation_bit", "update_period_us", "rated",
+        "position", "current", "current_scale", "amplitude", "tap", "saturation_bit", "update_period_us", "rated",  # noqa: E501
         "save",
     }  # fmt: skip
     assert profile.save_semantics
@@ -94,7 +97,11 @@ def test_the_page_of_the_drives_names_every_profile(name: str, checkout: Path) -
     profile = profile_of(name)
     page = (checkout / "docs/reference/drive-profiles.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if f"`{name}`" in line)
-    for reported in (str(profile.current), profile.amplitude.value, profile.current_scale.form.value):
+    for reported in (
+        str(profile.current),
+        profile.amplitude.value,
+        profile.current_scale.form.value,
+    ):
         assert reported in row
     assert ("ACTUAL" in row) is (profile.tap is TapPoint.ACTUAL)
 
@@ -117,7 +124,9 @@ def test_a_raw_unit_is_so_many_ampere(name: str) -> None:
     value, ampere = EXPECTED[name]
     scale = profile_of(name).current_scale
     assert len(scale.objects) == (value is not None)
-    assert scale.ampere_per_unit(() if value is None else (value,)) == pytest.approx(ampere, rel=1e-12)
+    assert scale.ampere_per_unit(() if value is None else (value,)) == pytest.approx(
+        ampere, rel=1e-12
+    )
 
 
 def test_the_terminal_of_2002h_54_divides_by_root_two() -> None:
@@ -132,12 +141,18 @@ def test_profiles_without_reference_are_those_of_the_notes() -> None:
     assert without == {"schunk-pilz-prbt", "technosoft-ipos", "beckhoff-el72x1"}
 
 
-# -- strictness --------------------------------------------------------------------------------------------------------
+# -- strictness
+# --------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def test_a_peak_current_that_no_one_entered_is_named_with_its_line() -> None:
     text = (FOLDER / "technosoft-ipos.yaml").read_bytes()
-    with pytest.raises(ConfigurationInconsistent, match=r"ipos\.yaml:9: current_scale\.peak_current_a: .*data sheet"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"ipos\.yaml:9: "
+        r"current_scale\.peak_current_a: "
+        r".*data sheet",
+    ):
         drive_from_text(text, "ipos.yaml")
 
 
@@ -145,11 +160,24 @@ def test_a_peak_current_that_no_one_entered_is_named_with_its_line() -> None:
     ("old", "new", "message"),
     [
         ("tap: reference", "tap: reference\ntapp: actual", r"x:\d+: tapp: .*did you mean"),
-        ("ampere_per_unit: 0.001", "ampere_per_unit: 0.001\n  digits: 3", r"x:6: current_scale: .*ampere_per_unit"),
-        ("ampere_per_unit: 0.001", "ampere_per_unit: -0.001", r"x:8: current_scale\.ampere_per_unit"),
+        (
+            "ampere_per_unit: 0.001",
+            "ampere_per_unit: 0.001\n  digits: 3",
+            r"x:6: current_scale: .*ampere_per_unit",
+        ),
+        (
+            "ampere_per_unit: 0.001",
+            "ampere_per_unit: -0.001",
+            r"x:8: current_scale\.ampere_per_unit",
+        ),
         ("ampere_per_unit: 0.001", "ampere_per_unit: null", r"x:6: current_scale"),
         ("form: fixed-step", "form: n * 0.001", r"x:7: current_scale\.form"),
-        ("form: fixed-step", "form: per-mille-of-rated-current", r"x:6: current_scale: .*rated_current of a scale"),
+        (
+            "form: fixed-step",
+            "form: per-mille-of-rated-current",
+            r"x:6: current_scale: "
+            r".*rated_current of a scale",
+        ),
         ("basis: eds", "basis: hearsay", r"facts\.position\.basis"),
         ("    basis: notes\n", "", r"facts\.current_scale\.basis"),
         ("mapping: stored", "mapping: perhaps", r"save\.mapping"),
@@ -162,11 +190,14 @@ def test_what_is_not_a_profile_is_refused_with_its_line(old: str, new: str, mess
         drive_from_text(text.replace(old, new, 1).encode(), "x")
 
 
-@given(st.sampled_from(tuple(ScaleForm)), st.sets(st.sampled_from(sorted(frozenset().union(*SCALE_KEYS.values())))))
+@given(
+    st.sampled_from(tuple(ScaleForm)),
+    st.sets(st.sampled_from(sorted(frozenset().union(*SCALE_KEYS.values())))),
+)
 @settings(deadline=None)
 def test_a_form_takes_its_own_keys_and_no_other(form: ScaleForm, keys: set[str]) -> None:
     entry = "{index: 0x6075, type: u32}"
-    values = {"factor": "1.0e-6", "objects": f"[{entry}]", "ampere_per_unit": "0.01", "digits": "3280",
+    values = {"factor": "1.0e-6", "objects": f"[{entry}]", "ampere_per_unit": "0.01", "digits": "3280",  # noqa: E501
               "peak_current_a": "8.0"}  # fmt: skip
     scale = "".join(f"  {key}: {values.get(key, entry)}\n" for key in sorted(keys))
     text = f"""name: any
@@ -204,7 +235,8 @@ update_period_us: 1000
 save_semantics: any
 source: any
 """
-    scale, now = drive_from_text(old, "old").current_scale, profile_of("generic-cia402").current_scale
+    scale = drive_from_text(old, "old").current_scale
+    now = profile_of("generic-cia402").current_scale
     assert (scale.factor, scale.objects) == (now.factor, now.objects)
 
 
@@ -215,29 +247,43 @@ def test_a_profile_may_name_the_data_sheet_beside_it_and_no_other_place() -> Non
         drive_from_text(f"{text}eds: ../../secret\n".encode(), "x")
 
 
-# -- data sheets -------------------------------------------------------------------------------------------------------
+# -- data sheets
+# -------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
-@pytest.mark.parametrize(("name", "file"), [(name, file) for name, files in SHEETS.items() for file in files])
-def test_a_profile_agrees_with_the_makers_data_sheet(name: str, file: str, shared_data: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "file"), [(name, file) for name, files in SHEETS.items() for file in files]
+)
+def test_a_profile_agrees_with_the_makers_data_sheet(
+    name: str, file: str, shared_data: Path
+) -> None:
     assert disagreements(profile_of(name), sheet(shared_data, file)) == ()
 
 
 @pytest.mark.parametrize(
     ("file", "missing"),
-    [("maxon_epos4.eds", "6074h:00"), ("Schunk_0_63_cob.dcf", "6074h:00"), ("pilz_prbt_0_1.dcf", "6074h:00"),
+    [("maxon_epos4.eds", "6074h:00"), ("Schunk_0_63_cob.dcf", "6074h:00"), ("pilz_prbt_0_1.dcf", "6074h:00"),  # noqa: E501
      ("ros2_canopen_cia402_slave.eds", "6074h:00")],
 )  # fmt: skip
-def test_the_standard_profile_does_not_fit_these_drives(file: str, missing: str, shared_data: Path) -> None:
+def test_the_standard_profile_does_not_fit_these_drives(
+    file: str, missing: str, shared_data: Path
+) -> None:
     found = disagreements(profile_of("generic-cia402"), sheet(shared_data, file))
     assert any(line.startswith(f"{missing}: no such object") for line in found)
 
 
-@pytest.mark.parametrize(("name", "file"), [("elmo-gold", "Elmo_cob.dcf"), ("elmo-gold", "ElmoSimplIQ_cob.dcf")])
-def test_a_wrong_width_or_an_object_that_cannot_be_mapped_is_reported(name: str, file: str, shared_data: Path) -> None:
-    reported, profile = sheet(shared_data, file), profile_of(name)
+@pytest.mark.parametrize(
+    ("name", "file"), [("elmo-gold", "Elmo_cob.dcf"), ("elmo-gold", "ElmoSimplIQ_cob.dcf")]
+)
+def test_a_wrong_width_or_an_object_that_cannot_be_mapped_is_reported(
+    name: str, file: str, shared_data: Path
+) -> None:
+    reported = sheet(shared_data, file)
+    profile = profile_of(name)
     wide = replace(profile, current=replace(profile.current, bits=32))
-    assert disagreements(wide, reported) == ("6074h:00 (torque_demand): i16 in the data sheet, i32 in the profile",)
+    assert disagreements(wide, reported) == (
+        "6074h:00 (torque_demand): i16 in the data sheet, i32 in the profile",
+    )
     rated = replace(profile, current=profile.current_scale.objects[0])
     assert disagreements(rated, reported) == (
         "6075h:00 (motor_rated_current): not mappable according to the data sheet",
@@ -276,13 +322,28 @@ def test_a_data_sheet_is_read_with_its_empty_fields() -> None:
     read = data_sheet(SHEET.encode(), "x")
     assert set(read) == {0x6064, 0x1008, 0x1018}
     agreed = profile_of("elmo-gold")
-    profile = replace(agreed, current=agreed.position, current_scale=replace(agreed.current_scale, objects=()))
+    profile = replace(
+        agreed, current=agreed.position, current_scale=replace(agreed.current_scale, objects=())
+    )
     profile = replace(profile, rated=None, torque=None, save=None)
     # All that the sheet lacks is what every recording needs.
-    needed = ("6041h:00", "6040h:00", "607Ah:00", "6081h:00", "6083h:00", "6060h:00", "6061h:00", "1017h:00")
-    absent = (*(f"{entry}: no such object" for entry in needed), "found 0 TPDOs in the drive; expected 2")
+    needed = (
+        "6041h:00",
+        "6040h:00",
+        "607Ah:00",
+        "6081h:00",
+        "6083h:00",
+        "6060h:00",
+        "6061h:00",
+        "1017h:00",
+    )
+    absent = (
+        *(f"{entry}: no such object" for entry in needed),
+        "found 0 TPDOs in the drive; expected 2",
+    )
     assert disagreements(profile, read) == absent
-    name, vendor = ObjectEntry(0x1008, 0, 32, signed=False), ObjectEntry(0x1018, 1, 32, signed=False)
+    name = ObjectEntry(0x1008, 0, 32, signed=False)
+    vendor = ObjectEntry(0x1018, 1, 32, signed=False)
     assert disagreements(replace(profile, position=name, current=vendor), read)[:4] == (
         "1008h:00 (name): no integer in the data sheet, u32 in the profile",
         "1008h:00 (name): not mappable according to the data sheet",
@@ -305,7 +366,8 @@ def test_a_damaged_data_sheet_is_read_or_named(where: int, damage: bytes) -> Non
         assert data_sheet(text[:where] + damage + text[where + len(damage) :], "x")
 
 
-# -- to the ampere -----------------------------------------------------------------------------------------------------
+# -- to the ampere
+# -----------------------------------------------------------------------------------------------------  # noqa: E501
 
 PLAN = """format: drivegain-plan
 cell: demo
@@ -318,7 +380,7 @@ LONGER = (
     PLAN
     + """  - {target_deg: [-40, 20, 40, -30, 30, -40], velocity: 0.5, acceleration: 0.5, dwell_s: 0.2}
   - {target_deg: [30, -40, 80, 30, -30, 30], velocity: 0.5, acceleration: 0.5, dwell_s: 0.2}
-"""
+"""  # noqa: E501
 )
 STEP_A = {
     Dialect.EPOS4: (0.001,) * 6,
@@ -340,7 +402,9 @@ MAKES = {
 ENTERED_NM = 0.8  # within a factor of three of every motor's
 HEATED = {"time_constant_s": 2.0, "resistance_k_per_w": 5.0}
 WARMING = UndeclaredEffect(
-    "temperature-friction", 1, {"viscous_percent_per_k": -1.0, "coulomb_percent_per_k": 0.0, **HEATED}
+    "temperature-friction",
+    1,
+    {"viscous_percent_per_k": -1.0, "coulomb_percent_per_k": 0.0, **HEATED},
 )
 
 
@@ -363,15 +427,25 @@ def recorded(
     make = MAKES[dialect]
     drives = folder / "drives"
     drives.mkdir()
-    text = (checkout / "configs/cells/demo.yaml").read_text().replace("../robots", str(checkout / "configs/robots"))
-    text = text.replace("period_us: 1000", "period_us: 2000").replace("channel: demo", f"channel: {folder.name}")
+    text = (
+        (checkout / "configs/cells/demo.yaml")
+        .read_text()
+        .replace("../robots", str(checkout / "configs/robots"))
+    )
+    text = text.replace("period_us: 1000", "period_us: 2000").replace(
+        "channel: demo", f"channel: {folder.name}"
+    )
     for peak_a in (8, 6):
         # The simulated amplifier reports the temperature of its motor.
         found = "{index: 0x22A3, subindex: 1, type: u16, kelvin_per_unit: 1.0}"
-        text_of_make = text_of(make, peak_a).replace(found, "{index: 0x2005, type: i16, kelvin_per_unit: 0.1}")
+        text_of_make = text_of(make, peak_a).replace(
+            found, "{index: 0x2005, type: i16, kelvin_per_unit: 0.1}"
+        )
         (drives / f"{make}-{peak_a}.yaml").write_text(text_of_make)
-    # Two sizes of amplifier, as a person would enter them for a make that does not report its peak current.
-    first, second = text[: text.index("- name: J4")], text[text.index("- name: J4") :]
+    # Two sizes of amplifier, as a person would enter them for a make that does not report its peak
+    # current.
+    first = text[: text.index("- name: J4")]
+    second = text[text.index("- name: J4") :]
     cell_file = folder / "cell.yaml"
     cell_file.write_text(
         first.replace("drive: generic-cia402", f"drive: {make}-8")
@@ -396,14 +470,23 @@ def recorded(
             moves = load_plan(folder / "plan.yaml", cell)
             out = folder / "a.mcap"
             request = RecordingRequest(
-                cell_file, cell, moves, out, payload=None, operator="Ada", granted_by="test", run_id="1"
+                cell_file,
+                cell,
+                moves,
+                out,
+                payload=None,
+                operator="Ada",
+                granted_by="test",
+                run_id="1",
             )
             done = record(request)
     finally:
         bus.shutdown()
     assert done.log.valid, done.log.reason
     run, _ = load_run(done.path)
-    return RecordedRun(cell_file, cell, done.path, run, *(np.array(column) for column in zip(*seen, strict=True)))
+    return RecordedRun(
+        cell_file, cell, done.path, run, *(np.array(column) for column in zip(*seen, strict=True))
+    )
 
 
 def test_torque_and_temperature_are_read_beside_the_samples(
@@ -432,16 +515,26 @@ def test_a_run_is_in_ampere_whatever_the_drive_counts_in(
     reported = recorded(checkout, tmp_path, monkeypatch, dialect)
     profile = reported.cell.axes[0].profile
     assert profile is not None
-    truth = reported.actual_a if profile.tap is TapPoint.ACTUAL else reported.reference_a
-    measured, half_step = reported.run.current_a, 0.5001 * np.array(STEP_A[dialect])
-    assert np.abs(measured).max(axis=0).min() > 0.2  # the arm moves: a dead channel would pass every bound
+    if profile.tap is TapPoint.ACTUAL:
+        truth = reported.actual_a
+    else:
+        truth = reported.reference_a
+    measured = reported.run.current_a
+    half_step = 0.5001 * np.array(STEP_A[dialect])
+    # The arm moves: a dead channel would pass every bound
+    assert np.abs(measured).max(axis=0).min() > 0.2
     starts = range(len(truth) - len(measured) + 1)
-    fits = [k for k in starts if (np.abs(truth[k : k + len(measured)] - measured) <= half_step).all()]
+    fits = [
+        k for k in starts if (np.abs(truth[k : k + len(measured)] - measured) <= half_step).all()
+    ]
     assert len(fits) == 1
 
 
 def test_an_actual_current_is_said_to_be_one(
-    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    checkout: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     reported = recorded(checkout, tmp_path, monkeypatch, Dialect.IPOS)
     capsys.readouterr()
@@ -450,13 +543,19 @@ def test_an_actual_current_is_said_to_be_one(
     drive = read_log(reported.log).head.readback.axes[0].drive
     assert (drive["tap"], drive["signal"]) == ("actual", "ACTUAL current 6077h:00")
     assert [axis.gain_unit for axis in reported.cell.axes] == ["Nm/A(actual)"] * 6
-    assert shown == dict.fromkeys(reported.cell.axis_names, "ACTUAL current 6077h:00, amplitude unstated")
+    assert shown == dict.fromkeys(
+        reported.cell.axis_names, "ACTUAL current 6077h:00, amplitude unstated"
+    )
     spec = load_simulation(checkout / "configs/simulation/clean.yaml")
     bus = open_bus(bus_address(reported.cell))
     try:
-        with SimulatedCell(replace(spec, axes=tuple(replace(a, dialect=Dialect.IPOS) for a in spec.axes)), bus):
+        with SimulatedCell(
+            replace(spec, axes=tuple(replace(a, dialect=Dialect.IPOS) for a in spec.axes)), bus
+        ):
             assert main(["scan", str(reported.cell_file)]) == ExitCode.OK
-            assert "J1, J2, J3, J4, J5, J6: ACTUAL current, not the reference" in capsys.readouterr().out
+            assert (
+                "J1, J2, J3, J4, J5, J6: ACTUAL current, not the reference"
+            ) in capsys.readouterr().out
             assert main(["scan", str(reported.cell_file), "--json"]) == ExitCode.OK
             assert json.loads(capsys.readouterr().out)["current"] == shown
     finally:

@@ -37,7 +37,10 @@ def test_the_files_are_those_of_the_log_with_the_same_digest(
     ("urdf", "places"),
     [
         ("tx40.urdf", ["demo.yaml", "drives/generic-cia402.yaml", "tx40.urdf"]),
-        ("../../a/tx40.urdf", ["a/tx40.urdf", "cells/cells/demo.yaml", "cells/drives/generic-cia402.yaml"]),
+        (
+            "../../a/tx40.urdf",
+            ["a/tx40.urdf", "cells/cells/demo.yaml", "cells/drives/generic-cia402.yaml"],
+        ),
         ("/robots/tx40.urdf", ["demo.yaml", "drives/generic-cia402.yaml", "robot.urdf"]),
     ],
 )

@@ -1,4 +1,6 @@
-"""Data sheets that are odd as CiA 306 allows give the object dictionary that they were written from."""
+"""Data sheets that are odd as CiA 306 allows give the object dictionary that they were written
+from.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A log, a calibration and a description are of one cell, or are refused; a corrected description is named."""
+"""A log, a calibration and a description are of one cell, or are refused;
+a corrected description is named.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,14 @@ from daq.config.same_cell import (
     differing_zeros,
     mismatch,
     mismatch_of_calibration,
-    robot_identity,
+    robot_differences,
 )
 from daq.documents.calibration_file import decode_calibration, encode_calibration, save_calibration
-from daq.errors import ExitCode, LogsDiffer
+from daq.errors import ConfigurationInconsistent, ExitCode, LogsDiffer
 from daq.log.conversion import load_run
+from daq.workflow.experiment import PlannedMove
 from daq.workflow.fit import Reading
+from daq.workflow.plan import Plan, load_plan, save_plan
 from daq.workflow.weigh import weigh_logs
 from ident.calibration import Calibration, Source
 from ident.data.conditioning import Conditioning
@@ -46,7 +50,9 @@ def log(checkout: Path, tmp_path: Path) -> Path:
     return write(tmp_path / "bare.mcap", demo_content(checkout), ROWS)
 
 
-def _copy(checkout: Path, folder: Path, change: Callable[[str], str], name: str = "cell.yaml") -> Path:
+def _copy(
+    checkout: Path, folder: Path, change: Callable[[str], str], name: str = "cell.yaml"
+) -> Path:
     text = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8")
     changed = change(text.replace("../", f"{checkout}/configs/"))
     path = folder / name
@@ -69,59 +75,89 @@ def _calibration(cell: str) -> Calibration:
 
 
 OTHERS: dict[str, tuple[Callable[[str], str], str]] = {
-    "another name": (_replaced("name: demo", "name: press"), "a log of cell 'demo'; expected one of cell 'press'"),
+    "another name": (
+        _replaced("name: demo", "name: press"),
+        "a log of cell 'demo'; expected one of cell 'press'",
+    ),
     "another axis": (_replaced("name: J2", "name: A2"), "axes J1, J2, .*; expected J1, A2"),
-    "another node": (_replaced("node_id: 3", "node_id: 33"), "node id 3 of axis J3; expected 33"),
+    "another node": (
+        _replaced("node_id: 3", "node_id: 33"),
+        "drive of J3 with node id 3; expected drive of J3 with node id 33",
+    ),
 }
 
 
 @pytest.mark.parametrize("kind", OTHERS)
-def test_another_cell_is_refused_with_what_shows_it(kind: str, checkout: Path, tmp_path: Path, log: Path) -> None:
+def test_another_cell_is_refused_with_what_shows_it(
+    kind: str, checkout: Path, tmp_path: Path, log: Path
+) -> None:
     change, message = OTHERS[kind]
     other = load_cell(_copy(checkout, tmp_path, change))
-    with pytest.raises(LogsDiffer, match=f"{message}.*another robot's description gives wrong gains"):
+    with pytest.raises(
+        LogsDiffer, match=f"{message}.*another robot's description gives wrong gains"
+    ):
         load_run(log, other)
 
 
 def test_a_log_of_exchanged_node_numbers_is_to_be_recorded_again(checkout: Path, log: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
     first, second, *others = cell.axes
-    exchanged = (replace(first, node_id=second.node_id), replace(second, node_id=first.node_id), *others)
+    exchanged = (
+        replace(first, node_id=second.node_id),
+        replace(second, node_id=first.node_id),
+        *others,
+    )
     with pytest.raises(
-        LogsDiffer, match=r"node id 1 of axis J1; expected 2.*record again with the corrected cell file"
+        LogsDiffer,
+        match=r"drive of J1 with node id 1; .*; expected drive of J1 with node id 2; .*record "
+        r"again with the corrected "
+        r"cell file",
     ):
         load_run(log, replace(cell, axes=exchanged))
 
 
 @pytest.mark.parametrize("name", ["gantry", "dualv", "five-bar", "seven-axis"])
-def test_a_robot_with_another_number_of_axes_is_another_one(name: str, checkout: Path, log: Path) -> None:
+def test_a_robot_with_another_number_of_axes_is_another_one(
+    name: str, checkout: Path, log: Path
+) -> None:
     with pytest.raises(LogsDiffer, match=f"a log of cell 'demo'; expected one of cell '{name}'"):
         load_run(log, load_cell(checkout / f"configs/cells/{name}.yaml"))
 
 
-def test_a_robot_with_another_number_of_axes_and_the_same_name_is_another_one(checkout: Path, log: Path) -> None:
+def test_a_robot_with_another_number_of_axes_and_the_same_name_is_another_one(
+    checkout: Path, log: Path
+) -> None:
     gantry = load_cell(checkout / "configs/cells/gantry.yaml")
     with pytest.raises(LogsDiffer, match="axes J1, J2"):
         load_run(log, replace(gantry, name="demo"))
 
 
-def test_a_correction_without_the_payload_of_the_log_is_refused(checkout: Path, tmp_path: Path) -> None:
+def test_a_correction_without_the_payload_of_the_log_is_refused(
+    checkout: Path, tmp_path: Path
+) -> None:
     loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, payload=DISC), ROWS)
     renamed = load_cell(_copy(checkout, tmp_path, _replaced("name: disc", "name: cube")))
-    with pytest.raises(LogsDiffer, match="payload disc on flange-a, which the given description does not have"):
+    with pytest.raises(
+        LogsDiffer, match="payload disc on flange-a, which the given description does not have"
+    ):
         load_run(loaded, renamed)
 
 
 def test_a_robot_with_other_joints_is_another_one(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
-    for old, new in (('<joint name="J2"', '<joint name="elbow"'), ('type="revolute"', 'type="prismatic"')):
+    for old, new in (
+        ('<joint name="J2"', '<joint name="elbow"'),
+        ('type="revolute"', 'type="prismatic"'),
+    ):
         assert old in demo.urdf
         found = mismatch(demo, replace(demo, urdf=demo.urdf.replace(old, new, 1)))
         assert found is not None
         assert "as in the given description" in found.expected
 
 
-def test_drives_of_other_serial_numbers_are_of_another_robot(checkout: Path, tmp_path: Path) -> None:
+def test_drives_of_other_serial_numbers_are_of_another_robot(
+    checkout: Path, tmp_path: Path
+) -> None:
     """The drives of this log reported the serial number 7, and its description names none."""
     unnamed = _copy(checkout, tmp_path, lambda text: re.sub(r", serial: \d+", "", text))
     content = replace(demo_content(checkout), files=bundle(unnamed))
@@ -135,7 +171,9 @@ def test_drives_of_other_serial_numbers_are_of_another_robot(checkout: Path, tmp
         return replace(declared, axes=(replace(axes[0], identity=identity), *axes[1:]))
 
     load_run(log, with_serial(7))
-    with pytest.raises(LogsDiffer, match="serial number 7, reported by the drive of axis J1; expected 8"):
+    with pytest.raises(
+        LogsDiffer, match="serial number 7, reported by the drive of axis J1; expected 8"
+    ):
         load_run(log, with_serial(8))
     found = mismatch(with_serial(7), with_serial(8))
     assert found is not None
@@ -145,7 +183,10 @@ def test_drives_of_other_serial_numbers_are_of_another_robot(checkout: Path, tmp
 UPSIDE_DOWN = _replaced("gravity_m_s2: [0.0, 0.0, -9.81]", "gravity_m_s2: [0.0, 0.0, 9.81]")
 CORRECTIONS: dict[str, tuple[Callable[[str], str], tuple[str, ...]]] = {
     "gravity": (UPSIDE_DOWN, ("robot.gravity_m_s2",)),
-    "nameplate": (_replaced("nameplate_gain_nm_per_a: ", "nameplate_gain_nm_per_a: 1"), ("axes.nameplate_gain (J1)",)),
+    "nameplate": (
+        _replaced("nameplate_gain_nm_per_a: ", "nameplate_gain_nm_per_a: 1"),
+        ("axes.nameplate_gain (J1)",),
+    ),
     "mass": (_replaced("mass_kg: 4.59", "mass_kg: 4.60"), ("payloads",)),
     "filter": (_replaced("position_cutoff_hz: 40", "position_cutoff_hz: 41"), ("conditioning",)),
     "comment": (lambda text: f"# later\n{text}", ()),
@@ -153,7 +194,9 @@ CORRECTIONS: dict[str, tuple[Callable[[str], str], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("kind", CORRECTIONS)
-def test_a_corrected_description_is_taken_and_recorded(kind: str, checkout: Path, tmp_path: Path, log: Path) -> None:
+def test_a_corrected_description_is_taken_and_recorded(
+    kind: str, checkout: Path, tmp_path: Path, log: Path
+) -> None:
     change, sections = CORRECTIONS[kind]
     corrected = load_cell(_copy(checkout, tmp_path, change))
     run, described = load_run(log, corrected)
@@ -169,14 +212,26 @@ def test_a_corrected_description_is_taken_and_recorded(kind: str, checkout: Path
 
 def test_geometry_ratio_and_zero_are_corrections(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
-    axes = (replace(demo.axes[0], zero_offset_rad=0.1), *demo.axes[1:-1], replace(demo.axes[-1], zero_offset_rad=0.2))
-    mended = replace(demo, urdf=demo.urdf.replace("0.225", "0.2251"), ratio=2.0 * demo.ratio, axes=axes)
+    axes = (
+        replace(demo.axes[0], zero_offset_rad=0.1),
+        *demo.axes[1:-1],
+        replace(demo.axes[-1], zero_offset_rad=0.2),
+    )
+    mended = replace(
+        demo, urdf=demo.urdf.replace("0.225", "0.2251"), ratio=2.0 * demo.ratio, axes=axes
+    )
     assert mended.urdf != demo.urdf
     assert mismatch(demo, mended) is None
-    assert differing_sections(demo, mended) == ("robot.urdf", "drive_train.ratio", "axes.zero_offset (J1, J6)")
+    assert differing_sections(demo, mended) == (
+        "robot.urdf",
+        "drive_train.ratio",
+        "axes.zero_offset (J1, J6)",
+    )
 
 
-def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(checkout: Path, demo: Path) -> None:
+def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(
+    checkout: Path, demo: Path
+) -> None:
     files = bundle(demo)
     given = load_cell(demo)
     broken = {**files, "cell.yaml": files["cell.yaml"].replace(b"node_id: 3", b"node_id: 2")}
@@ -191,43 +246,74 @@ def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(c
 def test_a_correction_is_said_once_for_logs_that_share_a_description(
     checkout: Path, tmp_path: Path, log: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(60)]))
+    loaded = write(
+        tmp_path / "loaded.mcap",
+        demo_content(checkout, DISC),
+        samples([[k] * 6 for k in range(60)]),
+    )
     corrected = load_cell(_copy(checkout, tmp_path, UPSIDE_DOWN))
     reading = Reading.of([log, loaded], corrected)
     list(reading.runs([log, loaded], "fit"))
     assert [record.getMessage() for record in caplog.records] == [
-        f"{log}: the given description of the cell replaces the one in the log; they differ in robot.gravity_m_s2"
+        f"{log}: the given description of the cell replaces the one in the log; they differ in "
+        "robot.gravity_m_s2"
     ]
-    found = [source.recording.corrected for source in reading.sources if source.recording is not None]
+    found = [
+        source.recording.corrected for source in reading.sources if source.recording is not None
+    ]
     assert found == [("robot.gravity_m_s2",)] * 2
     # As the calibration keeps it.
     calibration = replace(demo_calibration(), sources=tuple(reading.sources))
-    again: tuple[Source, ...] = decode_calibration(encode_calibration(calibration), "calibration.yaml").sources
+    again: tuple[Source, ...] = decode_calibration(
+        encode_calibration(calibration), "calibration.yaml"
+    ).sources
     assert again == tuple(reading.sources)
 
 
-def test_logs_of_two_descriptions_are_not_weighed_by_one_model(checkout: Path, tmp_path: Path, log: Path) -> None:
+def test_logs_of_two_descriptions_are_not_weighed_by_one_model(
+    checkout: Path, tmp_path: Path, log: Path
+) -> None:
     content = replace(demo_content(checkout), files=bundle(_copy(checkout, tmp_path, UPSIDE_DOWN)))
     other = write(tmp_path / "other.mcap", content, samples([[k] * 6 for k in range(60)]))
     calibration = _calibration("demo")
-    with pytest.raises(LogsDiffer, match=r"in robot\.gravity_m_s2; expected one description for all logs"):
+    with pytest.raises(
+        LogsDiffer,
+        match=r"in robot\.gravity_m_s2; expected one description "
+        r"for all logs",
+    ):
         weigh_logs(calibration, [log, other])
-    with pytest.raises(LogsDiffer, match=r"in robot\.gravity_m_s2; expected one description for all logs"):
+    with pytest.raises(
+        LogsDiffer,
+        match=r"in robot\.gravity_m_s2; expected one description "
+        r"for all logs",
+    ):
         weigh_logs(calibration, [log], bare=[other])
 
 
 VERBS: dict[str, tuple[list[str], ExitCode]] = {
     "fit": (["fit", "LOG", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
-    "fit with fixed gains": (["fit", "LOG", "--gains", "fixed", "--cell", "CELL"], ExitCode.DATA_UNFIT),
-    "fit of cases": (["fit", "LOG", "LOG", "--cases", "out", "--cell", "CELL"], ExitCode.DATA_UNFIT),
+    "fit with fixed gains": (
+        ["fit", "LOG", "--gains", "fixed", "--cell", "CELL"],
+        ExitCode.DATA_UNFIT,
+    ),
+    "fit of cases": (
+        ["fit", "LOG", "LOG", "--cases", "out", "--cell", "CELL"],
+        ExitCode.DATA_UNFIT,
+    ),
     "residual": (["residual", "LOG", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "validate": (["validate", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "weigh": (["weigh", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "contact": (["contact", "CALIBRATION", "LOG", "--cell", "CELL"], ExitCode.DATA_UNFIT),
     "certificate": (["certificate", "DEMO", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
-    "export urdf": (["export", "urdf", "CELL", "DEMO", "--out", "out.urdf"], ExitCode.CONFIGURATION),
+    "export urdf": (
+        ["export", "urdf", "CELL", "DEMO", "--out", "out.urdf"],
+        ExitCode.CONFIGURATION,
+    ),
     "export mjcf": (["export", "mjcf", "CELL", "DEMO", "--out", "out.xml"], ExitCode.CONFIGURATION),
-    "export bag": (["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"], ExitCode.CONFIGURATION),
+    "export bag": (
+        ["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"],
+        ExitCode.CONFIGURATION,
+    ),
     "monitor": (["monitor", "CELL", "--calibration", "DEMO", "--once"], ExitCode.DATA_UNFIT),
     "apply": (["apply", "CELL", "DEMO", "--configuration-changed"], ExitCode.CALIBRATION_REFUSED),
 }
@@ -242,14 +328,21 @@ def test_every_verb_refuses_the_description_of_another_robot(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The log is of cell demo; the description is of cell press, with the same axes; a calibration of each."""
+    """The log is of cell demo; the description is of cell press, with the same axes;
+    a calibration of each.
+    """
     monkeypatch.chdir(tmp_path)
     cell = _copy(checkout, tmp_path, OTHERS["another name"][0])
     calibration = tmp_path / "press-calibration.yaml"
     save_calibration(_calibration("press"), calibration)
     of_demo = tmp_path / "demo-calibration.yaml"
     save_calibration(_calibration("demo"), of_demo)
-    files = {"LOG": str(log), "CELL": str(cell), "CALIBRATION": str(calibration), "DEMO": str(of_demo)}
+    files = {
+        "LOG": str(log),
+        "CELL": str(cell),
+        "CALIBRATION": str(calibration),
+        "DEMO": str(of_demo),
+    }
     arguments, code = VERBS[verb]
     assert main([files.get(word, word) for word in arguments]) == code
     said = " ".join(capsys.readouterr().err.split())
@@ -266,17 +359,35 @@ SAME_NAME: dict[str, tuple[Callable[[str], str], str]] = {
 }
 OF_ANOTHER_ROBOT: dict[str, tuple[list[str], ExitCode]] = {
     "validate": (["validate", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
-    "export csv": (["export", "csv", "CALIBRATION", "LOG", "--out", "out.csv"], ExitCode.DATA_UNFIT),
+    "export csv": (
+        ["export", "csv", "CALIBRATION", "LOG", "--out", "out.csv"],
+        ExitCode.DATA_UNFIT,
+    ),
     "console": (["console", "CELL", "--calibration", "CALIBRATION"], ExitCode.DATA_UNFIT),
     "weigh": (["weigh", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
     "contact": (["contact", "CALIBRATION", "LOG"], ExitCode.DATA_UNFIT),
     "certificate": (["certificate", "CALIBRATION", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
-    "beside": (["certificate", "OWN", "--beside", "CALIBRATION", "--cell", "CELL"], ExitCode.CALIBRATION_REFUSED),
-    "export urdf": (["export", "urdf", "CELL", "CALIBRATION", "--out", "out.urdf"], ExitCode.CONFIGURATION),
-    "export mjcf": (["export", "mjcf", "CELL", "CALIBRATION", "--out", "out.xml"], ExitCode.CONFIGURATION),
-    "export bag": (["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"], ExitCode.CONFIGURATION),
+    "beside": (
+        ["certificate", "OWN", "--beside", "CALIBRATION", "--cell", "CELL"],
+        ExitCode.CALIBRATION_REFUSED,
+    ),
+    "export urdf": (
+        ["export", "urdf", "CELL", "CALIBRATION", "--out", "out.urdf"],
+        ExitCode.CONFIGURATION,
+    ),
+    "export mjcf": (
+        ["export", "mjcf", "CELL", "CALIBRATION", "--out", "out.xml"],
+        ExitCode.CONFIGURATION,
+    ),
+    "export bag": (
+        ["export", "bag", "LOG", "--calibration", "CALIBRATION", "--out", "bag"],
+        ExitCode.CONFIGURATION,
+    ),
     "monitor": (["monitor", "CELL", "--calibration", "CALIBRATION", "--once"], ExitCode.DATA_UNFIT),
-    "apply": (["apply", "CELL", "CALIBRATION", "--configuration-changed"], ExitCode.CALIBRATION_REFUSED),
+    "apply": (
+        ["apply", "CELL", "CALIBRATION", "--configuration-changed"],
+        ExitCode.CALIBRATION_REFUSED,
+    ),
     "history": (["history", "CELL", "--add", "CALIBRATION"], ExitCode.DATA_UNFIT),
 }
 
@@ -317,7 +428,9 @@ def test_a_calibration_names_the_joint_in_which_its_robot_differs(checkout: Path
     sliding = replace(demo, urdf=demo.urdf.replace('type="revolute"', 'type="prismatic"', 1))
     found = mismatch_of_calibration(calibration, sliding)
     assert found is not None
-    assert found.found == "another robot with the cell name 'demo': joint J1 (prismatic, on the base)"
+    assert found.found == (
+        "another robot with the cell name 'demo': joint J1 (prismatic, on the base)"
+    )
     assert found.expected == "joint J1 (revolute, on the base), as in the calibration"
 
 
@@ -329,26 +442,108 @@ def test_what_a_description_corrects_or_leaves_open_makes_no_other_robot(checkou
     exchanged = replace(first, identity=replace(first.identity, serial=99))
     unnamed = replace(first, identity=None)
     for axis in (exchanged, unnamed, replace(first, zero_offset_rad=0.1)):
-        assert mismatch_of_calibration(calibration, replace(demo, axes=(axis, *demo.axes[1:]))) is None
+        assert (
+            mismatch_of_calibration(calibration, replace(demo, axes=(axis, *demo.axes[1:]))) is None
+        )
     lengthened = replace(demo, urdf=demo.urdf.replace("0.225", "0.2251"))
     assert mismatch_of_calibration(calibration, lengthened) is None
     # Files of earlier versions do not name their robot.
-    assert mismatch_of_calibration(_calibration("demo"), replace(demo, axes=(unnamed, *demo.axes[1:]))) is None
+    assert (
+        mismatch_of_calibration(_calibration("demo"), replace(demo, axes=(unnamed, *demo.axes[1:])))
+        is None
+    )
 
 
-def test_a_calibration_has_the_digests_of_a_plan_of_its_robot(checkout: Path) -> None:
+def _without_vendors(cell: Cell) -> Cell:
+    return replace(cell, axes=tuple(replace(axis, identity=None) for axis in cell.axes))
+
+
+def _with_another_vendor(cell: Cell) -> Cell:
+    first = cell.axes[0]
+    assert first.identity is not None
+    identity = replace(first.identity, vendor_id=first.identity.vendor_id + 1)
+    return replace(cell, axes=(replace(first, identity=identity), *cell.axes[1:]))
+
+
+def _with_a_sliding_joint(cell: Cell) -> Cell:
+    return replace(cell, urdf=cell.urdf.replace('type="revolute"', 'type="prismatic"', 1))
+
+
+def _with_another_parent(cell: Cell) -> Cell:
+    """The last joint on the base, beside the arm."""
+    root = re.search(r'<parent link="([^"]+)"', cell.urdf)
+    last = list(re.finditer(r'<parent link="([^"]+)"', cell.urdf))[-1]
+    assert root is not None
+    urdf = cell.urdf[: last.start(1)] + root[1] + cell.urdf[last.end(1) :]
+    return replace(cell, urdf=urdf)
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        (_without_vendors, True),
+        (_with_another_vendor, False),
+        (_with_a_sliding_joint, False),
+        (_with_another_parent, False),
+    ],
+)
+def test_logs_plans_and_calibrations_agree_on_what_one_robot_is(
+    change: Callable[[Cell], Cell], same: bool, checkout: Path, tmp_path: Path
+) -> None:
+    demo = load_cell(checkout / "configs/cells/demo.yaml")
+    for made_with, used_with in ((demo, change(demo)), (change(demo), demo)):
+        calibration = replace(_calibration("demo"), robot=calibrated_robot(made_with))
+        plan_file = tmp_path / "plan.yaml"
+        move = PlannedMove((0.0,) * 6, velocity=0.1, acceleration=0.1, dwell_s=0.1)
+        made = Plan(
+            cell="demo",
+            seed=1,
+            condition=1.0,
+            predicted_std_percent=(),
+            duration_s=1.0,
+            moves=(move,),
+            units=tuple(axis.unit for axis in demo.axes),
+            robot=calibrated_robot(made_with),
+        )
+        save_plan(made, plan_file)
+        refused = []
+        if mismatch(made_with, used_with) is not None:
+            refused.append("log")
+        if mismatch_of_calibration(calibration, used_with) is not None:
+            refused.append("calibration")
+        try:
+            read = load_plan(plan_file, used_with)
+        except ConfigurationInconsistent as error:
+            assert error.subject == f"{plan_file}: robot"
+            refused.append("plan")
+        else:
+            assert read.robot == made.robot
+        assert refused == ([] if same else ["log", "calibration", "plan"])
+
+
+def test_a_robot_with_fewer_axes_is_named_by_its_axes(checkout: Path) -> None:
+    robot = calibrated_robot(load_cell(checkout / "configs/cells/demo.yaml"))
+    (difference,) = robot_differences(replace(robot, drives=robot.drives[:2]), robot)
+    assert difference.found == "axes J1, J2"
+    assert difference.expected == "axes J1, J2, J3, J4, J5, J6"
+
+
+def test_a_calibration_keeps_the_robot_that_it_is_of(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
     robot = calibrated_robot(demo)
-    identity = robot_identity(demo)
-    assert (robot.kinematics_sha256, robot.drives_sha256) == (identity.kinematics_sha256, identity.drives_sha256)
     content = encode_calibration(replace(_calibration("demo"), robot=robot))
     assert decode_calibration(content, "calibration.yaml").robot == robot
     assert f"robot:\n  kinematics_sha256: {robot.kinematics_sha256}".encode() in content
 
 
-def test_the_axes_whose_zeros_differ_are_found_among_the_sections(checkout: Path, demo: Path, tmp_path: Path) -> None:
+def test_the_axes_whose_zeros_differ_are_found_among_the_sections(
+    checkout: Path, demo: Path, tmp_path: Path
+) -> None:
     other = _copy(
-        checkout, tmp_path, lambda text: text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 2.0", 2), "o.yaml"
+        checkout,
+        tmp_path,
+        lambda text: text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 2.0", 2),
+        "o.yaml",
     )
     sections = differing_sections(load_cell(demo), load_cell(other))
     assert differing_zeros(sections) == ("J1", "J2")

@@ -33,7 +33,9 @@ def test_a_byte_order_mark_decides(encoding: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
 @pytest.mark.parametrize("declaration", ["", _declaration("UTF-8")])
-def test_names_stay_apart_without_a_declaration_and_with_a_wrong_one_of_utf_8(encoding: str, declaration: str) -> None:
+def test_names_stay_apart_without_a_declaration_and_with_a_wrong_one_of_utf_8(
+    encoding: str, declaration: str
+) -> None:
     text = declaration + ROBOT
     assert urdf_text(text.encode(encoding), "arm.urdf") == text
 
@@ -45,7 +47,10 @@ def test_lines_before_the_declaration_are_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("encoding", "message"),
-    [("klingon", "found the encoding 'klingon', which is not known"), ("us-ascii", "byte 55 is not in the declared")],
+    [
+        ("klingon", "found the encoding 'klingon', which is not known"),
+        ("us-ascii", "byte 55 is not in the declared"),
+    ],
 )
 def test_what_the_declaration_does_not_explain_is_refused(encoding: str, message: str) -> None:
     data = (_declaration(encoding) + ROBOT).encode("latin-1")
@@ -67,7 +72,10 @@ def test_a_cell_is_read_with_links_that_only_the_declaration_tells_apart(cell_pa
     for plain, accented in (("link1", "Ä"), ("link2", "Ö")):
         assert plain in text
         text = text.replace(plain, accented)
-    body = text.partition("?>")[2] if text.startswith("<?xml") else text
+    if text.startswith("<?xml"):
+        body = text.partition("?>")[2]
+    else:
+        body = text
     urdf.write_bytes((_declaration("ISO-8859-1") + body).encode("latin-1"))
     assert "Ö" in load_cell(cell_path).urdf
 
@@ -84,7 +92,9 @@ def test_a_cell_is_read_with_links_that_only_the_declaration_tells_apart(cell_pa
         ("<sdf/>", "its outermost element is <sdf>", "<robot>"),
     ],
 )
-def test_the_advice_is_about_the_urdf(cell_path: Path, content: str, found: str, expected: str) -> None:
+def test_the_advice_is_about_the_urdf(
+    cell_path: Path, content: str, found: str, expected: str
+) -> None:
     (cell_path.parents[1] / "robots/rx90.urdf").write_text(content, encoding="utf-8")
     with pytest.raises(ConfigurationInconsistent) as caught:
         load_cell(cell_path)

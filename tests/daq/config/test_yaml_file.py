@@ -60,10 +60,30 @@ def test_a_good_file_is_read() -> None:
             '"fast"',
             "number",
         ),
-        ("axes:\n - name: J1\n   limits: {velocity_deg_s: '3'}\n", "axes[0].limits.velocity_deg_s", '"3"', "number"),
-        ("axes:\n - name: J1\n   limits: {velocity_deg_s: true}\n", "axes[0].limits.velocity_deg_s", "true", "number"),
-        ("axes:\n - name: J1\n   limits: {velocity_deg_s: .nan}\n", "axes[0].limits.velocity_deg_s", "NaN", "finite"),
-        ("axes:\n - name: 1\n   limits: {velocity_deg_s: 1}\n", "axes[0].name", "integer 1", "string"),
+        (
+            "axes:\n - name: J1\n   limits: {velocity_deg_s: '3'}\n",
+            "axes[0].limits.velocity_deg_s",
+            '"3"',
+            "number",
+        ),
+        (
+            "axes:\n - name: J1\n   limits: {velocity_deg_s: true}\n",
+            "axes[0].limits.velocity_deg_s",
+            "true",
+            "number",
+        ),
+        (
+            "axes:\n - name: J1\n   limits: {velocity_deg_s: .nan}\n",
+            "axes[0].limits.velocity_deg_s",
+            "NaN",
+            "finite",
+        ),
+        (
+            "axes:\n - name: 1\n   limits: {velocity_deg_s: 1}\n",
+            "axes[0].name",
+            "integer 1",
+            "string",
+        ),
         ("axes:\n - name: J1\n", "axes[0].limits", "nothing", "required"),
         ("axes: []\n", "axes", "list []", "at least 1"),
         (
@@ -76,7 +96,9 @@ def test_a_good_file_is_read() -> None:
         ("", "the whole file", "null", "object"),
     ],
 )
-def test_a_mistake_is_named_with_place_found_and_expected(text: str, where: str, found: str, expected: str) -> None:
+def test_a_mistake_is_named_with_place_found_and_expected(
+    text: str, where: str, found: str, expected: str
+) -> None:
     with pytest.raises(SchemaMismatch) as caught:
         _read(text)
     message = str(caught.value)
@@ -99,7 +121,9 @@ def test_the_remedy_names_a_page_with_every_key(model: type[StrictModel], checko
         read_model(parse_yaml(b"colour: red\n", "file.yaml"), model)
     page = checkout / "docs/reference" / model.reference
     assert f"docs/reference/{page.name} has every key" in caught.value.remedy
-    assert re.search("^<!-- generated: (cell file|schemas) -->$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.search(
+        "^<!-- generated: (cell file|schemas) -->$", page.read_text(encoding="utf-8"), re.MULTILINE
+    )
 
 
 @pytest.mark.parametrize(
@@ -127,7 +151,14 @@ def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, fou
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("no", "no"), ("on", "on"), ("12:30:00", "12:30:00"), ("2024-01-01", "2024-01-01"), ("017", "017"), ("0x1F", 31)],
+    [
+        ("no", "no"),
+        ("on", "on"),
+        ("12:30:00", "12:30:00"),
+        ("2024-01-01", "2024-01-01"),
+        ("017", "017"),
+        ("0x1F", 31),
+    ],
 )
 def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
     assert parse_yaml(f"a: {text}\n".encode(), "file.yaml").tree == {"a": value}
@@ -170,7 +201,9 @@ def test_a_missing_file_of_the_command_line_is_sought_in_the_current_folder(tmp_
         read_yaml_bytes(tmp_path / "none.yaml")
 
 
-@pytest.mark.parametrize("text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999])
+@pytest.mark.parametrize(
+    "text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999]
+)
 def test_an_integer_that_nothing_can_hold_is_reported(text: str) -> None:
     with pytest.raises(YamlInvalid):
         _read(f"axes:\n  - {{name: J1, limits: {{velocity_deg_s: {text}}}}}\n")

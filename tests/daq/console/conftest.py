@@ -18,5 +18,7 @@ def cell(checkout: Path) -> Cell:
 
 @pytest.fixture
 def cell_file(tmp_path: Path) -> Path:
-    """A path of its own, so that the feeds of two tests have different addresses; it is not read."""
+    """A path of its own, so that the feeds of two tests have different addresses;
+    it is not read.
+    """
     return tmp_path / "cell.yaml"

@@ -29,12 +29,16 @@ RATE_HZ = 500.0
 
 
 def facts(cell: Cell, log: Path | None) -> RunFacts:
-    """A run of a cell of uncoupled motors, in which a count is a milliradian and a raw unit a milliampere."""
+    """A run of a cell of uncoupled motors, in which a count is a milliradian and a raw unit a
+    milliampere.
+    """
     count = len(cell.axes)
     identity = [[float(row == column) for column in range(count)] for row in range(count)]
     scales = [1e-3] * count, [1e-3] * count, identity, [0.0] * count
     loads = {} if log is None else {"can0": 0.4}
-    return RunFacts("id", None if log is None else str(log), cell.axis_names, RATE_HZ, 3, *scales, None, loads)
+    return RunFacts(
+        "id", None if log is None else str(log), cell.axis_names, RATE_HZ, 3, *scales, None, loads
+    )
 
 
 def predicting_calibration() -> Calibration:
@@ -43,19 +47,25 @@ def predicting_calibration() -> Calibration:
     # Without dry friction, whose sign depends on the last digit of a speed near zero.
     each = {"Ia": 1.0, "fv": 3.0, "off": 0.5}
     parameters = tuple(
-        Parameter(f"{name}{axis}", value / axis, 0.1, "SI") for name, value in each.items() for axis in range(1, 7)
+        Parameter(f"{name}{axis}", value / axis, 0.1, "SI")
+        for name, value in each.items()
+        for axis in range(1, 7)
     )
     gravity = Parameter("mx2", 2.0, 0.1, "kg m"), Parameter("my3", -1.0, 0.1, "kg m")
     left = (0.01,) * 6  # of currents of some tenths of an ampere
     found = demo_calibration()
-    return replace(found, filter=filters, effects=(), parameters=(*parameters, *gravity), current_residual=left)
+    return replace(
+        found, filter=filters, effects=(), parameters=(*parameters, *gravity), current_residual=left
+    )
 
 
 class Recording:
     """Publishes samples, as the recorder does; as a monitor does without a log."""
 
     def __init__(self, feed: Feed, cell: Cell, log: Path | None) -> None:
-        self.feed, self.axes, self.samples = feed, len(cell.axes), 0
+        self.feed = feed
+        self.axes = len(cell.axes)
+        self.samples = 0
         feed.begin(facts(cell, log), self.statistics)
 
     def statistics(self) -> RunStatistics:
@@ -63,13 +73,17 @@ class Recording:
         return RunStatistics(self.samples, 0, (0,) * self.axes, valid=True)
 
     def run(self, count: int) -> None:
-        """Publish so many samples; positions and currents are the number of the cycle and of the axis."""
+        """Publish so many samples; positions and currents are the number of the cycle and of the
+        axis.
+        """
         for _ in range(count):
             cycle = self.samples
             self.samples += 1
             position = tuple(cycle + axis for axis in range(self.axes))
             current = tuple(-cycle - axis for axis in range(self.axes))
-            self.feed.sample(Sample(cycle, cycle * 2_000_000, position, current, (0x237,) * self.axes))
+            self.feed.sample(
+                Sample(cycle, cycle * 2_000_000, position, current, (0x237,) * self.axes)
+            )
 
 
 class Arrivals(deque[socket.socket]):
@@ -139,7 +153,9 @@ class Served:
         self.port = self.listener.getsockname()[1]
         page = Page(cell, self.live, Results(cell_file, cell, report=report))
         self.server = server_of(page, TOKEN, self.port)
-        self.thread = threading.Thread(target=lambda: asyncio.run(self.server.serve(sockets=[self.listener])))
+        self.thread = threading.Thread(
+            target=lambda: asyncio.run(self.server.serve(sockets=[self.listener]))
+        )
 
     def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
         """Ask for a path as it is written; underscores of the headers' names are hyphens."""
@@ -156,7 +172,9 @@ class Served:
         """A page that has asked for the curves, and does not read yet."""
         connection = socket.create_connection(("127.0.0.1", self.port), timeout=10)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        connection.sendall(f"GET /{TOKEN}/curves HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n\r\n".encode())
+        connection.sendall(
+            f"GET /{TOKEN}/curves HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\n\r\n".encode()
+        )
         return connection
 
 

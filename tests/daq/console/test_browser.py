@@ -1,4 +1,6 @@
-"""The page in Chromium beside whole recordings of the simulated cell: what it shows is what the log holds."""
+"""The page in Chromium beside whole recordings of the simulated cell:
+what it shows is what the log holds.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ from tests.daq.console.feeds import TOKEN, Recording, arrivals, predicting_calib
 CHROMIUM = os.environ.get("DRIVEGAIN_CHROMIUM", "")
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.skipif(not CHROMIUM, reason="DRIVEGAIN_CHROMIUM names no browser; `make test-console` does"),
+    pytest.mark.skipif(
+        not CHROMIUM, reason="DRIVEGAIN_CHROMIUM names no browser; `make test-console` does"
+    ),
 ]
 FAULTS = """\
 faults:
@@ -44,12 +48,15 @@ faults:
   - {fault: emergency, axis: J3, at_s: 4.0, emcy_code: 0x7305}
 """
 SHORT_S = "8"  #: Duration of a plan that a recording comes to the end of
-LONG_S = "240"  #: Of one that is stopped: a simulated cell moves faster than a real one, and a browser may be slow
+#: Of one that is stopped: a simulated cell moves faster than a real one, and a browser may be slow
+LONG_S = "240"
 HEARD_S = 60.0  #: Time for the page to show what is awaited; longer than a busy machine needs
 
 
 def until(page: Page, condition: str) -> None:
-    """Wait in the page for a condition of its script; the browser's own waiting would need `unsafe-eval`."""
+    """Wait in the page for a condition of its script;
+    the browser's own waiting would need `unsafe-eval`.
+    """
     found = page.evaluate(f"""() => new Promise((resolve) => {{
         const end = performance.now() + {1e3 * HEARD_S};
         const look = () => {{
@@ -74,20 +81,36 @@ class Rig:
         duration_s: str,
         simulated: Sequence[str] = ("clean",),
     ) -> None:
-        self.folder, self.checkout, self.stack = folder, checkout, stack
+        self.folder = folder
+        self.checkout = checkout
+        self.stack = stack
         (folder / "faults.yaml").write_text(faults, encoding="utf-8")
         shutil.copytree(checkout / "configs", folder / "configs")
         self.cell_file = folder / "configs" / "cells" / "demo.yaml"
         given = ("--faults", str(folder / "faults.yaml")) if faults else ()
         simulation = self.start("simulate", *simulated, "--port", "0", *given)
         assert simulation.stdout is not None
-        lines = list(iter(simulation.stdout.readline, "\n")) + list(iter(simulation.stdout.readline, "\n"))
+        lines = list(iter(simulation.stdout.readline, "\n")) + list(
+            iter(simulation.stdout.readline, "\n")
+        )
         text = self.cell_file.read_text(encoding="utf-8")
         bus = "".join(lines[lines.index("bus:\n") :])
-        self.cell_file.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL), encoding="utf-8")
+        self.cell_file.write_text(
+            re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL), encoding="utf-8"
+        )
         self.cell = load_cell(self.cell_file)
-        self.plan, self.log = folder / "plan.yaml", folder / "run.mcap"
-        planned = ["plan", str(self.cell_file), "--out", str(self.plan), "--duration", duration_s, "--exchanges", "0"]
+        self.plan = folder / "plan.yaml"
+        self.log = folder / "run.mcap"
+        planned = [
+            "plan",
+            str(self.cell_file),
+            "--out",
+            str(self.plan),
+            "--duration",
+            duration_s,
+            "--exchanges",
+            "0",
+        ]
         assert main(planned) == ExitCode.OK
         calibration = folder / "calibration.yaml"
         save_calibration(predicting_calibration(), calibration)
@@ -127,7 +150,9 @@ class Rig:
 
     def record(self) -> subprocess.Popen[str]:
         """Begin a recording."""
-        return self.start("record", str(self.cell_file), str(self.plan), "--out", str(self.log), "--enable-motion")
+        return self.start(
+            "record", str(self.cell_file), str(self.plan), "--out", str(self.log), "--enable-motion"
+        )
 
     def kept(self) -> Log:
         """The log, or what was saved of it."""
@@ -147,14 +172,17 @@ class Rig:
 def browser() -> Iterator[Browser]:
     """Chromium without a window."""
     with sync_playwright() as playwright:
-        # A container's root may not make the namespaces of the browser's sandbox; it opens our own page alone.
+        # A container's root may not make the namespaces of the browser's sandbox; it opens our own
+        # page alone.
         found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield found
         found.close()
 
 
 @contextmanager
-def rig(folder: Path, checkout: Path, browser: Browser, faults: str = "", duration_s: str = SHORT_S) -> Iterator[Rig]:
+def rig(
+    folder: Path, checkout: Path, browser: Browser, faults: str = "", duration_s: str = SHORT_S
+) -> Iterator[Rig]:
     """Run cell and console until the block ends."""
     with ExitStack() as stack:
         yield Rig(folder, checkout, browser, stack, faults, duration_s)
@@ -167,7 +195,8 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
         recorder = made.record()
         output, _ = recorder.communicate(timeout=120)
         assert recorder.returncode == ExitCode.DEVICE_FAULT, output
-        shown, log = made.shown(), made.kept()
+        shown = made.shown()
+        log = made.kept()
         status = shown["status"]
         assert status["samples"] == len(log.samples.cycle)
         assert status["missing"] == sum(log.statistics.missing) > 0
@@ -192,12 +221,20 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
         plain = [re.sub(r"^(J\d)(?: \(node \d+\))?: ", r"\1: ", text) for text in texts]
         assert len(shown["events"]) == len(log.events)
         assert all(
-            one.endswith(other.partition(": ")[2]) or other in one for one, other in zip(in_page, plain, strict=True)
+            one.endswith(other.partition(": ")[2]) or other in one
+            for one, other in zip(in_page, plain, strict=True)
         )
-        emergency = next(event for event in shown["events"] if event["kind"] == EventKind.EMCY.value)
+        emergency = next(
+            event for event in shown["events"] if event["kind"] == EventKind.EMCY.value
+        )
         assert emergency["axis"] == names[2]
         body = made.page.inner_text("body")
-        for words in ("7305h", "check the plugs and cables of encoder", "The axes are stopped", "ended early"):
+        for words in (
+            "7305h",
+            "check the plugs and cables of encoder",
+            "The axes are stopped",
+            "ended early",
+        ):
             assert words in body, words
         assert "INVALID" not in body  # it never came to an end that could be judged
         for figure in ("Bus load", "Sample rate"):  # of a run that has ended there is none
@@ -208,7 +245,9 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
         assert made.refused == []
 
 
-def test_the_button_stops_the_axes_and_the_page_says_so(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+def test_the_button_stops_the_axes_and_the_page_says_so(
+    tmp_path: Path, checkout: Path, browser: Browser
+) -> None:
     with rig(tmp_path, checkout, browser, duration_s=LONG_S) as made:
         recorder = made.record()
         until(made.page, "window.drivegain.points.length > 20")
@@ -216,13 +255,21 @@ def test_the_button_stops_the_axes_and_the_page_says_so(tmp_path: Path, checkout
         output, _ = recorder.communicate(timeout=120)
         assert recorder.returncode == ExitCode.INTERRUPTED, output
         assert "axes stopped" in output
-        until(made.page, "document.querySelector('#stopped').textContent.includes('its axes are stopped')")
-        shown, log = made.shown(), made.kept()
+        until(
+            made.page,
+            "document.querySelector('#stopped').textContent.includes('its axes are stopped')",
+        )
+        shown = made.shown()
+        log = made.kept()
         assert shown["status"]["samples"] == len(log.samples.cycle)
         assert shown["status"]["end"]["axes_stopped"]
         assert made.page.is_disabled("#stop")
-        # Predicted where the arm moves; this calibration is the declared model, so only its being there is checked.
-        assert any(value is not None for row in shown["rows"] for value in row[1:7]) or not shown["rows"]
+        # Predicted where the arm moves; this calibration is the declared model, so only its being
+        # there is checked.
+        assert (
+            any(value is not None for row in shown["rows"] for value in row[1:7])
+            or not shown["rows"]
+        )
         assert made.refused == []
 
 
@@ -231,23 +278,43 @@ def test_a_page_of_another_site_reads_nothing_and_stops_nothing(
 ) -> None:
     with rig(tmp_path, checkout, browser) as made:
         other = browser.new_page()
-        other.route("http://evil.example/", lambda route: route.fulfill(body="<p>evil</p>", content_type="text/html"))
+        other.route(
+            "http://evil.example/",
+            lambda route: route.fulfill(body="<p>evil</p>", content_type="text/html"),
+        )
         other.goto("http://evil.example/")
         for method in ("GET", "POST"):
-            asked = f"fetch('{made.address}stop', {{method: '{method}'}}).then(() => 'read', () => 'refused')"
+            asked = (
+                f"fetch('{made.address}stop', {{method: '{method}'}}).then(() => 'read', () => "
+                "'refused')"
+            )
             assert other.evaluate(asked) == "refused"
         other.close()
         assert made.page.evaluate("window.drivegain.status.stop") is None
-        injected = "document.body.append(Object.assign(document.createElement('script'), {text: 'window.evil = 1'}))"
+        injected = (
+            "document.body.append(Object.assign(document.createElement('script'), {text: "
+            "'window.evil = 1'}))"
+        )
         made.page.evaluate(injected)
         assert made.page.evaluate("window.evil") is None
         assert any("Content Security Policy" in text for text in made.refused)
 
 
-def test_a_preview_is_a_right_handed_view_from_above(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+def test_a_preview_is_a_right_handed_view_from_above(
+    tmp_path: Path, checkout: Path, browser: Browser
+) -> None:
     cell = checkout / "configs" / "cells" / "demo.yaml"
     preview = tmp_path / "plan.html"
-    planned = ["plan", str(cell), "--out", str(tmp_path / "plan.yaml"), "--duration", "8", "--exchanges", "0"]
+    planned = [
+        "plan",
+        str(cell),
+        "--out",
+        str(tmp_path / "plan.yaml"),
+        "--duration",
+        "8",
+        "--exchanges",
+        "0",
+    ]
     assert main([*planned, "--preview", str(preview)]) == ExitCode.OK
     page = browser.new_page(viewport={"width": 1000, "height": 1300})
     faults: list[str] = []
@@ -257,12 +324,19 @@ def test_a_preview_is_a_right_handed_view_from_above(tmp_path: Path, checkout: P
     for button in ("From above", "Along y", "Along x", "3-D", "+"):
         page.click(f"button:text-is('{button}')")
         origin, x, y, z = (
-            np.array(page.evaluate(f"(([see, near]) => [...see({point}), near({point})])(camera(400, 400))"))
+            np.array(
+                page.evaluate(
+                    f"(([see, near]) => [...see({point}), near({point})])(camera(400, 400))"
+                )
+            )
             for point in ("[0, 0, 0]", "[1, 0, 0]", "[0, 1, 0]", "[0, 0, 1]")
         )
         scale = page.evaluate("camera(400, 400)[2]")
-        # Right, up, and towards the viewer are a right-handed frame, so the images of x, y, z must be one as well.
-        axes = np.stack([one - origin for one in (x, y, z)]) * np.array([1 / scale, -1 / scale, 1.0])
+        # Right, up, and towards the viewer are a right-handed frame, so the images of x, y, z must
+        # be one as well.
+        axes = np.stack([one - origin for one in (x, y, z)]) * np.array(
+            [1 / scale, -1 / scale, 1.0]
+        )
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(axes) == pytest.approx(1.0)
         assert axes[2, 2] >= -1e-9  # seen from the side or from above, never from below
@@ -274,7 +348,9 @@ def test_a_preview_is_a_right_handed_view_from_above(tmp_path: Path, checkout: P
 def _events_can_be_seen(page: Page) -> None:
     """No line of the events is cut: a few are shown, and a button has the others."""
     count = page.evaluate("document.querySelectorAll('#events li').length")
-    visible = "[...document.querySelectorAll('#events li')].filter((one) => one.checkVisibility()).length"
+    visible = (
+        "[...document.querySelectorAll('#events li')].filter((one) => one.checkVisibility()).length"
+    )
     assert page.evaluate(visible) == 8 < count
     list_ = "document.querySelector('#events')"
     assert page.evaluate(f"{list_}.scrollHeight <= {list_}.clientHeight")
@@ -297,12 +373,15 @@ def test_a_bar_is_red_for_a_reason(tmp_path: Path, checkout: Path, browser: Brow
                     const card = document.querySelector("#axes article");
                     return [card.querySelector(".values").textContent,
                             card.querySelector(".bar").classList.contains("near")];
-                }""",
+                }""",  # noqa: E501
                 share,
             )
             for share in (-0.01, 0.01, 0.5, 0.99, 1.01)
         }
-    said = {share: text.partition(" deg, ")[2].partition("current")[0] for share, (text, _) in texts.items()}
+    said = {
+        share: text.partition(" deg, ")[2].partition("current")[0]
+        for share, (text, _) in texts.items()
+    }
     assert said == {
         -0.01: "below its lower limit, ",
         0.01: "near its lower limit, ",
@@ -313,10 +392,14 @@ def test_a_bar_is_red_for_a_reason(tmp_path: Path, checkout: Path, browser: Brow
     assert [red for _, red in texts.values()] == [True, True, False, True, True]
 
 
-def test_a_simulated_cell_shows_the_rate_of_its_own_time(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+def test_a_simulated_cell_shows_the_rate_of_its_own_time(
+    tmp_path: Path, checkout: Path, browser: Browser
+) -> None:
     with rig(tmp_path, checkout, browser, duration_s=LONG_S) as made:
         made.record()
-        until(made.page, "window.drivegain.points.length > 20 && window.drivegain.status.rate_hz > 0")
+        until(
+            made.page, "window.drivegain.points.length > 20 && window.drivegain.status.rate_hz > 0"
+        )
         figures = made.page.inner_text("#figures")
         assert "1000 Hz, simulated" in figures
         assert "none: simulated" in figures
@@ -341,7 +424,8 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
         # No column is behind the edge of its table.
         until(phone, "document.querySelector('.table')")
         assert phone.evaluate(
-            "[...document.querySelectorAll('.table')].every((one) => one.scrollWidth <= one.clientWidth)"
+            "[...document.querySelectorAll('.table')].every((one) => one.scrollWidth <= "
+            "one.clientWidth)"
         )
         # A number is on one line with its per cent sign.
         lines = phone.evaluate(
@@ -349,7 +433,7 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
                 const range = document.createRange();
                 range.selectNodeContents(one);
                 return range.getClientRects().length;
-            })"""
+            })"""  # noqa: E501
         )
         assert lines and set(lines) == {1}
 
@@ -368,10 +452,13 @@ def _state_after_three_blocks(cell: Cell, folder: Path) -> None:
         for number, role in enumerate(roles, 1)
     )
     runs = tuple(
-        RecordedRun(name=block.name, sha256="", attempts=1, samples=1, lost_cycles=0, missing=()) for block in blocks
+        RecordedRun(name=block.name, sha256="", attempts=1, samples=1, lost_cycles=0, missing=())
+        for block in blocks
     )
     gains = tuple(
-        GainSoFar(axis=axis.name, unit=axis.gain_unit, value=10.0, std_percent=0.9, target_percent=0.5)
+        GainSoFar(
+            axis=axis.name, unit=axis.gain_unit, value=10.0, std_percent=0.9, target_percent=0.5
+        )
         for axis in cell.axes
     )
     progress = Progress(blocks=3, motion_s=60.0, fitted_s=40.0, std_percent=(0.9,) * len(gains))
@@ -391,24 +478,33 @@ def _state_after_three_blocks(cell: Cell, folder: Path) -> None:
     save(Session(folder, state))
 
 
-def test_the_session_shows_the_gains_after_each_move(browser: Browser, cell: Cell, cell_file: Path) -> None:
+def test_the_session_shows_the_gains_after_each_move(
+    browser: Browser, cell: Cell, cell_file: Path
+) -> None:
     folder = sessions_folder(cell_file) / "20260105T020000Z"
     _state_after_three_blocks(cell, folder)
     gains = [QuickGain(axis.name, axis.gain_unit, 10.0, 0.8, 0.5) for axis in cell.axes]
-    look = QuickLook("block-4-loaded", 1, 9, 44.0, gains=gains, why="it needs more moves", left_s=69.0)
+    look = QuickLook(
+        "block-4-loaded", 1, 9, 44.0, gains=gains, why="it needs more moves", left_s=69.0
+    )
     feed = Feed(cell_file)
     accepted = arrivals(feed)
     with served(cell_file, cell) as console, feed, browser.new_context() as context:
         page = context.new_page()
         page.goto(f"http://127.0.0.1:{console.port}/{TOKEN}/")
         until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")
-        # A console is connected before the feed accepts it: what is published in between is for nobody.
+        # A console is connected before the feed accepts it: what is published in between is for
+        # nobody.
         assert accepted.wait(HEARD_S)
         recording = Recording(feed, cell, folder / "block-4-loaded.mcap")
         for number in (1, 2):
             feed.look(replace(look, move=number, motion_s=40.0 + 4.0 * number))
             recording.run(50)
-            until(page, f"document.getElementById('outlook').textContent.includes('after move {number} of 9')")
+            until(
+                page,
+                "document.getElementById('outlook').textContent.includes('after move "
+                f"{number} of 9')",
+            )
         assert page.inner_text("#next-step") == "The robot moves: block-4-loaded"
         assert "J1 is worst (it needs more moves): about 69 s left" in page.inner_text("#outlook")
         # One point of the block that was judged and two of moves since, for each axis.
@@ -448,12 +544,17 @@ class Technician:
 
     def mount(self) -> None:
         """Mount what the last heading asks for."""
-        body = "none" if self.asked_for().startswith("NOTHING") else "disc"
+        if self.asked_for().startswith("NOTHING"):
+            body = "none"
+        else:
+            body = "disc"
         self.mounted.write_text(f"{body}\n", encoding="utf-8")
 
     def answer(self, question: str) -> None:
         """Answer a question, with Enter where it asks for nothing else."""
-        given = next((text for begin, text in self.answers.items() if question.startswith(begin)), "")
+        given = next(
+            (text for begin, text in self.answers.items() if question.startswith(begin)), ""
+        )
         self.said += "\n"
         assert self.command.stdin is not None
         self.command.stdin.write(f"{given}\n".encode())
@@ -467,7 +568,9 @@ def newest_state(cell_file: Path, cell: Cell) -> GuidedState:
     return state
 
 
-def test_a_whole_session_is_shown_as_its_files_hold_it(tmp_path: Path, checkout: Path, browser: Browser) -> None:
+def test_a_whole_session_is_shown_as_its_files_hold_it(
+    tmp_path: Path, checkout: Path, browser: Browser
+) -> None:
     mounted = tmp_path / "mounted.txt"
     mounted.write_text("none\n", encoding="utf-8")
     simulated = ("demo", "--payload-from", str(mounted))
@@ -487,7 +590,10 @@ def test_a_whole_session_is_shown_as_its_files_hold_it(tmp_path: Path, checkout:
         technician = Technician(command, mounted)
         while (question := technician.asked()) is not None:
             if "press Enter" in question and "cell" in question:
-                until(page, f"document.getElementById('next-step').textContent.startsWith('{technician.asked_for()}')")
+                until(
+                    page,
+                    f"document.getElementById('next-step').textContent.startsWith('{technician.asked_for()}')",
+                )
                 technician.mount()
                 _precision_is_that_of(page, newest_state(made.cell_file, made.cell))
             elif question.startswith("Type yes"):
@@ -513,7 +619,9 @@ def _precision_is_that_of(page: Page, state: GuidedState) -> None:
     if not state.progress:
         return
     until(page, f"window.drivegain.guided?.precision?.progress.length === {len(state.progress)}")
-    assert page.locator("#precision circle:not(.quick)").count() == len(state.progress) * len(state.gains)
+    assert page.locator("#precision circle:not(.quick)").count() == len(state.progress) * len(
+        state.gains
+    )
     labels = page.locator("#precision text").all_text_contents()
     if page.locator("#precision circle.quick").count() == 0:
         for gain, std_percent in zip(state.gains, state.progress[-1].std_percent, strict=True):

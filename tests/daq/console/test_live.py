@@ -56,8 +56,12 @@ UNFIT: dict[str, Callable[[Cell], bytes]] = {
     "an unknown packet": lambda _: HEAD.pack(7, 0, 0, 0, 0, 0),
     "an unknown event": lambda _: _text({"events": [{**EVENT, "kind": "surprise"}]}),
     "an event of axis 9": lambda _: _text({"events": [{**EVENT, "axis": 9}]}),
-    "a run without a key": lambda cell: _text({"run": {k: v for k, v in _run(cell)["run"].items() if k != "moves"}}),
-    "a run of five axes": lambda cell: _text({"run": asdict(facts(replace(cell, axes=cell.axes[:5]), None))}),
+    "a run without a key": lambda cell: _text(
+        {"run": {k: v for k, v in _run(cell)["run"].items() if k != "moves"}}
+    ),
+    "a run of five axes": lambda cell: _text(
+        {"run": asdict(facts(replace(cell, axes=cell.axes[:5]), None))}
+    ),
     "a run of no rate": lambda cell: _text(_run(cell, rate_hz=0.0)),
     "a run with a short list": lambda cell: _text(_run(cell, rad_per_count=[1.0])),
     "too many samples": lambda cell: _samples(len(cell.axes), 2),
@@ -83,7 +87,9 @@ def test_keys_of_a_later_version_are_ignored(cell: Cell, cell_file: Path) -> Non
 
 
 def test_a_look_at_the_gains_is_shown_until_the_next_run(cell: Cell, cell_file: Path) -> None:
-    look = QuickLook("block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)], left_s=12.0)
+    look = QuickLook(
+        "block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)], left_s=12.0
+    )
     live = Live(cell_file, cell)
     live.take(_text(_run(cell)))
     assert live.status()["quick"] is None
@@ -117,7 +123,9 @@ def _other_program(cell_file: Path, packet: bytes) -> Iterator[None]:
         thread.join(30)
 
 
-def test_a_recorder_of_another_version_is_said_and_the_next_one_is_shown(cell: Cell, cell_file: Path) -> None:
+def test_a_recorder_of_another_version_is_said_and_the_next_one_is_shown(
+    cell: Cell, cell_file: Path
+) -> None:
     with served(cell_file, cell) as console:
         live = console.live
         with _other_program(cell_file, _text(_run(cell, rate_hz="fast"))):
@@ -155,7 +163,9 @@ def test_a_background_task_that_ends_is_said(cell: Cell, cell_file: Path) -> Non
     assert "restart the console" in live.status()["alarm"]
 
 
-def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(cell: Cell, cell_file: Path) -> None:
+def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(
+    cell: Cell, cell_file: Path
+) -> None:
     now_s = [0.0]
     live = Live(cell_file, cell, clock=lambda: now_s[0])
     live.take(_text(_run(cell)))
@@ -180,7 +190,8 @@ def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(cell: Ce
 
 def test_a_stop_is_forgotten_when_the_next_recorder_begins(cell: Cell, cell_file: Path) -> None:
     with served(cell_file, cell) as console:
-        live, own = console.live, f"http://127.0.0.1:{console.port}"
+        live = console.live
+        own = f"http://127.0.0.1:{console.port}"
         for number in range(2):
             asked = threading.Event()
             feed = Feed(cell_file, asked.set)
@@ -205,8 +216,12 @@ def test_a_simulated_cell_in_lockstep_has_no_load_of_a_bus(cell: Cell, cell_file
 
 
 @pytest.mark.parametrize("pacing", PacingMode)
-def test_the_sample_rate_is_that_of_the_cells_own_time(cell: Cell, cell_file: Path, pacing: PacingMode) -> None:
-    """A simulated cell answers half as fast again as a real one: its rate is that of its SYNC all the same."""
+def test_the_sample_rate_is_that_of_the_cells_own_time(
+    cell: Cell, cell_file: Path, pacing: PacingMode
+) -> None:
+    """A simulated cell answers half as fast again as a real one:
+    its rate is that of its SYNC all the same.
+    """
     assert cell.sync is not None
     now_s = [0.0]
     declared = replace(cell, sync=replace(cell.sync, pacing=pacing))
@@ -221,4 +236,6 @@ def test_the_sample_rate_is_that_of_the_cells_own_time(cell: Cell, cell_file: Pa
     assert live.run is not None
     measured = live.rate_hz
     assert measured > 1.2 * live.run.rate_hz
-    assert live.status()["rate_hz"] == (live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1))
+    assert live.status()["rate_hz"] == (
+        live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1)
+    )

@@ -49,7 +49,9 @@ def test_the_page_loads_nothing_from_elsewhere_and_runs_no_inline_script(console
     answer, page = console.ask(f"/{TOKEN}/")
     assert answer.status == 200
     policy = answer.headers["content-security-policy"]
-    assert "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
+    assert (
+        "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
+    )
     assert answer.headers["referrer-policy"] == "no-referrer"
     assert "server" not in answer.headers
     for name in re.findall(rb'(?:src|href)="([^"]+)"', page):
@@ -59,7 +61,9 @@ def test_the_page_loads_nothing_from_elsewhere_and_runs_no_inline_script(console
     assert not re.search(rb"<script(?![^>]* src=)|<style|\son[a-z]+=|\sstyle=", page)
 
 
-@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/stop", "//", f"/{TOKEN[:-1]}/", f"/x{TOKEN}/", f"/{TOKEN}x/"])
+@pytest.mark.parametrize(
+    "path", ["/", "/wrong/", "/wrong/stop", "//", f"/{TOKEN[:-1]}/", f"/x{TOKEN}/", f"/{TOKEN}x/"]
+)
 def test_without_the_token_there_is_nothing(console: Served, path: str) -> None:
     answer, content = console.ask(path)
     assert (answer.status, content) == (404, b"not found")
@@ -72,15 +76,23 @@ def test_a_question_about_the_whole_server_is_refused_like_any_other(console: Se
     assert "content-security-policy" in answer.headers
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example", "[::1]"])
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example", "[::1]"]
+)
 def test_a_name_that_was_bound_to_this_computer_is_refused(console: Served, host: str) -> None:
     assert console.ask(f"/{TOKEN}/", host=host)[0].status == 421
-    assert console.ask(f"/{TOKEN}/stop", "POST", host=host, origin=f"http://{host}")[0].status == 421
+    assert (
+        console.ask(f"/{TOKEN}/stop", "POST", host=host, origin=f"http://{host}")[0].status == 421
+    )
 
 
 def test_another_origin_can_neither_read_nor_stop(console: Served) -> None:
     own = f"http://127.0.0.1:{console.port}"
-    for headers in ({"origin": "http://evil.example"}, {"origin": "null"}, {"sec_fetch_site": "cross-site"}):
+    for headers in (
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"sec_fetch_site": "cross-site"},
+    ):
         assert console.ask(f"/{TOKEN}/cell", **headers)[0].status == 403
     for headers in ({}, {"origin": "null"}, {"origin": own.replace("http", "https")}):
         assert console.ask(f"/{TOKEN}/stop", "POST", **headers)[0].status == 403
@@ -92,8 +104,8 @@ def test_another_origin_can_neither_read_nor_stop(console: Served) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["secret.txt", "report/secret.txt", "report/../secret.txt", "../secret.txt", "%2e%2e/secret.txt",
-             "page.js/../../../pyproject.toml", "/etc/passwd", "report?file=secret.txt%00", "..%2fsecret.txt"]
+    "path", ["secret.txt", "report/secret.txt", "report/../secret.txt", "../secret.txt", "%2e%2e/secret.txt",  # noqa: E501
+             "page.js/../../../pyproject.toml", "/etc/passwd", "report?file=secret.txt%00", "..%2fsecret.txt"]  # noqa: E501
 )  # fmt: skip
 def test_no_path_leads_to_a_file(console: Served, path: str) -> None:
     answer, content = console.ask(f"/{TOKEN}/{path}")
@@ -107,7 +119,9 @@ def test_the_report_runs_no_script(console: Served) -> None:
     assert answer.headers["content-security-policy"].startswith("sandbox; default-src 'none'")
 
 
-def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell_file: Path) -> None:
+def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(
+    cell: Cell, cell_file: Path
+) -> None:
     stopped = threading.Event()
     feed = Feed(cell_file, stopped.set)
     accepted = arrivals(feed)
@@ -130,7 +144,9 @@ def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell
             assert stopped.wait(10)
         # Every tenth sample of 500 Hz, with its values.
         first = round(shown[0][0] * 500)
-        assert [round(500 * point[0]) for point in shown] == [first + 10 * step for step in range(len(shown))]
+        assert [round(500 * point[0]) for point in shown] == [
+            first + 10 * step for step in range(len(shown))
+        ]
         assert console.live.dropped == 0
     degree = cell.axes[0].unit.si
     for point in shown[:50]:
@@ -139,7 +155,9 @@ def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(cell: Cell, cell
         assert point[1 + len(cell.axes)] == pytest.approx(-1e-3 * cycle)
 
 
-def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(cell: Cell, cell_file: Path) -> None:
+def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(
+    cell: Cell, cell_file: Path
+) -> None:
     watching = Feed(cell_file, stop=None)
     accepted = arrivals(watching)
     with served(cell_file, cell) as console, watching:
@@ -209,7 +227,9 @@ def test_more_pages_than_are_served_are_refused_also_at_once(console: Served) ->
 def test_a_damaged_audit_log_is_a_problem_of_the_history_on_the_page(tmp_path: Path) -> None:
     configs = tmp_path / "configs"
     shutil.copytree(
-        Path(__file__).parents[3] / "configs", configs, ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
+        Path(__file__).parents[3] / "configs",
+        configs,
+        ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*"),
     )
     cell_file = configs / "cells" / "demo.yaml"
     results = Results(cell_file, load_cell(cell_file))
@@ -224,7 +244,9 @@ def test_a_damaged_audit_log_is_a_problem_of_the_history_on_the_page(tmp_path: P
     assert shown["calibrations"] == 1
 
 
-def test_the_gains_of_another_robot_are_a_problem_on_the_page(cell: Cell, cell_file: Path, tmp_path: Path) -> None:
+def test_the_gains_of_another_robot_are_a_problem_on_the_page(
+    cell: Cell, cell_file: Path, tmp_path: Path
+) -> None:
     own = calibrated_robot(cell)
     other = replace(own, drives=(replace(own.drives[0], node_id=99), *own.drives[1:]))
     calibration = tmp_path / "calibration.yaml"
@@ -238,7 +260,9 @@ def test_the_gains_of_another_robot_are_a_problem_on_the_page(cell: Cell, cell_f
     assert any("drive of J1 with node id 1" in problem for problem in document["problems"])
 
 
-def test_a_file_that_no_reader_expected_does_not_end_the_looking(cell: Cell, cell_file: Path) -> None:
+def test_a_file_that_no_reader_expected_does_not_end_the_looking(
+    cell: Cell, cell_file: Path
+) -> None:
     results = Results(cell_file, cell)
     page = Page(cell, Live(cell_file, cell), results)
     given: list[Calibration | ValueError] = [ValueError("5 errors for 6 axes"), demo_calibration()]
@@ -272,6 +296,9 @@ def test_a_named_file_that_does_not_exist_is_an_error(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
 ) -> None:
     missing = tmp_path / "missing.yaml"
-    assert main(["console", str(checkout / "configs" / "cells" / "demo.yaml"), option, str(missing)]) != ExitCode.OK
+    assert (
+        main(["console", str(checkout / "configs" / "cells" / "demo.yaml"), option, str(missing)])
+        != ExitCode.OK
+    )
     error = capsys.readouterr().err
     assert all(word in error for word in ("missing.yaml", "found", "expected"))

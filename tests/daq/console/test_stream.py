@@ -1,4 +1,6 @@
-"""The stream for Foxglove: a client of its protocol gets what the feed holds, and can change nothing."""
+"""The stream for Foxglove: a client of its protocol gets what the feed holds,
+and can change nothing.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,11 @@ from tests.daq.console.feeds import facts
 pytest.importorskip("foxglove", reason="needs foxglove-sdk, of the optional extra `foxglove`")
 from daq.console.stream import PREDICTED_TOPIC, RESIDUAL_TOPIC, SCHEMAS, FoxgloveStream
 
-TEXT_FRAME, DATA_FRAME, MESSAGE_DATA = 1, 2, 1
-ORIGIN_NS, PERIOD_NS = 1_700_000_000_000_000_000, 20_000_000
+TEXT_FRAME = 1
+DATA_FRAME = 2
+MESSAGE_DATA = 1
+ORIGIN_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 20_000_000
 
 
 class Client:
@@ -41,8 +46,10 @@ class Client:
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=30)
         self.socket.sendall(
-            f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            f"Sec-WebSocket-Key: {base64.b64encode(bytes(16)).decode()}\r\nSec-WebSocket-Version: 13\r\n"
+            f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: "
+            "Upgrade\r\n"
+            "Sec-WebSocket-Key: "
+            f"{base64.b64encode(bytes(16)).decode()}\r\nSec-WebSocket-Version: 13\r\n"
             "Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n".encode()
         )
         self.incoming = self.socket.makefile("rb")
@@ -63,13 +70,17 @@ class Client:
         """The next frame: its kind and content."""
         kind, length = self.incoming.read(2)
         if length >= 126:
-            (length,) = struct.unpack(">H" if length == 126 else ">Q", self.incoming.read(2 if length == 126 else 8))
+            (length,) = struct.unpack(
+                ">H" if length == 126 else ">Q", self.incoming.read(2 if length == 126 else 8)
+            )
         return kind & 0x0F, self.incoming.read(length)
 
     def send(self, message: dict[str, Any]) -> None:
         """Send a JSON object, masked by zeros."""
         content = json.dumps(message).encode()
-        self.socket.sendall(struct.pack(">BBH4x", 0x80 | TEXT_FRAME, 0x80 | 126, len(content)) + content)
+        self.socket.sendall(
+            struct.pack(">BBH4x", 0x80 | TEXT_FRAME, 0x80 | 126, len(content)) + content
+        )
 
     def subscribe(self) -> None:
         """Subscribe to every topic, once all are advertised."""
@@ -95,13 +106,18 @@ class Client:
 
 
 def _samples(cell: Cell, number: int, count: int) -> bytes:
-    """Samples of 50 Hz as the feed packs them: positions and currents are the numbers of the cycle and of the axis."""
+    """Samples of 50 Hz as the feed packs them:
+    positions and currents are the numbers of the cycle and of the axis.
+    """
     axes = len(cell.axes)
-    layout, packed = packet_struct(axes), b""
+    layout = packet_struct(axes)
+    packed = b""
     for cycle in range(count):
         values = [cycle + axis for axis in range(axes)]
         time_ns = ORIGIN_NS + PERIOD_NS * cycle
-        packed += layout.pack(cycle, time_ns, 0, *values, *(-value for value in values), *[0x1237] * axes)
+        packed += layout.pack(
+            cycle, time_ns, 0, *values, *(-value for value in values), *[0x1237] * axes
+        )
     return HEAD.pack(SAMPLES, number, count, 0, 0, count) + packed
 
 
@@ -129,7 +145,8 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
     cell: Cell, cell_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("daq.console.stream.URDF_S", 0.05)
-    live, axes = Live(cell_file, cell), len(cell.axes)
+    live = Live(cell_file, cell)
+    axes = len(cell.axes)
     live.calibration = demo_calibration()
     stream = FoxgloveStream(live, 0)
     with _followed(stream) as loop, Client(stream.port) as client:
@@ -138,15 +155,33 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
         topic, _, urdf = client.message()  # the subscription holds from now on
         assert (topic, urdf.data) == ("/robot_description", cell.urdf)
         run = {"run": asdict(replace(facts(cell, None), rate_hz=50.0))}
-        event = {"time_ns": ORIGIN_NS, "axis": 2, "kind": "emcy", "code": 0x7305, "text": "EMCY 7305h"}
+        event = {
+            "time_ns": ORIGIN_NS,
+            "axis": 2,
+            "kind": "emcy",
+            "code": 0x7305,
+            "text": "EMCY 7305h",
+        }
         for number, message in enumerate((run, _samples(cell, 1, 30), {"events": [event]})):
             head = HEAD.pack(TEXT, number, 30, 0, 0, 0)
-            packet = message if isinstance(message, bytes) else head + json.dumps(message).encode()
+            if isinstance(message, bytes):
+                packet = message
+            else:
+                packet = head + json.dumps(message).encode()
             loop.call_soon_threadsafe(live.take, packet)
-        loop.call_soon_threadsafe(lambda: live.rows.add([[0.1, *range(axes), *range(10, 10 + axes)]]))
+        loop.call_soon_threadsafe(
+            lambda: live.rows.add([[0.1, *range(axes), *range(10, 10 + axes)]])
+        )
         found: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in SCHEMAS}
-        expected = {"/joint_states": 30, "/cell/currents": 30, "/cell/predicted": 1, "/cell/residual": 1}
-        while any(len(found[topic]) < count for topic, count in {**expected, "/cell/events": 1}.items()):
+        expected = {
+            "/joint_states": 30,
+            "/cell/currents": 30,
+            "/cell/predicted": 1,
+            "/cell/residual": 1,
+        }
+        while any(
+            len(found[topic]) < count for topic, count in {**expected, "/cell/events": 1}.items()
+        ):
             topic, *rest = client.message()
             found[topic].append((rest[0], rest[1]))
     gains = [gain.value for gain in demo_calibration().gains]
@@ -165,19 +200,30 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
     assert list(predicted.current_a) == list(range(axes))
     assert list(found["/cell/residual"][0][1].current_a) == list(range(10, 10 + axes))
     ((_, event_seen),) = found["/cell/events"]
-    assert (event_seen.axis, event_seen.kind, event_seen.code, event_seen.text) == (2, "emcy", 0x7305, "EMCY 7305h")
+    assert (event_seen.axis, event_seen.kind, event_seen.code, event_seen.text) == (
+        2,
+        "emcy",
+        0x7305,
+        "EMCY 7305h",
+    )
 
 
 def test_the_shipped_layout_shows_what_the_stream_sends(checkout: Path) -> None:
-    layout = json.loads((checkout / "configs" / "viewers" / "foxglove.json").read_text(encoding="utf-8"))
-    plotted = {path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())}
+    layout = json.loads(
+        (checkout / "configs" / "viewers" / "foxglove.json").read_text(encoding="utf-8")
+    )
+    plotted = {
+        path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())
+    }
     topics = {path.partition(".")[0] for path in plotted}
     assert topics - set(SCHEMAS) == {"/cell/samples"}  # in logs alone
     for topic in (PREDICTED_TOPIC, RESIDUAL_TOPIC):
         assert {f"{topic}.current_a[{axis}]" for axis in range(6)} <= plotted
 
 
-def test_a_port_that_is_taken_is_a_wrong_command_line(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_that_is_taken_is_a_wrong_command_line(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = str(other.getsockname()[1])
         cell_file = str(checkout / "configs" / "cells" / "demo.yaml")

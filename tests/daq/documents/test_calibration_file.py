@@ -20,7 +20,13 @@ from daq.documents.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
+from daq.errors import (
+    CalibrationMissing,
+    CalibrationRefused,
+    CalibrationUnreadable,
+    UsageError,
+    exit_code,
+)
 from ident.calibration import Calibration, PayloadMass
 from ident.errors import EffectRefused
 from tests.daq.calibrations import calibrations, demo_calibration
@@ -47,7 +53,10 @@ def test_every_calibration_comes_back_as_it_was_written(calibration: Calibration
 
 def test_libyaml_writes_what_a_fit_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_file, "_Dumper", None)
-    assert decode_calibration(encode_calibration(demo_calibration()), "calibration.yaml") == demo_calibration()
+    assert (
+        decode_calibration(encode_calibration(demo_calibration()), "calibration.yaml")
+        == demo_calibration()
+    )
 
 
 def test_a_saved_calibration_is_the_only_file_left(path: Path) -> None:
@@ -63,9 +72,16 @@ def test_the_document_is_json_without_nan(calibration: Calibration) -> None:
 
 def test_the_document_has_what_fit_json_promises() -> None:
     document = json.loads(json.dumps(as_document(demo_calibration())))
-    assert {"method", "gains", "parameters", "relative_error_percent", "condition", "rows", "filter", "effects"} <= set(
-        document
-    )
+    assert {
+        "method",
+        "gains",
+        "parameters",
+        "relative_error_percent",
+        "condition",
+        "rows",
+        "filter",
+        "effects",
+    } <= set(document)
     fourth = document["gains"][3]
     assert {"axis", "value", "std_percent", "unit", "nameplate", "change_percent"} <= set(fourth)
     assert fourth["change_percent"] == pytest.approx(100 * (-9.21 / -11.52 - 1))
@@ -76,7 +92,17 @@ def test_the_document_has_what_fit_json_promises() -> None:
 
 
 def test_one_entry_is_on_one_line(path: Path) -> None:
-    assert len(re.findall(r"^- \{axis: J\d, value: .* change_percent: \S+\}$", path.read_text(), re.MULTILINE)) == 6
+    assert (
+        len(
+            re.findall(
+                r"^- \{axis: J\d, value: .* "
+                r"change_percent: \S+\}$",
+                path.read_text(),
+                re.MULTILINE,
+            )
+        )
+        == 6
+    )
 
 
 @pytest.mark.parametrize(
@@ -118,7 +144,9 @@ def test_a_comment_added_by_hand_is_no_edit(path: Path) -> None:
         ("rows: 14400", "rows: [14400", r"calibration\.yaml:\d+"),
     ],
 )
-def test_what_does_not_belong_is_refused_with_its_place(path: Path, old: str, new: str, says: str) -> None:
+def test_what_does_not_belong_is_refused_with_its_place(
+    path: Path, old: str, new: str, says: str
+) -> None:
     text = path.read_text()
     assert text.count(old) == 1
     path.write_text(text.replace(old, new))
@@ -127,7 +155,9 @@ def test_what_does_not_belong_is_refused_with_its_place(path: Path, old: str, ne
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"\x00\xff", b"[]", b"gains: 3", b"a: \t- b", b"%PDF-1.4"])
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00\xff", b"[]", b"gains: 3", b"a: \t- b", b"%PDF-1.4"]
+)
 def test_another_file_is_refused(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(CalibrationUnreadable):
@@ -162,7 +192,9 @@ def test_the_exit_codes_distinguish_data_from_refusal() -> None:
 
 
 @pytest.mark.parametrize("call", ["open", "fchmod", "fsync", "replace"])
-def test_a_failing_disk_leaves_the_old_calibration(path: Path, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_disk_leaves_the_old_calibration(
+    path: Path, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = path.read_bytes()
 
     def fail(*arguments: object, **options: object) -> None:
@@ -193,6 +225,13 @@ def test_an_impossible_payload_mass_is_refused(key: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize("given_as", [None, "spring", 3.0])
-def test_own_effects_that_are_no_list_of_effects_are_refused_before_a_file_is_used(path: Path, given_as: Any) -> None:
-    with pytest.raises(EffectRefused, match=r"^`own_effects`: found .*; expected "):
+def test_own_effects_that_are_no_list_are_refused_before_a_file_is_used(
+    path: Path, given_as: Any
+) -> None:
+    with pytest.raises(UsageError, match=r"own_effects.*found .*; expected "):
         load_calibration(path, own_effects=given_as)
+
+
+def test_own_effects_that_are_no_effects_are_refused_before_a_file_is_used(path: Path) -> None:
+    with pytest.raises(EffectRefused, match=r"^`own_effects`: found .*; expected "):
+        load_calibration(path, own_effects=[3.0])  # type: ignore[list-item]

@@ -24,7 +24,9 @@ def _page(checkout: Path) -> str:
     return (checkout / "docs/how-to/read-a-calibration.md").read_text(encoding="utf-8")
 
 
-def test_the_ten_lines_of_the_page_read_every_gain_and_parameter(checkout: Path, tmp_path: Path) -> None:
+def test_the_ten_lines_of_the_page_read_every_gain_and_parameter(
+    checkout: Path, tmp_path: Path
+) -> None:
     small = Parameter("Ixx2 - 0.5*Iyy2", 3e-05, 1e-6, "kg m²")
     calibration = replace(demo_calibration(), parameters=(*demo_calibration().parameters, small))
     save_calibration(calibration, tmp_path / "calibration.yaml")
@@ -32,7 +34,11 @@ def test_the_ten_lines_of_the_page_read_every_gain_and_parameter(checkout: Path,
     assert len([line for line in code.splitlines() if line]) <= 10
     checked = code + 'import sys\nassert not {"daq", "ident", "drivers"} & set(sys.modules)\n'
     done = subprocess.run(
-        [sys.executable, "-X", "utf8", "-c", checked], cwd=tmp_path, capture_output=True, text=True, check=True
+        [sys.executable, "-X", "utf8", "-c", checked],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     lines = done.stdout.splitlines()
     assert lines[0] == "J1: 33.9 ± 0.14 Nm/A"

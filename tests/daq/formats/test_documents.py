@@ -1,4 +1,6 @@
-"""Controllers' documents in JSON, XML and DCF: only the numbers meant change, as bytes and as any parser sees them."""
+"""Controllers' documents in JSON, XML and DCF:
+only the numbers meant change, as bytes and as any parser sees them.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,22 @@ from daq.config.controller import ControllerFormat
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import ControllerUnfit
 from daq.formats.dcf_document import DcfDocument
-from daq.formats.document import FORMATS, comment_behind, decode_document, format_of, read_controller_file
+from daq.formats.document import (
+    FORMATS,
+    comment_behind,
+    decode_document,
+    format_of,
+    read_controller_file,
+)
 from daq.formats.json_document import JsonDocument
 from daq.formats.scalar import ControllerDocument, rewrite_gain
 from daq.formats.xml_document import XmlDocument
 from daq.formats.yaml_document import YamlDocument
 
 EXAMPLES = settings(max_examples=80)
-_numbers = st.sampled_from(["32.96", "-11.52", "7", "0", "1e3", "2.5E-3", "0.10", "-0.0", "123456789.125"])
+_numbers = st.sampled_from(
+    ["32.96", "-11.52", "7", "0", "1e3", "2.5E-3", "0.10", "-0.0", "123456789.125"]
+)
 _gains = st.floats(1e-3, 1e4).flatmap(lambda gain: st.sampled_from([gain, -gain]))
 _ends = st.sampled_from(["\n", "\r\n"])
 _words = st.text("abcdefghijklmnopqrstuvwxyzéß漢", min_size=1, max_size=5)
@@ -35,7 +45,9 @@ _words = st.text("abcdefghijklmnopqrstuvwxyzéß漢", min_size=1, max_size=5)
 
 @dataclass(frozen=True)
 class _Case:
-    """A generated file: its text cut where the numbers meant are, their keys, and how it is encoded."""
+    """A generated file: its text cut where the numbers meant are, their keys,
+    and how it is encoded.
+    """
 
     pieces: tuple[str, ...]
     numbers: tuple[str, ...]
@@ -43,7 +55,9 @@ class _Case:
     encoding: str = "utf-8"
 
     def content(self, numbers: tuple[str, ...]) -> bytes:
-        return "".join(a + b for a, b in zip(self.pieces, (*numbers, ""), strict=True)).encode(self.encoding)
+        return "".join(a + b for a, b in zip(self.pieces, (*numbers, ""), strict=True)).encode(
+            self.encoding
+        )
 
 
 _HOLE = "\0"
@@ -62,7 +76,11 @@ def _json_cases(draw: st.DrawFn) -> _Case:
     gap = st.sampled_from(["", " ", "\t", end, end + "    "])
 
     def value(path: tuple[str, ...], depth: int) -> str:
-        kind = draw(st.sampled_from(["hole", "number", "word", "text", *(["object", "list"] if depth < 3 else [])]))
+        kind = draw(
+            st.sampled_from(
+                ["hole", "number", "word", "text", *(["object", "list"] if depth < 3 else [])]
+            )
+        )
         if kind == "hole" and path:
             numbers.append(draw(_numbers))
             keys.append(".".join(path))
@@ -70,17 +88,25 @@ def _json_cases(draw: st.DrawFn) -> _Case:
         if kind == "object" or not path:
             names = draw(st.lists(_words, max_size=4, unique=True))
             inside = [
-                f"{draw(gap)}{json.dumps(name, ensure_ascii=draw(st.booleans()))}{draw(gap)}:{draw(gap)}"
+                f"{draw(gap)}{json.dumps(name, ensure_ascii=draw(st.booleans()))}{draw(gap)}:{draw(gap)}"  # noqa: E501
                 f"{value((*path, name), depth + 1)}{draw(gap)}"
                 for name in names
             ]
             return "{" + ",".join(inside) + "}"
         if kind == "list":
             size = draw(st.integers(0, 3))
-            return "[" + ",".join(draw(gap) + value((*path, str(i)), depth + 1) for i in range(size)) + "]"
+            return (
+                "["
+                + ",".join(draw(gap) + value((*path, str(i)), depth + 1) for i in range(size))
+                + "]"
+            )
         if kind == "text":
-            return json.dumps(draw(st.sampled_from(["32.96", 'say "7"', "\\", "déjà 漢", "{a: 1}", "\u2028"])))
-        return draw(st.sampled_from(["true", "null"])) if kind == "word" else draw(_numbers)
+            return json.dumps(
+                draw(st.sampled_from(["32.96", 'say "7"', "\\", "déjà 漢", "{a: 1}", "\u2028"]))
+            )
+        if kind == "word":
+            return draw(st.sampled_from(["true", "null"]))
+        return draw(_numbers)
 
     head = draw(st.sampled_from(["", "\ufeff", " ", end]))
     return _case(head + value((), 0) + draw(gap), numbers, keys)
@@ -92,7 +118,10 @@ def _xml_cases(draw: st.DrawFn) -> _Case:
     keys: list[str] = []
     end = draw(_ends)
     encoding = draw(st.sampled_from(["utf-8", "utf-8", "iso-8859-1", "windows-1252"]))
-    names = _words if encoding == "utf-8" else st.text("abcdefgéß", min_size=1, max_size=5)
+    if encoding == "utf-8":
+        names = _words
+    else:
+        names = st.text("abcdefgéß", min_size=1, max_size=5)
     noise = st.sampled_from(
         [
             "",
@@ -116,7 +145,11 @@ def _xml_cases(draw: st.DrawFn) -> _Case:
         parts = []
         used: dict[str, int] = {}
         for _ in range(draw(st.integers(0, 3))):
-            name = draw(st.sampled_from(["Gain", "ns:Axis", "Ü", "Axis"]) if encoding == "utf-8" else st.just("Axis"))
+            name = draw(
+                st.sampled_from(["Gain", "ns:Axis", "Ü", "Axis"])
+                if encoding == "utf-8"
+                else st.just("Axis")
+            )
             used[name] = used.get(name, 0) + 1
             parts.append(draw(noise) + inner(f"{path}/{name}[{used[name]}]", name, depth + 1))
         return "".join(parts) + draw(noise)
@@ -127,16 +160,19 @@ def _xml_cases(draw: st.DrawFn) -> _Case:
         if draw(st.booleans()):
             quote = draw(st.sampled_from(["'", '"']))
             space = draw(st.sampled_from(["", " "]))
-            before, hole = draw(st.sampled_from([" ", end])), number(path + "/@gain")
+            before = draw(st.sampled_from([" ", end]))
+            hole = number(path + "/@gain")
             attributes += f"{before}gain{space}={space}{quote}{space}{hole}{space}{quote}"
         attributes += draw(st.sampled_from(["", " ", " note='a>b'", f"{end}x='&lt;7'"]))
-        shape = draw(st.sampled_from(["number", "text", "empty", *(["elements"] if depth < 3 else [])]))
+        shape = draw(
+            st.sampled_from(["number", "text", "empty", *(["elements"] if depth < 3 else [])])
+        )
         if shape == "empty":
             return f"<{name}{attributes}/>"
         if shape == "number":
             pad = draw(st.sampled_from(["", " ", end]))
             return f"<{name}{attributes}>{pad}{number(path)}{pad}</{name}>"
-        return f"<{name}{attributes}>{escape(label) if shape == 'text' else element(path, depth)}</{name}>"
+        return f"<{name}{attributes}>{escape(label) if shape == 'text' else element(path, depth)}</{name}>"  # noqa: E501
 
     head = f'<?xml version="1.0" encoding="{encoding}"?>{end}'
     if encoding == "utf-8":
@@ -150,24 +186,48 @@ def _dcf_cases(draw: st.DrawFn) -> _Case:
     numbers: list[str] = []
     keys: list[str] = []
     end = draw(_ends)
-    lines = [draw(st.sampled_from(["; Müller, 32.96", "[FileInfo]", "", "[Comments]", "[DeviceInfo]"]))]
+    lines = [
+        draw(st.sampled_from(["; Müller, 32.96", "[FileInfo]", "", "[Comments]", "[DeviceInfo]"]))
+    ]
     if lines[0].startswith("["):
         lines += ["Lines=1", "Line1=made by hand; 7"]
-    objects = draw(st.lists(st.tuples(st.integers(0x2000, 0x2003), st.integers(0, 0x1F)), max_size=6, unique=True))
+    objects = draw(
+        st.lists(
+            st.tuples(st.integers(0x2000, 0x2003), st.integers(0, 0x1F)), max_size=6, unique=True
+        )
+    )
     for index, sub in objects:
-        title = f"{index:04X}sub{sub:X}" if sub or draw(st.booleans()) else f"{index:04x}"
+        if sub or draw(st.booleans()):
+            title = f"{index:04X}sub{sub:X}"
+        else:
+            title = f"{index:04x}"
         kind = draw(st.sampled_from([4, 8, 0x11, 7]))
         space = draw(st.sampled_from(["", " "]))
-        lines += [f"[{title}]", f"ParameterName=gain {index}", f"DataType=0x{kind:04X}", "DefaultValue=32.96"]
+        lines += [
+            f"[{title}]",
+            f"ParameterName=gain {index}",
+            f"DataType=0x{kind:04X}",
+            "DefaultValue=32.96",
+        ]
         if draw(st.booleans()):
             lines.append("; the value é")
         if draw(st.booleans()):
             keys.append(
-                draw(st.sampled_from([f"{index:04x}sub{sub:x}", f"{index:04X}:{sub:02X}", f"0x{index:X}sub{sub:X}"]))
+                draw(
+                    st.sampled_from(
+                        [
+                            f"{index:04x}sub{sub:x}",
+                            f"{index:04X}:{sub:02X}",
+                            f"0x{index:X}sub{sub:X}",
+                        ]
+                    )
+                )
             )
             whole = st.sampled_from(["0", "17", "0x1F", "0x0000ab", "123456"])
             numbers.append(draw(whole if kind in (4, 7) else _numbers))
-            lines.append(f"{draw(st.sampled_from(['ParameterValue', 'parametervalue']))}{space}={space}{_HOLE}{space}")
+            lines.append(
+                f"{draw(st.sampled_from(['ParameterValue', 'parametervalue']))}{space}={space}{_HOLE}{space}"  # noqa: E501
+            )
         lines += draw(st.sampled_from([[], [""], ["PDOMapping=0"], ["Denotation=32.96"]]))
     return _case(end.join(lines) + draw(st.sampled_from(["", end])), numbers, keys, "iso-8859-1")
 
@@ -184,9 +244,12 @@ def _json_tree(content: bytes) -> object:
 
 
 def _xml_tree(content: bytes) -> object:
-    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True, insert_pis=True))
+    parser = ElementTree.XMLParser(
+        target=ElementTree.TreeBuilder(insert_comments=True, insert_pis=True)
+    )
     return [
-        (e.tag, tuple(sorted(e.attrib.items())), e.text, e.tail) for e in ElementTree.fromstring(content, parser).iter()
+        (e.tag, tuple(sorted(e.attrib.items())), e.text, e.tail)
+        for e in ElementTree.fromstring(content, parser).iter()
     ]
 
 
@@ -206,9 +269,13 @@ def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObje
     found = document.locate(case.keys)
     assert [scalar.text for scalar in found] == list(case.numbers)
     spelt = tuple(
-        rewrite_gain(scalar, gain if scalar.integer is None else abs(round(gain)) + 1, 0.003 * abs(gain)).spelling
+        rewrite_gain(
+            scalar, gain if scalar.integer is None else abs(round(gain)) + 1, 0.003 * abs(gain)
+        ).spelling
         for scalar, gain in zip(
-            found, data.draw(st.lists(_gains, min_size=len(found), max_size=len(found))), strict=True
+            found,
+            data.draw(st.lists(_gains, min_size=len(found), max_size=len(found))),
+            strict=True,
         )
     )
     spelling = dict(zip(case.keys, spelt, strict=True))
@@ -233,14 +300,20 @@ def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObje
 @EXAMPLES
 @given(data=st.data())
 def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
-    kind: ControllerFormat, cases: st.SearchStrategy[_Case], tree: Callable[[bytes], object], data: st.DataObject
+    kind: ControllerFormat,
+    cases: st.SearchStrategy[_Case],
+    tree: Callable[[bytes], object],
+    data: st.DataObject,
 ) -> None:
-    """The readers are none of those with which the document proves itself, and know nothing of its keys."""
+    """The readers are none of those with which the document proves itself,
+    and know nothing of its keys.
+    """
     case = data.draw(cases)
     document = decode_document(case.content(case.numbers), "robot", kind)
     marks = tuple(str(70000 + i) for i in range(len(case.keys)))
     changed = document.with_values(dict(zip(case.keys, marks, strict=True)))
-    seen, expected = repr(tree(changed.content)), repr(tree(document.content))
+    seen = repr(tree(changed.content))
+    expected = repr(tree(document.content))
     for mark in marks:
         assert seen.count(mark) == 1
     if case.keys:
@@ -263,28 +336,42 @@ def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObje
     at = data.draw(st.integers(0, len(content) - 1))
     other = bytes([data.draw(st.integers(1, 126).filter(lambda byte: byte != content[at]))])
     with pytest.raises(ControllerUnfit):
-        decode_document(content[:at] + other + content[at + 1 :], "robot", kind).check_against(document, spelling)
+        decode_document(content[:at] + other + content[at + 1 :], "robot", kind).check_against(
+            document, spelling
+        )
 
 
 @pytest.mark.parametrize("kind", list(ControllerFormat), ids=lambda kind: kind.value)
 @given(
-    begin=st.sampled_from([b"", b"\xff\xfe", b"[", b"{", b"{}", b"<a", b"<a/>", b"[6076]\n", b"\0"]),
+    begin=st.sampled_from(
+        [b"", b"\xff\xfe", b"[", b"{", b"{}", b"<a", b"<a/>", b"[6076]\n", b"\0"]
+    ),
     noise=st.binary(max_size=60),
 )
-def test_whatever_is_in_the_file_it_is_refused_in_words(kind: ControllerFormat, begin: bytes, noise: bytes) -> None:
+def test_whatever_is_in_the_file_it_is_refused_in_words(
+    kind: ControllerFormat, begin: bytes, noise: bytes
+) -> None:
     with pytest.raises(ControllerUnfit, match=r"nothing was written|is this the right file"):
         decode_document(begin + noise, "robot", kind).locate(("6076.nowhere",))
 
 
 def test_a_line_that_goes_on_with_no_value_is_no_dcf() -> None:
     """To `configparser`, an indented line belongs to the value above it."""
-    document = decode_document(b"[2003]\nDataType=8\nParameterValue=1.5\n[6076]\nflag\n  x\n", "a.dcf")
+    document = decode_document(
+        b"[2003]\nDataType=8\nParameterValue=1.5\n[6076]\nflag\n  x\n", "a.dcf"
+    )
     with pytest.raises(ControllerUnfit, match=r"no DCF"):
         document.with_values({"2003": "2.5"})
 
 
 @settings(max_examples=300)
-@given(lines=st.lists(st.sampled_from(["[6076]", "[2003]", "flag", "  x", "a=1", "=", "ParameterValue=1.5", ";", ""])))
+@given(
+    lines=st.lists(
+        st.sampled_from(
+            ["[6076]", "[2003]", "flag", "  x", "a=1", "=", "ParameterValue=1.5", ";", ""]
+        )
+    )
+)
 def test_a_dcf_of_any_lines_is_read_or_refused_in_words(lines: list[str]) -> None:
     document = decode_document("\n".join(lines).encode(), "a.dcf")
     with suppress(ControllerUnfit):
@@ -345,7 +432,9 @@ def test_json_that_does_not_fit_is_refused(text: str, key: str, says: str) -> No
         ("<R><G>0x10</G></R>", "R/G", "'0x10'"),
     ],
 )
-def test_a_number_in_xml_that_cannot_be_changed_alone_is_refused(text: str, key: str, says: str) -> None:
+def test_a_number_in_xml_that_cannot_be_changed_alone_is_refused(
+    text: str, key: str, says: str
+) -> None:
     with pytest.raises(ControllerUnfit) as caught:
         XmlDocument("robot", text, "utf-8").locate((key,))
     assert says in str(caught.value)
@@ -373,7 +462,10 @@ def test_xml_that_is_not_safe_or_none_is_refused(content: bytes, says: str) -> N
 
 def test_deep_and_wide_xml_takes_no_recursion() -> None:
     deep = b"<R><G>1.5</G>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"<b/>" * 20_000 + b"</R>"
-    assert b"<G>2.5000</G>" in decode_document(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
+    assert (
+        b"<G>2.5000</G>"
+        in decode_document(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
+    )
 
 
 _DCF = """\
@@ -480,9 +572,15 @@ ParameterValue=32960
 
 
 @pytest.mark.parametrize("object_type", ["0x8", "0x9", "8", "9"])
-def test_the_name_of_a_record_asks_for_a_subindex_and_not_to_remove_a_section(object_type: str) -> None:
+def test_the_name_of_a_record_asks_for_a_subindex_and_not_to_remove_a_section(
+    object_type: str,
+) -> None:
     document = DcfDocument("drive.dcf", _RECORD.format(object_type=object_type))
-    with pytest.raises(ControllerUnfit, match=r"\[2003\], an array or record.*name one of its subindices"):
+    with pytest.raises(
+        ControllerUnfit,
+        match=r"\[2003\], an array or record.*name one of its "
+        r"subindices",
+    ):
         document.locate(("2003",))
     count, gain = document.locate(("2003:00", "2003:01"))
     assert (count.value, gain.value) == (1.0, 32960.0)
@@ -517,7 +615,9 @@ CompactSubObj=2
 def test_an_element_of_an_array_in_compact_storage_is_changed_in_its_list_of_values() -> None:
     document = DcfDocument("drive.dcf", _COMPACT)
     assert [scalar.value for scalar in document.locate(("2003:01", "2003sub3"))] == [1.5, 32.5]
-    assert document.with_values({"2003:03": "33.0000"}).text == _COMPACT.replace("3=32.5", "3=33.0000")
+    assert document.with_values({"2003:03": "33.0000"}).text == _COMPACT.replace(
+        "3=32.5", "3=33.0000"
+    )
 
 
 @pytest.mark.parametrize(
@@ -547,20 +647,30 @@ def test_a_value_that_depends_on_the_node_is_refused_on_either_side(value: str) 
         DcfDocument("drive.dcf", text).locate(("2003",))
 
 
-@pytest.mark.parametrize("number", ["0x0_8", "0_8", "0b1000", "0o10", "010", "+8", "-0x8", "8.0", "0x", "8h"])
+@pytest.mark.parametrize(
+    "number", ["0x0_8", "0_8", "0b1000", "0o10", "010", "+8", "-0x8", "8.0", "0x", "8h"]
+)
 @pytest.mark.parametrize("entry", ["DataType", "ObjectType"])
 def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> None:
     others = {"DataType": "0x0008", "ObjectType": "0x7"} | {entry: number}
-    text = "[2003]\n" + "".join(f"{name}={written}\n" for name, written in others.items()) + "ParameterValue=1.5\n"
+    text = (
+        "[2003]\n"
+        + "".join(f"{name}={written}\n" for name, written in others.items())
+        + "ParameterValue=1.5\n"
+    )
     with pytest.raises(ControllerUnfit) as caught:
         DcfDocument("drive.dcf", text).locate(("2003",))
     line = text.splitlines().index(f"{entry}={number}") + 1
-    assert f"line {line}: '{number}'; expected {entry.lower()} in decimal digits" in str(caught.value)
+    assert (f"line {line}: '{number}'; expected {entry.lower()} in decimal digits") in str(
+        caught.value
+    )
 
 
 @pytest.mark.parametrize("kind", ["0x0008", "0X8", "8", "0x00000008", "0x11", "17"])
 def test_a_type_may_be_written_in_each_way_that_cia_306_knows(kind: str) -> None:
-    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue=1.5\n").locate(("2003",))
+    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue=1.5\n").locate(
+        ("2003",)
+    )
     assert scalar.value == 1.5
 
 
@@ -569,15 +679,21 @@ def test_a_type_may_be_written_in_each_way_that_cia_306_knows(kind: str) -> None
 def test_a_number_of_a_dcf_that_begins_with_zero_is_not_guessed(kind: str, number: str) -> None:
     """10 to a reader of decimals, 8 to one of CiA 306."""
     with pytest.raises(ControllerUnfit) as caught:
-        DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n").locate(("2003",))
+        DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n").locate(
+            ("2003",)
+        )
     assert f"line 3: '{number}'" in str(caught.value)
     assert "octal" in str(caught.value)
     assert "nothing was written" in str(caught.value)
 
 
-@pytest.mark.parametrize(("number", "value"), [("0", 0.0), ("0.10", 0.1), ("010.5", 10.5), ("-0.0", 0.0), ("10", 10.0)])
+@pytest.mark.parametrize(
+    ("number", "value"), [("0", 0.0), ("0.10", 0.1), ("010.5", 10.5), ("-0.0", 0.0), ("10", 10.0)]
+)
 def test_a_real_of_a_dcf_with_a_point_is_no_octal_number(number: str, value: float) -> None:
-    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType=8\nParameterValue={number}\n").locate(("2003",))
+    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType=8\nParameterValue={number}\n").locate(
+        ("2003",)
+    )
     assert scalar.value == value
 
 
@@ -591,7 +707,8 @@ def test_a_number_of_xml_that_begins_with_zero_is_decimal() -> None:
 def test_an_object_is_its_index_and_subindex_however_its_section_spells_them(key: str) -> None:
     changed = DcfDocument("drive.dcf", _DCF).with_values({key: "2.5000"})
     assert changed.text == _DCF.replace(
-        "[200Dsub0A]\nDataType=0x0008\nParameterValue=1.5", "[200Dsub0A]\nDataType=0x0008\nParameterValue=2.5000"
+        "[200Dsub0A]\nDataType=0x0008\nParameterValue=1.5",
+        "[200Dsub0A]\nDataType=0x0008\nParameterValue=2.5000",
     )
 
 
@@ -649,8 +766,12 @@ def test_the_same_number_stays_as_the_human_wrote_it() -> None:
     assert rewrite_gain(decimal, 32.97, 0.01, 1000.0) != rewrite_gain(decimal, 32.96, 0.01, 1000.0)
 
 
-@pytest.mark.parametrize("name", ["Elmo_cob.dcf", "ElmoSimplIQ_cob.dcf", "Schunk_0_63_cob.dcf", "pilz_prbt_0_1.dcf"])
-def test_a_real_device_configuration_changes_in_one_number_alone(shared_data: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["Elmo_cob.dcf", "ElmoSimplIQ_cob.dcf", "Schunk_0_63_cob.dcf", "pilz_prbt_0_1.dcf"]
+)
+def test_a_real_device_configuration_changes_in_one_number_alone(
+    shared_data: Path, name: str
+) -> None:
     content = (shared_data / "eds" / name).read_bytes()
     document = decode_document(content, name)
     heartbeat = "1017"
@@ -701,7 +822,9 @@ def test_the_configuration_may_give_the_format_instead() -> None:
 
 
 def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
-    pipe, large, folder = tmp_path / "pipe.yaml", tmp_path / "large.yaml", tmp_path / "folder.yaml"
+    pipe = tmp_path / "pipe.yaml"
+    large = tmp_path / "large.yaml"
+    folder = tmp_path / "folder.yaml"
     os.mkfifo(pipe)
     folder.mkdir()
     with large.open("wb") as stream:
@@ -724,7 +847,11 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "comment"),
     [
-        ("a.yaml", "gain: 32.96   # Nm per A, from the data sheet \nother: 1\n", "Nm per A, from the data sheet"),
+        (
+            "a.yaml",
+            "gain: 32.96   # Nm per A, from the data sheet \nother: 1\n",
+            "Nm per A, from the data sheet",
+        ),
         ("a.yaml", "gain: '32.96' # of 'J1': {a: #2}\r\n", "of 'J1': {a: #2}"),
         ("a.yaml", "{gain: 32.96, kp: 7}  # both", "both"),
         ("a.yaml", "gain: 32.96\n# of the next line\n", ""),
@@ -735,19 +862,30 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
         ("a.dcf", "ParameterValue=32.96\n; of the next line\n", ""),
     ],
 )
-def test_the_comment_behind_a_number_is_that_of_its_line(name: str, text: str, comment: str) -> None:
+def test_the_comment_behind_a_number_is_that_of_its_line(
+    name: str, text: str, comment: str
+) -> None:
     rest = text.partition("32.96")[2]
     assert comment_behind(rest, name) == comment
-    as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(Path(name).suffix)
+    as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(
+        Path(name).suffix
+    )
     if as_format is not None:
         assert comment_behind(rest, "a.conf", as_format) == comment
 
 
-_DOTTED_YAML = "node:\n  ros__parameters:\n    gains.J1.nm_per_a: 32.96\n    gains: {J2: {nm_per_a: -11.52}}\n"
-_DOTTED_JSON = '{"node": {"ros__parameters": {"gains.J1.nm_per_a": 32.96, "gains": {"J2": {"nm_per_a": -11.52}}}}}'
+_DOTTED_YAML = (
+    "node:\n  ros__parameters:\n    gains.J1.nm_per_a: 32.96\n    gains: {J2: {nm_per_a: -11.52}}\n"
+)
+_DOTTED_JSON = (
+    '{"node": {"ros__parameters": {"gains.J1.nm_per_a": 32.96, "gains": {"J2": '
+    '{"nm_per_a": -11.52}}}}}'
+)
 
 
-@pytest.mark.parametrize(("name", "text"), [("ros2.yaml", _DOTTED_YAML), ("ros2.json", _DOTTED_JSON)])
+@pytest.mark.parametrize(
+    ("name", "text"), [("ros2.yaml", _DOTTED_YAML), ("ros2.json", _DOTTED_JSON)]
+)
 def test_keys_of_the_file_may_have_dots(name: str, text: str) -> None:
     document = decode_document(text.encode(), name)
     keys = ("node.ros__parameters.gains.J1.nm_per_a", "node.ros__parameters.gains.J2.nm_per_a")
@@ -756,9 +894,14 @@ def test_keys_of_the_file_may_have_dots(name: str, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "text"), [("a.yaml", "a.b: 1.5\na: {b: 2.5}\n"), ("a.json", '{"a.b": 1.5, "a": {"b": 2.5}}')]
+    ("name", "text"),
+    [("a.yaml", "a.b: 1.5\na: {b: 2.5}\n"), ("a.json", '{"a.b": 1.5, "a": {"b": 2.5}}')],
 )
 def test_a_key_that_two_places_read_as_is_refused(name: str, text: str) -> None:
     document = decode_document(text.encode(), name)
-    with pytest.raises(ControllerUnfit, match=r"2 places that read as this key: (a\.b and a / b|a / b and a\.b)"):
+    with pytest.raises(
+        ControllerUnfit,
+        match=r"2 places that read as this key: (a\.b and a / b|a "
+        r"/ b and a\.b)",
+    ):
         document.locate(("a.b",))

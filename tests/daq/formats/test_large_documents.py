@@ -44,7 +44,12 @@ def test_yaml_within_the_bounds_is_read_and_rewritten() -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"\n" * (MAX_CELL_BYTES - 100) + b"a: [1\n", b"[" * MAX_CELL_BYTES, b"- 1\n" * 200_000, b"a: 1\n" * 2_500_000],
+    [
+        b"\n" * (MAX_CELL_BYTES - 100) + b"a: [1\n",
+        b"[" * MAX_CELL_BYTES,
+        b"- 1\n" * 200_000,
+        b"a: 1\n" * 2_500_000,
+    ],
     ids=["blank", "brackets", "values", "10 MB"],
 )
 def test_a_large_cell_file_is_refused_at_once(content: bytes) -> None:

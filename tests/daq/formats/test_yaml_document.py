@@ -1,4 +1,6 @@
-"""The controller's YAML file: only the numbers meant change, whatever a human has made of the rest."""
+"""The controller's YAML file: only the numbers meant change,
+whatever a human has made of the rest.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,10 @@ def test_only_theNUMBERS_meant_change(case: Case, data: st.DataObject) -> None:
     assert [scalar.text for scalar in found] == list(case.numbers)
     assert [scalar.value for scalar in found] == [float(number) for number in case.numbers]
 
-    spelt = tuple(spell(gain, 0.003 * abs(gain), number) for gain, number in zip(gains, case.numbers, strict=True))
+    spelt = tuple(
+        spell(gain, 0.003 * abs(gain), number)
+        for gain, number in zip(gains, case.numbers, strict=True)
+    )
     changed = file.with_values(dict(zip(case.keys, spelt, strict=True)))
 
     assert changed.text == case.text(spelt)
@@ -42,10 +47,14 @@ def test_only_theNUMBERS_meant_change(case: Case, data: st.DataObject) -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(
-    st.floats(1e-9, 1e9).flatmap(lambda gain: st.tuples(st.sampled_from([gain, -gain]), st.floats(1e-6, 0.5))),
+    st.floats(1e-9, 1e9).flatmap(
+        lambda gain: st.tuples(st.sampled_from([gain, -gain]), st.floats(1e-6, 0.5))
+    ),
     st.just("") | NUMBERS,
 )
-def test_a_gain_is_spelt_exactly_enough_for_every_reader(pair: tuple[float, float], like: str) -> None:
+def test_a_gain_is_spelt_exactly_enough_for_every_reader(
+    pair: tuple[float, float], like: str
+) -> None:
     gain, relative_std = pair
     std = relative_std * abs(gain)
     text = spell(gain, std, like)
@@ -78,7 +87,9 @@ def test_a_gain_is_spelt_exactly_enough_for_every_reader(pair: tuple[float, floa
         (33.9, 0.034, "32.961234", "33.900000"),
     ],
 )
-def test_digits_follow_the_uncertainty_and_the_habit_of_the_file(gain: float, std: float, like: str, text: str) -> None:
+def test_digits_follow_the_uncertainty_and_the_habit_of_the_file(
+    gain: float, std: float, like: str, text: str
+) -> None:
     assert spell(gain, std, like) == text
 
 
@@ -126,7 +137,8 @@ def test_a_number_that_cannot_be_changed_alone_is_refused(text: str, key: str, s
 
 
 @pytest.mark.parametrize(
-    "text", ["g: !!float 7", "g: !<tag:yaml.org,2002:float> 7", "g: &x !!float '7'", "g: 0", "g: 0.5"]
+    "text",
+    ["g: !!float 7", "g: !<tag:yaml.org,2002:float> 7", "g: &x !!float '7'", "g: 0", "g: 0.5"],
 )
 def test_what_is_written_for_a_tagged_number_is_a_number_to_both_readers(text: str) -> None:
     (scalar,) = YamlDocument("robot.yaml", text).locate(("g",))
@@ -158,7 +170,11 @@ def test_the_second_look_finds_any_other_change(other: str) -> None:
 
 
 def test_a_bomb_of_aliases_is_no_danger() -> None:
-    text = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60)) + "gain: 1.0\n"
+    text = (
+        "a0: &a0 [x, x]\n"
+        + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60))
+        + "gain: 1.0\n"
+    )
     assert "gain: 2.5000\n" in YamlDocument("robot.yaml", text).with_values({"gain": "2.5000"}).text
 
 

@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 _words = st.text("abcdefghijklmnopqrstuvwxyzé_", min_size=1, max_size=6).filter(
     lambda word: word not in ("y", "n", "no", "on", "off", "yes", "true", "false", "null", "gain")
 )
-_comments = st.sampled_from(["", "   # data sheet", " # Ü 漢 😀", " #", "          # 33.9 'quoted' {a: b}"])
-NUMBERS = st.sampled_from(["32.96", "-11.52", "7", "+1.5", "1e3", "2.5E-3", "0.10", ".5", "5.", "00.5"])
+_comments = st.sampled_from(
+    ["", "   # data sheet", " # Ü 漢 😀", " #", "          # 33.9 'quoted' {a: b}"]
+)
+NUMBERS = st.sampled_from(
+    ["32.96", "-11.52", "7", "+1.5", "1e3", "2.5E-3", "0.10", ".5", "5.", "00.5"]
+)
 _quotes = st.sampled_from(["", "", "", "'", '"'])
 _gaps = st.sampled_from([" ", "  ", "        "])
 _elsewhere = st.sampled_from(
@@ -45,22 +49,50 @@ def cases(draw: st.DrawFn) -> Case:
     newline = draw(st.sampled_from(["\n", "\r\n"]))
     axes = draw(st.lists(_words, min_size=1, max_size=4, unique=True))
     step = " " * draw(st.sampled_from([1, 2, 4]))
-    head = draw(st.sampled_from(["", "\ufeff", "# a human's file", "---", "%YAML 1.1\n---", "title: 'déjà 漢 😀 vu'"]))
-    around = [draw(_elsewhere).replace("|+|", "\0+|").replace("|", newline).replace("\0", "|") for _ in range(2)]
-    around[1] = around[1].replace("&d", "&e").replace("*d", "*e").replace(": ", "_2: ", 1) if around[1] else ""
+    head = draw(
+        st.sampled_from(
+            ["", "\ufeff", "# a human's file", "---", "%YAML 1.1\n---", "title: 'déjà 漢 😀 vu'"]
+        )
+    )
+    around = [
+        draw(_elsewhere).replace("|+|", "\0+|").replace("|", newline).replace("\0", "|")
+        for _ in range(2)
+    ]
+    if around[1]:
+        around[1] = around[1].replace("&d", "&e").replace("*d", "*e").replace(": ", "_2: ", 1)
+    else:
+        around[1] = ""
     pieces = [head + (newline if head.strip("\ufeff") else "") + around[0] + f"drives:{newline}"]
     numbers: list[str] = []
     keys: list[str] = []
     for axis in axes:
         shape = draw(st.sampled_from(["block", "flow", "list", "anchored", "tagged", "last"]))
-        number, quote, gap, comment = draw(NUMBERS), draw(_quotes), draw(_gaps), draw(_comments)
+        number = draw(NUMBERS)
+        quote = draw(_quotes)
+        gap = draw(_gaps)
+        comment = draw(_comments)
         before, after = {
-            "block": (f"{step}{axis}:{newline}{step * 2}gain:{gap}", f"{comment}{newline}{step * 2}kp: 32.96{newline}"),
+            "block": (
+                f"{step}{axis}:{newline}{step * 2}gain:{gap}",
+                f"{comment}{newline}{step * 2}kp: 32.96{newline}",
+            ),
             "flow": (f"{step}{axis}: {{gain:{gap}", f" , kp: 7 }}{comment}{newline}"),
-            "list": (f"{step}{axis}:{comment}{newline}{step}- 32.96{newline}{step}-{gap}", f"{comment}{newline}"),
-            "anchored": (f"{step}{axis}: {{kp: 1, gain: &{'x' * (len(keys) + 1)} ", f"}}{comment}{newline}"),
-            "tagged": (f"{step}{axis}:{newline}{step * 2}gain: !!float{gap}", f"{comment}{newline}{newline}"),
-            "last": (f"{step}? {axis}{newline}{step}:{step}gain:{gap}", f"{comment}{newline}# {axis}{newline}"),
+            "list": (
+                f"{step}{axis}:{comment}{newline}{step}- 32.96{newline}{step}-{gap}",
+                f"{comment}{newline}",
+            ),
+            "anchored": (
+                f"{step}{axis}: {{kp: 1, gain: &{'x' * (len(keys) + 1)} ",
+                f"}}{comment}{newline}",
+            ),
+            "tagged": (
+                f"{step}{axis}:{newline}{step * 2}gain: !!float{gap}",
+                f"{comment}{newline}{newline}",
+            ),
+            "last": (
+                f"{step}? {axis}{newline}{step}:{step}gain:{gap}",
+                f"{comment}{newline}# {axis}{newline}",
+            ),
         }[shape]
         pieces[-1] += before + quote
         pieces.append(quote + after)

@@ -24,14 +24,18 @@ from tests.daq.jobs.rig import Rig, make_plan
 def short_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A few moves."""
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    return make_plan(cell, tmp_path_factory.mktemp("plan") / "short.yaml", seed=3, duration_s=6.0, moves=2)
+    return make_plan(
+        cell, tmp_path_factory.mktemp("plan") / "short.yaml", seed=3, duration_s=6.0, moves=2
+    )
 
 
 @pytest.fixture(scope="session")
 def one_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A single move."""
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    return make_plan(cell, tmp_path_factory.mktemp("plan") / "one.yaml", seed=3, duration_s=6.0, moves=1)
+    return make_plan(
+        cell, tmp_path_factory.mktemp("plan") / "one.yaml", seed=3, duration_s=6.0, moves=1
+    )
 
 
 @pytest.fixture(scope="session", name="whole_job")
@@ -64,7 +68,9 @@ def made_session(whole_session: tuple[Rig, MadeSession]) -> MadeSession:
 
 @pytest.fixture(scope="session", autouse=True)
 def _outlooks_once() -> Iterator[None]:
-    """All sessions that copy the one that was made have its fit, whose outlook is computed once for each question."""
+    """All sessions that copy the one that was made have its fit,
+    whose outlook is computed once for each question.
+    """
     known: dict[tuple[int, bytes], tuple[Fit, Outlook]] = {}
 
     def outlook_once(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> Outlook:

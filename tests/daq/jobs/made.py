@@ -1,4 +1,6 @@
-"""A whole job, made once: rigs whose recordings and fit are copies of it, at a time of their own."""
+"""A whole job, made once: rigs whose recordings and fit are copies of it,
+at a time of their own.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ class Made:
             out = request.out
             further["require_released"]()  # before the drives are used
             further["require_released"]()  # before they get power
-            # Logs of another day are other logs; the fit that would read them knows its result already.
+            # Logs of another day are other logs; the fit that would read them knows its result
+            # already.
             out.write_bytes(self.logs[out.stem].read_bytes() + str(rig.clock.at).encode())
             return replace(self.recorded[out.stem], path=out)
 
@@ -63,7 +66,9 @@ class Made:
                     source,
                     sha256=sha256_of(session / f"{source.name}.mcap") or "",
                     recording=source.recording
-                    and replace(source.recording, controller_sha256=None, recorded_s=created.timestamp()),
+                    and replace(
+                        source.recording, controller_sha256=None, recorded_s=created.timestamp()
+                    ),
                 )
                 for source in self.calibration.sources
             )
@@ -74,13 +79,16 @@ class Made:
                 recording_configuration_sha256=rig.cell.recording_digest,
                 sources=sources,
                 gains=tuple(
-                    replace(gain, value=gain.value * factors.get(gain.axis, 1.0)) for gain in self.calibration.gains
+                    replace(gain, value=gain.value * factors.get(gain.axis, 1.0))
+                    for gain in self.calibration.gains
                 ),
             )
 
         return replace(
             rig.tools,
-            save_report=lambda _fit, _account, _calibration, folder: (folder / "report.html").touch(),
+            save_report=lambda _fit, _account, _calibration, folder: (
+                folder / "report.html"
+            ).touch(),
             drives=lambda _cell, _undisturbed, _take_over: None,
             record=copied,
             fit=lambda logs, *, holdout: self.fitted,
@@ -124,10 +132,20 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
         return called
 
     rig.tools = replace(
-        tools, record=keep_record, **{name: keep(name) for name in ("fit", "close_loop", "account", "calibration")}
+        tools,
+        record=keep_record,
+        **{name: keep(name) for name in ("fit", "close_loop", "account", "calibration")},
     )
     with serving(rig) as cell_there:
         rig.job()
         assert powerless(cell_there)
     logs = {name: rig.session.folder / f"{name}.mcap" for name in recorded}
-    return rig, Made(plan_file, logs, recorded, kept["fit"], kept["close_loop"], kept["account"], kept["calibration"])
+    return rig, Made(
+        plan_file,
+        logs,
+        recorded,
+        kept["fit"],
+        kept["close_loop"],
+        kept["account"],
+        kept["calibration"],
+    )

@@ -1,4 +1,6 @@
-"""A whole guided session, made once: rigs whose recordings, fits and predictions are copies of it."""
+"""A whole guided session, made once:
+rigs whose recordings, fits and predictions are copies of it.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ class MadeSession(Made):
 
     Attributes:
         plans: by their seeds.
-        before, after: what the gains of before and of after the write predict of the acceptance run.
+        before, after: what the gains of before and of after the write predict of the acceptance
+            run.
     """
 
     plans: dict[int, Plan]
@@ -45,7 +48,9 @@ class MadeSession(Made):
     def tools(self, rig: Rig, **factors: float) -> Tools:
         """As for a job, with plans and predictions."""
 
-        def predicted(calibration: Calibration, logs: Sequence[Path], cell: Cell) -> tuple[Validation, ...]:
+        def predicted(
+            calibration: Calibration, logs: Sequence[Path], cell: Cell
+        ) -> tuple[Validation, ...]:
             own = [gain.value for gain in self.calibration.gains]
             is_new = [gain.value for gain in calibration.gains] == own
             return (self.after if is_new else self.before,)
@@ -137,7 +142,12 @@ def whole_session(folder: Path) -> tuple[Rig, MadeSession]:
 
     def quick_plan(cell: Cell, *, seed: int, duration_s: float, **_further: Any) -> Plan:
         plans[seed] = plan(
-            cell, seed=seed, duration_s=duration_s, exchanges=100, largest_condition=1e6, largest_std_percent=100.0
+            cell,
+            seed=seed,
+            duration_s=duration_s,
+            exchanges=100,
+            largest_condition=1e6,
+            largest_std_percent=100.0,
         )
         return plans[seed]
 

@@ -1,4 +1,6 @@
-"""A cell of one's own for each test: its files, its clock, its commands, and the simulated cell on a virtual bus."""
+"""A cell of one's own for each test: its files, its clock, its commands,
+and the simulated cell on a virtual bus.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ from drivers.simulation.spec import CellSpec, ToggleBit
 
 BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
 PERIOD_US = 2000
-"""Period of the cells here. A millisecond would be twice as many frames, and tests of a job need no more."""
+"""Period of the cells here.
+
+A millisecond would be twice as many frames, and tests of a job need no more.
+"""
 WHO = "the test's job"
 RUNS: tuple[dict[str, Any], ...] = (
     {"name": "bare-1"},
@@ -54,14 +59,22 @@ def _cell(path: Path, _content: bytes) -> Cell:
 
 @cache
 def _truth(payload: str | None) -> CellSpec:
-    return _with_period(load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload))
+    return _with_period(
+        load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload)
+    )
 
 
 def _with_period(truth: CellSpec) -> CellSpec:
-    """The same at PERIOD_US, in steps of the same time, and with noise that filters leave as much of."""
+    """The same at PERIOD_US, in steps of the same time,
+    and with noise that filters leave as much of.
+    """
     slower = PERIOD_US / truth.sync_period_us
-    axes = (replace(axis, current_noise_a=axis.current_noise_a / slower**0.5) for axis in truth.axes)
-    return replace(truth, sync_period_us=PERIOD_US, substeps=round(slower * truth.substeps), axes=tuple(axes))
+    axes = (
+        replace(axis, current_noise_a=axis.current_noise_a / slower**0.5) for axis in truth.axes
+    )
+    return replace(
+        truth, sync_period_us=PERIOD_US, substeps=round(slower * truth.substeps), axes=tuple(axes)
+    )
 
 
 class TestClock:
@@ -146,10 +159,20 @@ class Rig:
 
     def job(self, **further: Any) -> Conclusion:
         journal = Journal(self.said, Form.JSON, lambda: self.clock.at)
-        return recalibrate(self.cell_file, self.cell, self.tools, journal, who=WHO, lock_folder=self.folder, **further)
+        return recalibrate(
+            self.cell_file,
+            self.cell,
+            self.tools,
+            journal,
+            who=WHO,
+            lock_folder=self.folder,
+            **further,
+        )
 
 
-def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = None, **section: Any) -> Rig:
+def make_rig(
+    folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = None, **section: Any
+) -> Rig:
     """A cell's files, and tools with a clock of their own.
 
     Args:
@@ -165,7 +188,10 @@ def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = N
     document = yaml.safe_load((shipped / "cells" / "demo.yaml").read_text(encoding="utf-8"))
     document["bus"]["channel"] = f"recalibration {folder.parent.name} {folder.name}"
     document["sync"]["period_us"] = PERIOD_US
-    document["policy"] = policy or {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
+    document["policy"] = policy or {
+        "motion": "allowed",
+        "apply": {"by": "job", "max_std_percent": 8},
+    }
     document["recalibration"] = {
         "runs": [{"plan_file": str(plan_file), **run} for run in RUNS],
         "interlock": {"command": ["test", "-e", "closed"]},
@@ -199,7 +225,9 @@ def serving(
 ) -> Iterator[SimulatedCell]:
     """The simulated cell of a rig, powered on, with what its mount command has mounted."""
     mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
-    truth = replace(mounted.at_power_on() if spec is None else _with_period(spec), faults=faults, seed=seed)
+    truth = replace(
+        mounted.at_power_on() if spec is None else _with_period(spec), faults=faults, seed=seed
+    )
     truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
     bus = open_bus(bus_address(rig.cell))
     try:
@@ -215,10 +243,17 @@ def powerless(cell: SimulatedCell) -> bool:
     return not any(node.drive.state in powered for node in cell.nodes)
 
 
-def make_plan(cell: Cell, path: Path, *, seed: int, duration_s: float, moves: int | None = None) -> Path:
+def make_plan(
+    cell: Cell, path: Path, *, seed: int, duration_s: float, moves: int | None = None
+) -> Path:
     """A plan for tests: not the best one."""
     made: Plan = plan(
-        cell, seed=seed, duration_s=duration_s, exchanges=100, largest_condition=1e6, largest_std_percent=100.0
+        cell,
+        seed=seed,
+        duration_s=duration_s,
+        exchanges=100,
+        largest_condition=1e6,
+        largest_std_percent=100.0,
     )
     save_plan(replace(made, moves=made.moves[:moves]), path)
     return path

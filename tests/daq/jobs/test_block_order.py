@@ -1,4 +1,6 @@
-"""Which block comes next: orders that cancel drift, and orders that need few changes of the payload."""
+"""Which block comes next: orders that cancel drift,
+and orders that need few changes of the payload.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,13 @@ AFTER_THREE = BlocksSoFar(bare=1, loaded=1, is_mounted=True)
 
 
 @given(st.integers(0, 50))
-def test_after_each_whole_group_bare_and_loaded_blocks_lie_at_the_same_mean_time(groups: int) -> None:
+def test_after_each_whole_group_bare_and_loaded_blocks_lie_at_the_same_mean_time(
+    groups: int,
+) -> None:
     first = len(FIRST_BLOCKS)
-    roles = {number: fixed_role(number) for number in range(first, first + groups * len(NEXT_BLOCKS))}
+    roles = {
+        number: fixed_role(number) for number in range(first, first + groups * len(NEXT_BLOCKS))
+    }
     bare = [number for number, role in roles.items() if role is BlockRole.BARE]
     loaded = [number for number, role in roles.items() if role is BlockRole.LOADED]
     assert len(bare) == len(loaded)
@@ -89,7 +95,9 @@ def _fewest_loaded(bare: int, target: float) -> int | None:
     """
     numbers = range(1, 2000)
     at = bisect_left(
-        numbers, True, key=lambda loaded: _variance(replace(AFTER_THREE, bare=bare, loaded=loaded)) <= target
+        numbers,
+        True,
+        key=lambda loaded: _variance(replace(AFTER_THREE, bare=bare, loaded=loaded)) <= target,
     )
     return numbers[at] if at < len(numbers) else None
 
@@ -118,7 +126,9 @@ def test_it_is_quicker_than_the_order_that_cancels_drift(ratio: float) -> None:
 
 
 def _until_limit(first_ratio: float, blocks: int, *, is_fixed: bool) -> tuple[float, int]:
-    """σ² over that of the target after so many further blocks, or less, and the changes of the payload."""
+    """σ² over that of the target after so many further blocks, or less,
+    and the changes of the payload.
+    """
     target = _variance(AFTER_THREE) / first_ratio
     steps = [AFTER_THREE]
     for number in range(blocks):
@@ -175,7 +185,9 @@ def test_a_prediction_that_is_far_off_costs_a_few_blocks_at_most(ratio: float) -
     assert bare_blocks_first(ratio, NO_LIMIT) == MOST_BARE_FIRST
 
 
-@pytest.mark.parametrize(("blocks_in_time", "bare"), [(1, 1), (3, 1), (5, 2), (6, 2), (9, 4), (13, 6), (40, 6)])
+@pytest.mark.parametrize(
+    ("blocks_in_time", "bare"), [(1, 1), (3, 1), (5, 2), (6, 2), (9, 4), (13, 6), (40, 6)]
+)
 def test_a_session_too_short_for_its_target_keeps_half_of_its_time_for_the_payload(
     blocks_in_time: int, bare: int
 ) -> None:

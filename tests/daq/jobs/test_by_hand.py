@@ -1,4 +1,6 @@
-"""A person records in a cell that has a scheduled job: the policy permits the job alone, the interlock holds both."""
+"""A person records in a cell that has a scheduled job:
+the policy permits the job alone, the interlock holds both.
+"""
 
 from __future__ import annotations
 
@@ -63,13 +65,22 @@ def test_an_interlock_that_says_no_holds_a_person_too(
         assert record_by_hand(rig, one_move, "--enable-motion") == ExitCode.OK
 
 
-def test_a_program_that_records_is_held_by_a_door_that_opens_before_power(tmp_path: Path, one_move: Path) -> None:
+def test_a_program_that_records_is_held_by_a_door_that_opens_before_power(
+    tmp_path: Path, one_move: Path
+) -> None:
     """The library has the same guard as the command: the drives were prepared, and get no power."""
     rig = make_rig(tmp_path / "cell", one_move, interlock=CLOSED_ONCE)
     out = rig.folder / "a.mcap"
     plan = load_plan(one_move, rig.cell)
     request = RecordingRequest(
-        rig.cell_file, rig.cell, plan, out, payload=None, operator="Ada", granted_by=None, run_id="1"
+        rig.cell_file,
+        rig.cell,
+        plan,
+        out,
+        payload=None,
+        operator="Ada",
+        granted_by=None,
+        run_id="1",
     )
     with serving(rig) as cell:
         with pytest.raises(MotionRefused, match="--enable-motion"):

@@ -26,13 +26,16 @@ from tests.daq.jobs.rig import Rig
 pytestmark = pytest.mark.slow
 
 NEEDS_PERSON, BY_THE_JOB = (
-    {"motion": "allowed", "apply": {"by": by, "max_std_percent": 8, "max_age_days": None}} for by in ("person", "job")
+    {"motion": "allowed", "apply": {"by": by, "max_std_percent": 8, "max_age_days": None}}
+    for by in ("person", "job")
 )
 """The logs of these tests are as old as the year in which they play."""
 
 
 def test_a_job_that_writes_makes_its_certificate_once_more(tmp_path: Path, made: Made) -> None:
-    """The first one is made before the decision; what stays must not say that the gains are still to be written."""
+    """The first one is made before the decision;
+    what stays must not say that the gains are still to be written.
+    """
     rig = made_rig(tmp_path / "cell", made)
     tools = rig.tools
     before: list[str] = []
@@ -104,7 +107,9 @@ def test_a_failed_check_refuses_and_the_next_job_records_anew(tmp_path: Path, ma
     ]
 
 
-def test_recordings_that_contradict_the_model_are_not_fitted_twice(tmp_path: Path, made: Made) -> None:
+def test_recordings_that_contradict_the_model_are_not_fitted_twice(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
     known = rig.tools
 
@@ -114,14 +119,19 @@ def test_recordings_that_contradict_the_model_are_not_fitted_twice(tmp_path: Pat
     rig.tools = replace(known, fit=contradicted)
     with pytest.raises(ModelContradicted):
         rig.job()
-    assert (rig.session.state.outcome, rig.session.state.exit_code) == (Outcome.UNFIT, ExitCode.DATA_UNFIT)
+    assert (rig.session.state.outcome, rig.session.state.exit_code) == (
+        Outcome.UNFIT,
+        ExitCode.DATA_UNFIT,
+    )
     rig.tools = known
     assert rig.job().outcome is Outcome.APPLIED
     assert len(rig.sessions) == 2
 
 
 def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
-    """The job once a day at three, due once a week: it acts where something has changed, and only there."""
+    """The job once a day at three, due once a week:
+    it acts where something has changed, and only there.
+    """
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=4)
     days = 7 * 8
     outcomes: list[tuple[int, str]] = []
@@ -158,7 +168,8 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     decision = rig.sessions[-1].state.decision
     assert decision is not None
     assert not any(gain.differs for gain in decision.gains)
-    # The last four, and the one whose gains are in force: its logs are what the controller rests on.
+    # The last four, and the one whose gains are in force: its logs are what the controller rests
+    # on.
     assert len(rig.sessions) == 5
     assert rig.sessions[0].state.outcome is Outcome.APPLIED
     fitted = rig.sessions[0].state.fitted
@@ -172,8 +183,12 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     assert len(begun) == len(ended) == len(outcomes)
 
 
-def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(tmp_path: Path, made: Made) -> None:
-    """Their writer was killed right after the write: taken for exact, they would differ from each new one too often."""
+def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(
+    tmp_path: Path, made: Made
+) -> None:
+    """Their writer was killed right after the write:
+    taken for exact, they would differ from each new one too often.
+    """
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
     assert rig.job().outcome is Outcome.APPLIED
     _forget_the_write(rig)
@@ -185,7 +200,9 @@ def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(tmp_p
     assert all(gain.old_std > 0 for gain in decision.gains)
 
 
-def test_a_drift_is_reported_although_the_job_applies_it_in_slices(tmp_path: Path, made: Made) -> None:
+def test_a_drift_is_reported_although_the_job_applies_it_in_slices(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
     for week in range(12):
         rig.tools = made.tools(rig, J4=0.98**week)
@@ -196,7 +213,9 @@ def test_a_drift_is_reported_although_the_job_applies_it_in_slices(tmp_path: Pat
         rig.clock.go_on(days=7)
     assert [axis for axis, alarm in alarms.items() if alarm] == ["J4"]
     warned = [event for event in rig.events if event["event"] == "drift"]
-    assert [(event["level"], event["axis"], event["text"]) for event in warned] == [("warning", "J4", alarms["J4"])]
+    assert [(event["level"], event["axis"], event["text"]) for event in warned] == [
+        ("warning", "J4", alarms["J4"])
+    ]
     assert alarms["J4"] in (rig.sessions[-1].folder / "summary.txt").read_text()
     metrics = (rig.cells / "drivegain_demo.prom").read_text()
     reported = [f'drift_alarm{{axis="J{n}",cell="demo"}} {float(n == 4)}' for n in range(1, 7)]
@@ -215,7 +234,9 @@ def test_nothing_is_removed_while_no_one_knows_what_is_in_force(tmp_path: Path, 
     assert "no old session removed" in {event["event"] for event in rig.events}
 
 
-def test_a_job_says_that_its_history_may_lack_something_and_removes_nothing(tmp_path: Path, made: Made) -> None:
+def test_a_job_says_that_its_history_may_lack_something_and_removes_nothing(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
     assert rig.job().outcome is Outcome.APPLIED
     rig.clock.go_on(days=7)
@@ -228,7 +249,9 @@ def test_a_job_says_that_its_history_may_lack_something_and_removes_nothing(tmp_
     assert said["history may be incomplete"] == said["no old session removed"] == MAY_LACK
 
 
-def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_history(tmp_path: Path, made: Made) -> None:
+def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_history(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB)
     apply = rig.tools.apply
 
@@ -243,10 +266,14 @@ def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_histo
     assert "the history may lack this write; the next job, apply or history --add enters it" in {
         event["event"] for event in rig.events
     }
-    assert "drivegain rollback" in " ".join(json.loads((rig.session.folder / "summary.json").read_text())["to_do"])
+    assert "drivegain rollback" in " ".join(
+        json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    )
 
 
-def test_a_history_that_cannot_be_read_is_reported_before_anything_moves(tmp_path: Path, made: Made) -> None:
+def test_a_history_that_cannot_be_read_is_reported_before_anything_moves(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
     (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
     with pytest.raises(HistoryUnreadable):
@@ -258,7 +285,13 @@ def test_a_calibration_that_a_second_person_must_sign_says_so_in_what_is_to_do(
     tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
     public = generate(tmp_path, "bob")[1].line
-    signed = {"by": "person", "max_std_percent": 8, "max_age_days": None, "signatures": 1, "signers": {"bob": public}}
+    signed = {
+        "by": "person",
+        "max_std_percent": 8,
+        "max_age_days": None,
+        "signatures": 1,
+        "signers": {"bob": public},
+    }
     rig = made_rig(tmp_path / "cell", made, policy={**NEEDS_PERSON, "apply": signed})
     assert rig.job().outcome is Outcome.PROPOSED
     sign, _, _, apply = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]

@@ -1,4 +1,6 @@
-"""Every fault of tests/faults in a job: exit code, the controller's file untouched, audit, axes without power."""
+"""Every fault of tests/faults in a job: exit code, the controller's file untouched, audit,
+axes without power.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from tests.faults.test_at_start import REFUSALS
 from tests.faults.test_in_motion import STOPS
 
 STRIKE = 120
-"""SYNCs since power-on: in the first move of the first recording, which begins at about 30 and takes more than 500."""
+"""SYNCs since power-on: in the first move of the first recording,
+which begins at about 30 and takes more than 500.
+"""
 AXIS = 2
 CUT_OFF = {
     "silent": (FaultSpec(FaultKind.SILENT, None, STRIKE), SampleLost),
@@ -39,13 +43,17 @@ BORNE = (
     FaultSpec(FaultKind.REFUSES_SAVE, AXIS),
     FaultSpec(FaultKind.ERROR_PASSIVE, None, STRIKE),
 )
-"""No run ends of them: one is warned of, one is noted in the log, and a job writes no gain into a drive."""
+"""No run ends of them: one is warned of, one is noted in the log,
+and a job writes no gain into a drive.
+"""
 ONLY_BARE = {"command": ["sh", "-c", 'test "$1" = none', "mount"]}
 
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A simulated cell in this process is never that late; waiting for one that is silent would be most of the time."""
+    """A simulated cell in this process is never that late;
+    waiting for one that is silent would be most of the time.
+    """
     monkeypatch.setattr(daq.workflow.record, "LOCKSTEP_TIMEOUT_S", 0.4)
 
 
@@ -60,7 +68,10 @@ def fails(rig: Rig, cell: SimulatedCell, kind: type[Exception]) -> Exception:
     assert rig.controller.read_bytes() == before
     assert rig.backups == []
     assert (session.state.outcome, session.state.exit_code) == (Outcome.STOPPED, code)
-    assert [entry.action for entry in rig.audit] == [AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED]
+    assert [entry.action for entry in rig.audit] == [
+        AuditAction.RECALIBRATION_BEGUN,
+        AuditAction.RECALIBRATION_ENDED,
+    ]
     assert rig.audit[-1].details["outcome"] == "stopped"
     assert rig.audit[-1].details["exit_code"] == code
     assert type(caught.value).__name__ in session.state.problem
@@ -77,7 +88,9 @@ def test_a_fault_in_motion_ends_the_job_and_leaves_the_controller_as_it_was(
     rig = make_rig(tmp_path / "cell", short_plan)
     if promise.toggle_bit is not None:
         with_toggle_bit(rig, promise.toggle_bit)
-    with serving(rig, replace(promise.fault, at_cycle=STRIKE), toggle_bit=promise.toggle_bit) as cell:
+    with serving(
+        rig, replace(promise.fault, at_cycle=STRIKE), toggle_bit=promise.toggle_bit
+    ) as cell:
         fails(rig, cell, promise.error)
         assert powerless(cell)
     assert exit_code(promise.error) == ExitCode.DEVICE_FAULT
@@ -93,8 +106,13 @@ def test_a_cell_that_is_cut_off_ends_the_job_and_what_no_one_can_reach_is_said(
     rig = make_rig(tmp_path / "cell", short_plan)
     with serving(rig, fault) as cell:
         error = fails(rig, cell, kind)
-        # Those that can be reached are stopped; the others stop by themselves (tests/faults), after this test ends.
-        others = [node for index, node in enumerate(cell.nodes) if fault.axis is not None and index != fault.axis]
+        # Those that can be reached are stopped; the others stop by themselves (tests/faults), after
+        # this test ends.
+        others = [
+            node
+            for index, node in enumerate(cell.nodes)
+            if fault.axis is not None and index != fault.axis
+        ]
         assert {node.drive.state for node in others} <= {PowerState.SWITCH_ON_DISABLED}
     assert any(note.startswith("while stopping") for note in error.__notes__)
     assert "while stopping" in (rig.session.folder / "summary.txt").read_text()
@@ -114,7 +132,9 @@ def test_a_fault_from_the_start_ends_the_job_before_anything_moves(
 def test_a_drive_that_refuses_its_mapping_ends_the_command_with_its_error(
     tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a timer calls it: an SDO abort of the library is behind the error that its feed describes."""
+    """As a timer calls it: an SDO abort of the library is behind the error that its feed
+    describes.
+    """
     rig = make_rig(tmp_path / "cell", short_plan)
     with serving(rig, FaultSpec(FaultKind.REFUSES_MAPPING, 1)) as cell:
         assert main(["recalibrate", str(rig.cell_file)]) == ExitCode.DEVICE_FAULT
@@ -122,11 +142,16 @@ def test_a_drive_that_refuses_its_mapping_ends_the_command_with_its_error(
     last = json.loads(capsys.readouterr().err.splitlines()[-1])
     assert (last["event"], last["error"]) == ("failed", "SetupRefused")
     assert last["text"].startswith("J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted")
-    assert (rig.session.state.outcome, rig.session.state.exit_code) == (Outcome.STOPPED, ExitCode.DEVICE_FAULT)
+    assert (rig.session.state.outcome, rig.session.state.exit_code) == (
+        Outcome.STOPPED,
+        ExitCode.DEVICE_FAULT,
+    )
 
 
 def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:
-    """Once its recorder accepts the run the job goes on, here to a payload that is never mounted."""
+    """Once its recorder accepts the run the job goes on,
+    here to a payload that is never mounted.
+    """
     rig = make_rig(tmp_path / "cell", one_move, retries=1, mount=ONLY_BARE)
     with serving(rig, FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)) as cell:
         assert "mount command" in str(fails(rig, cell, JobHeld))
@@ -164,11 +189,17 @@ def test_a_job_moves_no_axis_that_would_go_on_without_it_unless_the_cell_says_so
 def test_an_axis_beyond_its_limit_is_brought_back_by_a_job_where_the_cell_says_so(
     tmp_path: Path, one_move: Path, allowed: bool
 ) -> None:
-    """In the simulated cell, with friction and noise; the run after it is refused only for its payload."""
-    policy = {"motion": "allowed", "recovery_motion": "allowed"} if allowed else {"motion": "allowed"}
+    """In the simulated cell, with friction and noise;
+    the run after it is refused only for its payload.
+    """
+    if allowed:
+        policy = {"motion": "allowed", "recovery_motion": "allowed"}
+    else:
+        policy = {"motion": "allowed"}
     rig = make_rig(tmp_path / "cell", one_move, policy=policy, mount=ONLY_BARE)
     spec = load_simulation(shipped_simulation("demo"))
-    start_rad, limit_rad = spec.start_rad.copy(), rig.cell.axes[AXIS].limits.position[1]
+    start_rad = spec.start_rad.copy()
+    limit_rad = rig.cell.axes[AXIS].limits.position[1]
     start_rad[AXIS] = limit_rad + 0.002
     with serving(rig, spec=replace(spec, start_rad=start_rad)) as cell:
         error = fails(rig, cell, JobHeld if allowed else MotionRefused)
@@ -181,7 +212,9 @@ def test_an_axis_beyond_its_limit_is_brought_back_by_a_job_where_the_cell_says_s
 
 
 def test_no_kind_of_fault_is_left_out() -> None:
-    seen = {promise.fault.kind for promise in STOPS.values()} | {fault.kind for fault, _ in CUT_OFF.values()}
+    seen = {promise.fault.kind for promise in STOPS.values()} | {
+        fault.kind for fault, _ in CUT_OFF.values()
+    }
     assert seen | {*REFUSALS, *COUNTED, *(fault.kind for fault in BORNE)} == set(FaultKind)
 
 
@@ -197,7 +230,9 @@ def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(
     assert rig.session.state.exit_code == ExitCode.DATA_UNFIT
 
 
-def test_a_drive_in_fault_and_one_that_has_power_are_a_persons_business(tmp_path: Path, short_plan: Path) -> None:
+def test_a_drive_in_fault_and_one_that_has_power_are_a_persons_business(
+    tmp_path: Path, short_plan: Path
+) -> None:
     rig = make_rig(tmp_path / "cell", short_plan)
     with serving(rig) as cell:
         cell.nodes[AXIS].drive.state = PowerState.FAULT
@@ -214,6 +249,9 @@ def with_toggle_bit(rig: Rig, bit: int) -> None:
     shipped = shipped_configurations() / "drives" / "generic-cia402.yaml"
     profile = yaml.safe_load(shipped.read_text(encoding="utf-8"))
     profile["toggle_bit"] = bit
-    profile["facts"]["toggle_bit"] = {"basis": "assumed", "where": "of a drive that this test makes up"}
+    profile["facts"]["toggle_bit"] = {
+        "basis": "assumed",
+        "where": "of a drive that this test makes up",
+    }
     (rig.cells / "drives").mkdir()
     (rig.cells / "drives" / shipped.name).write_text(yaml.safe_dump(profile), encoding="utf-8")

@@ -1,4 +1,6 @@
-"""Many cells' logs: each fitted as it would be alone, by any worker and however often it was interrupted."""
+"""Many cells' logs: each fitted as it would be alone,
+by any worker and however often it was interrupted.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +32,28 @@ from hypothesis import strategies as st
 from daq.cli import main
 from daq.config.cell_file import bundle
 from daq.documents.calibration_file import as_document, load_calibration
-from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError, WorkersLost
+from daq.errors import (
+    ConfigurationMissing,
+    DaqError,
+    ExitCode,
+    LogMissing,
+    OutputFailed,
+    UsageError,
+    WorkersLost,
+)
 from daq.jobs import fleet as fleet_module
 from daq.jobs.cell_fit import Failure, FleetFit, Loop, failure_of, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
-from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
+from daq.jobs.fleet_survey import (
+    CellLogs,
+    SeenLog,
+    StoredLog,
+    UnknownLog,
+    at_hand,
+    by_cell,
+    list_logs,
+    survey,
+)
 from daq.workflow.fit import calibration_of, fit
 from ident.errors import DataUnfit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
@@ -54,7 +73,9 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fleet")
     (plans,) = plans_of(1, exchanges=40, duration_s=5.5)
     for number in range(CELLS):
-        make_cell(FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2, period_us=4000))
+        make_cell(
+            FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2, period_us=4000)
+        )
     return folder
 
 
@@ -108,15 +129,18 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
 ) -> None:
     # Several tasks look at heads, and a cell's logs are spread over two of them.
     monkeypatch.setattr(fleet_module, "SURVEYED", 4)
-    out, table = tmp_path / "out", tmp_path / "fleet.csv"
-    code = main(["fleet", str(fleet), "--workers", "2", "--out", str(out), "--csv", str(table), "--json"])
+    out = tmp_path / "out"
+    table = tmp_path / "fleet.csv"
+    code = main(
+        ["fleet", str(fleet), "--workers", "2", "--out", str(out), "--csv", str(table), "--json"]
+    )
     assert code == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     assert (document["fitted"], document["failed"]) == (CELLS, 0)
     assert _files(out) == single
-    assert [cell["error_on"] for cell in document["cells"]] == ["holdout"] * WITH_HOLDOUT + ["fit"] * (
-        CELLS - WITH_HOLDOUT
-    )
+    assert [cell["error_on"] for cell in document["cells"]] == ["holdout"] * WITH_HOLDOUT + [
+        "fit"
+    ] * (CELLS - WITH_HOLDOUT)
     rows = list(csv.DictReader(io.StringIO(table.read_text())))
     for row, cell in zip(rows, document["cells"], strict=True):
         assert row["cell"] == cell["cell"]
@@ -127,7 +151,9 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
 
 
 @pytest.mark.processes
-def test_processes_give_the_same(fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path) -> None:
+def test_processes_give_the_same(
+    fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     command = ["fleet", str(fleet), "--scheduler", "processes", "--workers", "2", "--out", str(out)]
     assert main(command) == ExitCode.OK
@@ -140,9 +166,17 @@ def test_a_scheduler_that_runs_already_gives_the_same(
 ) -> None:
     out = tmp_path / "out"
     with distributed.LocalCluster(  # type: ignore[no-untyped-call]
-        n_workers=1, threads_per_worker=2, processes=False, host="127.0.0.1", protocol="tcp", dashboard_address=None
+        n_workers=1,
+        threads_per_worker=2,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tcp",
+        dashboard_address=None,
     ) as cluster:
-        assert main(["fleet", str(few), "--scheduler", cluster.scheduler_address, "--out", str(out)]) == ExitCode.OK
+        assert (
+            main(["fleet", str(few), "--scheduler", cluster.scheduler_address, "--out", str(out)])
+            == ExitCode.OK
+        )
         assert len(cluster.scheduler.workers) == 1  # it goes on
     made = _files(out)
     assert made == {cell: single[cell] for cell in made}
@@ -162,7 +196,9 @@ def test_the_table_shows_every_cell_and_marks_errors_on_the_fit_itself(
     assert "* on the moves of the fit" in shown
 
 
-def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(
+    few: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (few / "cell-000" / "loaded.mcap").unlink()
     (few / "cell-000" / "held-out.mcap").unlink()
     whole = (few / "cell-002" / "bare.mcap").read_bytes()
@@ -184,9 +220,16 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys
     assert str(few / "cell-002" / "bare.mcap") in truncated["error"]["text"]
 
 
-def test_a_run_that_its_recorder_marked_invalid_is_reported_its_cell(tmp_path: Path, checkout: Path) -> None:
+def test_a_run_that_its_recorder_marked_invalid_is_reported_its_cell(
+    tmp_path: Path, checkout: Path
+) -> None:
     files = bundle(checkout / "configs/cells/demo.yaml")
-    write(tmp_path / "a.mcap", content(6, None, files), samples([(0,) * 6] * 9), verdict=(False, "the drives fell off"))
+    write(
+        tmp_path / "a.mcap",
+        content(6, None, files),
+        samples([(0,) * 6] * 9),
+        verdict=(False, "the drives fell off"),
+    )
     (row,) = _fitted(tmp_path, None)
     assert row.cell == "demo"
     assert isinstance(row.result, Failure)
@@ -203,7 +246,10 @@ def test_two_configurations_of_a_cell_are_two_rows_and_said_so(
         write(tmp_path / f"{name}.mcap", content(6, None, carried), samples([(0,) * 6] * 9))
     assert main(["fleet", str(tmp_path), "--json"]) == ExitCode.DATA_UNFIT
     document = json.loads(capsys.readouterr().out)["cells"]
-    assert [(cell["cell"], cell["configurations"]) for cell in document] == [("demo", 2), ("demo", 2)]
+    assert [(cell["cell"], cell["configurations"]) for cell in document] == [
+        ("demo", 2),
+        ("demo", 2),
+    ]
     assert sorted(len(cell["fit"]) for cell in document) == [1, 2]
     assert main(["fleet", str(tmp_path)]) == ExitCode.DATA_UNFIT
     assert "demo: logs of 2 configurations" in " ".join(capsys.readouterr().out.split())
@@ -244,8 +290,11 @@ def _only(few: Path, cell: str) -> CellLogs:
 
 
 @pytest.mark.parametrize("ending", [".yaml", ".json"])
-def test_a_file_on_the_shelf_that_is_too_large_is_replaced(ending: str, few: Path, tmp_path: Path) -> None:
-    cell, out = _only(few, "cell-003"), tmp_path / "out"
+def test_a_file_on_the_shelf_that_is_too_large_is_replaced(
+    ending: str, few: Path, tmp_path: Path
+) -> None:
+    cell = _only(few, "cell-003")
+    out = tmp_path / "out"
     (first,) = _fitted(few, out)
     file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
     file.unlink()
@@ -263,7 +312,8 @@ def test_a_file_on_the_shelf_that_is_too_large_is_replaced(ending: str, few: Pat
 def test_what_cannot_be_replaced_on_the_shelf_is_reported_before_anything_is_fitted(
     ending: str, what: str, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell, out = _only(few, "cell-003"), tmp_path / "out"
+    cell = _only(few, "cell-003")
+    out = tmp_path / "out"
     monkeypatch.setattr(fleet_module, "fit_cell", None)
     file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
     if what == "folder":
@@ -287,7 +337,8 @@ def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_reported_by_its
     few: Path, tmp_path: Path
 ) -> None:
     cell = _only(few, "cell-003")
-    shelf, made = open_cache(tmp_path / "out", Loop.OPEN), fit_cell(cell, Loop.OPEN, CREATED)
+    shelf = open_cache(tmp_path / "out", Loop.OPEN)
+    made = fit_cell(cell, Loop.OPEN, CREATED)
     note = shelf.file(cell).with_suffix(".json")
     note.mkdir()
     assert isinstance(made, FleetFit)
@@ -358,7 +409,9 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
         assert made == {cell: single[cell] for cell in made}
         assert len(made) == 3
         assert list(scratch.iterdir()) == []
-        seen = by_cell(log for log in survey(list_logs("memory://hall")) if isinstance(log, SeenLog))
+        seen = by_cell(
+            log for log in survey(list_logs("memory://hall")) if isinstance(log, SeenLog)
+        )
         assert all(open_cache(out, Loop.OPEN).cached(cell) is not None for cell in seen)
         # A fault of a copy is reported under the name of its original.
         whole = store.cat_file("/hall/cell-002/bare.mcap")
@@ -372,9 +425,10 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
 
 
 def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
-    by_path, by_address = list_logs(str(few)), list_logs(f"file://{few}")
+    by_path = list_logs(str(few))
+    by_address = list_logs(f"file://{few}")
     assert [log.name for log in by_path] == [log.name for log in by_address]
-    reported = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]
+    reported = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]  # noqa: E501
             for logs in (by_path, by_address)]  # fmt: skip
     assert reported[0] == reported[1]
     assert len(reported[0]) == 7
@@ -396,17 +450,21 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
         one.bind(str(logs / "socket.mcap"))
         assert main(["fleet", address.format(logs), "--json"]) == ExitCode.DATA_UNFIT
     output = {cell["cell"]: cell for cell in json.loads(capsys.readouterr().out)["cells"]}
-    assert {name: cell["error"]["text"].split("; expected")[0] for name, cell in output.items()} == {
+    assert {
+        name: cell["error"]["text"].split("; expected")[0] for name, cell in output.items()
+    } == {
         "folder.mcap": f"{logs}/folder.mcap: found a folder",
-        "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to {tmp_path}/unmounted.mcap, "
-        "which leads nowhere",
+        "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to "
+        f"{tmp_path}/unmounted.mcap, which leads nowhere",
         "link.mcap": f"{logs}/link.mcap: found a folder",
         "pipe.mcap": f"{logs}/pipe.mcap: found something that is no regular file",
         "round.mcap": f"{logs}/round.mcap: found a link to {logs}/round.mcap, which leads nowhere",
         "socket.mcap": f"{logs}/socket.mcap: found something that is no regular file",
         "zero.mcap": f"{logs}/zero.mcap: found something that is no regular file",
     }
-    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in output.values()} == {("LogMissing", 4)}
+    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in output.values()} == {
+        ("LogMissing", 4)
+    }
 
 
 def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
@@ -424,26 +482,39 @@ def test_a_pipe_that_takes_the_place_of_a_log_meanwhile_is_not_opened(tmp_path: 
 
 
 @pytest.mark.parametrize("place", ["nowhere", "memory://nowhere", "."])
-def test_a_place_without_logs_is_no_empty_table(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_without_logs_is_no_empty_table(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LogMissing):
         list_logs(place)
     assert main(["fleet", place]) == ExitCode.DATA_UNFIT
 
 
-def test_what_is_not_installed_is_named_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_installed_is_named_with_the_line_that_installs_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def absent(name: str) -> Any:
         raise ImportError(name)
 
     monkeypatch.setattr(fleet_module, "import_module", absent)
-    with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[fleet\]'"), worker_pool("processes", 1):
+    with (
+        pytest.raises(
+            ConfigurationMissing,
+            match=r"pip install "
+            r"'drivegain\[fleet\]'",
+        ),
+        worker_pool("processes", 1),
+    ):
         pass
     with pytest.raises(ConfigurationMissing, match="nonsense"):
         list_logs("nonsense://bucket/logs")
 
 
 def test_processes_of_this_machine_say_nothing_about_their_end() -> None:
-    """On a busy machine a heartbeat finds the scheduler gone, and a worker would print its traceback."""
+    """On a busy machine a heartbeat finds the scheduler gone,
+    and a worker would print its traceback.
+    """
     of_a_worker = logging.getLogger("distributed.worker")
     with worker_pool("processes", 1) as pool:
         level = pool.executor.submit(of_a_worker.getEffectiveLevel).result()
@@ -479,8 +550,12 @@ def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.Monkey
 
 def test_the_words_of_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, str | int, int | None]] = []
-    monkeypatch.setattr(fleet_module, "_processes", lambda workers: asked.append(("processes", workers, None)))
-    monkeypatch.setattr(fleet_module, "_scheduler", lambda *given: asked.append(("scheduler", *given)))
+    monkeypatch.setattr(
+        fleet_module, "_processes", lambda workers: asked.append(("processes", workers, None))
+    )
+    monkeypatch.setattr(
+        fleet_module, "_scheduler", lambda *given: asked.append(("scheduler", *given))
+    )
     with worker_pool("threads", 3) as pool, worker_pool("threads", None) as as_many_as_processors:
         assert (pool.workers, as_many_as_processors.workers) == (3, len(os.sched_getaffinity(0)))
     worker_pool("processes", 2)
@@ -495,7 +570,10 @@ def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) ->
     notes.write_text("my notes\n")
     assert main(["fleet", str(few), "--csv", str(notes)]) == ExitCode.USAGE
     assert notes.read_text() == "my notes\n"
-    assert main(["fleet", str(few), "--csv", str(tmp_path / "absent" / "fleet.csv")]) == ExitCode.UNEXPECTED
+    assert (
+        main(["fleet", str(few), "--csv", str(tmp_path / "absent" / "fleet.csv")])
+        == ExitCode.UNEXPECTED
+    )
     assert main(["fleet", str(few), "--out", str(notes)]) == ExitCode.USAGE
 
 
@@ -522,12 +600,15 @@ def test_heads_that_no_one_could_read_are_rows(few: Path, monkeypatch: pytest.Mo
     assert not any(row.fitted for row in rows)
 
 
-def test_a_name_that_is_no_text_ends_nothing(few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_is_no_text_ends_nothing(
+    few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Bytes that are no UTF-8, in a log of a cell and in one of no cell."""
     shutil.rmtree(few / "cell-000")
     (few / "cell-002" / "bare.mcap").rename(few / "cell-002" / os.fsdecode(b"b\xff.mcap"))
     (few / os.fsdecode(b"=c\xff\x1b[2J.mcap")).write_bytes(b"\x89MCAP0\r\nno log of ours")
-    out, table = tmp_path / "out", tmp_path / "fleet.csv"
+    out = tmp_path / "out"
+    table = tmp_path / "fleet.csv"
     assert main(["fleet", str(few), "--out", str(out), "--csv", str(table)]) == ExitCode.DATA_UNFIT
     assert "\x1b[2J" not in capsys.readouterr().out
     assert [row["cell"] for row in csv.DictReader(io.StringIO(table.read_text()))] == [
@@ -588,7 +669,9 @@ def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.Monkey
 
 @given(st.integers(1, 5), st.integers(0, 30))
 def test_no_more_is_in_work_than_there_are_workers(workers: int, pieces: int) -> None:
-    handed, back, most = 0, 0, 0
+    handed = 0
+    back = 0
+    most = 0
     with ThreadPoolExecutor(workers) as executor:
 
         def submit(piece: int) -> Future[int]:
@@ -640,7 +723,9 @@ def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) ->
         for held in cell.holdout:
             assert held.mounting is not None
             assert {held.mounting, None} <= set(fitted)
-            assert all(seen.started_ns <= held.started_ns for seen in cell.fit if seen.mounting is not None)
+            assert all(
+                seen.started_ns <= held.started_ns for seen in cell.fit if seen.mounting is not None
+            )
         if not cell.holdout and None in fitted:
             newest = [mounting for mounting in fitted if mounting is not None][-1:]
             assert all(fitted.count(mounting) == 1 for mounting in newest)

@@ -1,4 +1,6 @@
-"""A guided session: order of blocks, outcome, interrupts at any call, mistakes in blocks, answers of a person."""
+"""A guided session: order of blocks, outcome, interrupts at any call, mistakes in blocks,
+answers of a person.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,13 @@ from daq.errors import (
 from daq.jobs import calibrate as guided_session
 from daq.jobs import job, reporting
 from daq.jobs.acceptance import TOLERANCE, Accept
-from daq.jobs.block_check import BlockFacts, compared_with, look_at_block, look_at_geometry, mistake_in
+from daq.jobs.block_check import (
+    BlockFacts,
+    compared_with,
+    look_at_block,
+    look_at_geometry,
+    mistake_in,
+)
 from daq.jobs.block_order import FIRST_BLOCKS
 from daq.jobs.certificate import save_certificate
 from daq.jobs.context import Tools
@@ -60,14 +68,27 @@ from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
 from ident.errors import CORRECTION_UNCLEAR, ChannelsExchanged, Diagnosis, GeometryTurned
 from tests.daq.histories import history_of
-from tests.daq.jobs.made_session import BLOCK_S, MASS_KG, MadeSession, given_answers, made_session_rig, run_session
+from tests.daq.jobs.made_session import (
+    BLOCK_S,
+    MASS_KG,
+    MadeSession,
+    given_answers,
+    made_session_rig,
+    run_session,
+)
 from tests.daq.jobs.rig import BEGAN, WHO, Rig, serving
 
 pytestmark = pytest.mark.slow
 
-CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now", "network", "geometry"})
-"""Tools between which a session reads and writes its own files; the clock is read beside each of them, gains that are
-in a file need no network, and the geometry is judged only where a block shows a mistake."""
+CALLED = tuple(
+    field.name
+    for field in fields(Tools)
+    if field.name not in {"monotonic_s", "now", "network", "geometry"}
+)
+"""Tools between which a session reads and writes its own files; the clock is read beside each of
+them, gains that are in a file need no network, and the geometry is judged only where a block shows
+a mistake.
+"""
 QUICK = ("drives", "record", "fit", "save_report", "apply", "validate", "certify")
 """Tools at which every test run interrupts; `processes` takes every call of every tool."""
 
@@ -84,7 +105,11 @@ def test_a_session_over_the_driver_finds_the_gains_writes_them_once_and_accepts_
     rig, _ = whole_session
     state = state_of(rig)
     assert state.outcome is Outcome.APPLIED
-    assert [block.name for block in state.blocks] == ["block-1-bare", "block-2-loaded", "block-3-held-out"]
+    assert [block.name for block in state.blocks] == [
+        "block-1-bare",
+        "block-2-loaded",
+        "block-3-held-out",
+    ]
     assert [run.name for run in state.runs] == [block.name for block in state.blocks]
     assert all(gain.is_precise for gain in state.gains)
     truth = load_simulation(shipped_configurations() / "simulation" / "demo.yaml", None)
@@ -105,7 +130,9 @@ def test_a_session_over_the_driver_finds_the_gains_writes_them_once_and_accepts_
     assert len(rig.backups) == 1
 
 
-def test_new_moves_show_which_gains_were_wrong_before_the_write(whole_session: tuple[Rig, MadeSession]) -> None:
+def test_new_moves_show_which_gains_were_wrong_before_the_write(
+    whole_session: tuple[Rig, MadeSession],
+) -> None:
     acceptance = state_of(whole_session[0]).acceptance
     assert acceptance is not None
     assert acceptance.accepted
@@ -118,7 +145,9 @@ def test_new_moves_show_which_gains_were_wrong_before_the_write(whole_session: t
     assert all(scale.new == pytest.approx(1.0, abs=0.02) for scale in acceptance.scales)
 
 
-def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     # The controller did not take the gains that were written: it has the previous gains.
     rig.tools = replace(rig.tools, validate=lambda *_: (made_session.before,))
@@ -158,7 +187,10 @@ def test_the_session_leaves_files_that_the_other_verbs_read(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # The verbs have the clock of this computer, and the logs are of another year.
-    policy = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8, "max_age_days": None}}
+    policy = {
+        "motion": "allowed",
+        "apply": {"by": "job", "max_std_percent": 8, "max_age_days": None},
+    }
     rig = made_session_rig(tmp_path / "cell", made_session, policy=policy)
     assert run_session(rig).exit_code == ExitCode.OK
     assert main(["history", str(rig.cell_file), "--verify"]) == ExitCode.OK
@@ -173,9 +205,13 @@ def test_the_session_leaves_files_that_the_other_verbs_read(
 
 
 class Interruption:
-    """Counts the calls of a session's tools, and raises an error at one of them: before it, or after it."""
+    """Counts the calls of a session's tools, and raises an error at one of them:
+    before it, or after it.
+    """
 
-    def __init__(self, error: BaseException | None = None, at: int = -1, *, after: bool = False) -> None:
+    def __init__(
+        self, error: BaseException | None = None, at: int = -1, *, after: bool = False
+    ) -> None:
         self.calls: list[str] = []
         self._error = error
         self._at = at
@@ -183,7 +219,9 @@ class Interruption:
 
     def tools(self, tools: Tools) -> Tools:
         """Return the tools with their calls counted."""
-        return replace(tools, **{name: self._counted(name, getattr(tools, name)) for name in CALLED})
+        return replace(
+            tools, **{name: self._counted(name, getattr(tools, name)) for name in CALLED}
+        )
 
     def _counted(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*given: Any, **further: Any) -> Any:
@@ -219,7 +257,9 @@ def test_every_tool_is_among_the_calls(calls: list[str]) -> None:
 
 
 def ends_the_same_after(rig: Rig, interruption: Interruption, error: BaseException) -> None:
-    """Interrupt a session there; the same call again has the same outcome, with one write in every record."""
+    """Interrupt a session there; the same call again has the same outcome,
+    with one write in every record.
+    """
     tools = rig.tools
     rig.tools = interruption.tools(tools)
     with pytest.raises(type(error)):
@@ -244,12 +284,22 @@ ERRORS = (KeyboardInterrupt, JobHeld)
 
 
 def interrupted_at_each(
-    folder: Path, made: MadeSession, calls: list[str], names: tuple[str, ...], kind: type[BaseException], *, after: bool
+    folder: Path,
+    made: MadeSession,
+    calls: list[str],
+    names: tuple[str, ...],
+    kind: type[BaseException],
+    *,
+    after: bool,
 ) -> int:
     """Interrupt a session of its own at each call of some tools; return how many there were."""
     chosen = [at for at, name in enumerate(calls) if name in names]
     for at in chosen:
-        error = KeyboardInterrupt() if kind is KeyboardInterrupt else JobHeld("x", found="y", expected="z", remedy="w")
+        error = (
+            KeyboardInterrupt()
+            if kind is KeyboardInterrupt
+            else JobHeld("x", found="y", expected="z", remedy="w")
+        )
         rig = made_session_rig(folder / f"{at}-{calls[at]}", made)
         ends_the_same_after(rig, Interruption(error, at, after=after), error)
     return len(chosen)
@@ -259,9 +309,15 @@ def interrupted_at_each(
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
 @pytest.mark.parametrize("kind", ERRORS)
 def test_a_session_that_is_interrupted_at_any_call_ends_with_the_same_outcome(
-    tmp_path: Path, made_session: MadeSession, calls: list[str], kind: type[BaseException], after: bool
+    tmp_path: Path,
+    made_session: MadeSession,
+    calls: list[str],
+    kind: type[BaseException],
+    after: bool,
 ) -> None:
-    assert interrupted_at_each(tmp_path, made_session, calls, CALLED, kind, after=after) == len(calls)
+    assert interrupted_at_each(tmp_path, made_session, calls, CALLED, kind, after=after) == len(
+        calls
+    )
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -271,10 +327,14 @@ def test_a_session_that_is_interrupted_goes_on_with_the_same_command(
     """At the last call of a tool; Ctrl-C before it, an error right after it has done its work."""
     last = len(calls) - 1 - calls[::-1].index(name)
     before = KeyboardInterrupt()
-    ends_the_same_after(made_session_rig(tmp_path / "before", made_session), Interruption(before, last), before)
+    ends_the_same_after(
+        made_session_rig(tmp_path / "before", made_session), Interruption(before, last), before
+    )
     after = JobHeld("x", found="y", expected="z", remedy="w")
     ends_the_same_after(
-        made_session_rig(tmp_path / "after", made_session), Interruption(after, last, after=True), after
+        made_session_rig(tmp_path / "after", made_session),
+        Interruption(after, last, after=True),
+        after,
     )
 
 
@@ -282,7 +342,9 @@ def test_a_session_that_is_interrupted_goes_on_with_the_same_command(
 def test_the_certificate_says_who_wrote_and_accepted_the_gains(
     tmp_path: Path, made_session: MadeSession, calls: list[str], killed_at: str
 ) -> None:
-    """Also where the command that has the fit was ended before the write: its details are still on the page."""
+    """Also where the command that has the fit was ended before the write:
+    its details are still on the page.
+    """
     rig = made_session_rig(tmp_path / "cell", made_session)
     tools = replace(rig.tools, save_report=partial(save_certificate, rig.cell_file, rig.cell))
     rig.tools = tools
@@ -312,11 +374,17 @@ def test_a_certificate_that_cannot_be_written_again_is_a_warning_with_what_to_do
 
     rig.tools = replace(rig.tools, certify=refused)
     assert run_session(rig).exit_code == ExitCode.OK
-    (event,) = [event for event in rig.events if event["event"].startswith("the certificate is that of before")]
+    (event,) = [
+        event
+        for event in rig.events
+        if event["event"].startswith("the certificate is that of before")
+    ]
     assert "drivegain certificate " in event["text"]
 
 
-def test_a_result_that_is_no_number_accepts_nothing(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_result_that_is_no_number_accepts_nothing(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     """An axis that did not move in the acceptance run has no scale."""
     rig = made_session_rig(tmp_path / "cell", made_session)
     moved = made_session.after.use.copy()
@@ -333,7 +401,9 @@ def test_a_result_that_is_no_number_accepts_nothing(tmp_path: Path, made_session
 def test_a_session_that_was_killed_right_after_its_write_does_not_write_again(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    """As a loss of power leaves it: the controller's file is new, and the state is that of before the write."""
+    """As a loss of power leaves it: the controller's file is new,
+    and the state is that of before the write.
+    """
     rig = made_session_rig(tmp_path / "cell", made_session)
     before: list[bytes] = []
     write = rig.tools.apply
@@ -356,7 +426,9 @@ def test_a_session_that_was_killed_right_after_its_write_does_not_write_again(
     assert state_of(rig).acceptance is not None
 
 
-def test_the_interlock_is_asked_before_every_motion(tmp_path: Path, made_session: MadeSession) -> None:
+def test_the_interlock_is_asked_before_every_motion(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session, warm_up_min=0)
     events: list[str] = []
     tools = rig.tools
@@ -413,7 +485,9 @@ def test_a_session_ends_when_its_time_is_up_and_says_what_was_not_reached(
     assert f"Not reached: {state.missing}" in (rig.session.folder / "summary.txt").read_text()
 
 
-def test_a_closed_gate_refuses_the_write_and_the_session_is_over(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_closed_gate_refuses_the_write_and_the_session_is_over(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     policy = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 0.2}}
     rig = made_session_rig(tmp_path / "cell", made_session)
     document = json.loads(rig.cell_file.read_text())
@@ -474,14 +548,18 @@ def test_a_rehearsal_makes_the_moves_of_the_first_blocks_slowly_and_leaves_no_lo
     ]
 
 
-def test_a_second_terminal_learns_that_the_bus_is_taken(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_second_terminal_learns_that_the_bus_is_taken(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     with bus_lock(rig.cell, rig.folder), pytest.raises(BusTaken, match="one at a time"):
         run_session(rig)
     assert rig.sessions == ()
 
 
-def test_the_target_is_in_the_cell_file_and_no_log_depends_on_it(tmp_path: Path, made_session: MadeSession) -> None:
+def test_the_target_is_in_the_cell_file_and_no_log_depends_on_it(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     before = rig.cell
     assert before.target_sigma_percent == 0.5
@@ -499,7 +577,9 @@ def test_the_target_is_in_the_cell_file_and_no_log_depends_on_it(tmp_path: Path,
 def test_job_session_and_demonstration_take_the_same_stages(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They differ in the schedule of runs and in the operator; a session accepts, and the demonstration has no page."""
+    """They differ in the schedule of runs and in the operator;
+    a session accepts, and the demonstration has no page.
+    """
     taken: list[tuple[Stage, ...]] = []
 
     def noting(stages: tuple[Stage, ...], *_: object) -> Session:
@@ -541,7 +621,9 @@ LATER_BLOCKS = {
 
 
 def aimed_rig(folder: Path, made: MadeSession, planned: list[dict[str, Any]]) -> Rig:
-    """A session whose gains are never precise: later blocks are copies of the first ones, with plans of their own."""
+    """A session whose gains are never precise:
+    later blocks are copies of the first ones, with plans of their own.
+    """
     rig = made_session_rig(folder, made)
     tools = rig.tools
 
@@ -591,7 +673,9 @@ def test_from_the_fourth_block_on_moves_are_for_the_worst_gain(
         assert ratio.tolist() == pytest.approx(estimated)
     worst = max(state.gains, key=lambda gain: gain.std_percent)
     page = (rig.session.folder / "plan-4.html").read_text()
-    assert f"Planned for the gain that is farthest from its target after 3 blocks: {worst.axis}," in page
+    assert (
+        f"Planned for the gain that is farthest from its target after 3 blocks: {worst.axis},"
+    ) in page
     assert "Planned for" not in (rig.session.folder / "plan-1.html").read_text()
     assert all(gain.cause for gain in state.gains)
 
@@ -602,14 +686,20 @@ def test_with_friction_by_payload_all_bare_blocks_come_before_the_payload(
     planned: list[dict[str, Any]] = []
     rig = aimed_rig(tmp_path / "cell", made_session, planned)
     document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
-    rig.cell_file.write_text(json.dumps({**document, "friction_by_payload": True}), encoding="utf-8")
+    rig.cell_file.write_text(
+        json.dumps({**document, "friction_by_payload": True}), encoding="utf-8"
+    )
     predicted_percent = max(made_session.plans[0].predicted_std_percent)
     # By the first plan two bare blocks are enough. This rig has no third block that is loaded.
     with pytest.raises(KeyError, match="block-3-loaded"):
         run_session(rig, target_percent=predicted_percent / 1.3, time_limit_min=20 * BLOCK_S / 60.0)
     state = state_of(rig)
     assert state.bare_first == 2
-    assert [block.name for block in state.blocks] == ["block-1-bare", "block-2-bare", "block-3-loaded"]
+    assert [block.name for block in state.blocks] == [
+        "block-1-bare",
+        "block-2-bare",
+        "block-3-loaded",
+    ]
     assert planned == []
 
 
@@ -617,7 +707,10 @@ def test_later_blocks_stay_where_the_accepted_ones_were(
     aimed_session: tuple[Rig, list[dict[str, Any]], Conclusion],
 ) -> None:
     rig, _, _ = aimed_session
-    plans = [load_plan(rig.session.folder / f"plan-{number}.yaml", rig.cell) for number in (1, 2, 3, 4, 5)]
+    plans = [
+        load_plan(rig.session.folder / f"plan-{number}.yaml", rig.cell)
+        for number in (1, 2, 3, 4, 5)
+    ]
     accepted = [move for one in plans[:3] for move in one.moves]
     lower = np.min([move.target_rad for move in accepted], axis=0) - 2e-5
     upper = np.max([move.target_rad for move in accepted], axis=0) + 2e-5
@@ -638,7 +731,9 @@ def test_at_the_time_limit_it_says_what_is_missing_and_what_would_help(
     more_time, *by_axis = state.would_help
     assert "--time-limit" in more_time
     assert [line.split(":")[0] for line in by_axis] == [gain.axis for gain in state.gains]
-    assert [event["would_help"] for event in rig.events if event["event"] == "time is up"] == [list(state.would_help)]
+    assert [event["would_help"] for event in rig.events if event["event"] == "time is up"] == [
+        list(state.would_help)
+    ]
     said = ending(ended, rig.cell_file)
     assert "What would help:" in said
     assert more_time in said
@@ -679,7 +774,8 @@ PAYLOAD = "disc"
 
 
 class Scale:
-    """Says what is on the flange, as `look_at_block` finds it by the moves; what is mounted is in a file.
+    """Says what is on the flange, as `look_at_block` finds it by the moves;
+    what is mounted is in a file.
 
     Attributes:
         looked: name of each block that was looked at.
@@ -728,22 +824,31 @@ def test_a_block_with_the_wrong_body_is_recorded_again_and_kept(
     assert len(state_of(rig).runs) == len(FIRST_BLOCKS)
 
 
-def test_a_body_that_was_there_from_the_beginning_costs_every_block(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_body_that_was_there_from_the_beginning_costs_every_block(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     scale = Scale(rig, 4.6, 4.6, 4.6, 0.0, 4.6, 4.6)
     rig.tools = replace(rig.tools, look=scale)
     assert run_session(rig).outcome is Outcome.APPLIED
     assert "".join(name.split("-")[1] for name in scale.looked) == "122123"
-    first, second = [event["text"] for event in rig.events if event["event"] == "mistake in a block"]
+    first, second = [
+        event["text"] for event in rig.events if event["event"] == "mistake in a block"
+    ]
     assert "DISC was missing" in first
-    assert "if DISC is mounted now, it was there before, too. All of these are recorded again" in second
+    assert (
+        "if DISC is mounted now, it was there before, too. All of these are recorded again"
+    ) in second
 
 
-def test_bare_blocks_are_compared_before_any_payload_was_weighed(tmp_path: Path, made_session: MadeSession) -> None:
+def test_bare_blocks_are_compared_before_any_payload_was_weighed(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     """With `friction_by_payload`, several bare blocks come first."""
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [
-        Block(name=f"block-{number}-bare", payload=None, mass_kg=None, holdout=False, plan="") for number in (1, 2, 3)
+        Block(name=f"block-{number}-bare", payload=None, mass_kg=None, holdout=False, plan="")
+        for number in (1, 2, 3)
     ]
     left_on = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.4, added_std_kg=0.05))
     assert left_on is not None
@@ -755,10 +860,18 @@ def test_bare_blocks_are_compared_before_any_payload_was_weighed(tmp_path: Path,
     assert "4.4 kg less than in block-1-bare and block-2-bare" in was_there.text
 
 
-def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [
-        Block(name=f"block-{n}", payload=body, mass_kg=None if body is None else MASS_KG, holdout=False, plan="")
+        Block(
+            name=f"block-{n}",
+            payload=body,
+            mass_kg=None if body is None else MASS_KG,
+            holdout=False,
+            plan="",
+        )
         for n, body in enumerate((None, "disc", "disc", None), 1)
     ]
     assert [block.name for block in compared_with(blocks)] == ["block-1"]
@@ -766,24 +879,38 @@ def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(tmp_path: Path, m
     assert mistake is not None
     assert mistake.blocks == ("block-4",)
     assert "take DISC off" in mistake.text
-    assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.3, added_std_kg=0.05)) is None
+    assert (
+        mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.3, added_std_kg=0.05)) is None
+    )
     # A weighing that is too coarse tells nothing.
     assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.8)) is None
 
 
-def test_a_body_that_was_turned_between_two_loaded_blocks_is_noticed(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_body_that_was_turned_between_two_loaded_blocks_is_noticed(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [
-        Block(name=f"block-{n}", payload=body, mass_kg=None if body is None else MASS_KG, holdout=False, plan="")
+        Block(
+            name=f"block-{n}",
+            payload=body,
+            mass_kg=None if body is None else MASS_KG,
+            holdout=False,
+            plan="",
+        )
         for n, body in enumerate((None, "disc", "disc"), 1)
     ]
-    same_mass = BlockFacts(added_kg=0.1, added_std_kg=0.05, added_moment_kg_m=0.5, added_moment_std_kg_m=0.01)
+    same_mass = BlockFacts(
+        added_kg=0.1, added_std_kg=0.05, added_moment_kg_m=0.5, added_moment_std_kg_m=0.01
+    )
     turned = mistake_in(rig.cell, PAYLOAD, blocks, same_mass)
     assert turned is not None
     assert turned.blocks == ("block-3",)
     assert "about 109 mm away" in turned.text
     assert mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_kg_m=0.05)) is None
-    assert mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_std_kg_m=0.2)) is None
+    assert (
+        mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_std_kg_m=0.2)) is None
+    )
 
 
 def test_a_bare_block_that_is_recorded_again_is_weighed_beside_loaded_ones(
@@ -792,22 +919,35 @@ def test_a_bare_block_that_is_recorded_again_is_weighed_beside_loaded_ones(
     """The log of the first block was damaged; nothing is wrong with the others."""
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [
-        Block(name=f"block-{n}", payload=body, mass_kg=None if body is None else MASS_KG, holdout=False, plan="")
+        Block(
+            name=f"block-{n}",
+            payload=body,
+            mass_kg=None if body is None else MASS_KG,
+            holdout=False,
+            plan="",
+        )
         for n, body in ((2, "disc"), (3, "disc"), (1, None))
     ]
     assert [block.name for block in compared_with(blocks)] == ["block-2", "block-3"]
-    assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=-MASS_KG, added_std_kg=0.05)) is None
+    assert (
+        mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=-MASS_KG, added_std_kg=0.05))
+        is None
+    )
     still_on = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.1, added_std_kg=0.05))
     assert still_on is not None
     assert still_on.blocks == ("block-1",)
     assert still_on.text.endswith("take DISC off.")
 
 
-def test_a_session_goes_on_with_its_own_payload_alone(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_session_goes_on_with_its_own_payload_alone(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
     other = {**document["payloads"][0], "name": "ring", "mounting": "ring-a"}
-    rig.cell_file.write_text(json.dumps({**document, "payloads": [*document["payloads"], other]}), encoding="utf-8")
+    rig.cell_file.write_text(
+        json.dumps({**document, "payloads": [*document["payloads"], other]}), encoding="utf-8"
+    )
 
     def stop_before_the_third(payload: str | None) -> None:
         if len(rig.session.state.runs) == 2:
@@ -816,7 +956,9 @@ def test_a_session_goes_on_with_its_own_payload_alone(tmp_path: Path, made_sessi
     with pytest.raises(KeyboardInterrupt):
         run_session(rig, given_answers(rig, put=stop_before_the_third))
     rig.clock.go_on(minutes=5)
-    with pytest.raises(ConfigurationInconsistent, match="found a session whose blocks carry 'disc'") as caught:
+    with pytest.raises(
+        ConfigurationInconsistent, match="found a session whose blocks carry 'disc'"
+    ) as caught:
         run_session(rig, payload="ring")
     assert "--payload disc" in str(caught.value)
 
@@ -826,15 +968,21 @@ def test_an_axis_at_its_current_limit_and_an_unreadable_log_are_mistakes(
 ) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     blocks = [Block(name="block-1-bare", payload=None, mass_kg=None, holdout=False, plan="")]
-    saturated = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(saturated_percent=(0.0, 0.0, 4.2, 0.0, 0.0, 0.0)))
+    saturated = mistake_in(
+        rig.cell, PAYLOAD, blocks, BlockFacts(saturated_percent=(0.0, 0.0, 4.2, 0.0, 0.0, 0.0))
+    )
     assert saturated is not None
     assert "J3 was at its current limit for 4.2 %" in saturated.text
-    unreadable = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(unreadable="a jump of 3 rad: see to the encoder"))
+    unreadable = mistake_in(
+        rig.cell, PAYLOAD, blocks, BlockFacts(unreadable="a jump of 3 rad: see to the encoder")
+    )
     assert unreadable is not None
     assert "see to the encoder" in unreadable.text
 
 
-def test_a_mistake_that_stays_ends_the_session_with_what_to_do(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_mistake_that_stays_ends_the_session_with_what_to_do(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     rig.tools = replace(rig.tools, look=lambda *_: BlockFacts(unreadable="no encoder: see to it"))
     with pytest.raises(JobHeld, match="a mistake in 4 recordings"):
@@ -855,7 +1003,9 @@ def test_a_person_may_keep_a_block_with_a_mistake(
 
 
 def test_the_moves_show_what_is_on_the_flange(whole_session: tuple[Rig, MadeSession]) -> None:
-    """Weighed with the nameplate gains, which are up to 25 % off, from the recordings of a real session."""
+    """Weighed with the nameplate gains, which are up to 25 % off,
+    from the recordings of a real session.
+    """
     rig, made = whole_session
     bare = made.logs["block-1-bare"]
     loaded = made.logs["block-2-loaded"]
@@ -905,10 +1055,12 @@ def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
         run_session(rig, given_answers(rig, put=put))
     folder = rig.session.folder
     command = (
-        f"`drivegain residual {folder}/block-1-bare.mcap {folder}/block-2-loaded.mcap --cell {rig.cell_file} "
-        f"--out {folder}/corrected.yaml`"
+        f"`drivegain residual {folder}/block-1-bare.mcap {folder}/block-2-loaded.mcap --cell "
+        f"{rig.cell_file} --out {folder}/corrected.yaml`"
     )
-    assert f"The recorded blocks are not lost: {command} fits them with the new content" in str(caught.value)
+    assert (f"The recorded blocks are not lost: {command} fits them with the new content") in str(
+        caught.value
+    )
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -916,15 +1068,26 @@ def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
     rig.tools = replace(rig.tools, drives=stop)  # before anything moves
     with pytest.raises(KeyboardInterrupt):
         run_session(rig)
-    (event,) = [one for one in rig.events if one["event"] == "an unfinished session is not taken up"]
+    (event,) = [
+        one for one in rig.events if one["event"] == "an unfinished session is not taken up"
+    ]
     assert f"Its blocks are not lost: {command}" in event["reason"]
 
 
 def test_what_the_fit_says_to_check_is_to_do(tmp_path: Path, made_session: MadeSession) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
-    late = Diagnosis("current-late", (), ("J2",), "a current that is late by 2 ms", "no delay", "declare its delay")
+    late = Diagnosis(
+        "current-late",
+        (),
+        ("J2",),
+        "a current that is late by 2 ms",
+        "no delay",
+        "declare its delay",
+    )
     made = rig.tools.calibration
-    rig.tools = replace(rig.tools, calibration=lambda fitted, now: replace(made(fitted, now), diagnoses=(late,)))
+    rig.tools = replace(
+        rig.tools, calibration=lambda fitted, now: replace(made(fitted, now), diagnoses=(late,))
+    )
     ended = run_session(rig)
     assert ended.outcome is Outcome.APPLIED
     assert to_do(ended, rig.cell_file)[-1] == "CHECK J2: declare its delay"
@@ -934,23 +1097,33 @@ def test_what_the_fit_says_to_check_is_to_do(tmp_path: Path, made_session: MadeS
 
 @pytest.mark.parametrize(("name", "is_mended"), [("zero-off", True), (CORRECTION_UNCLEAR, False)])
 def test_a_wrong_description_is_to_be_corrected_before_anything_is_applied(
-    tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch, name: str, is_mended: bool
+    tmp_path: Path,
+    made_session: MadeSession,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    is_mended: bool,
 ) -> None:
     """Where two corrections are alike, none is to be made, and no blocks are fitted with it."""
     rig = made_session_rig(tmp_path / "cell", made_session)
     ended = run_session(rig)
-    wrong = Diagnosis(name, (), ("J2",), "the zero of J2 off by 2°", "that of the URDF", "see to J2")
+    wrong = Diagnosis(
+        name, (), ("J2",), "the zero of J2 off by 2°", "that of the URDF", "see to J2"
+    )
     calibration = replace(made_session.calibration, diagnoses=(wrong,))
     monkeypatch.setattr(reporting, "calibration_of_session", lambda _: calibration)
     proposed = replace(ended, outcome=Outcome.PROPOSED)
     steps = to_do(proposed, rig.cell_file)
-    applying = next(number for number, step in enumerate(steps) if step.startswith("drivegain apply"))
+    applying = next(
+        number for number, step in enumerate(steps) if step.startswith("drivegain apply")
+    )
     assert (steps.index("CHECK J2: see to J2") < applying) is is_mended
     refits = [step for step in steps if step.startswith("with the corrected file")]
     assert len(refits) == int(is_mended)
 
 
-TURNED = Diagnosis("gravity-turned", (), (), "gravity along [0, 1, 0]", "gravity along [0, 0, -1]", "correct it")
+TURNED = Diagnosis(
+    "gravity-turned", (), (), "gravity along [0, 1, 0]", "gravity along [0, 0, -1]", "correct it"
+)
 
 
 def test_a_wrong_geometry_ends_the_session_before_a_payload_is_blamed(
@@ -975,7 +1148,9 @@ def test_a_wrong_geometry_ends_the_session_before_a_payload_is_blamed(
     assert hint.endswith("the same command begins a new session")
 
 
-def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     turned = replace(made_session.fitted, diagnoses=(TURNED,))
     rig.tools = replace(rig.tools, fit=lambda logs, *, holdout: turned)
@@ -985,11 +1160,15 @@ def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(tmp_path: Path, m
     assert rig.session.state.outcome is Outcome.UNFIT
 
 
-def test_exchanged_currents_ask_for_no_further_block(tmp_path: Path, made_session: MadeSession) -> None:
+def test_exchanged_currents_ask_for_no_further_block(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
 
     def refused(logs: Sequence[Path], *, holdout: Sequence[Path]) -> Fit:
-        raise ChannelsExchanged("J1 and J2", found="each other's", expected="their own", remedy="record again")
+        raise ChannelsExchanged(
+            "J1 and J2", found="each other's", expected="their own", remedy="record again"
+        )
 
     rig.tools = replace(rig.tools, fit=refused)
     with pytest.raises(ChannelsExchanged) as caught:
@@ -1006,7 +1185,9 @@ def test_exchanged_currents_ask_for_no_further_block(tmp_path: Path, made_sessio
     assert len(rig.sessions) == 2
 
 
-def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(whole_session: tuple[Rig, MadeSession]) -> None:
+def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(
+    whole_session: tuple[Rig, MadeSession],
+) -> None:
     rig, made = whole_session
     logs = [made.logs["block-1-bare"], made.logs["block-2-loaded"]]
     assert look_at_geometry(rig.cell, logs) is None
@@ -1032,8 +1213,16 @@ def test_a_log_that_is_damaged_before_the_end_is_recorded_again_in_its_place(
     (rig.session.folder / "block-2-loaded.mcap").write_bytes(b"damaged")
     rig.tools = tools
     assert run_session(rig).outcome is Outcome.APPLIED
-    assert [block.name for block in state_of(rig).blocks] == ["block-1-bare", "block-2-loaded", "block-3-held-out"]
-    assert [run.name for run in state_of(rig).runs] == ["block-1-bare", "block-3-held-out", "block-2-loaded"]
+    assert [block.name for block in state_of(rig).blocks] == [
+        "block-1-bare",
+        "block-2-loaded",
+        "block-3-held-out",
+    ]
+    assert [run.name for run in state_of(rig).runs] == [
+        "block-1-bare",
+        "block-3-held-out",
+        "block-2-loaded",
+    ]
 
 
 # A person at the terminal
@@ -1065,7 +1254,23 @@ def test_a_person_who_answers_every_prompt_calibrates(
     assert applied.who == "a person"
 
 
-@pytest.mark.parametrize("answer", ["", "y", "Yes", "no"])
+@pytest.mark.parametrize("answer", ["Yes", "YES", "y\nyes"])
+def test_yes_in_either_case_writes_and_a_slip_is_asked_again(
+    tmp_path: Path,
+    made_session: MadeSession,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answer: str,
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    typed = "\n\n" + "4.59\n4.59\n" + "\n\n" * 2 + f"{answer}\n" + "\n\n"
+    assert run_session(rig, person(rig, monkeypatch, typed)).outcome is Outcome.APPLIED
+    assert ("Found 'y', expected yes, or Enter alone." in capsys.readouterr().err) == (
+        answer.startswith("y\n")
+    )
+
+
+@pytest.mark.parametrize("answer", ["", "no", "No", "y\n"])
 def test_anything_but_yes_leaves_the_controller(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch, answer: str
 ) -> None:
@@ -1073,6 +1278,23 @@ def test_anything_but_yes_leaves_the_controller(
     typed = "\n\n" + "4.59\n4.59\n" + "\n\n" * 2 + f"{answer}\n"
     ended = run_session(rig, person(rig, monkeypatch, typed))
     assert ended.outcome is Outcome.PROPOSED
+
+
+@pytest.mark.parametrize(
+    ("typed", "is_again"), [("keep\n", False), ("Keep\n", False), ("\n", True), ("kep\n\n", True)]
+)
+def test_keep_in_either_case_keeps_a_block(
+    tmp_path: Path,
+    made_session: MadeSession,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: str,
+    is_again: bool,
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    run = PlannedRun(name="bare-1", plan_file=Path("plan-1.yaml"))
+    operator = person(rig, monkeypatch, typed)
+    assert operator.record_again(run, ["bare-1"], "a mistake") == is_again
+    assert sys.stdin.read() == ""
 
 
 def test_the_mass_is_asked_again_until_it_is_the_same_twice(
@@ -1154,7 +1376,9 @@ def test_yes_move_is_for_simulated_cells(
 
 @pytest.fixture
 def _quick_planner(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The verb plans with 100 exchanges of moves in place of 3000: how good the plan is, is no matter of the table."""
+    """The verb plans with 100 exchanges of moves in place of 3000:
+    how good the plan is, is no matter of the table.
+    """
     tools = calibrate_verb._tools
 
     def with_quick_plan(*given: Any) -> Tools:

@@ -1,4 +1,6 @@
-"""Reasons that hold a job: interlock, mount, another job, time, signals, room, clock; the next job takes it up."""
+"""Reasons that hold a job: interlock, mount, another job, time, signals, room, clock;
+the next job takes it up.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +78,9 @@ def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made
     assert rig.session.state.attempt == 2
 
 
-def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(tmp_path: Path, made: Made) -> None:
+def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(
+    tmp_path: Path, made: Made
+) -> None:
     """Nothing has moved, and the message says the name, or the drive."""
     rig = made_rig(tmp_path / "cell", made)
     asked = []
@@ -96,17 +100,31 @@ def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(tmp
     entered = AuditAction.CALIBRATION_ENTERED
     append(ledger.audit, entered, at=BEGAN, who="anna", subject="history of demo", details=details)
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
-    assert "another robot with the cell name 'demo': found drive of J1 with product code 0x1;" in str(error)
+    assert (
+        "another robot with the cell name 'demo': found drive of J1 with product code 0x1;"
+    ) in str(error)
     renamed = {"old_name": "demo", "cell": "press", "robot": asdict(robot)}
-    append(ledger.audit, AuditAction.RENAMED, at=BEGAN, who="anna", subject="cell press", details=renamed)
+    append(
+        ledger.audit,
+        AuditAction.RENAMED,
+        at=BEGAN,
+        who="anna",
+        subject="cell press",
+        details=renamed,
+    )
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
     assert "a robot that was renamed to 'press'" in str(error)
+    assert "if it is another robot, give it another name, or another audit log" in str(error)
     assert asked == []
 
 
-def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(tmp_path: Path, one_move: Path) -> None:
+def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(
+    tmp_path: Path, one_move: Path
+) -> None:
     """In the simulated cell: the person who mounts the payload leaves the door open."""
-    left_open = {"command": ["sh", "-c", 'echo "$1" > mounted; test "$1" = none || rm -f closed', "mount"]}
+    left_open = {
+        "command": ["sh", "-c", 'echo "$1" > mounted; test "$1" = none || rm -f closed', "mount"]
+    }
     rig = make_rig(tmp_path / "cell", one_move, mount=left_open)
     with serving(rig) as cell:
         held(rig, NotReleased, ExitCode.NOT_RELEASED)
@@ -121,7 +139,9 @@ def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(tmp_path: P
 def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_power(
     tmp_path: Path, one_move: Path, warm_up_min: float
 ) -> None:
-    """Preflight and the recorder's begin have seen it closed; the last question comes when only the motion is left."""
+    """Preflight and the recorder's begin have seen it closed;
+    the last question comes when only the motion is left.
+    """
     rig = make_rig(tmp_path / "cell", one_move, warm_up_min=warm_up_min)
     cycles: list[int] = []
     with serving(rig) as cell:
@@ -138,14 +158,21 @@ def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_powe
         held(rig, NotReleased, ExitCode.NOT_RELEASED)
         assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
         assert cell.cycles == cycles[2]
-    # By the third question the drives had been mapped and had answered a SYNC, and no move had been made.
+    # By the third question the drives had been mapped and had answered a SYNC, and no move had been
+    # made.
     assert len(cycles) == 3
     assert 0 < cycles[2] - cycles[1] < 10
     assert not list(rig.session.folder.glob("*.mcap*"))
 
 
-def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with_it(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made, mount={"command": ["sh", "-c", 'test "$1" = none -o -e changer', "mount"]})
+def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with_it(
+    tmp_path: Path, made: Made
+) -> None:
+    rig = made_rig(
+        tmp_path / "cell",
+        made,
+        mount={"command": ["sh", "-c", 'test "$1" = none -o -e changer', "mount"]},
+    )
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
     assert "mount command" in str(error)
     assert "disc" in str(error)
@@ -180,7 +207,8 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
     """A bus across processes; the other one is killed."""
     rig = made_rig(tmp_path / "cell", made)
     shared = replace(
-        rig.cell, buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
+        rig.cell,
+        buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses),
     )
     read_end, signal_end = os.pipe()
     child = os.fork()
@@ -202,7 +230,9 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
         pass
 
 
-def test_another_user_learns_that_a_bus_is_taken_whatever_our_umask_is(tmp_path: Path, made: Made) -> None:
+def test_another_user_learns_that_a_bus_is_taken_whatever_our_umask_is(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
     before = os.umask(0o077)
     try:
@@ -222,9 +252,15 @@ def test_a_lock_that_is_no_file_is_refused_at_once(tmp_path: Path, made: Made) -
     assert (rig.folder / lock_name(bus)).is_fifo()
 
 
-def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hub_has_one_lock_whatever_it_is_called(
+    tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (bus,) = made_rig(tmp_path / "cell", made).cell.buses
-    known = {"hub": ["fd00::7", "10.0.0.9", "10.0.0.7"], "hub.lan": ["10.0.0.7", "10.0.0.9"], "other": ["10.0.0.8"]}
+    known = {
+        "hub": ["fd00::7", "10.0.0.9", "10.0.0.7"],
+        "hub.lan": ["10.0.0.7", "10.0.0.9"],
+        "other": ["10.0.0.8"],
+    }
     known |= {"localhost": ["::1", "127.0.0.1"], "127.0.0.1": ["127.0.0.1"], "::1": ["::1"]}
 
     def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
@@ -236,7 +272,9 @@ def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, mo
     monkeypatch.setattr(socket, "getaddrinfo", addresses)
 
     def name(host: str) -> str:
-        return lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
+        return lock_name(
+            replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
+        )
 
     assert name("hub") == name("hub.lan") == "drivegain-socketcand-can0-10.0.0.7-29536.lock"
     assert name("localhost") == name("127.0.0.1") == name("::1") != name("hub")
@@ -246,20 +284,34 @@ def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, mo
 
 @pytest.mark.parametrize(
     "host",
-    ["127.0.0.1", "127.0.0.2", "0.0.0.0", "::", "::1", "::ffff:127.0.0.1", "::ffff:0.0.0.0", "::FFFF:7f00:1"],
+    [
+        "127.0.0.1",
+        "127.0.0.2",
+        "0.0.0.0",
+        "::",
+        "::1",
+        "::ffff:127.0.0.1",
+        "::ffff:0.0.0.0",
+        "::FFFF:7f00:1",
+    ],
 )
 def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, made: Made) -> None:
     (bus,) = made_rig(tmp_path / "cell", made).cell.buses
     hub = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
     assert (
-        lock_name(hub) == lock_name(replace(hub, host="localhost")) == "drivegain-socketcand-can0-localhost-29536.lock"
+        lock_name(hub)
+        == lock_name(replace(hub, host="localhost"))
+        == "drivegain-socketcand-can0-localhost-29536.lock"
     )
 
 
 @pytest.mark.parametrize(
-    ("one", "other"), [("::ffff:10.0.0.7", "10.0.0.7"), ("::ffff:a00:7", "10.0.0.7"), ("fd00:0::7", "fd00::7")]
+    ("one", "other"),
+    [("::ffff:10.0.0.7", "10.0.0.7"), ("::ffff:a00:7", "10.0.0.7"), ("fd00:0::7", "fd00::7")],
 )
-def test_an_address_of_a_hub_may_be_spelt_in_several_ways(one: str, other: str, tmp_path: Path, made: Made) -> None:
+def test_an_address_of_a_hub_may_be_spelt_in_several_ways(
+    one: str, other: str, tmp_path: Path, made: Made
+) -> None:
     (bus,) = made_rig(tmp_path / "cell", made).cell.buses
     names = [
         lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
@@ -271,12 +323,17 @@ def test_an_address_of_a_hub_may_be_spelt_in_several_ways(one: str, other: str, 
 def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
     tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As getaddrinfo answers where it maps; the IPv4 address goes before others as it does unmapped."""
+    """As getaddrinfo answers where it maps;
+    the IPv4 address goes before others as it does unmapped.
+    """
     (bus,) = made_rig(tmp_path / "cell", made).cell.buses
     known = {"hub": ["2001:db8::1", "::ffff:10.0.0.7"], "10.0.0.7": ["10.0.0.7"]}
 
     def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
-        return [(socket.AF_INET6 if ":" in one else socket.AF_INET, 1, 6, "", (one, port)) for one in known[host]]
+        return [
+            (socket.AF_INET6 if ":" in one else socket.AF_INET, 1, 6, "", (one, port))
+            for one in known[host]
+        ]
 
     monkeypatch.setattr(socket, "getaddrinfo", addresses)
     hub = replace(bus, interface="socketcand", channel="can0", host="hub", port=29536)
@@ -289,7 +346,8 @@ def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path
     with serving(rig) as cell:
 
         def room(_folder: Path) -> int:
-            # Asked ten times a second of recorded time: in the middle of the first move the bound is reached.
+            # Asked ten times a second of recorded time: in the middle of the first move the bound
+            # is reached.
             if any(node.drive.state is PowerState.OPERATION_ENABLED for node in cell.nodes):
                 powered.append(True)
                 if len(powered) == 3:
@@ -316,7 +374,9 @@ def test_an_alarm_does_not_cut_a_stop_short() -> None:
     assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
 
 
-def test_a_service_manager_that_ends_the_job_ends_the_motion(tmp_path: Path, one_move: Path) -> None:
+def test_a_service_manager_that_ends_the_job_ends_the_motion(
+    tmp_path: Path, one_move: Path
+) -> None:
     rig = make_rig(tmp_path / "cell", one_move)
     asked = []
     with serving(rig) as cell:
@@ -338,7 +398,9 @@ def test_a_service_manager_that_ends_the_job_ends_the_motion(tmp_path: Path, one
     assert rig.audit[-1].details["outcome"] == "interrupted"
 
 
-def test_a_disk_that_is_full_is_reported_before_and_during_a_run(tmp_path: Path, one_move: Path) -> None:
+def test_a_disk_that_is_full_is_reported_before_and_during_a_run(
+    tmp_path: Path, one_move: Path
+) -> None:
     rig = make_rig(tmp_path / "cell", one_move, min_free_mb=1000)
     rig.tools = replace(rig.tools, free=lambda _: 999 * 10**6)
     error = held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
@@ -350,31 +412,40 @@ def test_a_disk_that_is_full_is_reported_before_and_during_a_run(tmp_path: Path,
         assert powerless(cell)
 
 
-# Steps of the clock. Such a session held every later job with exit code 14 until its folder was moved, two years for a
-# date that was wrong once. Now it is said and does not count: what holds jobs must be what would harm, and a robot that
-# is calibrated once more by its own policy is not harmed.
+# Steps of the clock. Such a session held every later job with exit code 14 until its folder was
+# moved, two years for a date that was wrong once. Now it is said and does not count: what holds
+# jobs must be what would harm, and a robot that is calibrated once more by its own policy is not
+# harmed.
 
 ANY_AGE = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8, "max_age_days": None}}
 
 
 def not_counted(rig: Rig) -> list[str]:
     """Folders that the journal names as sessions from the future."""
-    return [event["folder"] for event in rig.events if event["event"] == "a session from the future does not count"]
+    return [
+        event["folder"]
+        for event in rig.events
+        if event["event"] == "a session from the future does not count"
+    ]
 
 
 @pytest.mark.parametrize("days", [3, 730])
-def test_a_job_under_a_later_date_does_not_hold_the_next_ones(tmp_path: Path, made: Made, days: int) -> None:
+def test_a_job_under_a_later_date_does_not_hold_the_next_ones(
+    tmp_path: Path, made: Made, days: int
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
     rig.clock.at = BEGAN + timedelta(days=days)
     assert rig.job().outcome is Outcome.APPLIED
     wrong = rig.session
     rig.clock.at = BEGAN + timedelta(hours=1)
-    # Due: the calibration under the wrong date does not count. What it has written is in force all the same.
+    # Due: the calibration under the wrong date does not count. What it has written is in force all
+    # the same.
     assert rig.job().outcome is Outcome.UNCHANGED
     assert not_counted(rig) == [str(wrong.folder)]
     right, last = rig.sessions
     assert last.folder == wrong.folder
-    # σ of the gains in force is that of the calibration which was written last, whatever its date is.
+    # σ of the gains in force is that of the calibration which was written last, whatever its date
+    # is.
     written = wrong.state.decision
     compared = right.state.decision
     assert written is not None
@@ -390,7 +461,9 @@ def test_a_job_under_a_later_date_does_not_hold_the_next_ones(tmp_path: Path, ma
     assert len(rig.sessions) == 3
 
 
-def test_an_unfinished_session_under_a_later_date_is_not_continued(tmp_path: Path, made: Made) -> None:
+def test_an_unfinished_session_under_a_later_date_is_not_continued(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE)
     rig.clock.at = BEGAN + timedelta(days=730)
     rig.closed.unlink()
@@ -404,14 +477,17 @@ def test_an_unfinished_session_under_a_later_date_is_not_continued(tmp_path: Pat
     assert wrong.folder.is_dir()
 
 
-def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(tmp_path: Path, made: Made) -> None:
+def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
     assert rig.job().outcome is Outcome.APPLIED
     first = rig.session
     rig.clock.at = BEGAN - timedelta(days=3)
     assert rig.job().outcome is Outcome.UNCHANGED
     assert not_counted(rig) == [str(first.folder)]
-    # With the right date again, the first one is the newest one, and the ages are those of the right dates.
+    # With the right date again, the first one is the newest one, and the ages are those of the
+    # right dates.
     rig.clock.at = BEGAN + timedelta(hours=23)
     ended = rig.job()
     assert ended.outcome is Outcome.NOT_DUE
@@ -419,7 +495,9 @@ def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(t
     assert not_counted(rig) == [str(first.folder)]
 
 
-def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set(tmp_path: Path, made: Made) -> None:
+def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
     assert rig.job().outcome is Outcome.APPLIED
     rig.clock.at = BEGAN - timedelta(days=730)
@@ -430,7 +508,9 @@ def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set
 
 
 @pytest.mark.parametrize("days", [-730, -3, 3, 730])
-def test_a_clock_that_steps_in_a_session_changes_no_age(tmp_path: Path, made: Made, days: int) -> None:
+def test_a_clock_that_steps_in_a_session_changes_no_age(
+    tmp_path: Path, made: Made, days: int
+) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
     copied = rig.tools.record
 
@@ -461,12 +541,16 @@ def test_nothing_moves_without_the_cells_own_leave(tmp_path: Path, made: Made) -
 
 
 def test_two_weighings_agree_as_they_do_everywhere(tmp_path: Path, made: Made) -> None:
-    """0.4 - 0.3 is more than 0.1 in binary; as for `record` and the gates, two spellings of one number are one."""
+    """0.4 - 0.3 is more than 0.1 in binary;
+    as for `record` and the gates, two spellings of one number are one.
+    """
     cell = made_rig(tmp_path / "cell", made).cell
     section = cell.recalibration
     assert section is not None
     runs = tuple(replace(run, mass_kg=None if run.payload is None else 0.4) for run in section.runs)
-    payloads = tuple(replace(payload, mass_kg=0.3, mass_tolerance_kg=0.1) for payload in cell.payloads)
+    payloads = tuple(
+        replace(payload, mass_kg=0.3, mass_tolerance_kg=0.1) for payload in cell.payloads
+    )
     weighed = replace(cell, payloads=payloads, recalibration=replace(section, runs=runs))
     assert section_of(weighed).runs == runs
 
@@ -516,7 +600,9 @@ def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
 
 
 def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path) -> None:
-    """A command that takes 9 s of a file's 5: the file was fresh when the command was asked, and is not any more."""
+    """A command that takes 9 s of a file's 5:
+    the file was fresh when the command was asked, and is not any more.
+    """
     path = tmp_path / "interlock"
     path.write_text("closed\n")
     os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
@@ -540,7 +626,10 @@ def test_an_interlock_that_is_no_file_says_no_at_once(tmp_path: Path) -> None:
 
 
 def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Path) -> None:
-    much = "i=0; while [ $i -lt 2000 ]; do printf '%01000d' 0; i=$((i+1)); done; echo; echo the end; exit 3"
+    much = (
+        "i=0; while [ $i -lt 2000 ]; do printf '%01000d' 0; i=$((i+1)); done; echo; echo the "
+        "end; exit 3"
+    )
     tracemalloc.start()
     try:
         ended = run_command(Command(("sh", "-c", much), 60.0), (), tmp_path)
@@ -558,7 +647,9 @@ def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Pat
 
 
 def test_a_command_says_how_it_ended_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    ended = run_command(Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0), ("disc",), tmp_path)
+    ended = run_command(
+        Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0), ("disc",), tmp_path
+    )
     assert ended.code == 3
     assert ended.said == f"disc in {tmp_path.resolve()}"
     assert run_command(Command(("no such program",), 10.0), (), tmp_path).code is None
@@ -575,7 +666,9 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made, warm_up_min=5)
     before = sorted(rig.folder.rglob("*"))
     journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
-    seen = preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+    seen = preview(
+        rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder
+    )
     assert "a new session" in seen.remark
     assert seen.steps[0] == "warm up for 5 min"
     assert "mount disc, record loaded-1" in seen.steps
@@ -585,9 +678,12 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
         preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
 
 
-def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_path: Path, made: Made) -> None:
+def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, warm_up_min=0.2)
-    made_of, copied = [], rig.tools.record
+    made_of = []
+    copied = rig.tools.record
 
     def noting(request: RecordingRequest, **further: Any) -> Recorded:
         made_of.append(request.out.stem)

@@ -1,4 +1,6 @@
-"""The job as a whole: what it makes, when it is not due, what it refuses, and what it leaves to a person."""
+"""The job as a whole: what it makes, when it is not due, what it refuses,
+and what it leaves to a person.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,14 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     assert session.state.outcome is Outcome.APPLIED
     assert session.state.exit_code == ExitCode.OK
     names = {path.name for path in session.folder.rglob("*")}
-    assert {"calibration.yaml", "report.html", "residual.json", "summary.txt", "proposal.diff", "state.json"} <= names
+    assert {
+        "calibration.yaml",
+        "report.html",
+        "residual.json",
+        "summary.txt",
+        "proposal.diff",
+        "state.json",
+    } <= names
     found = {
         gain["axis"]: gain["value"]
         for gain in yaml.safe_load((session.folder / "calibration.yaml").read_text())["gains"]
@@ -64,10 +73,13 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     assert {event["level"] for event in rig.events} <= {"info", "notice", "warning"}
 
 
-def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(tmp_path: Path, made: Made) -> None:
+def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
     rig.job()
-    target, digest = str(rig.controller), rig.audit[-1].details["calibration_sha256"]
+    target = str(rig.controller)
+    digest = rig.audit[-1].details["calibration_sha256"]
     known: list[str | None] = []
     for _ in range(2):
         assert main(["rollback", "--cell", str(rig.cell_file), "--by", "a person"]) == ExitCode.OK
@@ -76,7 +88,9 @@ def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(tmp_path: Pa
 
 
 def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -> None:
-    """By the mount command alone; a fit of runs that all carried the same would have found no gain."""
+    """By the mount command alone; a fit of runs that all carried the same would have found no
+    gain.
+    """
     rig, made = whole_job
     assert (rig.cells / "mounted").read_text() == "disc\n"
     mounted = [event["payload"] for event in rig.events if event["event"] == "mounted"]
@@ -84,10 +98,13 @@ def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -
     assert made.closed.final.training_error.total < 10.0
 
 
-def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(tmp_path: Path, made: Made) -> None:
+def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, every_h=144, resume_within_h=12)
     assert rig.job().outcome is Outcome.APPLIED
-    section, cell = rig.cell.recalibration, rig.cell
+    section = rig.cell.recalibration
+    cell = rig.cell
     assert section is not None
     rig.clock.go_on(hours=1)
     stopped = sessions.begin(section.folder, basis_of(cell, section), rig.clock())
@@ -101,7 +118,9 @@ def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(tmp_path: 
     assert (last.session, last.attempt) == (stopped.state.session, 2)
 
 
-def test_nothing_is_due_while_the_last_good_calibration_is_young(tmp_path: Path, made: Made) -> None:
+def test_nothing_is_due_while_the_last_good_calibration_is_young(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made, every_h=144)
     assert rig.job().outcome is Outcome.APPLIED
     before = rig.controller.read_bytes()

@@ -31,8 +31,14 @@ def said(form: Form, level: Level = Level.INFO, event: str = "event", **fields: 
     return stream.getvalue()
 
 
-@given(st.text(), st.dictionaries(st.text(), st.floats() | st.text() | st.integers()), st.sampled_from(Level))
-def test_an_event_is_one_line_whatever_is_in_it(text: str, values: dict[str, object], level: Level) -> None:
+@given(
+    st.text(),
+    st.dictionaries(st.text(), st.floats() | st.text() | st.integers()),
+    st.sampled_from(Level),
+)
+def test_an_event_is_one_line_whatever_is_in_it(
+    text: str, values: dict[str, object], level: Level
+) -> None:
     for form in (Form.JSON, Form.JOURNAL):
         line = said(form, level, "event", text=text, values=values)
         assert line.endswith("\n")
@@ -71,7 +77,9 @@ def test_a_person_reads_no_keys_and_no_lists_of_python() -> None:
     missing = said(Form.TEXT, missing=(0, 2, 0))
     assert missing.endswith("missing samples of each axis: 0, 2, 0\n")
     assert said(Form.TEXT, text="J3 is stiff", in_short=True).endswith(": J3 is stiff\n")
-    assert said(Form.TEXT, remark="written", exit_code=0, outcome="applied").endswith(": written, outcome applied\n")
+    assert said(Form.TEXT, remark="written", exit_code=0, outcome="applied").endswith(
+        ": written, outcome applied\n"
+    )
     assert said(Form.TEXT, free_mb=500, seconds=30.0, payload=None).endswith(
         ": free 500 MB, seconds 30, payload none\n"
     )
@@ -120,7 +128,9 @@ def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: P
     assert path.stat().st_mode & 0o777 == 0o644
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     families = {family.name: family for family in text_string_to_metric_families(path.read_text())}
-    outcomes = {s.labels["outcome"]: s.value for s in families["drivegain_recalibration_outcome"].samples}
+    outcomes = {
+        s.labels["outcome"]: s.value for s in families["drivegain_recalibration_outcome"].samples
+    }
     assert outcomes["stopped"] == 1.0
     assert sum(outcomes.values()) == 1.0
     assert families["drivegain_recalibration_exit_code"].samples[0].labels["cell"] == 'the "cell"\\'

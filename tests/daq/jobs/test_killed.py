@@ -1,4 +1,6 @@
-"""A job that is killed (-9) at any step, and the next one, which goes on: what was found is applied exactly once."""
+"""A job that is killed (-9) at any step, and the next one, which goes on:
+what was found is applied exactly once.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,13 @@ from tests.daq.killing import in_a_child
 
 pytestmark = pytest.mark.processes
 
-OF_GUIDED_SESSIONS = {"preview", "look", "validate", "network", "geometry"}  #: Tools that a job does not call
-CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"} | OF_GUIDED_SESSIONS)
+#: Tools that a job does not call
+OF_GUIDED_SESSIONS = {"preview", "look", "validate", "network", "geometry"}
+CALLED = tuple(
+    field.name
+    for field in fields(Tools)
+    if field.name not in {"monotonic_s", "plan"} | OF_GUIDED_SESSIONS
+)
 """What a job hands its work to: between two of these calls it reads and writes its own files."""
 
 
@@ -38,15 +45,20 @@ EFFECTS = ("record", "save_report", "apply", "certify")
 PURE = ("close_loop", "calibration", "account")
 """Nothing is written between the fit and these: to be killed there is to be killed at the fit."""
 FREQUENT = {"now": 6, "run": 6, "record": 2, "free": 2}
-"""Of these calls every so manieth is enough here; `tests.studies.recalibration_study --kills` takes every call."""
+"""Of these calls every so manieth is enough here;
+`tests.studies.recalibration_study --kills` takes every call.
+"""
 
 
 class Kill:
-    """Counts the calls of a job's tools, and kills the process at one of them: before it, or behind it."""
+    """Counts the calls of a job's tools, and kills the process at one of them:
+    before it, or behind it.
+    """
 
     def __init__(self, at: int | None = None, *, behind: bool = False) -> None:
         self.calls: list[str] = []
-        self._at, self._behind = at, behind
+        self._at = at
+        self._behind = behind
 
     def tools(self, tools: Tools) -> Tools:
         return replace(tools, **{name: self._called(name, getattr(tools, name)) for name in CALLED})
@@ -107,15 +119,21 @@ def test_every_step_is_among_the_calls(calls: list[str]) -> None:
 def test_a_job_that_is_killed_at_any_call_is_finished_by_the_next(
     tmp_path: Path, made: Made, calls: list[str], behind: bool
 ) -> None:
-    """Before each call, and behind each that has an effect: what it made is there, and the state does not know it."""
+    """Before each call, and behind each that has an effect:
+    what it made is there, and the state does not know it.
+    """
     for at, name in enumerate(calls):
         chosen = name not in PURE and calls[:at].count(name) % FREQUENT.get(name, 1) == 0
         if chosen and (name in EFFECTS or not behind):
-            finished_by_the_next(made_rig(tmp_path / f"{at}-{name}", made, metrics=None), Kill(at, behind=behind))
+            finished_by_the_next(
+                made_rig(tmp_path / f"{at}-{name}", made, metrics=None), Kill(at, behind=behind)
+            )
 
 
 def finished_by_the_next(rig: Rig, kill: Kill) -> None:
-    """Kill a job there, and let the next one finish it: what was found is in the controller's file, once."""
+    """Kill a job there, and let the next one finish it:
+    what was found is in the controller's file, once.
+    """
     before = rig.controller.read_bytes()
     killed_job(rig, kill)
     begun = bool(rig.sessions)
@@ -133,7 +151,9 @@ def finished_by_the_next(rig: Rig, kill: Kill) -> None:
 
 
 def killed_after(rig: Rig, wait_s: float) -> bool:
-    """Run the job in a process of its own, and kill that after so long; return whether it was not done before."""
+    """Run the job in a process of its own, and kill that after so long;
+    return whether it was not done before.
+    """
     child = in_a_child(lambda: rig.job().exit_code)
     time.sleep(wait_s)
     os.kill(child, signal.SIGKILL)
@@ -166,18 +186,25 @@ def finished_from_any_moment(rig: Rig, wait_s: float) -> tuple[bool, bool]:
 
 
 def _verified(rig: Rig) -> Verification:
-    """`drivegain history --verify`, of an audit that holds and a history without a flaw, whatever it lacks."""
+    """`drivegain history --verify`, of an audit that holds and a history without a flaw,
+    whatever it lacks.
+    """
     found = verify_ledger(ledger_of(rig.cell_file))
     assert found.verdict.holds
     assert found.broken == ()
     return found
 
 
-def test_a_job_that_is_killed_at_a_random_moment_is_finished_by_the_next(tmp_path: Path, made: Made) -> None:
+def test_a_job_that_is_killed_at_a_random_moment_is_finished_by_the_next(
+    tmp_path: Path, made: Made
+) -> None:
     """A few moments; `tests.studies.recalibration_study --moments 60` takes more."""
-    whole_s, chance = job_duration_s(made_rig(tmp_path / "whole", made, metrics=None)), random.Random(1)
+    whole_s = job_duration_s(made_rig(tmp_path / "whole", made, metrics=None))
+    chance = random.Random(1)
     for number in range(4):
-        finished_from_any_moment(made_rig(tmp_path / str(number), made, metrics=None), chance.uniform(0.0, whole_s))
+        finished_from_any_moment(
+            made_rig(tmp_path / str(number), made, metrics=None), chance.uniform(0.0, whole_s)
+        )
 
 
 def job_duration_s(rig: Rig) -> float:
@@ -197,7 +224,12 @@ def test_a_rollback_by_hand_after_a_killed_write_is_not_written_again(
     assert rig.session.state.outcome is None
     (backup,) = rig.backups
     if way == "rollback":
-        rollback(FileTarget(rig.controller), rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="a person")
+        rollback(
+            FileTarget(rig.controller),
+            rig.clock(),
+            audit=rig.cells / "demo.audit.jsonl",
+            who="a person",
+        )
     else:
         shutil.copyfile(backup, rig.controller)
     if way == "edited":
@@ -236,7 +268,9 @@ def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, 
     applied_once(rig)
 
 
-def test_a_log_that_is_not_what_was_recorded_is_recorded_again(tmp_path: Path, made: Made, calls: list[str]) -> None:
+def test_a_log_that_is_not_what_was_recorded_is_recorded_again(
+    tmp_path: Path, made: Made, calls: list[str]
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
     killed_job(rig, Kill(calls.index("fit")))
     log = rig.session.folder / "bare-1.mcap"

@@ -1,4 +1,6 @@
-"""A job that is killed (-9) in a recording, at a cell that is a process of its own; the next job takes it up."""
+"""A job that is killed (-9) in a recording, at a cell that is a process of its own;
+the next job takes it up.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def real_recorder(rig: Rig, made: Made) -> Rig:
 
 
 def kill_while_recording(rig: Rig, name: str, part_bytes: float) -> None:
-    """Run the job in a process of its own, and kill it when the unfinished log of this run has that size."""
+    """Run the job in a process of its own, and kill it when the unfinished log of this run has that
+    size.
+    """
     child = in_a_child(lambda: rig.job().exit_code)
     ended = 0
     while not ended:
@@ -73,7 +77,9 @@ def kill_while_recording(rig: Rig, name: str, part_bytes: float) -> None:
 
 
 def taken_up_from_a_recording(rig: Rig, made: Made, name: str, share: float) -> None:
-    """Kill a job in a recording, with that share of its log written, and let the next one finish the session."""
+    """Kill a job in a recording, with that share of its log written,
+    and let the next one finish the session.
+    """
     rig = real_recorder(rig, made)
     with cell_process(rig):
         kill_while_recording(rig, name, share * made.logs[name].stat().st_size)

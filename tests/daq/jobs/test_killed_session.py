@@ -1,4 +1,6 @@
-"""A guided session that is killed (-9) at a random moment; the same command ends with 0, and has written once."""
+"""A guided session that is killed (-9) at a random moment;
+the same command ends with 0, and has written once.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,11 @@ from tests.daq.jobs.made_session import MadeSession, run_session, session_rig
 from tests.daq.jobs.rig import Rig
 from tests.daq.killing import in_a_child
 
-CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "now", "network", "geometry"})
+CALLED = tuple(
+    field.name
+    for field in fields(Tools)
+    if field.name not in {"monotonic_s", "now", "network", "geometry"}
+)
 """Tools whose calls are the moments from which a kill is drawn: they are in every stage."""
 INTERLOCK = {"command": ["sh", "-c", "echo interlock >> events && test -e closed"]}
 """An interlock that releases the robot and leaves a line."""
@@ -105,9 +111,13 @@ def killed_rig(folder: Path, made: MadeSession, *, real: bool = False) -> Rig:
 
 
 def moving(rig: Rig, record: Callable[..., Recorded]) -> Callable[..., Recorded]:
-    """A recorder that leaves a line once the interlock was asked for the last time, right before power comes on."""
+    """A recorder that leaves a line once the interlock was asked for the last time,
+    right before power comes on.
+    """
 
-    def recorded(request: RecordingRequest, *, require_released: Callable[[], None], **further: Any) -> Recorded:
+    def recorded(
+        request: RecordingRequest, *, require_released: Callable[[], None], **further: Any
+    ) -> Recorded:
         asked: list[int] = []
 
         def ask() -> None:
@@ -171,11 +181,16 @@ def timed_calls(rig: Rig) -> list[TimedCall]:
         time.sleep(0.001)
     assert os.waitstatus_to_exitcode(status) == ExitCode.OK
     ends_s = [*begun_s[1:], time.monotonic()]
-    return [TimedCall(name, end - begin) for name, begin, end in zip(calls_of(rig), begun_s, ends_s, strict=True)]
+    return [
+        TimedCall(name, end - begin)
+        for name, begin, end in zip(calls_of(rig), begun_s, ends_s, strict=True)
+    ]
 
 
 def drawn_moment(calls: list[TimedCall], chance: random.Random) -> Moment:
-    """Any tool first, so that a short stage is as likely as a long one; then any of its calls, and any moment of it."""
+    """Any tool first, so that a short stage is as likely as a long one;
+    then any of its calls, and any moment of it.
+    """
     tool = chance.choice(sorted({call.tool for call in calls}))
     of_tool = [call for call in calls if call.tool == tool]
     number = chance.randrange(len(of_tool))
@@ -183,7 +198,9 @@ def drawn_moment(calls: list[TimedCall], chance: random.Random) -> Moment:
 
 
 def killed_at(rig: Rig, moment: Moment) -> bool:
-    """Run the session in a child and kill it at that moment; return whether it had not ended before."""
+    """Run the session in a child and kill it at that moment;
+    return whether it had not ended before.
+    """
     child = session_in_a_child(rig)
     ended = 0
     while not ended and calls_of(rig).count(moment.tool) <= moment.number:
@@ -198,7 +215,9 @@ def killed_at(rig: Rig, moment: Moment) -> bool:
 
 
 def ends_well_after(rig: Rig, moment: Moment) -> Killed:
-    """Kill a session at a moment; the same command ends with 0, with one certificate and one write."""
+    """Kill a session at a moment; the same command ends with 0,
+    with one certificate and one write.
+    """
     before = rig.controller.read_bytes()
     in_time = killed_at(rig, moment)
     tool = calls_of(rig)[-1]
@@ -220,7 +239,9 @@ def ends_well_after(rig: Rig, moment: Moment) -> Killed:
 
 
 def written_once(rig: Rig, before: bytes) -> None:
-    """Check that one write is in every record, and that the one certificate says who wrote and accepted it."""
+    """Check that one write is in every record, and that the one certificate says who wrote and
+    accepted it.
+    """
     state = rig.session.state
     assert isinstance(state, GuidedState)
     assert state.outcome is Outcome.APPLIED
@@ -260,4 +281,6 @@ def test_a_session_that_is_killed_at_a_random_moment_ends_with_the_same_command(
     assert {call.tool for call in calls} == set(CALLED)
     chance = random.Random(1)
     for number in range(4):
-        ends_well_after(killed_rig(tmp_path / f"{number}", made_session), drawn_moment(calls, chance))
+        ends_well_after(
+            killed_rig(tmp_path / f"{number}", made_session), drawn_moment(calls, chance)
+        )

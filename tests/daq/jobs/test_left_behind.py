@@ -1,4 +1,6 @@
-"""Drives that a killed recorder left with power: waited for, taken over at standstill, or left to a person."""
+"""Drives that a killed recorder left with power:
+waited for, taken over at standstill, or left to a person.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from tests.daq.jobs.rig import make_rig, serving
 
-AXIS, GUARD_MS = 2, 300
+AXIS = 2
+GUARD_MS = 300
 STAYS = PowerState.QUICK_STOP_ACTIVE
 
 
@@ -33,7 +36,9 @@ def _short_guard(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> PowerState:
-    """Leave an axis as a killed recorder does, if it has that id; the axis does not leave a quick stop by itself."""
+    """Leave an axis as a killed recorder does, if it has that id;
+    the axis does not leave a quick stop by itself.
+    """
     node = cell.nodes[AXIS]
     node.write(0x605A, 0, struct.pack("<h", 6))
     node.write(0x1016, 1, struct.pack("<I", recorder_id << 16 | GUARD_MS))
@@ -50,23 +55,37 @@ def test_a_drive_that_was_left_without_motion_loses_its_power_to_a_job_alone(
     with serving(rig) as cell:
         leave(cell, state)
         check_drives(rig.cell, nullcontext, take_over)
-        assert cell.nodes[AXIS].drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else state)
+        assert cell.nodes[AXIS].drive.state is (
+            PowerState.SWITCH_ON_DISABLED if take_over else state
+        )
         assert cell.plant.time_s < 1.0
 
 
 @pytest.mark.parametrize(
     ("state", "recorder_id"),
-    [(STAYS, 0), (STAYS, 3), (STAYS, 100), (PowerState.OPERATION_ENABLED, 0), (PowerState.OPERATION_ENABLED, 127)],
+    [
+        (STAYS, 0),
+        (STAYS, 3),
+        (STAYS, 100),
+        (PowerState.OPERATION_ENABLED, 0),
+        (PowerState.OPERATION_ENABLED, 127),
+    ],
     ids=lambda value: getattr(value, "name", str(value)),
 )
 def test_a_drive_that_is_anothers_or_did_not_stop_is_a_persons_business(
     tmp_path: Path, one_move: Path, state: PowerState, recorder_id: int
 ) -> None:
-    """An axis with id 3 is there, and no recorder takes 100: neither was a recorder that is gone."""
+    """An axis with id 3 is there, and no recorder takes 100:
+    neither was a recorder that is gone.
+    """
     rig = make_rig(tmp_path / "cell", one_move)
     with serving(rig) as cell:
         leave(cell, state, recorder_id)
-        with pytest.raises(StateRefused, match=r"J3 .*no power before a job.*nothing was changed.*drivegain record"):
+        with pytest.raises(
+            StateRefused,
+            match=r"J3 .*no power before a job.*nothing was "
+            r"changed.*drivegain record",
+        ):
             check_drives(rig.cell, nullcontext, True)
         assert cell.nodes[AXIS].drive.state is state
 
@@ -84,7 +103,9 @@ def test_a_drive_that_moves_in_its_quick_stop_is_left_alone(
         assert cell.nodes[AXIS].drive.state is STAYS
 
 
-def test_a_job_beside_a_master_whose_lock_is_not_seen_sends_nothing(tmp_path: Path, one_move: Path) -> None:
+def test_a_job_beside_a_master_whose_lock_is_not_seen_sends_nothing(
+    tmp_path: Path, one_move: Path
+) -> None:
     """A recorder on another computer: the axes may be in the middle of its motion."""
     rig = make_rig(tmp_path / "cell", one_move)
     over = threading.Event()

@@ -1,4 +1,6 @@
-"""The gains while a block of a guided session is recorded: by a process of its own, which reads the feed."""
+"""The gains while a block of a guided session is recorded:
+by a process of its own, which reads the feed.
+"""
 
 from __future__ import annotations
 
@@ -150,11 +152,15 @@ def looks_at(recorded: Recorded, *, every: int = 1, gap: bool = False) -> list[Q
     return found
 
 
-def test_a_bare_block_alone_gives_no_figures(whole_session: tuple[Rig, MadeSession], tmp_path: Path) -> None:
+def test_a_bare_block_alone_gives_no_figures(
+    whole_session: tuple[Rig, MadeSession], tmp_path: Path
+) -> None:
     looks = looks_at(while_recording(whole_session, tmp_path, "block-1-bare"))
     assert looks
     assert not any(look.gains for look in looks)
-    assert {look.missing.split(",")[0] for look in looks} == {"the gains show only beside a known mass"}
+    assert {look.missing.split(",")[0] for look in looks} == {
+        "the gains show only beside a known mass"
+    }
 
 
 def test_the_gains_come_while_the_loaded_block_is_recorded(
@@ -175,30 +181,41 @@ def test_the_gains_come_while_the_loaded_block_is_recorded(
         assert gain.target_percent == TARGET_PERCENT
 
 
-def test_the_moves_of_a_held_out_block_do_not_count(whole_session: tuple[Rig, MadeSession], tmp_path: Path) -> None:
+def test_the_moves_of_a_held_out_block_do_not_count(
+    whole_session: tuple[Rig, MadeSession], tmp_path: Path
+) -> None:
     looks = looks_at(while_recording(whole_session, tmp_path, "block-3-held-out"))
     assert all(look.is_held_out for look in looks)
     assert len({json.dumps(asdict(look)["gains"]) for look in looks}) == 1
     assert looks[0].gains
 
 
-def test_lost_samples_are_said_and_give_no_figures(whole_session: tuple[Rig, MadeSession], tmp_path: Path) -> None:
+def test_lost_samples_are_said_and_give_no_figures(
+    whole_session: tuple[Rig, MadeSession], tmp_path: Path
+) -> None:
     looks = looks_at(while_recording(whole_session, tmp_path, "block-2-loaded"), gap=True)
     assert looks[-1].missing == LOST
     assert not looks[-1].gains
 
 
-def test_a_run_that_is_no_block_is_not_watched(whole_session: tuple[Rig, MadeSession], tmp_path: Path) -> None:
+def test_a_run_that_is_no_block_is_not_watched(
+    whole_session: tuple[Rig, MadeSession], tmp_path: Path
+) -> None:
     recorded = while_recording(whole_session, tmp_path, "block-1-bare")
     facts = asdict(replace(recorded.facts, log=str(recorded.folder / "acceptance.mcap")))
     watch = BlockWatch(recorded.rig.cell, "disc", TARGET_PERCENT)
-    end = {**asdict(CellEvent(1, None, EventKind.MOVE_END, 0, "")), "kind": EventKind.MOVE_END.value}
+    end = {
+        **asdict(CellEvent(1, None, EventKind.MOVE_END, 0, "")),
+        "kind": EventKind.MOVE_END.value,
+    }
     for message in ({"run": facts}, {"events": [end]}):
         watch.take(HEAD.pack(TEXT, 0, 0, 0, 0, 0) + json.dumps(message).encode())
     assert watch.look() is None
 
 
-def test_an_earlier_block_that_cannot_be_read_is_named(whole_session: tuple[Rig, MadeSession], tmp_path: Path) -> None:
+def test_an_earlier_block_that_cannot_be_read_is_named(
+    whole_session: tuple[Rig, MadeSession], tmp_path: Path
+) -> None:
     recorded = while_recording(whole_session, tmp_path, "block-2-loaded")
     (recorded.folder / "block-1-bare.mcap").write_bytes(b"damaged")
     assert "an earlier block cannot be used" in looks_at(recorded)[-1].missing
@@ -230,7 +247,9 @@ def _unexpected(look: QuickLook) -> None:
 
 
 @contextmanager
-def live(recorded: Recorded, cell_file: Path) -> Iterator[tuple[Feed, list[QuickLook], threading.Event]]:
+def live(
+    recorded: Recorded, cell_file: Path
+) -> Iterator[tuple[Feed, list[QuickLook], threading.Event]]:
     """A feed with the process that watches it."""
     looks: list[QuickLook] = []
     came = threading.Event()
@@ -247,7 +266,9 @@ def live(recorded: Recorded, cell_file: Path) -> Iterator[tuple[Feed, list[Quick
 
 
 @pytest.mark.processes
-def test_the_process_prints_a_look_after_a_move(whole_session: tuple[Rig, MadeSession], tmp_path: Path) -> None:
+def test_the_process_prints_a_look_after_a_move(
+    whole_session: tuple[Rig, MadeSession], tmp_path: Path
+) -> None:
     recorded = while_recording(whole_session, tmp_path, "block-1-bare")
     with live(recorded, recorded.rig.cell_file) as (feed, looks, came):
         recorded.publish(feed)

@@ -1,4 +1,6 @@
-"""Blocks that have no room for enough moves take longer, as do all later ones, also after a session was interrupted."""
+"""Blocks that have no room for enough moves take longer, as do all later ones,
+also after a session was interrupted.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ from daq.jobs.block_order import FIRST_BLOCKS
 from daq.jobs.story import SENTENCES
 from daq.workflow.plan import Plan
 from daq.workflow.record import Recorded, RecordingRequest
-from tests.daq.jobs.made_session import BLOCK_S, MadeSession, given_answers, made_session_rig, run_session
+from tests.daq.jobs.made_session import (
+    BLOCK_S,
+    MadeSession,
+    given_answers,
+    made_session_rig,
+    run_session,
+)
 from tests.daq.jobs.rig import Rig
 
 
@@ -26,7 +34,9 @@ def _rig(folder: Path, made: MadeSession, needed_s: float) -> Rig:
 
     def plan_if_long(cell: Cell, *, seed: int, duration_s: float, **further: Any) -> Plan:
         if duration_s < needed_s:
-            raise PlanTooShort("plan", found="room for 4 moves", expected="at least 5", remedy="allow a longer run")
+            raise PlanTooShort(
+                "plan", found="room for 4 moves", expected="at least 5", remedy="allow a longer run"
+            )
         return planned(cell, seed=seed, duration_s=duration_s, **further)
 
     rig.tools = replace(rig.tools, plan=plan_if_long)
@@ -41,7 +51,11 @@ def _state(rig: Rig) -> GuidedState:
 
 def _said(rig: Rig) -> list[dict[str, Any]]:
     # The moves that accept the gains have a duration of their own, 10 s.
-    return [event for event in rig.events if event["event"] == "longer blocks" and event["asked_s"] % BLOCK_S == 0.0]
+    return [
+        event
+        for event in rig.events
+        if event["event"] == "longer blocks" and event["asked_s"] % BLOCK_S == 0.0
+    ]
 
 
 def test_blocks_are_twice_as_long_where_the_asked_duration_has_no_room(
@@ -60,11 +74,14 @@ def test_blocks_are_twice_as_long_where_the_asked_duration_has_no_room(
     assert [(one["asked_s"], one["duration_s"]) for one in said] == [(6.0, 12.0), (12.0, 24.0)]
     sentence = SENTENCES["longer blocks"].format_map(said[0])
     assert sentence == (
-        "6 s of moves are too short: found room for 4 moves; expected at least 5. The moves take 12 s instead."
+        "6 s of moves are too short: found room for 4 moves; expected at least 5. The moves take "
+        "12 s instead."
     )
 
 
-def test_a_session_that_goes_on_keeps_the_length_of_its_blocks(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_session_that_goes_on_keeps_the_length_of_its_blocks(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = _rig(tmp_path / "cell", made_session, 2.0 * BLOCK_S)
 
     def stop_before(payload: str | None) -> None:
@@ -96,7 +113,9 @@ def test_blocks_are_at_most_eight_times_as_long(tmp_path: Path, made_session: Ma
     assert not rig.session.state.runs
 
 
-def test_a_rehearsal_finds_the_length_of_the_blocks(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_rehearsal_finds_the_length_of_the_blocks(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = _rig(tmp_path / "cell", made_session, 2.0 * BLOCK_S)
     record = rig.tools.record
 

@@ -1,9 +1,10 @@
 """Mistakes that were rehearsed in a guided session: each is noticed at its block, with what to do.
 
-Here: a block with losses, an axis that trips, a bus that goes away, a full disk. The others are in `test_guided`:
+Here: a block with losses, an axis that trips, a bus that goes away, a full disk. The others are in
+`test_guided`:
 
-- a payload in a bare block, or forgotten in a loaded one, and the other payload (1.7 kg in the place of 4.6 kg):
-  `test_a_block_with_the_wrong_body_is_recorded_again_and_kept`;
+- a payload in a bare block, or forgotten in a loaded one, and the other payload (1.7 kg in the
+  place of 4.6 kg): `test_a_block_with_the_wrong_body_is_recorded_again_and_kept`;
 - a mass in grams: `test_a_mass_in_grams_or_of_another_body_is_not_taken`;
 - a changed cell file: `test_a_cell_file_that_changes_between_blocks_is_refused_with_the_way_out`;
 - a second terminal: `test_a_second_terminal_learns_that_the_bus_is_taken`.
@@ -36,7 +37,9 @@ LOADED = "block-2-loaded"
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A simulated cell in this process is never that late; waiting for one that is silent would be most of the time."""
+    """A simulated cell in this process is never that late;
+    waiting for one that is silent would be most of the time.
+    """
     monkeypatch.setattr(daq.workflow.record, "LOCKSTEP_TIMEOUT_S", 0.4)
 
 
@@ -61,7 +64,9 @@ def ends_at(rig: Rig, kind: type[Exception], code: ExitCode, block: str, kept: s
 
 
 def goes_on(rig: Rig, made: MadeSession) -> None:
-    """The same command, once the cause is removed: it ends with one write, and each block counts once."""
+    """The same command, once the cause is removed:
+    it ends with one write, and each block counts once.
+    """
     rig.tools = made.tools(rig)
     rig.clock.go_on(minutes=5)
     assert run_session(rig).exit_code == ExitCode.OK
@@ -99,7 +104,11 @@ def test_an_axis_that_trips_ends_the_block_and_says_how_to_reset_it(
     ids=["bus off", "silent"],
 )
 def test_a_bus_that_goes_away_ends_the_block_and_says_what_to_check(
-    tmp_path: Path, made_session: MadeSession, impatient: None, fault: FaultSpec, kind: type[Exception]
+    tmp_path: Path,
+    made_session: MadeSession,
+    impatient: None,
+    fault: FaultSpec,
+    kind: type[Exception],
 ) -> None:
     rig = session_rig(tmp_path / "cell")
     with_real_recorder(rig, made_session)
@@ -152,10 +161,14 @@ def test_a_block_with_losses_is_recorded_again_at_once_and_the_lossy_log_is_kept
         recorded: Recorded = copied(request, **further)
         if request.out.stem != next(lossy_blocks, ""):
             return recorded
-        return replace(recorded, log=replace(recorded.log, valid=False, reason="3 cycles lost", lost_cycles=3))
+        return replace(
+            recorded, log=replace(recorded.log, valid=False, reason="3 cycles lost", lost_cycles=3)
+        )
 
     def first_is_clean(request: RecordingRequest, **further: Any) -> Recorded:
-        return copied(request, **further) if request.out.stem == FIRST else with_losses(request, **further)
+        if request.out.stem == FIRST:
+            return copied(request, **further)
+        return with_losses(request, **further)
 
     rig.tools = replace(rig.tools, record=first_is_clean)
     assert run_session(rig).exit_code == ExitCode.OK
@@ -169,14 +182,18 @@ def test_a_block_with_losses_is_recorded_again_at_once_and_the_lossy_log_is_kept
     assert len(rig.session.state.runs) == 3
 
 
-def test_a_block_that_has_losses_each_time_ends_the_session_there(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_block_that_has_losses_each_time_ends_the_session_there(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = made_session_rig(tmp_path / "cell", made_session)
     copied = rig.tools.record
 
     def with_losses(request: RecordingRequest, **further: Any) -> Recorded:
         recorded: Recorded = copied(request, **further)
         is_lossy = request.out.stem == LOADED
-        return replace(recorded, log=replace(recorded.log, valid=not is_lossy, reason="3 cycles lost"))
+        return replace(
+            recorded, log=replace(recorded.log, valid=not is_lossy, reason="3 cycles lost")
+        )
 
     rig.tools = replace(rig.tools, record=with_losses)
     parts = ends_at(rig, RunInvalid, ExitCode.DATA_UNFIT, LOADED, FIRST)

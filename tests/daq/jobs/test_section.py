@@ -40,10 +40,16 @@ HELD_OUT = {**LOADED, "name": "held-out", "holdout": True}
         ({"interlock": {}}, "no job moves a robot unasked"),
         ({"warm_up_minutes": 1}, "warm_up_min"),
         ({"runs": [RUN, LOADED, {**HELD_OUT, "holdout": False}]}, "holdout: true"),
-        ({"runs": [RUN, {**LOADED, "holdout": True}, HELD_OUT]}, "one run without and one with a payload"),
+        (
+            {"runs": [RUN, {**LOADED, "holdout": True}, HELD_OUT]},
+            "one run without and one with a payload",
+        ),
         ({"runs": [RUN, {**LOADED, "name": "bare-1"}, HELD_OUT]}, "names of their own"),
         ({"runs": [{**RUN, "mass_kg": 1.0}, LOADED, HELD_OUT]}, "payload and its mass_kg"),
-        ({"runs": [{**RUN, "plan_file": "a.yaml"}, LOADED, HELD_OUT]}, "plan_file with approved moves"),
+        (
+            {"runs": [{**RUN, "plan_file": "a.yaml"}, LOADED, HELD_OUT]},
+            "plan_file with approved moves",
+        ),
         ({"runs": [{**RUN, "name": "warm-up"}, LOADED, HELD_OUT]}, "another name than warm-up"),
         ({"runs": [{**RUN, "name": "../up"}, LOADED, HELD_OUT]}, "name"),
         ({"mount": {"command": []}}, "at least 1 item"),
@@ -74,8 +80,12 @@ def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_every_key_and_its_example_is_one() -> None:
-    (example,) = re.findall(r"```yaml\n(recalibration:\n.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    TypeAdapter(RecalibrationSection).validate_json(json.dumps(yaml.safe_load(example)["recalibration"]))
+    (example,) = re.findall(
+        r"```yaml\n(recalibration:\n.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL
+    )
+    TypeAdapter(RecalibrationSection).validate_json(
+        json.dumps(yaml.safe_load(example)["recalibration"])
+    )
     for section in (RecalibrationSection, PlannedRun):
         for key in fields(section):
             assert re.search(rf"\b{key.name}:", example), key.name
@@ -95,12 +105,16 @@ def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) ->
     assert last_good(found) == made[4]
     now = BEGAN + timedelta(days=35)
     assert resumable_session(found, BASIS, now + timedelta(hours=1), 2.0) == made[5]
-    for basis in (replace(BASIS, configuration_sha256="d" * 64), replace(BASIS, plans_sha256="d" * 64)):
+    for basis in (
+        replace(BASIS, configuration_sha256="d" * 64),
+        replace(BASIS, plans_sha256="d" * 64),
+    ):
         assert resumable_session(found, basis, now + timedelta(hours=1), 2.0) is None
     for later_h in (3, -1):
         assert resumable_session(found, BASIS, now + timedelta(hours=later_h), 2.0) is None
     assert resumable_session(found[:5], BASIS, made[4].began, 2.0) is None
-    # The calibration of the third week is in force: its logs and signatures are what the controller rests on.
+    # The calibration of the third week is in force: its logs and signatures are what the controller
+    # rests on.
     fitted = Fitted(calibration_sha256="f" * 64, sentences=())
     save(replace(made[2], state=made[2].state.with_(fitted=fitted)))
     removed = remove_old(sessions(tmp_path), 1, {"f" * 64})

@@ -1,4 +1,6 @@
-"""Sessions of several cells in one folder, states that are not ours, and files of metrics with names of their own."""
+"""Sessions of several cells in one folder, states that are not ours,
+and files of metrics with names of their own.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,17 @@ from daq.jobs.context import sessions_that_count
 from daq.jobs.journal import Form
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.reporting import Conclusion, file_stem, to_do
-from daq.jobs.session import CLOCK_SLACK, STATE, Basis, Session, begin, begun_until, remove_old, save, sessions
+from daq.jobs.session import (
+    CLOCK_SLACK,
+    STATE,
+    Basis,
+    Session,
+    begin,
+    begun_until,
+    remove_old,
+    save,
+    sessions,
+)
 from daq.jobs.story import Story
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import BEGAN, make_rig
@@ -34,7 +46,11 @@ def test_two_cells_of_one_folder_have_sessions_of_their_own(tmp_path: Path) -> N
     rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml")
     other = rig.cell_file.with_name("other.yaml")
     shutil.copyfile(rig.cell_file, other)
-    folders = [section.folder.name for file in (rig.cell_file, other) if (section := load_cell(file).recalibration)]
+    folders = [
+        section.folder.name
+        for file in (rig.cell_file, other)
+        if (section := load_cell(file).recalibration)
+    ]
     assert folders == ["demo.recalibration", "other.recalibration"]
 
 
@@ -94,10 +110,15 @@ def test_no_one_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None
     assert sessions(tmp_path) == ()
 
 
-def test_a_file_in_the_place_of_the_folder_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_in_the_place_of_the_folder_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml")
     (rig.cells / "demo.recalibration").write_text("no folder")
-    for verb in (["history", str(rig.cell_file), "--verify", "--json"], ["recalibrate", str(rig.cell_file), "--json"]):
+    for verb in (
+        ["history", str(rig.cell_file), "--verify", "--json"],
+        ["recalibrate", str(rig.cell_file), "--json"],
+    ):
         assert main(verb) == ExitCode.CONFIGURATION
         output = capsys.readouterr()
         assert output.out == ""
@@ -108,13 +129,24 @@ def test_a_file_in_the_place_of_the_folder_is_reported(tmp_path: Path, capsys: p
 
 @pytest.mark.parametrize("key", ["attempts", "samples", "lost_cycles"])
 @pytest.mark.parametrize("number", ["-1", "1" + 400 * "0", "NaN"])
-def test_a_state_with_a_count_that_is_none_is_no_session(tmp_path: Path, key: str, number: str) -> None:
-    run = {"name": "a", "sha256": "0" * 64, "attempts": 1, "samples": 2, "lost_cycles": 0, "missing": [0]}
+def test_a_state_with_a_count_that_is_none_is_no_session(
+    tmp_path: Path, key: str, number: str
+) -> None:
+    run = {
+        "name": "a",
+        "sha256": "0" * 64,
+        "attempts": 1,
+        "samples": 2,
+        "lost_cycles": 0,
+        "missing": [0],
+    }
     session = begin(tmp_path, BASIS, BEGAN)
     state = json.loads((session.folder / STATE).read_text())
     (session.folder / STATE).write_text(json.dumps({**state, "runs": [run]}))
     assert len(sessions(tmp_path)) == 1
-    text = json.dumps({**state, "runs": [{**run, key: 0}]}).replace(f'"{key}": 0', f'"{key}": {number}')
+    text = json.dumps({**state, "runs": [{**run, key: 0}]}).replace(
+        f'"{key}": 0', f'"{key}": {number}'
+    )
     (session.folder / STATE).write_text(text)
     assert sessions(tmp_path) == ()
 
@@ -126,11 +158,15 @@ def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made
     assert calibration_of_session(session) is not None
     first, *others = session.state.runs
     for runs in ((first.model_copy(update={"sha256": "0" * 64}), *others), tuple(others)):
-        assert calibration_of_session(replace(session, state=session.state.with_(runs=runs))) is None
+        assert (
+            calibration_of_session(replace(session, state=session.state.with_(runs=runs))) is None
+        )
 
 
 @pytest.mark.parametrize("key", ["began", "attempt_began", "ended"])
-@pytest.mark.parametrize("time", ["2026-01-05T02:00:00", "yesterday", "", "2026-13-01T00:00:00+00:00"])
+@pytest.mark.parametrize(
+    "time", ["2026-01-05T02:00:00", "yesterday", "", "2026-13-01T00:00:00+00:00"]
+)
 def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, time: str) -> None:
     session = begin(tmp_path, BASIS, BEGAN)
     state = json.loads((session.folder / STATE).read_text())
@@ -140,20 +176,33 @@ def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, ti
 
 @given(st.datetimes(timezones=st.just(UTC)), st.integers(0, 10**9))
 def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s: int) -> None:
-    at, reported = BEGAN + timedelta(seconds=later_s), began.isoformat()
-    state = JobState(session="s", cell="demo", configuration_sha256="", began=reported, attempt_began=reported)
+    at = BEGAN + timedelta(seconds=later_s)
+    reported = began.isoformat()
+    state = JobState(
+        session="s", cell="demo", configuration_sha256="", began=reported, attempt_began=reported
+    )
     session = Session(Path("s"), state)
     counted = begun_until((session,), at)
     assert counted == (() if began > at + CLOCK_SLACK else (session,))
 
 
-def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibrations(tmp_path: Path, made: Made) -> None:
+def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibrations(
+    tmp_path: Path, made: Made
+) -> None:
     rig = made_rig(tmp_path / "cell", made)
-    foreign = begin(rig.cells / "demo.recalibration", replace(BASIS, cell="demo"), BEGAN.replace(year=2099))
-    ended = foreign.state.with_(outcome=Outcome.APPLIED, ended=BEGAN.isoformat(), attempt_began=BEGAN.isoformat())
+    foreign = begin(
+        rig.cells / "demo.recalibration", replace(BASIS, cell="demo"), BEGAN.replace(year=2099)
+    )
+    ended = foreign.state.with_(
+        outcome=Outcome.APPLIED, ended=BEGAN.isoformat(), attempt_began=BEGAN.isoformat()
+    )
     save(replace(foreign, state=ended))
     assert rig.job().outcome is Outcome.APPLIED
-    (said,) = [event for event in rig.events if event["event"] == "a session from the future does not count"]
+    (said,) = [
+        event
+        for event in rig.events
+        if event["event"] == "a session from the future does not count"
+    ]
     assert said["folder"] == str(foreign.folder)
     assert "move the folder away" in said["text"]
     assert foreign.folder.is_dir()
@@ -165,15 +214,21 @@ def test_a_person_reads_which_session_does_not_count(tmp_path: Path) -> None:
     terminal = io.StringIO()
     story = Story(terminal, Form.TEXT, lambda: BEGAN)
     for _ in range(2):  # said once
-        assert sessions_that_count(sessions(tmp_path), BEGAN + timedelta(hours=1), story) == (present,)
+        assert sessions_that_count(sessions(tmp_path), BEGAN + timedelta(hours=1), story) == (
+            present,
+        )
     said = " ".join(terminal.getvalue().split())
     assert said.startswith("! a session from the future does not count: found")
     assert said.count(future.state.began) == 1
     assert "timedatectl" in said
 
 
-def test_a_session_from_the_future_is_neither_removed_nor_taken_for_the_newest(tmp_path: Path) -> None:
-    """The newest one is asked what killed jobs have left before it; by a wrong date, that is all there is."""
+def test_a_session_from_the_future_is_neither_removed_nor_taken_for_the_newest(
+    tmp_path: Path,
+) -> None:
+    """The newest one is asked what killed jobs have left before it;
+    by a wrong date, that is all there is.
+    """
     made = [begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week)) for week in range(3)]
     future = begin(tmp_path, BASIS, BEGAN + timedelta(days=730))
     just_begun = tmp_path / "20260201T000000Z"
@@ -193,7 +248,9 @@ def test_two_cells_never_share_a_file_of_metrics(cells: list[str]) -> None:
     assert "/" not in one
 
 
-def test_what_to_do_can_be_typed_in_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_to_do_can_be_typed_in_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     target = PlannedWrite(file="gains.yaml", base_sha256="a" * 64, after_sha256="b" * 64)
     for outcome in (Outcome.PROPOSED, Outcome.APPLIED):

@@ -1,4 +1,6 @@
-"""A guided session whose gains are in the drives: written with `yes`, read back before the moves that accept them."""
+"""A guided session whose gains are in the drives:
+written with `yes`, read back before the moves that accept them.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def actions_of(rig: Rig) -> list[AuditAction]:
     return [entry.action for entry in rig.audit]
 
 
-def test_gains_in_drives_are_written_read_back_and_accepted(tmp_path: Path, made_session: MadeSession) -> None:
+def test_gains_in_drives_are_written_read_back_and_accepted(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = drives_rig(tmp_path / "cell", made_session)
     with serving(rig) as cell:
         assert run_session(rig).exit_code == ExitCode.OK
@@ -67,14 +71,22 @@ def test_gains_in_drives_are_written_read_back_and_accepted(tmp_path: Path, made
     assert state.outcome is Outcome.APPLIED
     assert state.acceptance is not None
     assert state.acceptance.accepted
-    assert actions_of(rig).count(AuditAction.APPLIED) == actions_of(rig).count(AuditAction.ACCEPTED) == 1
+    assert (
+        actions_of(rig).count(AuditAction.APPLIED)
+        == actions_of(rig).count(AuditAction.ACCEPTED)
+        == 1
+    )
     events = [event["event"] for event in rig.events]
-    assert events.index("the gains were read back from the drives") > events.index("written to the controller's file")
+    assert events.index("the gains were read back from the drives") > events.index(
+        "written to the controller's file"
+    )
     assert len(history_of(rig.cell_file).events) == 1
     page = (rig.session.folder / "report" / "report.html").read_text()
     assert "to the drives; accepted on " in page
     assert "J1, 2003h:01" in (rig.session.folder / "proposal.diff").read_text()
-    assert f"drivegain rollback {rig.cell_file} --drives --yes" in (rig.session.folder / "summary.txt").read_text()
+    assert (f"drivegain rollback {rig.cell_file} --drives --yes") in (
+        rig.session.folder / "summary.txt"
+    ).read_text()
 
 
 def test_a_session_that_ends_after_the_write_to_drives_does_not_write_again(
@@ -133,7 +145,11 @@ def test_drives_that_refuse_to_save_are_written_with_apply_and_the_session_goes_
             proposal = propose(DriveTarget(rig.cell, network, Saving.ANY), request)
             apply(proposal, rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="Kim")
         assert run_session(rig).exit_code == ExitCode.OK
-    assert actions_of(rig).count(AuditAction.APPLIED) == actions_of(rig).count(AuditAction.ACCEPTED) == 1
+    assert (
+        actions_of(rig).count(AuditAction.APPLIED)
+        == actions_of(rig).count(AuditAction.ACCEPTED)
+        == 1
+    )
     page = (rig.session.folder / "report" / "report.html").read_text()
     assert "by Kim to the drives; accepted on " in page
 
@@ -148,7 +164,9 @@ def test_without_yes_the_drives_keep_their_gains_and_the_command_for_later_is_sa
     assert " --drives --yes --base " in (rig.session.folder / "summary.txt").read_text()
 
 
-def test_a_job_without_an_operator_takes_no_gains_in_drives(tmp_path: Path, made_session: MadeSession) -> None:
+def test_a_job_without_an_operator_takes_no_gains_in_drives(
+    tmp_path: Path, made_session: MadeSession
+) -> None:
     rig = drives_rig(tmp_path / "cell", made_session)
     assert target_of(rig.cell).in_drives
     assert not target_of(made_session_rig(tmp_path / "file", made_session).cell).in_drives

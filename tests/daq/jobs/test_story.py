@@ -45,18 +45,38 @@ def story() -> tuple[Story, io.StringIO]:
 
 def test_the_worst_gain_comes_first_with_what_it_lacks() -> None:
     journal, stream = story()
-    journal.say(Level.INFO, "gains so far", gains=list(GAINS), blocks=3, motion_s=60.0, left_s=180.0)
+    journal.say(
+        Level.INFO, "gains so far", gains=list(GAINS), blocks=3, motion_s=60.0, left_s=180.0
+    )
     title, worst, other, outlook = stream.getvalue().strip().splitlines()
     assert title == "Gains after 3 blocks, 60 s of motion:"
-    assert worst.split() == ["J6", "6.79", "Nm/A", "±", "1.00", "%", "not", "yet:", "2.0", "×", "the", "target"]
+    assert worst.split() == [
+        "J6",
+        "6.79",
+        "Nm/A",
+        "±",
+        "1.00",
+        "%",
+        "not",
+        "yet:",
+        "2.0",
+        "×",
+        "the",
+        "target",
+    ]
     assert other.split() == ["J1", "33.9", "Nm/A", "±", "0.40", "%", "✓"]
     assert "J6 needs the longest: about 3 min more at this rate" in outlook
 
 
 def test_why_the_worst_gain_is_worst_is_said_after_a_block() -> None:
     journal, stream = story()
-    explained = ({**GAINS[0], "cause": ""}, {**GAINS[1], "cause": "its current is noisier than planned"})
-    journal.say(Level.INFO, "gains so far", gains=list(explained), blocks=3, motion_s=60.0, left_s=100.0)
+    explained = (
+        {**GAINS[0], "cause": ""},
+        {**GAINS[1], "cause": "its current is noisier than planned"},
+    )
+    journal.say(
+        Level.INFO, "gains so far", gains=list(explained), blocks=3, motion_s=60.0, left_s=100.0
+    )
     outlook = stream.getvalue().strip().splitlines()[-1]
     assert "J6 needs the longest (its current is noisier than planned): about 100 s more" in outlook
 
@@ -64,7 +84,9 @@ def test_why_the_worst_gain_is_worst_is_said_after_a_block() -> None:
 def quick(**changed: Any) -> str:
     """What a person reads of a look after a move."""
     gains = [QuickGain("J6", "Nm/A", 6.79, 1.0, 0.5), QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)]
-    look = QuickLook("block-4-loaded", 3, 14, 80.0, gains=gains, why="it needs more moves", left_s=240.0)
+    look = QuickLook(
+        "block-4-loaded", 3, 14, 80.0, gains=gains, why="it needs more moves", left_s=240.0
+    )
     journal, stream = story()
     journal.say(Level.INFO, "quick estimate", **asdict(replace(look, **changed)))
     return stream.getvalue()
@@ -88,7 +110,12 @@ def test_what_is_missing_is_said_in_the_place_of_figures() -> None:
 
 def test_at_the_time_limit_it_is_said_what_would_help() -> None:
     journal, stream = story()
-    journal.say(Level.NOTICE, "time is up", missing="J6 1.02 %", would_help=("more time", "J6: mount a heavier body"))
+    journal.say(
+        Level.NOTICE,
+        "time is up",
+        missing="J6 1.02 %",
+        would_help=("more time", "J6: mount a heavier body"),
+    )
     assert stream.getvalue().strip().splitlines() == [
         "The time is up. Not reached: J6 1.02 %.",
         "What would help:",
@@ -102,8 +129,16 @@ def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
     gains = [GainSoFar.model_validate(gain) for gain in GAINS]
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     blocks = [
-        Block(name=f"block-{number}-{kind}", payload=payload, mass_kg=None, holdout=kind == "held-out", plan="")
-        for number, (kind, payload) in enumerate([("bare", None), ("loaded", "disc"), ("held-out", "disc")], 1)
+        Block(
+            name=f"block-{number}-{kind}",
+            payload=payload,
+            mass_kg=None,
+            holdout=kind == "held-out",
+            plan="",
+        )
+        for number, (kind, payload) in enumerate(
+            [("bare", None), ("loaded", "disc"), ("held-out", "disc")], 1
+        )
     ]
     assert motion_left_s(cell, gains, blocks, 30.0) == pytest.approx(180.0)
     assert motion_left_s(cell, gains[:1], blocks, 30.0) == 0.0
@@ -120,14 +155,19 @@ def test_a_warning_is_said_once_and_what_is_for_programs_never() -> None:
         journal.say(Level.WARNING, "warning of the recorder", text="no rated torque")
     journal.say(Level.INFO, "mounted", payload="disc")
     journal.say(Level.ERROR, "something new", text="with its reason\x1b[2J")
-    assert stream.getvalue().splitlines() == ["! no rated torque", "! something new: with its reason\\x1b[2J"]
+    assert stream.getvalue().splitlines() == [
+        "! no rated torque",
+        "! something new: with its reason\\x1b[2J",
+    ]
 
 
 LARGEST_COUNT = 160  #: Words of a session of three blocks, without questions
 
 
 def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, MadeSession]) -> None:
-    """Each event of a real session has its fields as the sentences expect them, and no line has a time stamp."""
+    """Each event of a real session has its fields as the sentences expect them,
+    and no line has a time stamp.
+    """
     rig, _ = whole_session
     journal, stream = story()
     of_journal = {"time", "level", "event", "session", "step"}
@@ -142,9 +182,14 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
     # What a technician reads of a session, without names of files, numbers and signs.
     assert len([word for word in text.split() if word.isalpha()]) < LARGEST_COUNT
     # But for the names of folders, and for the certificate, which says when it was accepted.
-    timeless = [line for line in text.splitlines() if "/" not in line and not line.startswith("Certificate ")]
+    timeless = [
+        line
+        for line in text.splitlines()
+        if "/" not in line and not line.startswith("Certificate ")
+    ]
     assert "2026-" not in "".join(timeless)
-    # A session that reaches its target has no end of its time, and looks after a move are not of the session itself.
+    # A session that reaches its target has no end of its time, and looks after a move are not of
+    # the session itself.
     elsewhere = {"quick estimate", "time is up"}
     assert set(PARAGRAPHS) - elsewhere <= {event["event"] for event in rig.events}
     assert not set(PARAGRAPHS) & set(SENTENCES)
@@ -153,7 +198,9 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
 def state(**changed: object) -> GuidedState:
     blocks = (
         Block(name="block-1-bare", payload=None, mass_kg=None, holdout=False, plan="plan-1.yaml"),
-        Block(name="block-2-loaded", payload="disc", mass_kg=4.59, holdout=False, plan="plan-2.yaml"),
+        Block(
+            name="block-2-loaded", payload="disc", mass_kg=4.59, holdout=False, plan="plan-2.yaml"
+        ),
     )
     made = GuidedState(
         session="s",
@@ -175,23 +222,46 @@ ENDED = BEGAN.isoformat()
 FITTED = Fitted(calibration_sha256="", sentences=())
 DECIDED = {"complete": True, "fitted": FITTED, "decision": Decision(gains=(), remark="")}
 ACCEPTED = Acceptance(
-    log_sha256="", scales=(), old_error_percent=5.0, new_error_percent=2.0, accepted=True, remark="good"
+    log_sha256="",
+    scales=(),
+    old_error_percent=5.0,
+    new_error_percent=2.0,
+    accepted=True,
+    remark="good",
 )
 
 
 @pytest.mark.parametrize(
     ("changed", "stage", "step"),
     [
-        ({"runs": ()}, StageName.RECORD, "NOTHING on the flange, then the robot moves: block-1-bare"),
+        (
+            {"runs": ()},
+            StageName.RECORD,
+            "NOTHING on the flange, then the robot moves: block-1-bare",
+        ),
         ({"runs": (_run("block-1-bare"),)}, StageName.RECORD, "DISC (4.59 kg) on the flange"),
         ({}, StageName.RECORD, "the next block is being prepared"),
         ({"complete": True}, StageName.IDENTIFY, "being identified"),
         (DECIDED, StageName.WRITE, "type yes"),
         ({**DECIDED, "outcome": Outcome.APPLIED}, StageName.ACCEPT, "moves that are new"),
-        ({**DECIDED, "outcome": Outcome.APPLIED, "ended": ENDED}, StageName.ACCEPT, "moves that are new"),
-        ({**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED, "ended": ENDED}, StageName.ENDED, "applied"),
         (
-            {**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED, "ended": ENDED, "problem": "interrupted"},
+            {**DECIDED, "outcome": Outcome.APPLIED, "ended": ENDED},
+            StageName.ACCEPT,
+            "moves that are new",
+        ),
+        (
+            {**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED, "ended": ENDED},
+            StageName.ENDED,
+            "applied",
+        ),
+        (
+            {
+                **DECIDED,
+                "outcome": Outcome.APPLIED,
+                "acceptance": ACCEPTED,
+                "ended": ENDED,
+                "problem": "interrupted",
+            },
             StageName.ACCEPT,
             "the certificate",
         ),
@@ -209,14 +279,25 @@ def test_the_position_of_a_session_is_what_its_state_lacks(
 @pytest.mark.parametrize(
     ("changed", "step"),
     [
-        ({"runs": (_run("block-1-bare"),)}, "it records block-2-loaded again, which does not count yet"),
+        (
+            {"runs": (_run("block-1-bare"),)},
+            "it records block-2-loaded again, which does not count yet",
+        ),
         ({}, "it goes on with the next block"),
         ({"complete": True}, "it records nothing again, and goes on with the identification"),
-        ({**DECIDED, "outcome": Outcome.APPLIED}, "it goes on with the moves that accept the gains"),
-        ({**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED}, "it makes the certificate again"),
+        (
+            {**DECIDED, "outcome": Outcome.APPLIED},
+            "it goes on with the moves that accept the gains",
+        ),
+        (
+            {**DECIDED, "outcome": Outcome.APPLIED, "acceptance": ACCEPTED},
+            "it makes the certificate again",
+        ),
     ],
 )
-def test_the_next_step_after_an_error_is_what_the_same_command_does(changed: dict[str, object], step: str) -> None:
+def test_the_next_step_after_an_error_is_what_the_same_command_does(
+    changed: dict[str, object], step: str
+) -> None:
     assert goes_on_with(state(**changed)).startswith(step)
 
 

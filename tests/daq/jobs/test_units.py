@@ -1,4 +1,6 @@
-"""Service, timer and crontab line: what is in them, that systemd takes them, and that nothing foreign is replaced."""
+"""Service, timer and crontab line: what is in them, that systemd takes them,
+and that nothing foreign is replaced.
+"""
 
 from __future__ import annotations
 
@@ -49,10 +51,15 @@ def test_the_timer_never_makes_up_for_a_date_and_the_service_bounds_the_job(rig:
     assert service["Service"]["SuccessExitStatus"] == str(ExitCode.PROPOSED.value)
     assert "AF_CAN" in service["Service"]["RestrictAddressFamilies"]
     assert "PrivateTmp" not in service["Service"]
-    assert "User" not in read(units_of(rig.cell, section, installation(rig, user=True))[0].text)["Service"]
+    assert (
+        "User"
+        not in read(units_of(rig.cell, section, installation(rig, user=True))[0].text)["Service"]
+    )
 
 
-def test_what_is_written_through_a_link_is_writable_to_the_service(rig: Rig, tmp_path: Path) -> None:
+def test_what_is_written_through_a_link_is_writable_to_the_service(
+    rig: Rig, tmp_path: Path
+) -> None:
     """ProtectHome= would lock the folder in which the file is, wherever the link to it is."""
     elsewhere = tmp_path / "controllers of all cells"
     elsewhere.mkdir()
@@ -73,13 +80,20 @@ def test_the_service_is_little_exposed(rig: Rig, tmp_path: Path, owner: str) -> 
     assert section is not None
     service, _ = units_of(rig.cell, section, replace(installation(rig), owner=owner))
     (tmp_path / service.name).write_text(service.text, encoding="utf-8")
-    command = ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(tmp_path / service.name)]
+    command = [
+        "systemd-analyze",
+        "security",
+        "--offline=yes",
+        "--no-pager",
+        str(tmp_path / service.name),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     found = re.search(r"exposure level for \S+: ([0-9.]+)", done.stdout)
     if found is None:
         pytest.skip(f"systemd-analyze cannot judge a file here: {done.stderr.strip()}")
     assert float(found[1]) <= 3.0, done.stdout
-    assert "\nLimitRTPRIO=1\n" in service.text  # in place of CAP_SYS_NICE, for the capture's real-time priority
+    # In place of CAP_SYS_NICE, for the capture's real-time priority
+    assert "\nLimitRTPRIO=1\n" in service.text
 
 
 @pytest.mark.parametrize("user", [False, True], ids=["system", "user"])
@@ -121,9 +135,9 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     assert main([*command, "--yes"]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert f"systemctl enable --now {NAME}.timer" in shown
-    assert f"systemctl link '{folder}/{NAME}.service' '{folder}/{NAME}.timer'".replace("'", "") in shown.replace(
+    assert (f"systemctl link '{folder}/{NAME}.service' '{folder}/{NAME}.timer'").replace(
         "'", ""
-    )
+    ) in shown.replace("'", "")
     assert sorted(path.name for path in folder.iterdir()) == [f"{NAME}.service", f"{NAME}.timer"]
     assert main([*command, "--yes", "--schedule", "daily"]) == ExitCode.OK
     assert "OnCalendar=daily" in (folder / f"{NAME}.timer").read_text()
@@ -135,7 +149,9 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     assert (folder / f"{NAME}.service").read_bytes() == before
 
 
-def test_a_unit_of_an_earlier_version_is_replaced(rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_unit_of_an_earlier_version_is_replaced(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "units"
     # Under its earlier name, with the first line that earlier versions wrote.
     command = ["install-units", "--cell", str(rig.cell_file), "--to", str(folder), "--yes"]
@@ -143,7 +159,9 @@ def test_a_unit_of_an_earlier_version_is_replaced(rig: Rig, tmp_path: Path, caps
     service = folder / f"{NAME}.service"
     now = service.read_text(encoding="utf-8")
     assert now.startswith("# Made by `drivegain schedule`, which may replace this file.\n")
-    service.write_text(now.replace("`drivegain schedule`", "`drivegain install-units`", 1), encoding="utf-8")
+    service.write_text(
+        now.replace("`drivegain schedule`", "`drivegain install-units`", 1), encoding="utf-8"
+    )
     assert main(command) == ExitCode.OK
     assert service.read_text(encoding="utf-8") == now
 
@@ -154,7 +172,10 @@ def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     assert line.startswith("0 0 * * 1  ")
     assert line.rstrip().endswith(f"recalibrate --cell '{rig.cell_file}'")
     assert line.count("\n") == 1
-    assert main(["schedule", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"]) == ExitCode.USAGE
+    assert (
+        main(["schedule", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"])
+        == ExitCode.USAGE
+    )
 
 
 @pytest.mark.parametrize(
@@ -181,10 +202,15 @@ def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
     wanted = replace(installation(rig), cell_file=Path("/cells/100 % $HOME/it's.yaml"))
     assert unit_name(named) == "drivegain-recalibrate-50-h-cell-execstart-bin-false-cc6ad2"
     assert unit_name(rig.cell) == f"drivegain-recalibrate-{rig.cell.name}"
-    others = {unit_name(replace(rig.cell, name=name)) for name in ("Пресс 4", "Робот 4", "press 4", "press-4")}
+    others = {
+        unit_name(replace(rig.cell, name=name))
+        for name in ("Пресс 4", "Робот 4", "press 4", "press-4")
+    }
     assert len(others) == 4
     service = read(units_of(named, section, wanted)[0].text)["Service"]
-    assert service["ExecStart"] == '/usr/bin/true recalibrate --cell "/cells/100 %% $$HOME/it\'s.yaml"'
+    assert service["ExecStart"] == (
+        '/usr/bin/true recalibrate --cell "/cells/100 %% $$HOME/it\'s.yaml"'
+    )
     assert units_of(named, section, wanted)[0].text.count("\nExecStart=") == 1
     assert cron_line(wanted).endswith("--cell '/cells/100 \\% $HOME/it'\"'\"'s.yaml'")
 
@@ -212,14 +238,31 @@ def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
 def test_a_schedule_that_no_line_can_say_is_refused(
     rig: Rig, tmp_path: Path, schedule: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["schedule", "--cell", str(rig.cell_file), "--to", str(tmp_path / "units"), "--schedule", schedule]
+    command = [
+        "schedule",
+        "--cell",
+        str(rig.cell_file),
+        "--to",
+        str(tmp_path / "units"),
+        "--schedule",
+        schedule,
+    ]
     assert main([*command, "--yes"]) == ExitCode.USAGE
     assert "--schedule" in capsys.readouterr().err
     assert not (tmp_path / "units").exists()
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not on this computer")
-def test_systemd_reads_the_schedule_before_it_is_written(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["schedule", "--cell", str(rig.cell_file), "--schedule", "every sunday"]) == ExitCode.USAGE
+@pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is not on this computer"
+)
+def test_systemd_reads_the_schedule_before_it_is_written(
+    rig: Rig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["schedule", "--cell", str(rig.cell_file), "--schedule", "every sunday"])
+        == ExitCode.USAGE
+    )
     assert "calendar" in capsys.readouterr().err
-    assert main(["schedule", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK
+    assert (
+        main(["schedule", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK
+    )

@@ -49,7 +49,10 @@ def test_a_job_that_is_held_says_so_in_its_exit_code_and_in_json_alone(
 
 
 def test_a_person_at_a_terminal_reads_what_to_do(
-    tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    short_plan: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = make_rig(tmp_path / "cell", short_plan)
     rig.closed.unlink()

@@ -1,4 +1,6 @@
-"""The audit: whatever is done to its lines is found, what a killed writer leaves is reported, nothing is removed."""
+"""The audit: whatever is done to its lines is found, what a killed writer leaves is reported,
+nothing is removed.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ TREES = st.recursive(
     | st.integers()
     | st.floats(allow_nan=False, allow_infinity=False)
     | st.text(st.characters(), max_size=20),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 DETAILS = st.dictionaries(st.text(max_size=8), TREES, max_size=4)
@@ -76,7 +80,12 @@ def _lines(path: Path) -> list[bytes]:
 
 
 @given(
-    st.lists(st.tuples(st.sampled_from(AuditAction), st.text(max_size=30), st.text(max_size=30), DETAILS), max_size=5)
+    st.lists(
+        st.tuples(
+            st.sampled_from(AuditAction), st.text(max_size=30), st.text(max_size=30), DETAILS
+        ),
+        max_size=5,
+    )
 )
 def test_what_is_appended_is_read_back_and_the_chain_holds(
     asked: list[tuple[AuditAction, str, str, dict[str, object]]],
@@ -89,7 +98,12 @@ def test_what_is_appended_is_read_back_and_the_chain_holds(
         assert list(read(path)) == written
         assert [one.number for one in written] == list(range(1, len(asked) + 1))
         for one, (action, who, subject, details) in zip(written, asked, strict=True):
-            assert (one.action, one.who, one.subject, one.details) == (action, who, subject, details)
+            assert (one.action, one.who, one.subject, one.details) == (
+                action,
+                who,
+                subject,
+                details,
+            )
         verdict = verify(path, heads=[one.sha256 for one in written])
         assert verdict.holds
         assert verdict.broken is None
@@ -101,7 +115,12 @@ def test_the_digest_is_sha256_of_canonical_json_and_covers_the_one_before(tmp_pa
     tree = json.loads(_lines(tmp_path / "a")[1])
     assert tree.pop("sha256") == second.sha256
     assert tree["previous"] == first.sha256
-    assert second.sha256 == hashlib.sha256(json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    assert (
+        second.sha256
+        == hashlib.sha256(
+            json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
+        ).hexdigest()
+    )
     assert first.previous == "0" * 64
 
 
@@ -160,7 +179,9 @@ def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
     with _folder() as folder:
         entries = _filled(folder / "a")
     was = entries[place]
-    forged = entry(was.number, was.at, "another person", was.action, was.subject, was.details, was.previous)
+    forged = entry(
+        was.number, was.at, "another person", was.action, was.subject, was.details, was.previous
+    )
     verdict = _judge([encode(forged if one is was else one) for one in entries])
     assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(place + 1, Flaw.EDITED)]
     # Put between two others, it is one entry of that number too many.
@@ -180,8 +201,12 @@ def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=4), st.data())
-def test_what_killed_writers_leave_stays_and_is_reported(cuts: list[float], data: st.DataObject) -> None:
-    """Each write is cut at any byte; the next writer begins a line of its own, and the chain holds throughout."""
+def test_what_killed_writers_leave_stays_and_is_reported(
+    cuts: list[float], data: st.DataObject
+) -> None:
+    """Each write is cut at any byte; the next writer begins a line of its own,
+    and the chain holds throughout.
+    """
     with _folder() as folder:
         path = folder / "a"
         _filled(path, 1)
@@ -218,7 +243,10 @@ def test_zeros_after_a_power_cut_are_an_unfinished_line(tmp_path: Path) -> None:
     _filled(path, 1)
     verdict = verify(path)
     assert verdict.holds
-    assert [one.action for one in verdict.entries][2:] == [AuditAction.TORN_LINE, AuditAction.PROPOSED]
+    assert [one.action for one in verdict.entries][2:] == [
+        AuditAction.TORN_LINE,
+        AuditAction.PROPOSED,
+    ]
     assert verdict.entries[2].details["torn_bytes"] == 100
 
 
@@ -255,12 +283,18 @@ def test_what_is_left_of_a_first_entry_is_no_other_file(tmp_path: Path) -> None:
     for length in range(len(whole) - 1):
         path = tmp_path / str(length)
         path.write_bytes(whole[:length])
-        assert append(path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}).number == 1 + (length > 0)
+        assert append(
+            path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}
+        ).number == 1 + (length > 0)
         assert verify(path).holds
 
 
-@pytest.mark.parametrize("spoil", [lambda line: line.replace(b"Ito", b"Itu"), lambda _: b"{}", lambda _: b"17"])
-def test_nothing_is_appended_to_a_last_line_that_was_changed(tmp_path: Path, spoil: Callable[[bytes], bytes]) -> None:
+@pytest.mark.parametrize(
+    "spoil", [lambda line: line.replace(b"Ito", b"Itu"), lambda _: b"{}", lambda _: b"17"]
+)
+def test_nothing_is_appended_to_a_last_line_that_was_changed(
+    tmp_path: Path, spoil: Callable[[bytes], bytes]
+) -> None:
     path = tmp_path / "a"
     _filled(path, 2)
     first, last = _lines(path)
@@ -272,20 +306,31 @@ def test_nothing_is_appended_to_a_last_line_that_was_changed(tmp_path: Path, spo
     assert path.read_bytes() == spoiled
 
 
-def _write(begun: AuditAction, path: Path, subject: Path, before: bytes, after: bytes) -> AuditEntry:
-    digests = {f"sha256_{name}": hashlib.sha256(b).hexdigest() for name, b in (("before", before), ("after", after))}
+def _write(
+    begun: AuditAction, path: Path, subject: Path, before: bytes, after: bytes
+) -> AuditEntry:
+    digests = {
+        f"sha256_{name}": hashlib.sha256(b).hexdigest()
+        for name, b in (("before", before), ("after", after))
+    }
     return append(path, begun, at=NOW, who="K.", subject=str(subject), details=digests)
 
 
 @pytest.mark.parametrize("begun", [AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN])
 @pytest.mark.parametrize(
     ("now", "content"),
-    [(b"old", Content.BEFORE), (b"new", Content.AFTER), (b"edited", Content.OTHER), (None, Content.OTHER)],
+    [
+        (b"old", Content.BEFORE),
+        (b"new", Content.AFTER),
+        (b"edited", Content.OTHER),
+        (None, Content.OTHER),
+    ],
 )
 def test_of_a_write_without_an_end_the_file_reports_which_it_is(
     tmp_path: Path, begun: AuditAction, now: bytes | None, content: Content
 ) -> None:
-    path, file = tmp_path / "a", tmp_path / "x.yaml"
+    path = tmp_path / "a"
+    file = tmp_path / "x.yaml"
     if now is not None:
         file.write_bytes(now)
     first = _write(begun, path, file, b"old", b"new")
@@ -294,7 +339,14 @@ def test_of_a_write_without_an_end_the_file_reports_which_it_is(
     _write(begun, path, tmp_path / "y.yaml", b"other", b"file")
     second = _write(begun, path, file, b"new", b"newest")
     file.write_bytes(b"newest")
-    append(path, AuditAction.APPLIED, at=NOW, who="K.", subject=str(file), details={"begun": second.number})
+    append(
+        path,
+        AuditAction.APPLIED,
+        at=NOW,
+        who="K.",
+        subject=str(file),
+        details={"begun": second.number},
+    )
     found = {one.begun.number: one.content for one in verify(path).open_writes}
     assert found == {1: Content.AFTER, 2: Content.OTHER}
     (tmp_path / "y.yaml").mkdir()  # unreadable
@@ -304,13 +356,27 @@ def test_of_a_write_without_an_end_the_file_reports_which_it_is(
 @pytest.mark.parametrize("end", [AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED])
 def test_a_write_with_an_end_is_not_open(tmp_path: Path, end: AuditAction) -> None:
     begun = _write(AuditAction.APPLY_BEGUN, tmp_path / "a", tmp_path / "x", b"old", b"new")
-    append(tmp_path / "a", end, at=NOW, who="K.", subject=begun.subject, details={"begun": begun.number})
+    append(
+        tmp_path / "a",
+        end,
+        at=NOW,
+        who="K.",
+        subject=begun.subject,
+        details={"begun": begun.number},
+    )
     assert verify(tmp_path / "a").open_writes == ()
 
 
 def test_no_number_that_is_not_finite_gets_in(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="JSON"):
-        append(tmp_path / "a", AuditAction.PROPOSED, at=NOW, who="", subject="", details={"gain": math.nan})
+        append(
+            tmp_path / "a",
+            AuditAction.PROPOSED,
+            at=NOW,
+            who="",
+            subject="",
+            details={"gain": math.nan},
+        )
     assert (tmp_path / "a").read_bytes() == b""
 
 
@@ -351,7 +417,9 @@ def _append_many(path: Path, who: str) -> None:
 
 def test_many_writers_make_one_chain(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
-    writers = [context.Process(target=_append_many, args=(tmp_path / "a", str(k))) for k in range(4)]
+    writers = [
+        context.Process(target=_append_many, args=(tmp_path / "a", str(k))) for k in range(4)
+    ]
     for writer in writers:
         writer.start()
     for writer in writers:
@@ -363,7 +431,9 @@ def test_many_writers_make_one_chain(tmp_path: Path) -> None:
         assert [one.details["k"] for one in verdict.entries if one.who == who] == list(range(25))
 
 
-def test_a_lock_that_is_never_given_back_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_that_is_never_given_back_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(audit, "_PAUSE_S", 0.0)
     with (tmp_path / "a").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
@@ -385,7 +455,8 @@ def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
 def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object) -> None:
     """Any program can write a chain that holds."""
-    path, foreign_details = tmp_path / "a", {"sha256_before": strange, "sha256_after": strange, "begun": strange}
+    path = tmp_path / "a"
+    foreign_details = {"sha256_before": strange, "sha256_after": strange, "begun": strange}
     for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
         append(path, action, at=NOW, who="", subject="x", details=foreign_details)
     verdict = verify(path)

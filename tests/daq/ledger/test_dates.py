@@ -40,7 +40,9 @@ def week(number: int) -> datetime:
     return BEGIN + timedelta(weeks=number)
 
 
-def entries_with(ledger: Ledger, wrong: dict[int, timedelta], *, fell_from: int = 99, weeks: int = 14) -> list[Entry]:
+def entries_with(
+    ledger: Ledger, wrong: dict[int, timedelta], *, fell_from: int = 99, weeks: int = 14
+) -> list[Entry]:
     """The history of calibrations a week apart, in some of whose weeks the clock was off."""
     for number in range(weeks):
         factors = FELL if number >= fell_from else (1.0,) * 6
@@ -50,9 +52,13 @@ def entries_with(ledger: Ledger, wrong: dict[int, timedelta], *, fell_from: int 
 
 
 @pytest.mark.parametrize("days", [-730, -30, 30, 730])
-def test_a_calibration_under_a_wrong_date_is_at_its_place_in_the_history(tmp_path: Path, days: int) -> None:
+def test_a_calibration_under_a_wrong_date_is_at_its_place_in_the_history(
+    tmp_path: Path, days: int
+) -> None:
     entries = entries_with(ledger_in(tmp_path), {6: timedelta(days=days)})
-    assert [entry.created_by_clock is not None for entry in entries] == [number == 6 for number in range(14)]
+    assert [entry.created_by_clock is not None for entry in entries] == [
+        number == 6 for number in range(14)
+    ]
     assert [entry.recorded for entry in entries if entry.created_by_clock is None] == [
         week(n) for n in range(14) if n != 6
     ]
@@ -62,7 +68,9 @@ def test_a_calibration_under_a_wrong_date_is_at_its_place_in_the_history(tmp_pat
 
 @pytest.mark.parametrize("days", [-730, 730])
 def test_a_drift_is_found_behind_a_calibration_of_a_wrong_date(tmp_path: Path, days: int) -> None:
-    """Dated two years ahead, a sound calibration would be the newest one, and the drift of every later one unseen."""
+    """Dated two years ahead, a sound calibration would be the newest one,
+    and the drift of every later one unseen.
+    """
     entries = entries_with(ledger_in(tmp_path), {6: timedelta(days=days)}, fell_from=12)
     series = {one.axis: one for one in watch(entries, ())}
     assert series["J4"].alarmed
@@ -79,12 +87,16 @@ def test_the_first_calibration_may_be_the_one_of_the_wrong_date(tmp_path: Path) 
 
 
 def test_old_logs_that_are_entered_later_keep_the_date_of_their_recording(tmp_path: Path) -> None:
-    """Their date is theirs, not that of the day on which they were fitted; and that day's clock may be wrong."""
+    """Their date is theirs, not that of the day on which they were fitted;
+    and that day's clock may be wrong.
+    """
     ledger = ledger_in(tmp_path)
     for number in range(3, 6):
         enter_at(ledger, calibration_of(number), week(number))
     old = calibration_of(0)  # recorded in week 0
-    enter_calibration(ledger, old, digest=digest_of(old), who="anna", at=week(6) + timedelta(days=730))
+    enter_calibration(
+        ledger, old, digest=digest_of(old), who="anna", at=week(6) + timedelta(days=730)
+    )
     enter_at(ledger, calibration_of(7), week(7))
     entries = read_history(ledger).entries
     assert entries[0].digest == digest_of(old)
@@ -96,37 +108,58 @@ def test_the_same_logs_fitted_again_under_a_wrong_date_keep_their_place(tmp_path
     for number in range(4):
         enter_at(ledger, calibration_of(number), week(number))
     again = replace(calibration_of(1, FELL), created=(week(4) + timedelta(days=730)).isoformat())
-    enter_calibration(ledger, again, digest=digest_of(again), who="anna", at=week(4) + timedelta(days=730))
+    enter_calibration(
+        ledger, again, digest=digest_of(again), who="anna", at=week(4) + timedelta(days=730)
+    )
     enter_at(ledger, calibration_of(5), week(5))
     (found,) = (entry for entry in read_history(ledger).entries if entry.digest == digest_of(again))
     assert found.recorded == week(1)
     assert found.created_by_clock == week(4) + timedelta(days=730)
 
 
-def test_history_says_which_date_was_wrong(checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_history_says_which_date_was_wrong(
+    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     configs = Path(
-        shutil.copytree(checkout / "configs", tmp_path / "configs", ignore=shutil.ignore_patterns("*.jsonl*"))
+        shutil.copytree(
+            checkout / "configs", tmp_path / "configs", ignore=shutil.ignore_patterns("*.jsonl*")
+        )
     )
     file = configs / "cells/demo.yaml"
     entries_with(ledger_of(file), {2: timedelta(days=730)}, weeks=5)
     assert main(["history", str(file)]) == ExitCode.OK
     shown = " ".join(capsys.readouterr().out.split())
-    assert "found the date 2028-01-19; expected one about 2026-01-12, by the order of the audit log" in shown
+    assert (
+        "found the date 2028-01-19; expected one about 2026-01-12, by the order of the audit log"
+    ) in shown
     assert main(["history", str(file), "--json"]) == ExitCode.OK
     (axis, *_) = json.loads(capsys.readouterr().out)["axes"]
     assert ["misdated" in point for point in axis["points"]] == [False, False, True, False, False]
 
 
 def test_a_write_that_was_found_is_in_force_after_one_of_a_wrong_later_date(tmp_path: Path) -> None:
-    """By their dates the older write would be the last one, and its gains and their σ those in force."""
+    """By their dates the older write would be the last one,
+    and its gains and their σ those in force.
+    """
     ledger = ledger_in(tmp_path)
     target = drives_of(ledger.cell.name)
     digests = [enter_at(ledger, calibration_of(number), week(number)) for number in range(3)]
     write(ledger, target, "a" * 64, digest=digests[0], at=week(0))
     write(ledger, target, "b" * 64, digest=digests[1], at=week(1) + timedelta(days=730))
-    details: dict[str, object] = {"sha256_before": "b" * 64, "sha256_after": "c" * 64, "action": "applied"}
+    details: dict[str, object] = {
+        "sha256_before": "b" * 64,
+        "sha256_after": "c" * 64,
+        "action": "applied",
+    }
     details |= {"calibration": {"sha256": digests[2], "cell": ledger.cell.name}}
-    append(ledger.audit, AuditAction.WRITE_FOUND, at=week(2), who="anna", subject=target, details=details)
+    append(
+        ledger.audit,
+        AuditAction.WRITE_FOUND,
+        at=week(2),
+        who="anna",
+        subject=target,
+        details=details,
+    )
     write(ledger, str(tmp_path / "another"), "d" * 64, digest=digests[0], at=week(3))
     history = read_history(ledger)
     assert [event.digest for event in history.events if event.target == target] == digests
@@ -142,7 +175,9 @@ def test_times_in_order_are_left_alone() -> None:
 
 
 @given(st.lists(st.integers(0, 30), max_size=12))
-def test_the_longest_series_is_one_that_never_decreases_and_none_is_longer(hours: list[int]) -> None:
+def test_the_longest_series_is_one_that_never_decreases_and_none_is_longer(
+    hours: list[int],
+) -> None:
     times = [BEGIN + timedelta(hours=hour) for hour in hours]
     chosen = longest_ordered(times)
     assert chosen == sorted(set(chosen))
@@ -150,7 +185,9 @@ def test_the_longest_series_is_one_that_never_decreases_and_none_is_longer(hours
     assert series == sorted(series)
     lengths: list[int] = []  # of the longest series that ends with each time
     for index, time in enumerate(times):
-        before = [length for other, length in zip(times[:index], lengths, strict=True) if other <= time]
+        before = [
+            length for other, length in zip(times[:index], lengths, strict=True) if other <= time
+        ]
         lengths.append(1 + max(before, default=0))
     assert len(chosen) == max(lengths, default=0)
 

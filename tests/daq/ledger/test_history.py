@@ -1,4 +1,6 @@
-"""`drivegain history`: what a technician sees of drifts, of broken audits, and of nothing at all."""
+"""`drivegain history`: what a technician sees of drifts, of broken audits,
+and of nothing at all.
+"""
 
 from __future__ import annotations
 
@@ -87,8 +89,12 @@ _audits: dict[tuple[tuple[float, ...], ...], tuple[tuple[str, ...], bytes]] = {}
 
 
 def _filled(cell: Path, weeks: int, true: Callable[[int], tuple[float, ...]]) -> tuple[str, ...]:
-    """Fill the history, which has no file yet; the digests of its calibrations. Equal ones are filled once."""
-    path, key = _place(cell).audit, tuple(map(true, range(weeks)))
+    """Fill the history, which has no file yet; the digests of its calibrations.
+
+    Equal ones are filled once.
+    """
+    path = _place(cell).audit
+    key = tuple(map(true, range(weeks)))
     assert not path.exists()
     if key not in _audits:
         digests = fill(ledger_of(cell), weeks, true)
@@ -111,7 +117,9 @@ def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]
 
 def _entry(digest: str) -> Entry:
     demo = calibration_of(0)
-    return Entry(digest, BEGIN, BEGIN, "", BEGIN, "demo", "", "ml", "", 3.0, None, 1, demo.gains, ())
+    return Entry(
+        digest, BEGIN, BEGIN, "", BEGIN, "demo", "", "ml", "", 3.0, None, 1, demo.gains, ()
+    )
 
 
 def _put(cell: Path, digest: str) -> str:
@@ -122,7 +130,10 @@ def _put(cell: Path, digest: str) -> str:
     keys = {gain.axis: f"drives.{gain.axis}.gain" for gain in entry.gains}
     document = read_controller(controller.read_bytes(), controller.name)
     scalars = document.locate(tuple(keys.values()))
-    spelling = {s.key: rewrite_gain(s, g.value, g.std).spelling for s, g in zip(scalars, entry.gains, strict=True)}
+    spelling = {
+        s.key: rewrite_gain(s, g.value, g.std).spelling
+        for s, g in zip(scalars, entry.gains, strict=True)
+    }
     controller.write_bytes(document.with_values(spelling).content)
     return str(controller.resolve())
 
@@ -181,11 +192,17 @@ def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
     assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
 
 
-def test_a_drift_from_the_first_day_is_reported_as_steady(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drift_from_the_first_day_is_reported_as_steady(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _filled(cell, 9, sloping)
     assert main(["history", str(cell), "--axis", "J4"]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    reported = re.search(r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until now, (\d\.\d) σ", out)
+    reported = re.search(
+        r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until "
+        r"now, (\d\.\d) σ",
+        out,
+    )
     assert reported is not None
     assert float(reported[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
     assert "demagnetised" in out
@@ -199,8 +216,12 @@ def test_a_drift_from_the_first_day_is_reported_as_steady(cell: Path, capsys: py
     assert b"steady change" in picture.read_bytes()
 
 
-def test_an_alarm_that_has_passed_has_no_date(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """5 % on one day, the fourth: its row keeps the alarm, and the rest of the gain is as of any other."""
+def test_an_alarm_that_has_passed_has_no_date(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """5 % on one day, the fourth: its row keeps the alarm,
+    and the rest of the gain is as of any other.
+    """
     _filled(cell, 20, lambda week: (1.0, 1.0, 1.0, 0.95 if week == 3 else 1.0, 1.0, 1.0))
     series = _series(cell)[3]
     assert series.alarm_at(3) is not None
@@ -251,10 +272,15 @@ def test_a_gain_below_zero_falls_towards_zero(cell: Path) -> None:
 
 
 def test_the_same_logs_fitted_again_are_no_other_day(cell: Path) -> None:
-    """Twelve fits of one session are one calibration: the newest that was applied, else the newest."""
+    """Twelve fits of one session are one calibration:
+    the newest that was applied, else the newest.
+    """
     logs = calibration_of(0).sources
     fits = [
-        replace(calibration_of(week, (1.0 + 0.001 * week,) * 6), sources=logs[::-1] if week % 2 else logs)
+        replace(
+            calibration_of(week, (1.0 + 0.001 * week,) * 6),
+            sources=logs[::-1] if week % 2 else logs,
+        )
         for week in range(12)
     ]
     ledger = ledger_of(cell)
@@ -271,7 +297,8 @@ def test_the_same_logs_fitted_again_are_no_other_day(cell: Path) -> None:
     enter(ledger, calibration_of(1))
     assert [point.entry.digest for point in points()] == [digests[4], digest_of(calibration_of(1))]
     held = tuple(replace(gain, std=0.0) for gain in fits[0].gains)
-    enter(ledger, replace(fits[0], gains=held, sources=calibration_of(1).sources))  # knows no gain, hides none
+    # Knows no gain, hides none
+    enter(ledger, replace(fits[0], gains=held, sources=calibration_of(1).sources))
     assert points()[1].entry.digest == digest_of(calibration_of(1))
     # Another log held out is another question to the same recordings.
     other = replace(fits[0], sources=(*logs[:2], replace(logs[2], sha256="9" * 64)))
@@ -287,7 +314,10 @@ def test_old_logs_fitted_today_report_their_own_time(cell: Path) -> None:
     assert history_of(cell).entries[-1].digest == digest_of(year_ago)  # fitted last
     series = _series(cell)[3]
     assert series.points[0].entry.digest == digest_of(year_ago)
-    assert [point.entry.recorded for point in series.points[:2]] == [BEGIN - timedelta(days=400), BEGIN]
+    assert [point.entry.recorded for point in series.points[:2]] == [
+        BEGIN - timedelta(days=400),
+        BEGIN,
+    ]
     assert series.onset is None or series.onset < BEGIN + timedelta(weeks=1)
 
 
@@ -296,10 +326,14 @@ def test_a_log_without_its_time_has_that_of_the_fit(recorded_s: float | None) ->
     assert recorded_at(with_recordings(calibration_of(3), recorded_s=recorded_s), BEGIN) == BEGIN
 
 
-def test_a_gain_that_was_held_fixed_knows_nothing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_gain_that_was_held_fixed_knows_nothing(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _filled(cell, 3, lambda _: FLAT)
     fixed = calibration_of(5)
-    enter(ledger_of(cell), replace(fixed, gains=(replace(fixed.gains[0], std=0.0), *fixed.gains[1:])))
+    enter(
+        ledger_of(cell), replace(fixed, gains=(replace(fixed.gains[0], std=0.0), *fixed.gains[1:]))
+    )
     assert [len(series.points) for series in _series(cell)] == [3, 4, 4, 4, 4, 4]
     assert main(["history", str(cell)]) == 0
     assert "J1" in capsys.readouterr().out
@@ -316,12 +350,18 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
         save_calibration(own, file)
         digest = sha256_of(file) or ""
         enter_calibration(ledger_of(cell), own, digest=digest, who="job", at=BEGIN)
-    changes = [GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names]
-    return dict(known_of(history_of(cell), str(resolve_links(controller)), digest, changes).dispersions)
+    changes = [
+        GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names
+    ]
+    return dict(
+        known_of(history_of(cell), str(resolve_links(controller)), digest, changes).dispersions
+    )
 
 
 def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
-    """Also where a session was fitted again with a gain held fixed, and where that is its only fit."""
+    """Also where a session was fitted again with a gain held fixed,
+    and where that is its only fit.
+    """
     _filled(cell, 12, lambda week: (1.0 + 0.012 * (-1) ** week,) * 6)
     before = {series.axis: series.dispersion for series in _series(cell)}
     assert min(before.values()) > 1.5
@@ -335,7 +375,9 @@ def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
     assert _job_s_dispersions(cell) == refitted
     assert refitted == pytest.approx(before, rel=0.05)  # the same recordings of all axes as before
     alone = calibration_of(12)
-    enter(ledger_of(cell), replace(alone, gains=(replace(alone.gains[0], std=0.0), *alone.gains[1:])))
+    enter(
+        ledger_of(cell), replace(alone, gains=(replace(alone.gains[0], std=0.0), *alone.gains[1:]))
+    )
     charts = _series(cell)
     assert [len(series.points) for series in charts] == [12, 13, 13, 13, 13, 13]
     found = {series.axis: series.dispersion for series in charts}
@@ -364,7 +406,9 @@ def test_the_scatter_of_axes_is_reported_together_where_the_same_recordings_know
     ]
     found = dispersions_of(entries, names)
     assert tuple(found) == names
-    np.testing.assert_allclose([found["J1"], found["J2"]], dispersions(values[:, :2].T, np.full((2, 9), 0.1)))
+    np.testing.assert_allclose(
+        [found["J1"], found["J2"]], dispersions(values[:, :2].T, np.full((2, 9), 0.1))
+    )
     alone = np.delete(values[:, 2], 4)
     np.testing.assert_allclose(found["J3"], dispersions([alone], np.full((1, 8), 0.1))[0])
     assert dispersions_of(entries[:4], names) == dict.fromkeys(names, DISPERSION)
@@ -384,9 +428,20 @@ def test_an_axis_has_a_table_of_its_own(cell: Path, capsys: pytest.CaptureFixtur
     assert "one of J1" in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_change_that_is_explained_begins_a_new_baseline(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_change_that_is_explained_begins_a_new_baseline(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _filled(cell, 26, drifting)
-    explain = ["history", str(cell), "--acknowledge", "J4", "--by", "anna", "--why", "gearbox changed"]
+    explain = [
+        "history",
+        str(cell),
+        "--acknowledge",
+        "J4",
+        "--by",
+        "anna",
+        "--why",
+        "gearbox changed",
+    ]
     assert main(explain) == 0
     capsys.readouterr()
     series = _series(cell)[3]
@@ -417,16 +472,27 @@ def test_a_new_baseline_begins_where_one_says(cell: Path) -> None:
     assert series.began == 15
     assert not series.alarmed
     # A baseline that is still to come would silence the axis until then.
-    acknowledge(ledger_of(cell), "J4", since=BEGIN.replace(year=2130), at=BEGIN, who="anna", why="x")
+    acknowledge(
+        ledger_of(cell), "J4", since=BEGIN.replace(year=2130), at=BEGIN, who="anna", why="x"
+    )
     assert _series(cell)[3].acknowledged == series.acknowledged
     # One that began after the newest recording.
-    acknowledge(ledger_of(cell), "J4", since=BEGIN.replace(year=2130), at=BEGIN.replace(year=2130), who="a", why="x")
+    acknowledge(
+        ledger_of(cell),
+        "J4",
+        since=BEGIN.replace(year=2130),
+        at=BEGIN.replace(year=2130),
+        who="a",
+        why="x",
+    )
     series = _series(cell)[3]
     assert (series.began, series.drift, series.onset, alarm_text(series)) == (20, None, None, None)
     assert main(["history", str(cell), "--axis", "J4"]) == 0
 
 
-def test_a_baseline_that_begins_later_than_now_is_refused(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_baseline_that_begins_later_than_now_is_refused(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     _filled(cell, 3, lambda _: FLAT)
     explain = ["history", str(cell), "--acknowledge", "J4", "--why", "planned", "--since"]
     assert main([*explain, "2130-01-02T03:04:05+01:00"]) == 2
@@ -437,7 +503,9 @@ def test_a_baseline_that_begins_later_than_now_is_refused(cell: Path, capsys: py
     assert main([*explain, datetime.now(UTC).date().isoformat()]) == 0
 
 
-def test_a_log_of_tomorrow_begins_its_baseline_now(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_of_tomorrow_begins_its_baseline_now(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The clock of its recorder was ahead."""
     weeks = (datetime.now(UTC) - BEGIN).days // 7 + 2
     enter(ledger_of(cell), calibration_of(weeks))
@@ -486,7 +554,9 @@ def test_the_table_leaves_as_csv(cell: Path, capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 @pytest.mark.parametrize("arguments", [[], ["--axis", "J4"]])
-def test_the_picture_is_drawn_the_same_each_time(cell: Path, suffix: str, arguments: list[str]) -> None:
+def test_the_picture_is_drawn_the_same_each_time(
+    cell: Path, suffix: str, arguments: list[str]
+) -> None:
     _filled(cell, 26, drifting)
     out = cell.parent / f"history{suffix}"
     draw = ["history", str(cell), "--plot", str(out), *arguments]
@@ -508,10 +578,14 @@ def test_a_picture_has_its_kind_and_replaces_only_its_like(cell: Path) -> None:
     assert main(["history", str(cell), "--plot", str(cell.parent / "none" / "history.png")]) == 1
 
 
-def test_a_broken_audit_is_reported_by_its_first_line(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_audit_is_reported_by_its_first_line(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     audit = _place(cell).audit
     for number in range(4):
-        append(audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={"k": number})
+        append(
+            audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={"k": number}
+        )
     verify = ["history", str(cell), "--verify"]
     assert main(verify) == 0
     assert "4 entries, chain unbroken" in capsys.readouterr().out
@@ -525,11 +599,14 @@ def test_a_broken_audit_is_reported_by_its_first_line(cell: Path, capsys: pytest
     assert json.loads(capsys.readouterr().out)["audit"]["broken_line"] == 3
 
 
-def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_audit_whose_end_was_cut_off_is_noticed(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A chain cannot show that by itself: the note beside it knows its last entry."""
     place = _place(cell)
     entries = [
-        append(place.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="x", details={}) for _ in range(3)
+        append(place.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="x", details={})
+        for _ in range(3)
     ]
     assert main(["history", str(cell), "--verify"]) == 0
     place.audit.write_bytes(b"".join(place.audit.read_bytes().splitlines(keepends=True)[:2]))
@@ -537,12 +614,21 @@ def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.Ca
     assert entries[2].sha256[:12] in capsys.readouterr().err
 
 
-def test_an_audit_without_the_end_of_a_session_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_audit_without_the_end_of_a_session_is_noticed(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A session keeps the digest of the entry that ends it."""
     cell.write_text(cell.read_text() + RECALIBRATION)
     declared = load_cell(cell)
     assert declared.recalibration is not None
-    ended = append(_place(cell).audit, AuditAction.RECALIBRATION_ENDED, at=BEGIN, who="job", subject="x", details={})
+    ended = append(
+        _place(cell).audit,
+        AuditAction.RECALIBRATION_ENDED,
+        at=BEGIN,
+        who="job",
+        subject="x",
+        details={},
+    )
     session = begin(declared.recalibration.folder, Basis(declared.name, declared.digest, ""), BEGIN)
     assert main(["history", str(cell), "--verify"]) == 0
     save_session(replace(session, state=session.state.with_(audit_sha256=ended.sha256)))
@@ -552,14 +638,26 @@ def test_an_audit_without_the_end_of_a_session_is_noticed(cell: Path, capsys: py
     assert ended.sha256[:12] in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("content", "says"), [(b"old", "as before the write"), (b"new", "the new content")])
+@pytest.mark.parametrize(
+    ("content", "says"), [(b"old", "as before the write"), (b"new", "the new content")]
+)
 def test_a_write_that_never_ended_is_reported_with_what_the_file_is(
     cell: Path, capsys: pytest.CaptureFixture[str], content: bytes, says: str
 ) -> None:
     file = cell.parent / "controller.yaml"
     file.write_bytes(content)
-    digests = {"sha256_before": hashlib.sha256(b"old").hexdigest(), "sha256_after": hashlib.sha256(b"new").hexdigest()}
-    append(_place(cell).audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=str(file), details=digests)
+    digests = {
+        "sha256_before": hashlib.sha256(b"old").hexdigest(),
+        "sha256_after": hashlib.sha256(b"new").hexdigest(),
+    }
+    append(
+        _place(cell).audit,
+        AuditAction.APPLY_BEGUN,
+        at=BEGIN,
+        who="anna",
+        subject=str(file),
+        details=digests,
+    )
     assert main(["history", str(cell), "--verify"]) == 0
     assert says in " ".join(capsys.readouterr().out.split())
 
@@ -584,19 +682,29 @@ def _verified(cell: Path, capsys: pytest.CaptureFixture[str]) -> str:
 def test_a_write_of_which_the_history_does_not_know_is_reported_and_entered_by_hand(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    calibration = calibration_of(0)
+    file = cell.parent / "calibration.yaml"
     save_calibration(calibration, file)
     digest = digest_of(calibration)
     first = _write_down(cell, digest)
     back = _write_down(cell, digest, back=True)
     # Of another target the history of this cell need not know.
-    append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="/other.yaml", details={"begun": 1})
+    append(
+        _place(cell).audit,
+        AuditAction.APPLIED,
+        at=BEGIN,
+        who="anna",
+        subject="/other.yaml",
+        details={"begun": 1},
+    )
     reported = _verified(cell, capsys)
     for part in (f"entry {first.number} of", "applied by anna", digest[:12], "--add"):
         assert part in reported
     assert main(["history", str(cell), "--verify", "--json"]) == 4
     found = json.loads(capsys.readouterr().out)["audit"]
-    assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [(2, digest)]
+    assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [
+        (2, digest)
+    ]
     assert main(["history", str(cell), "--add", str(file)]) == 0
     assert capsys.readouterr().err.count("Entered too") == 1
     assert _verified(cell, capsys) == ""
@@ -614,7 +722,8 @@ def test_a_write_whose_calibration_is_added_later_is_in_its_place(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (second,) = _filled(cell, 1, lambda _: FLAT)
-    calibration, file = calibration_of(5), cell.parent / "calibration.yaml"
+    calibration = calibration_of(5)
+    file = cell.parent / "calibration.yaml"
     save_calibration(calibration, file)
     first = digest_of(calibration)
     lost = _write_down(cell, first)
@@ -628,8 +737,11 @@ def test_a_write_whose_calibration_is_added_later_is_in_its_place(
     assert [event.digest for event in history_of(cell).events] == [first, second]
 
 
-def test_nothing_is_entered_from_an_audit_that_someone_changed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+def test_nothing_is_entered_from_an_audit_that_someone_changed(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = calibration_of(0)
+    file = cell.parent / "calibration.yaml"
     save_calibration(calibration, file)
     _write_down(cell, digest_of(calibration))
     audit = _place(cell).audit
@@ -641,8 +753,12 @@ def test_nothing_is_entered_from_an_audit_that_someone_changed(cell: Path, capsy
     assert history_of(cell).events == ()
 
 
-def test_drives_that_are_written_once_more_are_written_twice(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`apply --drives` writes the values that are already there once more, to let the drives save it."""
+def test_drives_that_are_written_once_more_are_written_twice(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`apply --drives` writes the values that are already there once more,
+    to let the drives save it.
+    """
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     subject = drives_of("demo")
     for before in ("0" * 64, "1" * 64):
@@ -653,7 +769,9 @@ def test_drives_that_are_written_once_more_are_written_twice(cell: Path, capsys:
     assert history.in_force(subject) == digest
 
 
-def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_in_force_is_what_the_cell_s_own_controller_has(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     first, second, third = _filled(cell, 3, lambda _: FLAT)
     own = _put(cell, first)
 
@@ -667,7 +785,8 @@ def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pyte
     applied(second, "/another/controller.yaml")
     assert found_in_force() == first
     applied(third, own)
-    assert found_in_force() == first  # whatever the history says: the backup was copied back by hand
+    # Whatever the history says: the backup was copied back by hand
+    assert found_in_force() == first
     _put(cell, third)
     assert found_in_force() == third
     edited = Path(own).read_text().replace("loop:", "lopp:")
@@ -689,7 +808,11 @@ def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
 
     entries = tuple(_entry(name) for name in ("a", "b", "c"))
     done = [event("a", WriteAction.APPLIED, "anna")]
-    assert describe_actions(entries, done, "a") == {"a": "applied by anna, in force", "b": "-", "c": "-"}
+    assert describe_actions(entries, done, "a") == {
+        "a": "applied by anna, in force",
+        "b": "-",
+        "c": "-",
+    }
     done += [event("b", WriteAction.APPLIED, "ben"), event("c", WriteAction.APPLIED, "cem", "y")]
     assert describe_actions(entries, done, "b") == {
         "a": "applied by anna",
@@ -704,7 +827,9 @@ def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
     }
     done += [event(None, WriteAction.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
     assert describe_actions(entries, done, None)["c"] == "applied by cem, rolled back by eva"
-    assert describe_actions(entries, done, "c")["c"] == "applied by cem, rolled back by eva, in force"
+    assert describe_actions(entries, done, "c")["c"] == (
+        "applied by cem, rolled back by eva, in force"
+    )
 
 
 def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:
@@ -717,7 +842,8 @@ def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> Non
 def test_a_lost_history_is_not_called_empty(
     cell: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, lost: str
 ) -> None:
-    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    calibration = calibration_of(0)
+    file = cell.parent / "calibration.yaml"
     save_calibration(calibration, file)
     assert main(["history", str(cell), "--add", str(file)]) == 0
     _write_down(cell, digest_of(calibration))
@@ -730,7 +856,9 @@ def test_a_lost_history_is_not_called_empty(
     assert "--verify" in caplog.text
     assert "no calibration" not in capsys.readouterr().out
     # The next entry does not hide that there were others.
-    entered = append(_place(cell).audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={})
+    entered = append(
+        _place(cell).audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={}
+    )
     reported = _verified(cell, capsys)
     assert "noted elsewhere and missing here" in reported
     assert entered.sha256[:12] not in reported
@@ -751,7 +879,9 @@ def test_nothing_is_cut_off_in_80_columns(
     assert "…" not in shown
 
 
-def test_an_audit_that_is_no_regular_file_is_broken(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_audit_that_is_no_regular_file_is_broken(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     audit = _place(cell).audit
     for target in (cell.parent, Path("/dev/null"), cell.parent / "pipe"):
         if not target.exists():
@@ -763,7 +893,9 @@ def test_an_audit_that_is_no_regular_file_is_broken(cell: Path, capsys: pytest.C
         audit.unlink()
 
 
-def test_a_deleted_audit_is_reported_as_missing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_deleted_audit_is_reported_as_missing(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     _write_down(cell, digest)
     _place(cell).audit.unlink()

@@ -1,4 +1,6 @@
-"""A history that a killed writer never entered, or whose audit log is no audit log: reported, refused, repaired."""
+"""A history that a killed writer never entered, or whose audit log is no audit log:
+reported, refused, repaired.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +49,17 @@ def test_an_audit_of_any_length_is_not_read_into_memory(
         stream.truncate(1 << 40)  # no block of it is on the disk
     assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
     assert "more than 1073741824 bytes" in capsys.readouterr().err
-    assert main(["apply", str(cell), str(calibration_for(cell, 1.01)), "--yes"]) == ExitCode.CALIBRATION_REFUSED
+    assert (
+        main(["apply", str(cell), str(calibration_for(cell, 1.01)), "--yes"])
+        == ExitCode.CALIBRATION_REFUSED
+    )
     assert "more than 1073741824 bytes" in capsys.readouterr().err
 
 
 def kill_before_the_end(cell: Path) -> None:
-    """Leave what a writer leaves that is killed right after the rename: the begin in the audit, and no more."""
+    """Leave what a writer leaves that is killed right after the rename:
+    the begin in the audit, and no more.
+    """
     audit = place_of(cell).audit
     begun, *_ = audit.read_bytes().splitlines(keepends=True)
     audit.write_bytes(begun)
@@ -76,11 +83,18 @@ def test_a_write_that_was_killed_before_its_end_is_a_finding_until_it_is_entered
         assert main(["rollback", str(cell)]) == ExitCode.OK
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     found = [event.action for event in history_of(cell).events]
-    assert found == [WriteAction.APPLIED, *([WriteAction.ROLLED_BACK] if repair == "rollback" else [])]
-    assert [entry.action for entry in read(place_of(cell).audit)].count(AuditAction.WRITE_FOUND) == 1
+    assert found == [
+        WriteAction.APPLIED,
+        *([WriteAction.ROLLED_BACK] if repair == "rollback" else []),
+    ]
+    assert [entry.action for entry in read(place_of(cell).audit)].count(
+        AuditAction.WRITE_FOUND
+    ) == 1
 
 
-def test_a_write_that_was_killed_is_entered_before_the_one_that_follows(cell: Path, applied: Path) -> None:
+def test_a_write_that_was_killed_is_entered_before_the_one_that_follows(
+    cell: Path, applied: Path
+) -> None:
     kill_before_the_end(cell)
     assert main(["history", str(cell), "--add", str(applied)]) == ExitCode.OK
     later = calibration_for(cell, 1.02)

@@ -36,7 +36,16 @@ from daq.ledger.ledger import (
 )
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, calibration_for, demo_calibration
-from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, history_of, ledger_in, ledger_of, write
+from tests.daq.histories import (
+    BEGIN,
+    calibration_of,
+    digest_of,
+    enter,
+    history_of,
+    ledger_in,
+    ledger_of,
+    write,
+)
 
 FORK = multiprocessing.get_context("fork")
 NO_ONE = 65534
@@ -106,7 +115,11 @@ def test_entries_are_in_the_order_in_which_they_were_fitted(ledger: Ledger) -> N
     )
     enter_later(late, 4)
     found = [entry.created for entry in read_history(ledger).entries]
-    assert found == [BEGIN, BEGIN + timedelta(hours=1), *(BEGIN + timedelta(weeks=week) for week in (1, 2, 3))]
+    assert found == [
+        BEGIN,
+        BEGIN + timedelta(hours=1),
+        *(BEGIN + timedelta(weeks=week) for week in (1, 2, 3)),
+    ]
 
 
 def test_a_calibration_without_a_time_has_that_of_its_entry(ledger: Ledger) -> None:
@@ -121,14 +134,16 @@ def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> N
     other = {
         "cell": replace(calibration_of(1), cell="another"),
         "axes": replace(calibration_of(1), gains=known.gains[:5]),
-        "unit": replace(calibration_of(1), gains=(*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))),
+        "unit": replace(
+            calibration_of(1), gains=(*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))
+        ),
     }[different]
     enter(ledger, known)
     with pytest.raises(DataError) as refused:
         enter(ledger, other)
     assert len(read(ledger.audit)) == len(read_history(ledger).entries) == 1
     assert exit_code(DataError) == 4
-    assert "nothing was entered" in refused.value.remedy
+    assert "it was not entered" in refused.value.remedy
 
 
 def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
@@ -137,7 +152,9 @@ def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
     reported = []
 
     def in_force() -> None:
-        reported.append({None: "-", first: "first", second: "second"}[read_history(ledger).in_force("x.yaml")])
+        reported.append(
+            {None: "-", first: "first", second: "second"}[read_history(ledger).in_force("x.yaml")]
+        )
 
     write(ledger, "x.yaml", "1", digest=first)
     in_force()
@@ -183,7 +200,11 @@ def test_acknowledgements_come_back(ledger: Ledger) -> None:
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.datetimes(min_value=datetime(2, 1, 1), max_value=datetime(9998, 1, 1), timezones=st.timezones()))
+@given(
+    st.datetimes(
+        min_value=datetime(2, 1, 1), max_value=datetime(9998, 1, 1), timezones=st.timezones()
+    )
+)
 def test_times_are_kept_in_utc_in_their_order(at: datetime) -> None:
     kept = iso(at)
     # Of a time that a clock shows twice, or never, Python says that it equals none.
@@ -196,7 +217,9 @@ def test_times_are_kept_in_utc_in_their_order(at: datetime) -> None:
 
 def test_a_time_without_its_zone_is_refused(ledger: Ledger) -> None:
     with pytest.raises(ValueError, match="zone"):
-        enter_calibration(ledger, calibration_of(0), digest="0" * 64, who="anna", at=datetime(2026, 1, 1))
+        enter_calibration(
+            ledger, calibration_of(0), digest="0" * 64, who="anna", at=datetime(2026, 1, 1)
+        )
     assert read_history(ledger).entries == ()
 
 
@@ -249,7 +272,9 @@ def _add_many(folder: Path, weeks: range) -> None:
 
 
 def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
-    writers = [FORK.Process(target=_add_many, args=(tmp_path, range(first, 30))) for first in (0, 10, 20)]
+    writers = [
+        FORK.Process(target=_add_many, args=(tmp_path, range(first, 30))) for first in (0, 10, 20)
+    ]
     for writer in writers:
         writer.start()
     for writer in writers:
@@ -314,7 +339,14 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> N
         "sha256_after": "11507a0e2f5e69d5dfa40a62a1bd7b6ee57e6bcd85c67c9b8431b36fff21c437",
         "calibration": {"sha256": digest, "cell": "demo"},
     }
-    append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=subject, details=details)
+    append(
+        ledger.audit,
+        AuditAction.APPLY_BEGUN,
+        at=BEGIN,
+        who="anna",
+        subject=subject,
+        details=details,
+    )
     assert history_of(cell).events == ()  # a history does not depend on what a file is today
     assert main(["history", str(cell), "--verify"]) == 4
     for _ in range(2):
@@ -326,7 +358,14 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> N
     controller.write_bytes(b"edited")
     assert len(history_of(cell).events) == 1
     # Its writer was not killed after all, only late.
-    append(ledger.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=subject, details={"begun": 2})
+    append(
+        ledger.audit,
+        AuditAction.APPLIED,
+        at=BEGIN,
+        who="anna",
+        subject=subject,
+        details={"begun": 2},
+    )
     assert len(history_of(cell).events) == 1
 
 
@@ -337,7 +376,14 @@ def test_the_next_write_proves_the_killed_one_before_it(cell: Path) -> None:
     subject = str(load_cell(cell).controller_path)
     calibration = {"sha256": first, "cell": "demo"}
     details = {"sha256_before": "0" * 64, "sha256_after": "1" * 64, "calibration": calibration}
-    append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=subject, details=details)
+    append(
+        ledger.audit,
+        AuditAction.APPLY_BEGUN,
+        at=BEGIN,
+        who="anna",
+        subject=subject,
+        details=details,
+    )
     write(ledger, subject, "2" * 64, digest=second, before="1" * 64)
     assert [event.digest for event in history_of(cell).events] == [first, second]
     write(ledger, subject, "1" * 64, before="2" * 64)
@@ -352,24 +398,44 @@ def test_another_cell_of_the_same_audit_has_its_own(cell: Path) -> None:
     before = history_of(cell)
     calibration = {"sha256": "2" * 64, "cell": "another"}
     details = {"sha256_after": "1" * 64, "calibration": calibration}
-    begun = append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="ben", subject=subject, details=details)
+    begun = append(
+        ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="ben", subject=subject, details=details
+    )
     for action, more in (
         (AuditAction.APPLIED, {"begun": begun.number}),
-        (AuditAction.CALIBRATION_ENTERED, {"cell": "another", "sha256": "2" * 64, "entered": "x", "document": "y"}),
-        (AuditAction.ACKNOWLEDGED, {"cell": "another", "axis": "J4", "since": BEGIN.isoformat(), "why": "z"}),
+        (
+            AuditAction.CALIBRATION_ENTERED,
+            {"cell": "another", "sha256": "2" * 64, "entered": "x", "document": "y"},
+        ),
+        (
+            AuditAction.ACKNOWLEDGED,
+            {"cell": "another", "axis": "J4", "since": BEGIN.isoformat(), "why": "z"},
+        ),
     ):
         append(ledger.audit, action, at=BEGIN, who="ben", subject=subject, details=more)
     assert history_of(cell) == before
 
 
-def test_a_calibration_that_cannot_be_read_is_a_finding(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_calibration_that_cannot_be_read_is_a_finding(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Another program entered it, or a later version."""
     ledger = ledger_of(cell)
     enter(ledger, calibration_of(0))
-    unreadable: list[dict[str, object]] = [{"document": "no calibration"}, {"figures": {"gains": 1}}]
+    unreadable: list[dict[str, object]] = [
+        {"document": "no calibration"},
+        {"figures": {"gains": 1}},
+    ]
     for number, more in enumerate(unreadable):
         details = {"cell": "demo", "sha256": f"{number}" * 64, "entered": iso(BEGIN), **more}
-        append(ledger.audit, AuditAction.CALIBRATION_ENTERED, at=BEGIN, who="ben", subject="x", details=details)
+        append(
+            ledger.audit,
+            AuditAction.CALIBRATION_ENTERED,
+            at=BEGIN,
+            who="ben",
+            subject="x",
+            details=details,
+        )
     assert len(history_of(cell).entries) == 1
     assert main(["history", str(cell), "--verify"]) == 4
     said = " ".join(capsys.readouterr().err.split())
@@ -383,7 +449,9 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
 ) -> None:
     """A calibration that is missing changes the judgement of a gain and of its drift."""
     for factor in (1.0, 1.02, 1.01):
-        assert main(["apply", str(cell), str(calibration_for(cell, factor)), "--yes"]) == ExitCode.OK
+        assert (
+            main(["apply", str(cell), str(calibration_for(cell, factor)), "--yes"]) == ExitCode.OK
+        )
     ledger = ledger_of(cell)
     assert not read_history(ledger).may_lack
     lines = ledger.audit.read_bytes().splitlines(keepends=True)
@@ -399,26 +467,36 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
     assert read_history(ledger).may_lack
     assert verify_ledger(ledger).history.may_lack
     calibration = str(calibration_for(cell, 1.005))
-    for command in (["apply", str(cell), calibration], ["history", str(cell)], ["rollback", str(cell)]):
+    for command in (
+        ["apply", str(cell), calibration],
+        ["history", str(cell)],
+        ["rollback", str(cell)],
+    ):
         caplog.clear()
         assert main(command) == ExitCode.OK
         assert MAY_LACK in caplog.text
 
 
-def test_a_log_without_its_note_is_said_to_be_one(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_without_its_note_is_said_to_be_one(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["history", str(cell), "--add", str(calibration_for(cell))]) == ExitCode.OK
     note = head_file(ledger_of(cell).audit)
     for spoil in (note.unlink, lambda: note.write_text("no digest\n")):
         spoil()
         assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-        assert "a missing end of the audit log would not be noticed" in " ".join(capsys.readouterr().out.split())
+        assert ("a missing end of the audit log would not be noticed") in " ".join(
+            capsys.readouterr().out.split()
+        )
     assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.01))]) == ExitCode.OK
     capsys.readouterr()
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     assert "cannot be seen" not in capsys.readouterr().out
 
 
-def test_a_path_that_is_not_utf_8_is_in_the_history(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_path_that_is_not_utf_8_is_in_the_history(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     other = "/other/ctl\udcff.yaml"
     ledger = ledger_of(cell)
     subject = str(load_cell(cell).controller_path)

@@ -1,7 +1,8 @@
-"""A history of an earlier version, in SQLite: migrated once, kept aside, and never believed against the audit log.
+"""A history of an earlier version, in SQLite:
+migrated once, kept aside, and never believed against the audit log.
 
-`tests/data/make_two_ledgers.py` made the files: Ada applied a calibration, Bert another one, which Cleo rolled back; a
-third one was entered by hand, and Dora acknowledged a change of J4.
+`tests/data/make_two_ledgers.py` made the files: Ada applied a calibration, Bert another one, which
+Cleo rolled back; a third one was entered by hand, and Dora acknowledged a change of J4.
 """
 
 from __future__ import annotations
@@ -126,8 +127,12 @@ def test_each_command_that_enters_something_migrates_it(cell: Path, command: str
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
 
 
-def test_what_only_the_history_had_gets_into_the_audit(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A write without an audit log, as a program could make it, and one whose entry names only its begin."""
+def test_what_only_the_history_had_gets_into_the_audit(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A write without an audit log, as a program could make it,
+    and one whose entry names only its begin.
+    """
     change(
         cell,
         "INSERT INTO event (digest, deed, at, who, target) SELECT digest, 'applied', "
@@ -147,12 +152,20 @@ def test_what_only_the_history_had_gets_into_the_audit(cell: Path, capsys: pytes
     assert writers_of(cell) == [*WRITERS, "kim"]
 
 
-def test_a_history_of_a_version_whose_audit_has_no_calibrations(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Only the last lines of the audit log are of calibrations: without them it is one of that version."""
+def test_a_history_of_a_version_whose_audit_has_no_calibrations(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only the last lines of the audit log are of calibrations:
+    without them it is one of that version.
+    """
     audit = audit_of(cell)
     lines = audit.read_bytes().splitlines(keepends=True)
     audit.write_bytes(b"".join(lines[:2]))
-    change(cell, "DELETE FROM event WHERE number > 1; DELETE FROM acknowledgement; DELETE FROM sqlite_sequence")
+    change(
+        cell,
+        "DELETE FROM event WHERE number > 1; DELETE FROM acknowledgement; DELETE FROM "
+        "sqlite_sequence",
+    )
     digests = {one.digest for one in read_stored(stored_of(cell)).calibrations}
     assert len(digests) == 3
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
@@ -216,7 +229,8 @@ def test_a_row_of_what_the_audit_log_has_is_never_believed(
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     assert shown(cell, capsys) == json.loads((FILES / "history.json").read_text())
     assert writers_of(cell) == WRITERS
-    assert len(read(audit_of(cell))) == 13  # with the figures of three calibrations, and nothing of that row
+    # With the figures of three calibrations, and nothing of that row
+    assert len(read(audit_of(cell))) == 13
     assert len(asides_of(cell)) == 1
 
 
@@ -258,7 +272,8 @@ def test_a_file_that_is_no_history_is_refused_and_kept(
     for options in ((), ("--verify",), ("--add", str(calibration_for(cell)))):
         assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT, name
         assert "--migrate" in " ".join(capsys.readouterr().err.split())
-    # The write-back goes on without it: the gains are judged by the calibration and the controller's file.
+    # The write-back goes on without it: the gains are judged by the calibration and the
+    # controller's file.
     assert main(["apply", str(cell), str(calibration_for(cell))]) == ExitCode.OK
     assert stored_of(cell).read_bytes() == content
     assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
@@ -285,7 +300,9 @@ def test_a_sound_file_that_cannot_be_read_now_is_never_put_aside(
     assert writers_of(cell) == WRITERS
 
 
-@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), FileNotFoundError(2, "No such file")])
+@pytest.mark.parametrize(
+    "error", [PermissionError(13, "Permission denied"), FileNotFoundError(2, "No such file")]
+)
 def test_a_file_that_keeps_its_name_keeps_no_calibration_out(
     cell: Path, error: OSError, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -296,7 +313,9 @@ def test_a_file_that_keeps_its_name_keeps_no_calibration_out(
 
     with monkeypatch.context() as patch:
         patch.setattr(ledger_module, "set_aside", refuse)
-        assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.005))]) == ExitCode.OK
+        assert (
+            main(["history", str(cell), "--add", str(calibration_for(cell, 1.005))]) == ExitCode.OK
+        )
     assert ("keeps its name" in caplog.text) == isinstance(error, PermissionError)
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     assert len(history_of(cell).entries) == 4
@@ -327,7 +346,9 @@ def test_a_damaged_file_is_reported_and_never_a_surprise(random_: random.Random)
         damaged = bytearray((FILES / "demo.history.sqlite").read_bytes())
         for _ in range(random_.randint(1, 400)):
             damaged[random_.randrange(len(damaged))] = random_.randrange(256)
-        path.write_bytes(damaged[: random_.randint(1, len(damaged))] if random_.random() < 0.3 else damaged)
+        path.write_bytes(
+            damaged[: random_.randint(1, len(damaged))] if random_.random() < 0.3 else damaged
+        )
         try:
             read_stored(path)
         except HistoryUnreadable as error:
@@ -339,7 +360,8 @@ def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell: Path
     child = os.fork()
     if child == 0:
         connection = sqlite3.connect(stored_of(cell), isolation_level=None)
-        connection.execute("PRAGMA cache_size = 1")  # pages go to the file, and the old ones to the journal, at once
+        # Pages go to the file, and the old ones to the journal, at once
+        connection.execute("PRAGMA cache_size = 1")
         connection.execute("BEGIN IMMEDIATE")
         connection.execute("UPDATE calibration SET document = document || zeroblob(100000)")
         connection.execute("DELETE FROM event")

@@ -1,11 +1,14 @@
-"""A history is of one robot: another one of its name is left out and named, and a renamed cell keeps its history."""
+"""A history is of one robot: another one of its name is left out and named,
+and a renamed cell keeps its history.
+"""
 
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -20,13 +23,15 @@ from daq.errors import DataError, ExitCode
 from daq.files import sha256
 from daq.jobs.position import sessions_folder
 from daq.jobs.session import Basis, begin, rename_sessions, sessions
-from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger import ledger as ledger_module
+from daq.ledger.audit import AuditAction, append, read, verify
+from daq.ledger.fold import figures_of
 from daq.ledger.ledger import (
     Ledger,
     acknowledge,
     enter_calibration,
-    names_of,
     plan_rename,
+    present_name,
     read_history,
     read_standing,
     record_session,
@@ -75,12 +80,16 @@ def ledger(tmp_path: Path) -> Ledger:
 
 @pytest.fixture
 def renamed(ledger: Ledger) -> Ledger:
-    """The ledger of cell `press`, which was called demo and has three calibrations, a write and a session."""
+    """The ledger of cell `press`, which was called demo and has three calibrations,
+    a write and a session.
+    """
     digests = [_enter(ledger, _made(ledger.cell, week), week) for week in range(3)]
     write(ledger, drives_of("demo"), sha256(b"1"), digest=digests[0], at=BEGIN)
     acknowledge(ledger, "J1", since=BEGIN, at=BEGIN, who="anna", why="new gearbox")
     details = {"session": "s", "cell": "demo", "calibration_sha256": digests[0]}
-    record_session(ledger.audit, AuditAction.ACCEPTED, at=BEGIN, who="anna", subject="s", details=details)
+    record_session(
+        ledger.audit, AuditAction.ACCEPTED, at=BEGIN, who="anna", subject="s", details=details
+    )
     return _named(ledger, "press")
 
 
@@ -88,14 +97,22 @@ def test_no_drift_is_computed_over_two_robots(ledger: Ledger) -> None:
     for week in range(3):
         _enter(ledger, _made(ledger.cell, week), week)
     other = replace(ledger, cell=_other_robot(ledger.cell))
-    with pytest.raises(DataError, match=r"drive of J4 with product code 0x40200; expected .*0x40300"):
+    with pytest.raises(
+        DataError,
+        match=r"drive of J4 with product code 0x40200; expected "
+        r".*0x40300",
+    ):
         _enter(other, _made(other.cell, 3, FALLEN), 3)
     history = read_history(other)
     assert history.entries == ()
     assert watch(history.entries, history.acknowledgements) == ()
-    assert [one.entry.digest for one in history.other_robots] == [one.digest for one in read_history(ledger).entries]
+    assert [one.entry.digest for one in history.other_robots] == [
+        one.digest for one in read_history(ledger).entries
+    ]
     said = str(history.other_robots[0])
-    assert "is of another robot with the cell name 'demo': found drive of J4 with product code 0x40200" in said
+    assert (
+        "is of another robot with the cell name 'demo': found drive of J4 with product code 0x40200"
+    ) in said
     assert "expected drive of J4 with product code 0x40300, as in the cell file" in said
     assert verify_ledger(other).unknown == ()
 
@@ -121,7 +138,12 @@ def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renam
     assert read_history(renamed).entries == ()
     assert read_history(renamed).possible_names == ("demo",)
     planned = plan_rename(renamed, "demo")
-    assert (planned.calibrations, planned.writes, planned.acknowledgements, planned.undescribed) == (3, 1, 1, 0)
+    assert (
+        planned.calibrations,
+        planned.writes,
+        planned.acknowledgements,
+        planned.undescribed,
+    ) == (3, 1, 1, 0)
     assert ledger.audit.read_bytes() == lines
     rename_cell(renamed, planned, who="anna", at=LATER)
     # The chain is what it was, and one entry longer.
@@ -146,7 +168,9 @@ def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renam
     assert of_j4.alarmed
 
 
-def test_what_is_entered_under_the_old_name_later_is_of_another_cell(ledger: Ledger, renamed: Ledger) -> None:
+def test_what_is_entered_under_the_old_name_later_is_of_another_cell(
+    ledger: Ledger, renamed: Ledger
+) -> None:
     rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
     # The same robot, by a cell file that still has the old name.
     with pytest.raises(DataError, match=r"'demo', which this robot had until .*expected 'press'"):
@@ -179,7 +203,8 @@ def _rename(ledger: Ledger, old: str, week: int) -> None:
 
 def test_a_name_that_a_rename_has_freed_may_be_that_of_another_cell(ledger: Ledger) -> None:
     """The name that one robot had is another one's by now: each keeps its own calibrations."""
-    first, second = ledger, _named(ledger, "press")
+    first = ledger
+    second = _named(ledger, "press")
     of_first = _enter(first, _made(first.cell, 0), 0)
     of_second = _enter(second, _made(second.cell, 1, FALLEN), 1)
     line = _named(ledger, "line")
@@ -199,7 +224,9 @@ def test_a_job_that_was_held_for_its_old_name_is_no_history_of_that_name(renamed
     _rename(renamed, "demo", 11)
     before = len(read(renamed.audit))
     began = AuditAction.RECALIBRATION_BEGUN
-    record_session(renamed.audit, began, at=LATER, who="timer", subject="s", details={"cell": "demo"})
+    record_session(
+        renamed.audit, began, at=LATER, who="timer", subject="s", details={"cell": "demo"}
+    )
     planned = plan_rename(renamed, "demo")
     assert planned.entered_at is not None
     rename_cell(renamed, planned, who="anna", at=LATER)
@@ -213,12 +240,16 @@ def test_a_rename_to_the_name_of_another_robot_is_refused(ledger: Ledger) -> Non
     _enter(other, _made(other.cell, 0), 0)
     lines = ledger.audit.read_bytes()
     for wanted, name in ((press, "press"), (other, "demo")):
-        with pytest.raises(DataError, match=f"another robot with the cell name '{name}': found drive of J4"):
+        with pytest.raises(
+            DataError, match=f"another robot with the cell name '{name}': found drive of J4"
+        ):
             plan_rename(wanted, "demo")
     assert ledger.audit.read_bytes() == lines
 
 
-def test_a_name_that_the_log_does_not_have_is_refused_with_those_that_it_has(renamed: Ledger) -> None:
+def test_a_name_that_the_log_does_not_have_is_refused_with_those_that_it_has(
+    renamed: Ledger,
+) -> None:
     with pytest.raises(DataError, match="nothing of a cell 'dmeo'; cells in it: 'demo'"):
         plan_rename(renamed, "dmeo")
 
@@ -237,15 +268,21 @@ def _sessions_of(folder: Path, cell: str, count: int) -> None:
 def test_sessions_get_the_new_name_unless_they_began_after_the_rename(tmp_path: Path) -> None:
     _sessions_of(tmp_path, "demo", 3)
     _sessions_of(tmp_path, "gantry", 1)
-    count = rename_sessions([tmp_path, tmp_path / "none"], "demo", "press", BEGIN + timedelta(days=1))
+    count = rename_sessions(
+        [tmp_path, tmp_path / "none"], "demo", "press", BEGIN + timedelta(days=1)
+    )
     assert count == 2
     assert len(sessions(tmp_path, "press")) == 2
     assert len(sessions(tmp_path, "demo")) == 1
     assert len(sessions(tmp_path, "gantry")) == 1
 
 
-def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one(tmp_path: Path) -> None:
-    """Kill it at every eighth call: before the entry, in the middle of the sessions, and behind them."""
+def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one(
+    tmp_path: Path,
+) -> None:
+    """Kill it at every eighth call: before the entry, in the middle of the sessions,
+    and behind them.
+    """
 
     def prepared(folder: Path) -> tuple[Ledger, Callable[[], int]]:
         folder.mkdir()
@@ -290,7 +327,11 @@ def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one
 @pytest.fixture
 def cell_file(checkout: Path, tmp_path: Path) -> Path:
     """A demo cell, with two calibrations and a guided session under its name."""
-    text = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8").replace("../", f"{checkout}/configs/")
+    text = (
+        (checkout / "configs/cells/demo.yaml")
+        .read_text(encoding="utf-8")
+        .replace("../", f"{checkout}/configs/")
+    )
     path = tmp_path / "cell.yaml"
     path.write_text(text, encoding="utf-8")
     ledger = Ledger.of(load_cell(path))
@@ -304,7 +345,9 @@ def cell_file(checkout: Path, tmp_path: Path) -> Path:
 def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1))
+    cell_file.write_text(
+        cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    )
     audit = cell_file.with_name("cell.audit.jsonl")
     lines = audit.read_bytes()
     assert main(["history", str(cell_file)]) == ExitCode.OK
@@ -312,7 +355,9 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     capsys.readouterr()
     assert main(["history", str(cell_file), "--rename", "demo"]) == ExitCode.OK
     said = " ".join(capsys.readouterr().err.split())
-    assert "Would rename 'demo' to 'press': 2 calibrations, 0 writes, 0 explained changes, 1 session." in said
+    assert (
+        "Would rename 'demo' to 'press': 2 calibrations, 0 writes, 0 explained changes, 1 session."
+    ) in said
     assert audit.read_bytes() == lines
     assert len(sessions(sessions_folder(cell_file), "demo")) == 1
     assert main(["history", str(cell_file), "--rename", "demo", "--yes", "--json"]) == ExitCode.OK
@@ -321,11 +366,170 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     assert "drivegain-recalibrate-demo.timer" in captured.err
     assert len(sessions(sessions_folder(cell_file), "press")) == 1
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
-    assert names_of(load_cell(cell_file)) == {"press", "demo"}
+    press = load_cell(cell_file)
+    assert present_name(press, "demo", BEGIN) == "press"
+    assert present_name(press, "demo", datetime.now(UTC)) == "demo"
+    assert present_name(press, "press", BEGIN) == "press"
     # A copy of the cell file with the old name, as a schedule may have.
-    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1))
+    cell_file.write_text(
+        cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1)
+    )
     assert main(["history", str(cell_file)]) == ExitCode.OK
     assert "this cell was renamed: found the name 'demo', expected 'press'" in caplog.text
+    assert "if it is another robot, give it another name, or another audit log" in caplog.text
+
+
+def test_a_twin_that_takes_a_freed_name_learns_how_to_begin_its_own_history(
+    ledger: Ledger, renamed: Ledger
+) -> None:
+    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    twin = _made(ledger.cell, 12)
+    with pytest.raises(DataError, match="which this robot had until") as caught:
+        _enter(ledger, twin, 12)
+    assert "if it is another robot, give it another name, or another audit log" in str(caught.value)
+    # Either way is one that works.
+    named = _named(ledger, "twin")
+    _enter(named, replace(twin, cell="twin"), 12)
+    assert len(read_history(named).entries) == 1
+    elsewhere = replace(ledger, audit=ledger.audit.with_name("twin.audit.jsonl"))
+    _enter(elsewhere, twin, 12)
+    assert len(read_history(elsewhere).entries) == 1
+    assert read_history(elsewhere).renamed is None
+
+
+def test_a_rename_finds_the_sessions_that_a_cell_file_of_another_name_has_left(
+    cell_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    text = text.replace("name: press", "name: press\nhistory: {audit: cell.audit.jsonl}", 1)
+    press = cell_file.with_name("press.yaml")
+    cell_file.rename(press)
+    press.write_text(text, encoding="utf-8")
+    left_behind = sessions_folder(cell_file)
+    elsewhere = tmp_path / "elsewhere"
+    _sessions_of(elsewhere, "demo", 1)
+    # Beside its own cell file, which is still there, a session is of that one.
+    others = tmp_path / "other.sessions"
+    _sessions_of(others, "demo", 1)
+    others.with_suffix(".yaml").touch()
+    absent = ["--rename", "demo", "--sessions", str(tmp_path / "absent")]
+    assert main(["history", str(press), *absent]) == ExitCode.USAGE
+    options = ["--rename", "demo", "--sessions", str(elsewhere)]
+    assert main(["history", str(press), *options]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert "2 sessions. Nothing was renamed; --yes does it." in said
+    assert main(["history", str(press), *options, "--yes"]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"1 session in {left_behind}, where `drivegain calibrate` looks with --sessions" in said
+    assert len(sessions(left_behind, "press")) == 1
+    assert len(sessions(elsewhere, "press")) == 1
+    assert len(sessions(others, "demo")) == 1
+
+
+def test_who_adds_or_renames_is_recorded(cell_file: Path) -> None:
+    added = cell_file.with_name("calibration.yaml")
+    save_calibration(_made(load_cell(cell_file), 5), added)
+    audit = cell_file.with_name("cell.audit.jsonl")
+    assert main(["history", str(cell_file), "--add", str(added), "--by", "Ada"]) == ExitCode.OK
+    assert read(audit)[-1].action is AuditAction.CALIBRATION_ENTERED
+    assert read(audit)[-1].who.startswith("Ada")
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
+    cell_file.write_text(text, encoding="utf-8")
+    rename = ["--rename", "demo", "--yes", "--by", "Bert"]
+    assert main(["history", str(cell_file), *rename]) == ExitCode.OK
+    assert read(audit)[-1].action is AuditAction.RENAMED
+    assert read(audit)[-1].who.startswith("Bert")
+    assert main(["history", str(cell_file), "--by", "Cleo"]) == ExitCode.USAGE
+
+
+@pytest.mark.parametrize("verb", ["--add", "--rename", "--acknowledge"])
+def test_an_interrupt_after_an_entry_says_what_was_entered(
+    cell_file: Path,
+    verb: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    added = cell_file.with_name("calibration.yaml")
+    name = "demo"
+    if verb == "--rename":
+        name = "press"
+    text = cell_file.read_text(encoding="utf-8").replace("name: demo", f"name: {name}", 1)
+    cell_file.write_text(text, encoding="utf-8")
+    save_calibration(_made(load_cell(cell_file), 5), added)
+    arguments, entering, expected = {
+        "--add": ([str(added)], "enter_calibration", f"{added} was entered into"),
+        "--rename": (["demo", "--yes"], "rename_cell", "has the rename of 'demo' to 'press'"),
+        "--acknowledge": (
+            ["J1", "--why", "new gearbox"],
+            "acknowledge",
+            "the change of J1 was entered as explained into",
+        ),
+    }[verb]
+    enter = getattr(ledger_module, entering)
+
+    def enter_and_interrupt(*values: object, **options: object) -> object:
+        result = enter(*values, **options)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(ledger_module, entering, enter_and_interrupt)
+    before = len(read(cell_file.with_name("cell.audit.jsonl")))
+    assert main(["history", str(cell_file), verb, *arguments]) == ExitCode.INTERRUPTED
+    assert len(read(cell_file.with_name("cell.audit.jsonl"))) == before + 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert expected in said
+    assert "no file was written" not in said
+
+
+def _enter_unchecked(ledger: Ledger, calibration: Calibration, at: datetime) -> str:
+    """Enter a calibration as earlier versions did, which compared neither axes nor units."""
+    digest = digest_of(calibration)
+    details = {
+        "sha256": digest,
+        "cell": ledger.cell.name,
+        "entered": at.isoformat(),
+        "figures": figures_of(calibration, digest, at),
+    }
+    append(
+        ledger.audit,
+        AuditAction.CALIBRATION_ENTERED,
+        at=at,
+        who="anna",
+        subject=f"history of {ledger.cell.name}",
+        details=details,
+    )
+    return digest
+
+
+def test_calibrations_with_other_axes_or_units_are_counted_and_their_writes_known(
+    cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    ledger = Ledger.of(load_cell(cell_file))
+    assert ledger is not None
+    four = _made(ledger.cell, 3)
+    four = replace(four, gains=four.gains[:4])
+    milli = _made(ledger.cell, 4)
+    first = replace(milli.gains[0], unit="Nm/mA")
+    milli = replace(milli, gains=(first, *milli.gains[1:]))
+    digests = []
+    for week, calibration in ((3, four), (4, milli)):
+        at = BEGIN + timedelta(weeks=week)
+        digest = _enter_unchecked(ledger, calibration, at)
+        write(ledger, drives_of("demo"), sha256(str(week).encode()), digest=digest, at=at)
+        digests.append(digest)
+    _enter_unchecked(ledger, _made(ledger.cell, 5), BEGIN + timedelta(weeks=5))
+    assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
+    report = json.loads(capsys.readouterr().out)
+    assert report["calibrations"] == 3
+    by_axes, by_unit = report["not_compared"]
+    assert digests[0][:12] in by_axes
+    assert "found gains of J1, J2, J3, J4; expected of J1, J2, J3, J4, J5, J6, as in" in by_axes
+    assert digests[1][:12] in by_unit
+    assert "found J1 in Nm/mA; expected J1 in" in by_unit
+    assert "2 calibrations left out of tables, drift and alarms" in caplog.text
+    assert by_axes in caplog.text
+    assert verify_ledger(ledger).unknown == ()
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
 
 
 def test_the_verb_says_in_what_another_robot_differs(

@@ -1,4 +1,6 @@
-"""The state of one calibration by the ledger: each write, rollback and acceptance moves it, and nothing else does."""
+"""The state of one calibration by the ledger:
+each write, rollback and acceptance moves it, and nothing else does.
+"""
 
 from __future__ import annotations
 
@@ -28,15 +30,32 @@ def ledger(tmp_path: Path) -> Ledger:
 def accept(ledger: Ledger, digest: str, cell: str = "demo") -> None:
     details = {"session": "20260105T060000Z", "cell": cell, "calibration_sha256": digest}
     at = BEGIN + timedelta(hours=2)
-    record_session(ledger.audit, AuditAction.ACCEPTED, at=at, who="anna", subject="session", details=details)
+    record_session(
+        ledger.audit, AuditAction.ACCEPTED, at=at, who="anna", subject="session", details=details
+    )
 
 
-def test_new_moves_that_contradict_a_calibration_are_its_state_until_others_accept_it(ledger: Ledger) -> None:
+def test_new_moves_that_contradict_a_calibration_are_its_state_until_others_accept_it(
+    ledger: Ledger,
+) -> None:
     digest = enter(ledger, calibration_of(0))
     write(ledger, FILE, sha256(b"1"), digest=digest, at=BEGIN + timedelta(hours=1), who="anna")
-    details = {"session": "x", "cell": "demo", "calibration_sha256": digest, "remark": "J4", "undo": "rollback"}
+    details = {
+        "session": "x",
+        "cell": "demo",
+        "calibration_sha256": digest,
+        "remark": "J4",
+        "undo": "rollback",
+    }
     at = BEGIN + timedelta(hours=2)
-    record_session(ledger.audit, AuditAction.NOT_ACCEPTED, at=at, who="anna", subject="session", details=details)
+    record_session(
+        ledger.audit,
+        AuditAction.NOT_ACCEPTED,
+        at=at,
+        who="anna",
+        subject="session",
+        details=details,
+    )
     standing = read_standing(ledger, digest, NOW)
     assert standing.state is StandingState.NOT_ACCEPTED
     assert standing.acceptance is not None
@@ -68,7 +87,11 @@ def test_a_write_is_in_force_until_another_one_at_its_place(ledger: Ledger) -> N
     standing = read_standing(ledger, first, NOW)
     assert standing.state is StandingState.WRITTEN
     assert standing.write is not None
-    assert (standing.write.at, standing.write.who, standing.ended) == (BEGIN + timedelta(hours=1), "anna", None)
+    assert (standing.write.at, standing.write.who, standing.ended) == (
+        BEGIN + timedelta(hours=1),
+        "anna",
+        None,
+    )
     # A write of other gains elsewhere replaces nothing here.
     write(ledger, COPY, sha256(b"2"), digest=second, at=BEGIN + timedelta(hours=2))
     assert state(ledger, first) is state(ledger, second) is StandingState.WRITTEN
@@ -107,14 +130,20 @@ def test_a_rollback_ends_one_write_and_restores_the_other(ledger: Ledger) -> Non
 
 def test_gains_before_a_write_are_those_that_its_begin_has(ledger: Ledger) -> None:
     digest = enter(ledger, calibration_of(0))
-    changes = [{"axis": "J1", "old": 32.96, "new": 33.9}, {"axis": "J2", "old": None, "new": 1.0}, "no mapping"]
+    changes = [
+        {"axis": "J1", "old": 32.96, "new": 33.9},
+        {"axis": "J2", "old": None, "new": 1.0},
+        "no mapping",
+    ]
     details = {
         "sha256_before": sha256(b"0"),
         "sha256_after": sha256(b"1"),
         "calibration": {"sha256": digest, "cell": "demo"},
         "changes": changes,
     }
-    begun = append(ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=FILE, details=details)
+    begun = append(
+        ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=FILE, details=details
+    )
     ended = {"begun": begun.number}
     append(ledger.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=FILE, details=ended)
     assert read_standing(ledger, digest, NOW).before == {"J1": 32.96}
@@ -158,7 +187,13 @@ def test_the_last_write_of_each_place_decides(
     places: dict[str, int] = {}
     ever: set[int] = set()
     for hour, (place, week) in enumerate(steps):
-        write(ledger, place, sha256(f"{hour}".encode()), digest=digests[week], at=BEGIN + timedelta(hours=hour))
+        write(
+            ledger,
+            place,
+            sha256(f"{hour}".encode()),
+            digest=digests[week],
+            at=BEGIN + timedelta(hours=hour),
+        )
         places[place] = week
         ever.add(week)
     for week, digest in enumerate(digests):

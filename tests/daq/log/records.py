@@ -1,4 +1,6 @@
-"""Records of an MCAP file with right checksums, made up for tests: an attacker can make them too."""
+"""Records of an MCAP file with right checksums, made up for tests:
+an attacker can make them too.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,14 @@ import zstandard
 from mcap.opcode import Opcode
 
 from daq.log.container import MAGIC
-from daq.log.message import DEFINITIONS, EVENTS_SCHEMA, EVENTS_TOPIC, SAMPLES_SCHEMA, SAMPLES_TOPIC, sample_dtype
+from daq.log.message import (
+    DEFINITIONS,
+    EVENTS_SCHEMA,
+    EVENTS_TOPIC,
+    SAMPLES_SCHEMA,
+    SAMPLES_TOPIC,
+    sample_dtype,
+)
 
 
 def raw_record(opcode: int, body: bytes, length: int | None = None) -> bytes:
@@ -29,9 +38,9 @@ def finished_file(path: Path, records: list[bytes]) -> Path:
     """A file of these records, with both checksums."""
     data = MAGIC + b"".join(records)
     data += raw_record(Opcode.DATA_END, struct.pack("<I", zlib.crc32(data)))
-    footer = raw_record(Opcode.FOOTER, struct.pack("<QQ", 0, 0))[:9].replace(b"\x10", b"\x14", 1) + struct.pack(
-        "<QQ", 0, 0
-    )
+    footer = raw_record(Opcode.FOOTER, struct.pack("<QQ", 0, 0))[:9].replace(
+        b"\x10", b"\x14", 1
+    ) + struct.pack("<QQ", 0, 0)
     path.write_bytes(data + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC)
     return path
 
@@ -44,21 +53,42 @@ def metadata_record(name: str, entries: dict[str, str]) -> bytes:
 
 def attachment_record(name: str, data: bytes) -> bytes:
     """An attachment with its checksum."""
-    body = struct.pack("<QQ", 0, 0) + cdr_text(name) + cdr_text("") + struct.pack("<Q", len(data)) + data
+    body = (
+        struct.pack("<QQ", 0, 0)
+        + cdr_text(name)
+        + cdr_text("")
+        + struct.pack("<Q", len(data))
+        + data
+    )
     return raw_record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
 
 
 def chunk_record(data: bytes, size: int | None = None, compression: str = "zstd") -> bytes:
     """A chunk with its checksum."""
-    packed = zstandard.compress(data) if compression == "zstd" else data
-    head = struct.pack("<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data)) + cdr_text(compression)
+    if compression == "zstd":
+        packed = zstandard.compress(data)
+    else:
+        packed = data
+    head = struct.pack(
+        "<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data)
+    ) + cdr_text(compression)
     return raw_record(Opcode.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
 
 
 def definitions(topic: str, schema: str, number: int) -> bytes:
     """Schema and channel of a topic."""
-    described = struct.pack("<H", number) + cdr_text(schema) + cdr_text("ros2msg") + cdr_text(DEFINITIONS[schema])
-    channel = struct.pack("<HH", number, number) + cdr_text(topic) + cdr_text("cdr") + struct.pack("<I", 0)
+    described = (
+        struct.pack("<H", number)
+        + cdr_text(schema)
+        + cdr_text("ros2msg")
+        + cdr_text(DEFINITIONS[schema])
+    )
+    channel = (
+        struct.pack("<HH", number, number)
+        + cdr_text(topic)
+        + cdr_text("cdr")
+        + struct.pack("<I", 0)
+    )
     return raw_record(Opcode.SCHEMA, described) + raw_record(Opcode.CHANNEL, channel)
 
 
@@ -69,9 +99,19 @@ TOPICS = definitions(SAMPLES_TOPIC, SAMPLES_SCHEMA, 1) + definitions(EVENTS_TOPI
 def sample_records(cycle: Sequence[int], time_ns: Sequence[int], axes: int = 6) -> bytes:
     """Messages of samples at rest, shape (k,) each; one chunk holds some of them."""
     made = np.zeros(len(cycle), dtype=sample_dtype(axes))
-    heads = {"opcode": Opcode.MESSAGE, "length": made.itemsize - 9, "channel": 1, "encapsulation": 0x100}
-    for name, value in {**heads, **dict.fromkeys(("positions", "currents", "statuswords"), axes)}.items():
+    heads = {
+        "opcode": Opcode.MESSAGE,
+        "length": made.itemsize - 9,
+        "channel": 1,
+        "encapsulation": 0x100,
+    }
+    for name, value in {
+        **heads,
+        **dict.fromkeys(("positions", "currents", "statuswords"), axes),
+    }.items():
         made[name] = value
     made["cycle"] = cycle
-    made["seconds"], made["nanoseconds"] = np.divmod(np.asarray(time_ns, dtype=np.int64), 1_000_000_000)
+    made["seconds"], made["nanoseconds"] = np.divmod(
+        np.asarray(time_ns, dtype=np.int64), 1_000_000_000
+    )
     return made.tobytes()

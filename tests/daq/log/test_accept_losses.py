@@ -48,14 +48,20 @@ def test_nothing_else_may(reason: str) -> None:
     assert not reports_only_losses(reason)
 
 
-def test_a_lossy_log_is_refused_until_it_is_accepted_and_is_then_partial(checkout: Path, tmp_path: Path) -> None:
+def test_a_lossy_log_is_refused_until_it_is_accepted_and_is_then_partial(
+    checkout: Path, tmp_path: Path
+) -> None:
     rows = samples([[k, k, k, k, k, k] for k in range(40)])
-    path = write(tmp_path / "lossy.mcap", demo_content(checkout), rows, verdict=(False, "3 missing answers"))
+    path = write(
+        tmp_path / "lossy.mcap", demo_content(checkout), rows, verdict=(False, "3 missing answers")
+    )
     with pytest.raises(RunInvalid, match="--accept-losses"):
         load_run(path)
     run, _ = load_run(path, lossy=LossyLogs.ACCEPTED)
     assert run.partial
-    doubled = write(tmp_path / "doubled.mcap", demo_content(checkout), rows, verdict=(False, "3 answers twice"))
+    doubled = write(
+        tmp_path / "doubled.mcap", demo_content(checkout), rows, verdict=(False, "3 answers twice")
+    )
     with pytest.raises(RunInvalid):
         load_run(doubled, lossy=LossyLogs.ACCEPTED)
 
@@ -67,6 +73,8 @@ def test_the_recorder_counts_them_by_these_names() -> None:
     reason = stream_losses(counted)
     assert reason
     assert reports_only_losses(reason)
-    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == {loss.value for loss in Loss if loss.masked}
+    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == {
+        loss.value for loss in Loss if loss.masked
+    }
     assert {loss.value for loss in Loss if loss.masked} == set(MASKED)
     assert not reports_only_losses(stream_losses(StreamStatistics(missing=1, skipped_periods=1)))

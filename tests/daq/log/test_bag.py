@@ -1,4 +1,6 @@
-"""ROS 2 bags: the joint states that an independent writer put in, or an error that says what is there."""
+"""ROS 2 bags: the joint states that an independent writer put in,
+or an error that says what is there.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,16 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 
 from daq.cli import main
-from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
+from daq.config.import_description import (
+    CurrentColumns,
+    ImportDescription,
+    KeptPart,
+    PositionColumns,
+    PositionUnit,
+    Side,
+    TimeColumn,
+    TimeUnit,
+)
 from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
 from daq.log.bag_table import STAMP, interleaved, read_bag
 from daq.log.conversion import load_run
@@ -53,7 +64,9 @@ def message(row: int, joints: Sequence[int] = range(6), **changes: Any) -> dict[
 
 
 def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **options: Any) -> Path:
-    """A bag with these joint states, by topic, each recorded half a millisecond after the one before."""
+    """A bag with these joint states, by topic, each recorded half a millisecond after the one
+    before.
+    """
     with path.open("wb") as stream, Ros2Writer(stream, **options) as writer:
         schema = writer.register_msgdef(JOINTS_SCHEMA, DEFINITIONS[JOINTS_SCHEMA])
         for number, (topic, content) in enumerate(messages):
@@ -63,10 +76,14 @@ def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **opti
 
 def describe(topic: str | None = None, **changes: Any) -> ImportDescription:
     """A description, with what the reader needs of it alone."""
-    return ImportDescription.model_construct(topic=topic, **changes)
+    return ImportDescription.model_construct(
+        **{"topic": topic, "position": None, "current": None} | changes
+    )
 
 
-def read(path: Path, columns: tuple[str, ...] = COLUMNS, topic: str | None = None, **changes: Any) -> Table:
+def read(
+    path: Path, columns: tuple[str, ...] = COLUMNS, topic: str | None = None, **changes: Any
+) -> Table:
     """Columns with their stamps."""
     return read_bag(path, describe(topic, **changes), columns, TIME)
 
@@ -86,7 +103,9 @@ def assert_whole(table: Table) -> None:
 
 @pytest.mark.parametrize("compression", CompressionType)
 def test_a_bag_is_read_as_it_was_written(compression: CompressionType, tmp_path: Path) -> None:
-    assert_whole(read(write_bag(tmp_path / "run.mcap", whole(), compression=compression, chunk_size=4000)))
+    assert_whole(
+        read(write_bag(tmp_path / "run.mcap", whole(), compression=compression, chunk_size=4000))
+    )
 
 
 def _repack(source: Path, target: Path, **options: Any) -> Path:
@@ -100,7 +119,9 @@ def _repack(source: Path, target: Path, **options: Any) -> Path:
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
-            writer.add_message(channels[channel.id], content.log_time, content.data, content.publish_time)
+            writer.add_message(
+                channels[channel.id], content.log_time, content.data, content.publish_time
+            )
         writer.finish()
     return target
 
@@ -116,14 +137,20 @@ def test_chunks_and_checksums_are_optional(options: dict[str, Any], tmp_path: Pa
 
 
 def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
-    """One driver publishes the arm and another the wrist, each in a message of its own; a gripper is no axis.
+    """One driver publishes the arm and another the wrist, each in a message of its own;
+    a gripper is no axis.
 
-    The bag begins after the arm's message of its first stamp, and ends before the wrist's of its last one.
+    The bag begins after the arm's message of its first stamp, and ends before the wrist's of its
+    last one.
     """
     parts = [
         ("/joint_states", part)
         for row in range(ROWS)
-        for part in (message(row, (2, 0, 1)), message(row, (), name=["finger"]), message(row, (5, 3, 4)))
+        for part in (
+            message(row, (2, 0, 1)),
+            message(row, (), name=["finger"]),
+            message(row, (5, 3, 4)),
+        )
     ]
     table = read(write_bag(tmp_path / "run.mcap", parts))
     assert_whole(table)
@@ -131,7 +158,11 @@ def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
     cut = read(write_bag(tmp_path / "cut.mcap", parts[1:-1]))
     np.testing.assert_array_equal(cut.values, np.hstack((POSITION, EFFORT))[1:-1])
     assert cut.remarks == ("left out, as joints are missing at the ends of the bag: 2 stamps",)
-    with pytest.raises(TableUnfit, match=r"found no position.J4, .* at 1700000000.163456.*; expected all joints in"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"found no position.J4, .* at 1700000000.163456.*; "
+        r"expected all joints in",
+    ):
         read(write_bag(tmp_path / "gap.mcap", [*parts[:32], *parts[33:]]))
 
 
@@ -141,7 +172,10 @@ def _unmeasured(row: int) -> dict[str, Any]:
 
 
 def test_messages_before_the_first_reading_are_left_out(tmp_path: Path) -> None:
-    parts = [("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row)) for row in range(ROWS)]
+    parts = [
+        ("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row))
+        for row in range(ROWS)
+    ]
     table = read(write_bag(tmp_path / "run.mcap", parts))
     np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[3:-1])
     assert table.stamps is not None
@@ -154,7 +188,11 @@ def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> No
     parts = whole()
     parts[50] = ("/joint_states", message(50, effort=[0.5, float("nan"), 0.5, 0.5, 0.5, 0.5]))
     bag = write_bag(tmp_path / "run.mcap", parts)
-    with pytest.raises(TableUnfit, match=r"found nan for effort\.J2 at 1700000000\.323456\d+ s; .*by `keep`"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"found nan for effort\.J2 at 1700000000\.323456\d+ s; "
+        r".*by `keep`",
+    ):
         read(bag)
     table = read(bag, keep=KeptPart(to_row=50))
     np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[:50])
@@ -213,7 +251,9 @@ def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
     parts: list[tuple[str, dict[str, Any]]], other: str, tmp_path: Path
 ) -> None:
     bag = write_bag(tmp_path / "run.mcap", parts)
-    with pytest.raises(TableUnfit, match="found 2 publishers of the same joints on one topic") as caught:
+    with pytest.raises(
+        TableUnfit, match="found 2 publishers of the same joints on one topic"
+    ) as caught:
         read(bag)
     first = "1: position and effort of J1, J2, J3, J4, J5, J6, frame 'base', 200 messages"
     assert caught.value.found.endswith(f"{first}; {other}")
@@ -221,7 +261,11 @@ def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
     table = read(bag, publisher=1)
     assert_whole(table)
     assert table.remarks == (f"left out, of another publisher: {other}",)
-    with pytest.raises(TableUnfit, match=r"found publisher 3, and those of the topic are 1: .*; 2: "):
+    with pytest.raises(
+        TableUnfit,
+        match=r"found publisher 3, and those of the topic are "
+        r"1: .*; 2: ",
+    ):
         read(bag, publisher=3)
 
 
@@ -231,21 +275,101 @@ def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) 
         read(bag, publisher=2)
 
 
+def _of_sections(position: dict[str, Any], current: dict[str, Any]) -> dict[str, Any]:
+    """Sections whose positions and efforts have a topic or a publisher of their own."""
+    columns = COLUMNS[:6]
+    moved = PositionColumns(
+        file="run.mcap", columns=columns, unit=PositionUnit.RAD, side=Side.JOINT, **position
+    )
+    return {
+        "position": moved,
+        "current": CurrentColumns(file="run.mcap", columns=COLUMNS[6:], unit="A", **current),
+    }
+
+
+def _apart(
+    effort_topic: str, *, effort_rows: Sequence[int] = range(ROWS)
+) -> list[tuple[str, dict[str, Any]]]:
+    """Positions in messages of their own, and efforts in others."""
+    parts = []
+    for row in range(ROWS):
+        parts.append(("/joint_states", message(row, effort=[])))
+        if row in effort_rows:
+            parts.append((effort_topic, message(row, position=[])))
+    return parts
+
+
+@pytest.mark.parametrize(
+    ("topic", "position", "current"),
+    [
+        ("/efforts", {"topic": "/joint_states"}, {"topic": "/efforts"}),
+        ("/joint_states", {"publisher": 1}, {"publisher": 2}),
+    ],
+    ids=["two topics", "two publishers of a topic"],
+)
+def test_positions_and_efforts_of_different_messages_are_joined_by_their_stamps(
+    topic: str, position: dict[str, Any], current: dict[str, Any], tmp_path: Path
+) -> None:
+    sections = _of_sections(position, current)
+    bag = write_bag(tmp_path / "run.mcap", _apart(topic))
+    assert_whole(read(bag, **sections))
+    # Beginning and end are those of the shorter one.
+    bag = write_bag(tmp_path / "run.mcap", _apart(topic, effort_rows=range(10, ROWS - 20)))
+    table = read(bag, **sections)
+    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[10:-20])
+    assert table.stamps is not None
+    assert table.stamps.first_ns == START_NS + 10 * STEP_NS
+    assert any(
+        "left out, as other columns have none there: 30 stamps of /joint_states" in one
+        or "30 stamps of the topic (publisher 1)" in one
+        for one in table.remarks
+    )
+    part = read(bag, keep=KeptPart(from_row=3, to_row=52), **sections)
+    np.testing.assert_array_equal(part.values, table.values[2:52])
+    assert part.first_row == 2
+
+
+def test_messages_that_cannot_be_joined_are_named_with_their_rates(tmp_path: Path) -> None:
+    sections = _of_sections({"topic": "/joint_states"}, {"topic": "/efforts"})
+    bag = write_bag(tmp_path / "run.mcap", _apart("/efforts", effort_rows=range(0, ROWS, 2)))
+    with pytest.raises(TableUnfit) as caught:
+        read(bag, **sections)
+    rates = (
+        "200 stamps each 0.004 s on /joint_states and 100 stamps each 0.008 s on /efforts, 100 of "
+        "them the same"
+    )
+    assert caught.value.found == rates
+    assert "nothing is interpolated between messages" in caught.value.remedy
+    with pytest.raises(TableUnfit, match="`topic` under `position` and `current`"):
+        read(bag)
+    with pytest.raises(
+        TableUnfit, match="found topics /joint_states, /efforts; expected /absent of type"
+    ):
+        read(bag, **_of_sections({"topic": "/joint_states"}, {"topic": "/absent"}))
+
+
 @pytest.mark.parametrize("publisher", [None, 1])
-def test_positions_and_efforts_in_separate_messages_have_a_way(publisher: int | None, tmp_path: Path) -> None:
+def test_positions_and_efforts_in_separate_messages_have_a_way(
+    publisher: int | None, tmp_path: Path
+) -> None:
     parts = []
     for row in range(ROWS):
         parts.append(("/joint_states", message(row, effort=[])))
         parts.append(("/joint_states", message(row, position=[])))
     bag = write_bag(tmp_path / "run.mcap", parts)
-    with pytest.raises(TableUnfit, match="write each field to a CSV file"):
+    with pytest.raises(TableUnfit, match="write each field to a CSV file") as caught:
         read(bag, publisher=publisher)
+    assert (
+        "`position: {..., publisher: 1}` and `current: {..., publisher: 2}`"
+    ) in caught.value.remedy
 
 
 def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
     """A second node with the same joints, frame and fields: its stamps alone are others."""
     stamped = [(START_NS + row * STEP_NS, message(row)) for row in range(ROWS)]
-    stamped += [(START_NS + row * STEP_NS + later_ns, message(row)) for row in range(0, ROWS, every)]
+    stamped += [
+        (START_NS + row * STEP_NS + later_ns, message(row)) for row in range(0, ROWS, every)
+    ]
     stamped.sort(key=lambda one: one[0])
     parts = []
     for stamp_ns, content in stamped:
@@ -256,13 +380,97 @@ def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
 
 
 @pytest.mark.parametrize(("every", "later_ns"), [(1, 1_000_000), (1, 2_700_000), (5, 1_300_000)])
-def test_two_publishers_with_nothing_but_other_stamps_are_refused(every: int, later_ns: int, tmp_path: Path) -> None:
+def test_two_publishers_with_nothing_but_other_stamps_are_refused(
+    every: int, later_ns: int, tmp_path: Path
+) -> None:
     bag = write_bag(tmp_path / "run.mcap", _alike(every, later_ns))
     with pytest.raises(TableUnfit, match="stamps of two publishers") as caught:
         read(bag)
     assert f"{ROWS} messages each 0.004 s" in caught.value.found
     assert f"{ROWS // every} messages each {0.004 * every:g} s" in caught.value.found
     assert "`frame_id`" in caught.value.remedy
+    assert "`rhythm: 1`" in caught.value.remedy
+    first = read(bag, rhythm=1)
+    assert_whole(first)
+    second = read(bag, rhythm=2)
+    np.testing.assert_array_equal(second.values, np.hstack((POSITION, EFFORT))[::every])
+    assert second.stamps is not None
+    assert second.stamps.first_ns == START_NS + later_ns
+
+
+def test_a_rhythm_is_chosen_only_where_each_message_has_one(tmp_path: Path) -> None:
+    with pytest.raises(
+        TableUnfit,
+        match=r"found `rhythm: 2`, and no two even rows of stamps; .* "
+        r"leave `rhythm` out",
+    ):
+        read(write_bag(tmp_path / "run.mcap", whole()), rhythm=2)
+    lost = [one for number, one in enumerate(_alike(1, 1_300_000)) if number != 2 * ROWS - 21]
+    with pytest.raises(
+        TableUnfit,
+        match=r"found `rhythm: 1`, and (stamps of two publishers with "
+        r"steps|no two even)",
+    ):
+        read(write_bag(tmp_path / "run.mcap", lost), rhythm=1)
+
+
+def _write_channels(
+    path: Path, parts: Iterable[tuple[int, dict[str, Any]]], nodes: Sequence[str] = ("", "")
+) -> Path:
+    """A bag in which two channels have one topic, with the names of their nodes."""
+    source = write_bag(
+        path.with_suffix(".source"), [(f"/{number}", content) for number, content in parts]
+    )
+    with source.open("rb") as read_from, path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        channels: dict[str, int] = {}
+        for schema, channel, content in make_reader(read_from).iter_messages():
+            assert schema is not None
+            if channel.topic not in channels:
+                node = nodes[int(channel.topic[1:])]
+                metadata = {"callerid": node} if node else {}
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    "/joint_states", "cdr", number, metadata
+                )
+            writer.add_message(
+                channels[channel.topic], content.log_time, content.data, content.publish_time
+            )
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("nodes", "named"),
+    [
+        (
+            ("", ""),
+            r"2: channel 2, position "
+            r"and effort",
+        ),
+        (("/arm", "/fake"), r"1: /arm, .*; 2: /fake, channel 2, "),
+    ],
+)
+def test_publishers_with_a_channel_each_are_named_and_chosen(
+    nodes: Sequence[str], named: str, tmp_path: Path
+) -> None:
+    """Frame, joints and fields are the same."""
+    parts = []
+    for row in range(ROWS):
+        parts.append((0, message(row)))
+        parts.append((1, message(row, position=[0.0] * 6)))
+    bag = _write_channels(tmp_path / "run.mcap", parts, nodes)
+    with pytest.raises(TableUnfit, match=named):
+        read(bag)
+    assert_whole(read(bag, publisher=1))
+    assert not read(bag, publisher=2).values[:, :6].any()
+
+
+def test_channels_after_each_other_are_one_publisher(tmp_path: Path) -> None:
+    """A recorder that is set up anew in one file gives the topic another channel."""
+    parts = [(int(row >= ROWS // 2), message(row)) for row in range(ROWS)]
+    assert_whole(read(_write_channels(tmp_path / "run.mcap", parts)))
 
 
 @pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])
@@ -283,14 +491,24 @@ def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:
 
 
 def test_joints_that_are_never_stamped_together_are_refused(tmp_path: Path) -> None:
-    parts = [("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))) for row in range(ROWS)]
-    with pytest.raises(TableUnfit, match=r"found no position.J1, position.J2.*same stamp.*record a topic that has all"):
+    parts = [
+        ("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))) for row in range(ROWS)
+    ]
+    with pytest.raises(
+        TableUnfit,
+        match=r"found no position.J1, position.J2.*same stamp.*record a "
+        r"topic that has all",
+    ):
         read(write_bag(tmp_path / "run.mcap", parts))
 
 
 def test_without_stamps_the_time_of_recording_is_used(tmp_path: Path) -> None:
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    table = read(write_bag(tmp_path / "run.mcap", [(topic, {**one, "header": header}) for topic, one in whole()]))
+    table = read(
+        write_bag(
+            tmp_path / "run.mcap", [(topic, {**one, "header": header}) for topic, one in whole()]
+        )
+    )
     assert table.stamps is not None
     np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 5e-4, atol=1e-12)
     assert table.remarks == ("200 messages without a stamp: the time of the recording is used",)
@@ -303,9 +521,15 @@ def _simulated(row: int, joints: Sequence[int] = range(6)) -> dict[str, Any]:
     return message(row, joints, header=header)
 
 
-@pytest.mark.parametrize("parts", [(range(6),), ((2, 0, 1), (5, 3, 4))], ids=["one publisher", "two publishers"])
-def test_a_clock_that_starts_at_0_keeps_its_first_stamp(parts: tuple[Sequence[int], ...], tmp_path: Path) -> None:
-    messages = [("/joint_states", _simulated(row, joints)) for row in range(ROWS) for joints in parts]
+@pytest.mark.parametrize(
+    "parts", [(range(6),), ((2, 0, 1), (5, 3, 4))], ids=["one publisher", "two publishers"]
+)
+def test_a_clock_that_starts_at_0_keeps_its_first_stamp(
+    parts: tuple[Sequence[int], ...], tmp_path: Path
+) -> None:
+    messages = [
+        ("/joint_states", _simulated(row, joints)) for row in range(ROWS) for joints in parts
+    ]
     table = read(write_bag(tmp_path / "run.mcap", messages))
     np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT)))
     assert table.stamps is not None
@@ -314,7 +538,9 @@ def test_a_clock_that_starts_at_0_keeps_its_first_stamp(parts: tuple[Sequence[in
     assert table.remarks == ()
 
 
-def test_a_message_without_stamp_among_times_of_day_has_the_time_of_its_recording(tmp_path: Path) -> None:
+def test_a_message_without_stamp_among_times_of_day_has_the_time_of_its_recording(
+    tmp_path: Path,
+) -> None:
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     (topic, first), *others = whole()
     table = read(write_bag(tmp_path / "run.mcap", [(topic, {**first, "header": header}), *others]))
@@ -335,7 +561,10 @@ def _in_parts(folder: Path, listed: str) -> Path:
     folder.mkdir()
     for number in range(3):
         write_bag(folder / f"bag_{number}.mcap", whole()[number * 80 : (number + 1) * 80])
-    metadata = f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  topics: []\n"
+    metadata = (
+        f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  "
+        "topics: []\n"
+    )
     (folder / "metadata.yaml").write_text(metadata, encoding="utf-8")
     return folder
 
@@ -343,7 +572,9 @@ def _in_parts(folder: Path, listed: str) -> Path:
 LISTED = "".join(f"  - bag_{number}.mcap\n" for number in range(3))
 
 
-@pytest.mark.parametrize("listed", [LISTED, LISTED.replace("  - ", "    - '").replace(".mcap", ".mcap'")])
+@pytest.mark.parametrize(
+    "listed", [LISTED, LISTED.replace("  - ", "    - '").replace(".mcap", ".mcap'")]
+)
 def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None:
     """Without its last part it would end early, and nothing else shows it."""
     folder = _in_parts(tmp_path / "bag", listed)
@@ -351,25 +582,43 @@ def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None
     (folder / "bag_2.mcap").rename(folder / "renamed_2.mcap")
     assert_whole(read(folder))
     (folder / "renamed_2.mcap").unlink()
-    with pytest.raises(TableUnfit, match=r"found no bag_2\.mcap, which metadata\.yaml names; expected all 3 files"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"found no bag_2\.mcap, which metadata\.yaml names; "
+        r"expected all 3 files",
+    ):
         read(folder)
 
 
 def test_a_topic_is_chosen(tmp_path: Path) -> None:
     others = [("/desired", {**one, "position": [9.0] * 6}) for _, one in whole()]
     bag = write_bag(tmp_path / "run.mcap", [*others, *whole()])
-    with pytest.raises(TableUnfit, match=r"found joint states on 2 topics, /desired, /joint_states; .*`topic: NAME`"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"found joint states on 2 topics, /desired, "
+        r"/joint_states; .*`topic: NAME`",
+    ):
         read(bag)
     assert_whole(read(bag, topic="/joint_states"))
-    with pytest.raises(TableUnfit, match="found topics /desired, /joint_states; expected /arm of type sensor_msgs"):
+    with pytest.raises(
+        TableUnfit, match="found topics /desired, /joint_states; expected /arm of type sensor_msgs"
+    ):
         read(bag, topic="/arm")
 
 
 @pytest.mark.parametrize(
     ("columns", "changes", "error"),
     [
-        (("position.J7",), {}, "found joints J1, J2, J3, J4, J5, J6; expected those of position.J7"),
-        (("torque.J1",), {}, "found column 'torque.J1'; expected position.JOINT, velocity.JOINT or effort.JOINT"),
+        (
+            ("position.J7",),
+            {},
+            "found joints J1, J2, J3, J4, J5, J6; expected those of position.J7",
+        ),
+        (
+            ("torque.J1",),
+            {},
+            "found column 'torque.J1'; expected position.JOINT, velocity.JOINT or effort.JOINT",
+        ),
         (("velocity.J1",), {}, "6 names and 0 values of velocity"),
         (("effort.J1",), {"effort": [1.0, float("nan")] + [0.0] * 4}, None),
         (
@@ -377,7 +626,11 @@ def test_a_topic_is_chosen(tmp_path: Path) -> None:
             {"effort": [1.0, float("nan")] + [0.0] * 4},
             "found nan in every message for effort.J2; expected numbers",
         ),
-        (("effort.J2",), {"effort": [1.0, float("inf")] + [0.0] * 4}, "row 1, column effort.J2: found inf"),
+        (
+            ("effort.J2",),
+            {"effort": [1.0, float("inf")] + [0.0] * 4},
+            "row 1, column effort.J2: found inf",
+        ),
     ],
 )
 def test_what_a_bag_lacks_is_named(
@@ -413,7 +666,12 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     assert run.rate_hz == pytest.approx(250.0)
     np.testing.assert_allclose(run.position_rad, POSITION, atol=1e-8)
     np.testing.assert_allclose(run.current_a, EFFORT, atol=1e-8)
-    document["position"] = {"file": "run.mcap", "columns": list(JOINTS), "unit": "rad", "side": "joint"}
+    document["position"] = {
+        "file": "run.mcap",
+        "columns": list(JOINTS),
+        "unit": "rad",
+        "side": "joint",
+    }
     document["current"] = {"file": "run.mcap", "columns": list(JOINTS), "unit": "A"}
     description.write_text(json.dumps(document))
     again = tmp_path / "again.mcap"
@@ -421,28 +679,54 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     assert again.read_bytes() == out.read_bytes()
     time = {"file": "run.mcap", "column": "stamp", "unit": "s"}
     description.write_text(json.dumps({**document, "time": time}))
-    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]) == 4
+    assert (
+        main(
+            ["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]
+        )
+        == 4
+    )
 
 
-@pytest.mark.parametrize("columns", [list(JOINTS), ["effort"], [f"position.{name}" for name in JOINTS]])
+@pytest.mark.parametrize(
+    "columns", [list(JOINTS), ["effort"], [f"position.{name}" for name in JOINTS]]
+)
 def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[str]) -> None:
     write_bag(tmp_path / "run.mcap", whole()[:1])
-    description, out = tmp_path / "run.yaml", tmp_path / "log.mcap"
+    description = tmp_path / "run.yaml"
+    out = tmp_path / "log.mcap"
     document = {**_document(checkout), "temperature": {"file": "run.mcap", "columns": columns}}
     description.write_text(json.dumps(document))
-    with pytest.raises(TableUnfit, match="found `temperature` from a ROS 2 bag; expected a file with temperatures"):
+    with pytest.raises(
+        TableUnfit, match="found `temperature` from a ROS 2 bag; expected a file with temperatures"
+    ):
         import_recording(description, tmp_path, out, software="test")
     assert not out.exists()
 
 
-def test_torques_of_a_bag_come_from_another_field_than_the_currents(checkout: Path, tmp_path: Path) -> None:
-    write_bag(tmp_path / "run.mcap", [(topic, {**one, "velocity": one["effort"]}) for topic, one in whole()])
-    description, out = tmp_path / "run.yaml", tmp_path / "log.mcap"
-    # The field counts: the effort of other joints is no torque either where that of the axes is a current.
-    for columns in (list(JOINTS), ["effort"], [f"effort.{name}" for name in JOINTS], [f"K{k}" for k in range(6)]):
+def test_torques_of_a_bag_come_from_another_field_than_the_currents(
+    checkout: Path, tmp_path: Path
+) -> None:
+    write_bag(
+        tmp_path / "run.mcap",
+        [(topic, {**one, "velocity": one["effort"]}) for topic, one in whole()],
+    )
+    description = tmp_path / "run.yaml"
+    out = tmp_path / "log.mcap"
+    # The field counts: the effort of other joints is no torque either where that of the axes is a
+    # current.
+    for columns in (
+        list(JOINTS),
+        ["effort"],
+        [f"effort.{name}" for name in JOINTS],
+        [f"K{k}" for k in range(6)],
+    ):
         torque = {"file": "run.mcap", "columns": columns, "side": "joint"}
         description.write_text(json.dumps({**_document(checkout), "torque": torque}))
-        with pytest.raises(ConfigurationInconsistent, match=r"found effort of run\.mcap, which current is read from"):
+        with pytest.raises(
+            ConfigurationInconsistent,
+            match=r"found effort of run\.mcap, which "
+            r"current is read from",
+        ):
             import_recording(description, tmp_path, out, software="test")
     torque = {"file": "run.mcap", "columns": ["velocity"], "side": "joint"}
     description.write_text(json.dumps({**_document(checkout), "torque": torque}))
@@ -453,16 +737,27 @@ def test_torques_of_a_bag_come_from_another_field_than_the_currents(checkout: Pa
 def test_a_healthy_bag_is_called_a_bag(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     bag = write_bag(tmp_path / "run.mcap", whole())
     sums = _repack(bag, tmp_path / "sums.mcap", enable_data_crcs=True)
-    for words in (["info", bag], ["info", sums], ["salvage", bag, "--out", tmp_path / "saved.mcap"]):
+    for words in (
+        ["info", bag],
+        ["info", sums],
+        ["salvage", bag, "--out", tmp_path / "saved.mcap"],
+    ):
         assert main([str(word) for word in words]) == 4
         said = " ".join(capfd.readouterr().err.split())
         assert "joint states of J1, J2, J3, J4, J5, J6 on /joint_states" in said
         assert "damaged" not in said
         assert "drivegain import" in said
         assert "the joints as `columns`" in said
-    with pytest.raises(LogForeign, match=r"with /chatter; .*reads bags with sensor_msgs/msg/JointState"):
+    with pytest.raises(
+        LogForeign,
+        match=r"with /chatter; .*reads bags with "
+        r"sensor_msgs/msg/JointState",
+    ):
         read_log(_of_text(tmp_path / "text.mcap"))
-    with pytest.raises(TableUnfit, match="found topics /chatter; expected a topic of type sensor_msgs/msg/JointState"):
+    with pytest.raises(
+        TableUnfit,
+        match="found topics /chatter; expected a topic of type sensor_msgs/msg/JointState",
+    ):
         read(tmp_path / "text.mcap")
 
 
@@ -497,8 +792,12 @@ def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None
 
 @settings(deadline=None, max_examples=60, derandomize=True)
 @given(seed=st.integers(0, 10**6), hurt=st.sampled_from(("flip", "cut", "junk")))
-def test_a_damaged_bag_is_refused_or_the_same(seed: int, hurt: str, bag_bytes: bytes, tmp_path_factory: Any) -> None:
-    """With the checksums of ROS 2 (chunks only), damage between them may remove a chunk, never change a number."""
+def test_a_damaged_bag_is_refused_or_the_same(
+    seed: int, hurt: str, bag_bytes: bytes, tmp_path_factory: Any
+) -> None:
+    """With the checksums of ROS 2 (chunks only), damage between them may remove a chunk,
+    never change a number.
+    """
     rng = random.Random(seed)
     path = tmp_path_factory.getbasetemp() / "hurt.mcap"
     path.write_bytes(damaged(bag_bytes, hurt, rng.randrange(len(bag_bytes)), rng, junk_bytes=40))
@@ -514,7 +813,9 @@ def test_a_damaged_bag_is_refused_or_the_same(seed: int, hurt: str, bag_bytes: b
 @pytest.fixture(scope="module")
 def bag_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A bag of some chunks."""
-    return write_bag(tmp_path_factory.mktemp("bag") / "run.mcap", whole()[:60], chunk_size=4000).read_bytes()
+    return write_bag(
+        tmp_path_factory.mktemp("bag") / "run.mcap", whole()[:60], chunk_size=4000
+    ).read_bytes()
 
 
 @settings(deadline=None, max_examples=200, derandomize=True)
@@ -534,7 +835,12 @@ def test_a_message_of_the_other_byte_order_is_read() -> None:
         + struct.pack(">I2d", 2, 1.5, -2.5) + struct.pack(">II", 0, 0)
     )  # fmt: skip
     state = joint_state_from_cdr(big)
-    assert (state.stamp_ns, state.names, state.position, state.effort) == (5_000_000_006, ("J1", "J2"), (1.5, -2.5), ())
+    assert (state.stamp_ns, state.names, state.position, state.effort) == (
+        5_000_000_006,
+        ("J1", "J2"),
+        (1.5, -2.5),
+        (),
+    )
 
 
 def test_a_joint_twice_in_one_message_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""ROS 2 bags in SQLite, and packed ones, as `rosbags` writes them: the same numbers, or an error."""
+"""ROS 2 bags in SQLite, and packed ones, as `rosbags` writes them:
+the same numbers, or an error.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,16 @@ from daq.errors import DataError, ExitCode, LogCorrupt, LogTruncated, TableUnfit
 from daq.log.importing import reader_of
 from daq.log.mcap_bag import unpack_message
 from daq.log.message import JOINTS_SCHEMA
-from tests.daq.log.test_bag import EFFORT, JOINTS, POSITION, ROWS, START_NS, STEP_NS, assert_whole, read
+from tests.daq.log.test_bag import (
+    EFFORT,
+    JOINTS,
+    POSITION,
+    ROWS,
+    START_NS,
+    STEP_NS,
+    assert_whole,
+    read,
+)
 from tests.daq.logs import damaged
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -46,7 +57,9 @@ def record(folder: Path, storage: StoragePlugin, packed: CompressionMode, rows: 
             at = header(stamp(*divmod(time_ns, 10**9)), "base")
             message = state(at, list(JOINTS), POSITION[row], np.zeros(0), EFFORT[row])
             writer.write(joints, time_ns, TYPES.serialize_cdr(message, JOINTS_SCHEMA))
-            writer.write(chatter, time_ns, TYPES.serialize_cdr(text("hello"), "std_msgs/msg/String"))
+            writer.write(
+                chatter, time_ns, TYPES.serialize_cdr(text("hello"), "std_msgs/msg/String")
+            )
     return folder
 
 
@@ -54,7 +67,8 @@ KINDS = [
     (storage, packed)
     for storage in StoragePlugin
     for packed in CompressionMode
-    if (storage, packed) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)  # there is no such kind
+    # There is no such kind
+    if (storage, packed) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)
 ]
 
 
@@ -92,12 +106,12 @@ COMPUTED = """
     CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, unused INTEGER,
                            data BLOB GENERATED ALWAYS AS (zeroblob({size})) VIRTUAL);
     INSERT INTO messages SELECT id, topic_id, timestamp, 0 FROM kept;
-"""
+"""  # noqa: E501
 ENDLESS = """
     ALTER TABLE messages RENAME TO kept;
     CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
                             SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM n WHERE {which};
-"""
+"""  # noqa: E501
 MANY_TOPICS = """
     ALTER TABLE topics RENAME TO kept;
     CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
@@ -113,10 +127,16 @@ MANY_TOPICS = """
         (ENDLESS.format(which="id < 0"), "interrupted"),
         (ENDLESS.format(which="1"), "/joint_states with encapsulation 00"),
         (MANY_TOPICS.format(name="''"), "more bytes than the file has"),
-        (MANY_TOPICS.format(name="hex(zeroblob(20000000))"), "row 1: found more bytes than the file has"),
+        (
+            MANY_TOPICS.format(name="hex(zeroblob(20000000))"),
+            "row 1: found more bytes than the file has",
+        ),
         ("DROP TABLE topics", "no such table: topics"),
         ("DELETE FROM topics", "found topic 1, time 17000"),
-        ("UPDATE messages SET timestamp = 'noon'", "time 'noon'; expected a topic, nanoseconds and bytes"),
+        (
+            "UPDATE messages SET timestamp = 'noon'",
+            "time 'noon'; expected a topic, nanoseconds and bytes",
+        ),
         ("UPDATE messages SET data = 5", "expected a topic, nanoseconds and bytes"),
         ("UPDATE messages SET data = x'00010000'", "/joint_states with a message of 4 bytes"),
         ("UPDATE topics SET offered_qos_profiles = '" + "[" * 100_000 + "'", None),
@@ -140,30 +160,47 @@ def test_a_hostile_database_is_refused_in_bounded_time(
 
 
 @pytest.mark.parametrize("topic", [None, "/chatter"])
-def test_a_bag_without_the_joints_says_what_it_has(topic: str | None, database: Path, tmp_path: Path) -> None:
+def test_a_bag_without_the_joints_says_what_it_has(
+    topic: str | None, database: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "bag.db3"
     shutil.copyfile(database, path)
     with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = '/joint_states')")
-    with pytest.raises(TableUnfit, match=r"found topics /chatter; expected (a topic|/chatter) of type sensor_msgs"):
+        connection.execute(
+            "DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = "
+            "'/joint_states')"
+        )
+    with pytest.raises(
+        TableUnfit,
+        match=r"found topics /chatter; expected (a topic|/chatter) of "
+        r"type sensor_msgs",
+    ):
         read(path, topic=topic)
 
 
 @pytest.mark.parametrize("suffix", ["-wal", "-journal"])
-def test_a_database_that_its_recorder_has_not_finished_is_refused(suffix: str, database: Path, tmp_path: Path) -> None:
+def test_a_database_that_its_recorder_has_not_finished_is_refused(
+    suffix: str, database: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "bag.db3"
     shutil.copyfile(database, path)
     rest = tmp_path / f"bag.db3{suffix}"
     rest.touch()
     assert len(read(path).values) == 60
     rest.write_bytes(b"rows")
-    with pytest.raises(LogTruncated, match=rf"found bag\.db3{suffix}, .*; expected a finished bag; .*quick_check"):
+    with pytest.raises(
+        LogTruncated,
+        match=rf"found bag\.db3{suffix}, .*; expected a finished bag; "
+        r".*quick_check",
+    ):
         read(path)
 
 
 @settings(deadline=None, max_examples=80, derandomize=True)
 @given(seed=st.integers(0, 10**6), hurt=st.sampled_from(("flip", "cut", "junk")))
-def test_a_damaged_database_is_read_or_refused(seed: int, hurt: str, database: Path, tmp_path_factory: Any) -> None:
+def test_a_damaged_database_is_read_or_refused(
+    seed: int, hurt: str, database: Path, tmp_path_factory: Any
+) -> None:
     """SQLite has no checksums: a flipped bit of a number passes, a broken page does not."""
     rng = random.Random(seed)
     content = database.read_bytes()
@@ -180,7 +217,9 @@ def test_a_damaged_database_is_read_or_refused(seed: int, hurt: str, database: P
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap.zstd"
     path.write_bytes(zstandard.compress(bytes(2**28)))
-    with pytest.raises(LogCorrupt, match="unfolds to 200 times its size; expected a recording, packed by zstd"):
+    with pytest.raises(
+        LogCorrupt, match="unfolds to 200 times its size; expected a recording, packed by zstd"
+    ):
         read(path)
     with pytest.raises(ValueError, match="bytes that unfold to 268435456"):
         unpack_message(zstandard.compress(bytes(2**28)))
@@ -188,7 +227,9 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
         unpack_message(zstandard.compress(bytes(range(200)))[:-9])
 
 
-@pytest.mark.parametrize("change", [lambda data: data[:-50], lambda data: data[:50] + bytes(50) + data[100:]])
+@pytest.mark.parametrize(
+    "change", [lambda data: data[:-50], lambda data: data[:50] + bytes(50) + data[100:]]
+)
 def test_a_packed_file_that_is_damaged_is_named(
     change: Callable[[bytes], bytes], database: Path, tmp_path: Path
 ) -> None:
@@ -200,7 +241,10 @@ def test_a_packed_file_that_is_damaged_is_named(
 
 
 def test_no_room_for_what_a_file_unfolds_to_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], checkout: Path
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    checkout: Path,
 ) -> None:
     """As on a full disk."""
     folder = record(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.FILE)
@@ -208,9 +252,17 @@ def test_no_room_for_what_a_file_unfolds_to_is_an_error(
     description.write_text(
         f"name: run\ncell: {checkout / 'configs/cells/demo.yaml'}\n"
         "position: {file: bag, columns: [position], unit: rad, side: joint}\n"
-        "current: {file: bag, columns: [effort], unit: A}\ntime: {file: bag, column: header.stamp, unit: ns}\n"
+        "current: {file: bag, columns: [effort], unit: A}\ntime: {file: bag, column: header.stamp, "
+        "unit: ns}\n"
     )
-    words = ["import", str(description), "--data", str(folder.parent), "--out", str(tmp_path / "log.mcap")]
+    words = [
+        "import",
+        str(description),
+        "--data",
+        str(folder.parent),
+        "--out",
+        str(tmp_path / "log.mcap"),
+    ]
     assert main(words) == 0
     (tmp_path / "log.mcap").unlink()
     full = tmp_path / "full"

@@ -23,7 +23,8 @@ from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import START_NS, demo_content, joints, samples
 
-AXES, ROWS = 6, 200
+AXES = 6
+ROWS = 200
 GAINS = {f"J{number}": 10.0 * number for number in range(1, AXES + 1)}
 
 
@@ -35,7 +36,9 @@ def log(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Path:
         log.event(CellEvent(START_NS, 2, EventKind.EMCY, 0x8611, "J3 (node 3): following error"))
         log.reading(SlowReading(START_NS + 5_400_000, 1, Quantity.TORQUE, 0.25))
         log.reading(SlowReading(START_NS - 1, 0, Quantity.TEMPERATURE, 31.5))
-        for sample in samples([[100 * (axis + 1) * row for axis in range(AXES)] for row in range(ROWS)]):
+        for sample in samples(
+            [[100 * (axis + 1) * row for axis in range(AXES)] for row in range(ROWS)]
+        ):
             log.write(sample)
         log.conclude(True)
     return path
@@ -50,11 +53,15 @@ def _read(path: Path) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {}
     with AnyReader([path]) as reader:
         for connection, _, data in reader.messages():
-            found.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+            found.setdefault(connection.topic, []).append(
+                reader.deserialize(data, connection.msgtype)
+            )
     return found
 
 
-def test_rosbags_reads_a_bag_with_the_numbers_of_the_fit(log: Path, tmp_path: Path, checkout: Path) -> None:
+def test_rosbags_reads_a_bag_with_the_numbers_of_the_fit(
+    log: Path, tmp_path: Path, checkout: Path
+) -> None:
     done = export_bag(log, tmp_path / "bag", _calibration())
     found = _read(tmp_path / "bag")
     assert {topic: len(messages) for topic, messages in found.items()} == done.messages
@@ -64,7 +71,9 @@ def test_rosbags_reads_a_bag_with_the_numbers_of_the_fit(log: Path, tmp_path: Pa
     np.testing.assert_array_equal([state.position for state in states], run.position_rad)
     np.testing.assert_array_equal([one.current_a for one in found["/cell/currents"]], run.current_a)
     speed = (run.position_rad[-1] - run.position_rad[0]) / ((ROWS - 1) * 1e-3)
-    np.testing.assert_allclose([state.velocity for state in states], np.tile(speed, (ROWS, 1)), rtol=1e-9)
+    np.testing.assert_allclose(
+        [state.velocity for state in states], np.tile(speed, (ROWS, 1)), rtol=1e-9
+    )
     # Motor 6 turns with joints 5 and 6, so joint 5 carries the torque of both.
     torque = np.array(list(GAINS.values())) * run.current_a
     torque[:, 4] += torque[:, 5]
@@ -78,21 +87,33 @@ def test_rosbags_reads_a_bag_with_the_numbers_of_the_fit(log: Path, tmp_path: Pa
 
 def test_rosbags_reads_the_log_itself(log: Path) -> None:
     found = _read(log)
-    assert list(found["/cell/samples"][1].position_counts) == [100 * (axis + 1) for axis in range(AXES)]
-    states, currents = found["/joint_states"], found["/cell/currents"]
+    assert list(found["/cell/samples"][1].position_counts) == [
+        100 * (axis + 1) for axis in range(AXES)
+    ]
+    states = found["/joint_states"]
+    currents = found["/cell/currents"]
     assert len(states) == len(currents) == ROWS // 20
-    np.testing.assert_allclose([state.velocity for state in states[1:]], np.tile(100.0 * np.arange(1, 7), (9, 1)))
+    np.testing.assert_allclose(
+        [state.velocity for state in states[1:]], np.tile(100.0 * np.arange(1, 7), (9, 1))
+    )
     assert list(states[0].velocity) == [0.0] * AXES
     assert len(states[0].effort) == 0
     np.testing.assert_allclose(currents[1].current_a, -0.002 * 20 * 100.0 * np.arange(1, 7))
     assert "<robot" in found["/robot_description"][0].data
 
 
-def test_the_description_is_kept_for_late_subscribers_and_the_rest_is_not(log: Path, tmp_path: Path) -> None:
+def test_the_description_is_kept_for_late_subscribers_and_the_rest_is_not(
+    log: Path, tmp_path: Path
+) -> None:
     export_bag(log, tmp_path / "bag")
-    said = yaml.safe_load((tmp_path / "bag/metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    said = yaml.safe_load((tmp_path / "bag/metadata.yaml").read_text())[
+        "rosbag2_bagfile_information"
+    ]
     topics = [topic["topic_metadata"] for topic in said["topics_with_message_count"]]
-    durability = {topic["name"]: yaml.safe_load(topic["offered_qos_profiles"])[0]["durability"] for topic in topics}
+    durability = {
+        topic["name"]: yaml.safe_load(topic["offered_qos_profiles"])[0]["durability"]
+        for topic in topics
+    }
     assert durability.pop("/robot_description") == 1
     assert set(durability.values()) == {2}
     assert said["relative_file_paths"] == ["bag_0.mcap"]
@@ -113,9 +134,12 @@ def test_a_velocity_is_the_mean_over_twenty_milliseconds_and_less_at_the_ends() 
 
 def test_a_coupled_motor_acts_on_both_joints(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/gantry.yaml")
-    # Belt motors with opposite currents and gains of opposite signs push along X; with equal ones along Y.
+    # Belt motors with opposite currents and gains of opposite signs push along X; with equal ones
+    # along Y.
     gains = [100.0, -100.0, 150.0, 12.0, 7.0]
-    effort = joint_effort(cell, np.array([[1.0, -1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0, 0.0]]), gains)
+    effort = joint_effort(
+        cell, np.array([[1.0, -1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0, 0.0]]), gains
+    )
     assert abs(effort[0, 0]) == pytest.approx(0.0 if effort[0, 1] else 200.0)
     assert sorted(np.abs(effort[:, :2]).ravel().tolist()) == pytest.approx([0.0, 0.0, 200.0, 200.0])
 
@@ -130,7 +154,10 @@ def test_the_verb_says_what_it_wrote_and_refuses_what_is_there(
     assert said["effort"] is False
     with pytest.raises(UsageError, match="file or folder of that name"):
         export_bag(log, out)
-    for other in (replace(_calibration(), cell="other"), replace(_calibration(), gains=_calibration().gains[::-1])):
+    for other in (
+        replace(_calibration(), cell="other"),
+        replace(_calibration(), gains=_calibration().gains[::-1]),
+    ):
         with pytest.raises(ConfigurationInconsistent, match="as in the calibration"):
             export_bag(log, tmp_path / "other", other)
     assert [path.name for path in tmp_path.iterdir()] == ["bag"]

@@ -54,7 +54,9 @@ def record(checkout: Path, tmp_path: Path) -> Recorder:
 def test_joint_positions_are_those_of_the_drive_train(counts: list[int]) -> None:
     """q_motor = R q_joint (eq. 24), so R q must give the counts back."""
     joint_rad = DEMO_SCALING.joint_position(np.array(counts))
-    np.testing.assert_allclose(CELL.ratio @ joint_rad / (2 * pi) * 65536, counts, rtol=1e-9, atol=1e-3)
+    np.testing.assert_allclose(
+        CELL.ratio @ joint_rad / (2 * pi) * 65536, counts, rtol=1e-9, atol=1e-3
+    )
 
 
 def test_motor_six_also_turns_with_joint_five() -> None:
@@ -72,13 +74,16 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
     )
     path = record(samples([[1000 * k] * 6 for k in range(100)]), events=events, loaded=True)
     run, cell = load_run(path)
-    assert np.array_equal(load_run(str(path))[0].position_rad, run.position_rad)  # a name is as good as a path
+    # A name is as good as a path
+    assert np.array_equal(load_run(str(path))[0].position_rad, run.position_rad)
     assert cell.digest == CELL.digest
     assert run.payload == DISC
     assert run.rate_hz == pytest.approx(1000.0)
     assert run.time_s[0] == 0.0
     np.testing.assert_allclose(run.current_a[3], [-6.0] * 6)
-    np.testing.assert_allclose(run.position_rad[1, :4], 1000 * 2 * pi / 65536 / np.array([32, 32, 45, -48]))
+    np.testing.assert_allclose(
+        run.position_rad[1, :4], 1000 * 2 * pi / 65536 / np.array([32, 32, 45, -48])
+    )
     assert run.move is not None
     assert run.move.tolist() == [4] * 60 + [5] * 40
     assert run.valid is not None
@@ -89,12 +94,18 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
 def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder) -> None:
     """And what is printed of the payload is what was used."""
     log = record(samples([[1000 * k] * 6 for k in range(100)]), loaded=True)
-    heavier = replace(CELL, payloads=tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads))
+    heavier = replace(
+        CELL, payloads=tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads)
+    )
     run, _ = load_run(log, heavier)
     assert run.payload is not None
     assert run.payload.known == {"m": 5.049}
-    other = replace(CELL, payloads=tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads))
-    with pytest.raises(LogsDiffer, match="payload disc on flange-a, which the given description does not have"):
+    other = replace(
+        CELL, payloads=tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads)
+    )
+    with pytest.raises(
+        LogsDiffer, match="payload disc on flange-a, which the given description does not have"
+    ):
         load_run(log, other)
 
 
@@ -134,7 +145,9 @@ def test_one_late_sync_is_refused(record: Recorder) -> None:
     rows = samples([[0] * 6] * 400)
     late = replace(rows[7], time_ns=rows[7].time_ns + 510_000)
     with pytest.raises(
-        ClockImplausible, match=r"cycle 18 0\.49 ms after cycle 17, its most uneven step; expected 1 ms"
+        ClockImplausible,
+        match=r"cycle 18 0\.49 ms after cycle 17, its most uneven step; "
+        r"expected 1 ms",
     ):
         load_run(record([*rows[:7], late, *rows[8:]]))
 
@@ -147,12 +160,16 @@ def test_a_sync_within_half_of_its_period_is_taken(record: Recorder) -> None:
 
 @given(
     st.integers(-(2**31), 2**31 - 1),
-    st.lists(st.one_of(st.integers(-(2**31) + 1, 2**31 - 1), st.integers(-1000, 1000)), max_size=30),
+    st.lists(
+        st.one_of(st.integers(-(2**31) + 1, 2**31 - 1), st.integers(-1000, 1000)), max_size=30
+    ),
 )
 def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: list[int]) -> None:
     way = np.cumsum([start, *steps], dtype=np.int64)
     counter = ((way + 2**31) % 2**32 - 2**31).astype(np.int32)
-    np.testing.assert_array_equal(unwrapped(np.stack((counter, np.full_like(counter, 7)), axis=1))[:, 0], way)
+    np.testing.assert_array_equal(
+        unwrapped(np.stack((counter, np.full_like(counter, 7)), axis=1))[:, 0], way
+    )
 
 
 def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
@@ -160,17 +177,27 @@ def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
     end_rad = 2**31 / 65536 * 2 * pi / 32
     axes = (replace(CELL.axes[0], zero_offset_rad=-end_rad), *CELL.axes[1:])
     counts = [2**31 - 3 + k - (2**32 if k >= 3 else 0) for k in range(6)]
-    rows = [replace(row, current_raw=(0,) * 6) for row in samples([[count, 0, 0, 0, 0, 0] for count in counts])]
+    rows = [
+        replace(row, current_raw=(0,) * 6)
+        for row in samples([[count, 0, 0, 0, 0, 0] for count in counts])
+    ]
     run, _ = load_run(record(rows), replace(CELL, axes=axes))
-    np.testing.assert_allclose(run.position_rad[:, 0], np.arange(-3, 3) * 2 * pi / 65536 / 32, atol=1e-9)
+    np.testing.assert_allclose(
+        run.position_rad[:, 0], np.arange(-3, 3) * 2 * pi / 65536 / 32, atol=1e-9
+    )
 
 
 def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
     start = demo_content(checkout)
     top = 2**31 - 1
     quantum = 0.01 / top
-    readback = Readback(tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes))
-    rows = [Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6) for k, sign in enumerate((1, -1))]
+    readback = Readback(
+        tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes)
+    )
+    rows = [
+        Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6)
+        for k, sign in enumerate((1, -1))
+    ]
     run, _ = load_run(write(tmp_path / "i.mcap", replace(start, readback=readback), rows))
     np.testing.assert_allclose(run.position_rad[:, 0], [0.01 / 32, -0.01 / 32])
 
@@ -183,7 +210,9 @@ def test_an_invalid_run_is_refused(record: Recorder) -> None:
 def test_positions_outside_the_limits_are_refused(record: Recorder) -> None:
     turned = round(65536 * 32 * 0.8)
     with pytest.raises(
-        PositionImplausible, match=r"axis J1: found joint positions from 0 to 288 deg; .*the zero is wrong.*units"
+        PositionImplausible,
+        match=r"axis J1: found joint positions from 0 to 288 deg; .*the zero "
+        r"is wrong.*units",
     ):
         load_run(record(samples([[0] * 6, [turned, 0, 0, 0, 0, 0]])))
 
@@ -197,7 +226,9 @@ def test_a_log_of_another_cell_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_readback_of_drives_keeps_their_answers() -> None:
-    readback = readback_of_drives(("J1", "J2"), (0.1, 0.2), {"J2": {"serial": 2}, "J1": {"serial": 1}})
+    readback = readback_of_drives(
+        ("J1", "J2"), (0.1, 0.2), {"J2": {"serial": 2}, "J1": {"serial": 1}}
+    )
     assert [(a.name, a.current_per_unit, a.drive) for a in readback.axes] == [
         ("J1", 0.1, {"serial": 1}),
         ("J2", 0.2, {"serial": 2}),
@@ -218,7 +249,9 @@ def bouncing(count: int = 3000, size: bool = True) -> list[Sample]:
 
 
 def test_a_current_without_its_sign_is_refused_by_axis(record: Recorder) -> None:
-    with pytest.raises(CurrentUnsigned, match="axis J2: found currents that are never negative") as caught:
+    with pytest.raises(
+        CurrentUnsigned, match="axis J2: found currents that are never negative"
+    ) as caught:
         load_run(record(bouncing()))
     assert caught.value.axes == ("J2",)
 

@@ -1,4 +1,6 @@
-"""Lines of a CSV file that are no rows: units, comments, empty lines, a delimiter's name; and rows that are cut off."""
+"""Lines of a CSV file that are no rows: units, comments, empty lines, a delimiter's name;
+and rows that are cut off.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ from daq.log.csv_table import read_csv
 from daq.log.table import Table
 
 COUNT = 12
-VALUES = np.column_stack((0.01 * np.arange(COUNT), np.sin(np.arange(COUNT)), np.cos(np.arange(COUNT))))
+VALUES = np.column_stack(
+    (0.01 * np.arange(COUNT), np.sin(np.arange(COUNT)), np.cos(np.arange(COUNT)))
+)
 ROWS = [",".join(f"{value:.6f}" for value in row) for row in VALUES.tolist()]
 READ = np.round(VALUES, 6)[:, 1:]
 
@@ -51,7 +55,10 @@ def _read(
     """Read position and current, and the stamps of column `t`."""
     path = folder / "run.csv"
     path.write_text("\n".join(lines) + end, encoding="utf-8")
-    timed = None if time is None else TimeColumn(file="run.csv", column=stamps, unit=time)
+    if time is None:
+        timed = None
+    else:
+        timed = TimeColumn(file="run.csv", column=stamps, unit=time)
     moved = None
     if velocity is not None:
         moved = VelocityColumns(file="run.csv", columns=("v",), unit=velocity, side=Side.JOINT)
@@ -69,7 +76,9 @@ def _read(
     return read_csv(path, wanted, columns, timed)
 
 
-@pytest.mark.parametrize("units", ["s,rad,A", "[s],[rad],[A]", "(s), (rad), (A)", "sec,rad,", "s,m,A"])
+@pytest.mark.parametrize(
+    "units", ["s,rad,A", "[s],[rad],[A]", "(s), (rad), (A)", "sec,rad,", "s,m,A"]
+)
 def test_a_line_of_units_below_the_header_is_no_row(tmp_path: Path, units: str) -> None:
     if units.endswith(","):
         units += "Arms"
@@ -108,14 +117,67 @@ def test_units_that_contradict_the_description_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("names", "column"), [("t,q [deg],i", "q [deg]"), ("t [ms],q,i [A]", "t [ms]"), ("t,q,i [mA]", "i [mA]")]
+    ("names", "column"),
+    [("t,q [deg],i", "q [deg]"), ("t [ms],q,i [A]", "t [ms]"), ("t,q,i [mA]", "i [mA]")],
 )
-def test_a_unit_in_the_name_of_a_column_is_compared_too(tmp_path: Path, names: str, column: str) -> None:
+def test_a_unit_in_the_name_of_a_column_is_compared_too(
+    tmp_path: Path, names: str, column: str
+) -> None:
     stamps, position, current = names.split(",")
     with pytest.raises(TableUnfit, match=r"run\.csv:1") as caught:
         _read(tmp_path, [names, *ROWS], columns=(position, current), stamps=stamps)
     assert column in caught.value.subject
     assert "in the name of the column" in caught.value.found
+
+
+def test_a_line_of_units_is_known_by_that_of_the_time_alone(tmp_path: Path) -> None:
+    table = _read(tmp_path, ["t,q,i", "s,rounds,bits", *ROWS])
+    np.testing.assert_array_equal(table.values, READ)
+    assert table.remarks == (
+        "run.csv: line 2 was taken for the units of the columns: 's,rounds,bits'",
+    )
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:2, column t: found unit 'ms' in the "
+        r"line of units",
+    ):
+        _read(tmp_path, ["t,q,i", "ms,rounds,bits", *ROWS])
+
+
+def test_a_unit_in_a_name_must_be_that_of_the_line_of_units(tmp_path: Path) -> None:
+    columns = ("q [deg]", "i [A]")
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:2, column q \[deg\]: .* 'rad' .* and 'deg' in the name "
+        r".* one unit",
+    ):
+        _read(tmp_path, ["t,q [deg],i [A]", "s,rad,A", *ROWS], columns=columns)
+    # Letters that may be no unit, and units that say the same.
+    columns = ("q [A]", "i [Arms]")
+    assert (
+        len(_read(tmp_path, ["t,q [A],i [Arms]", "s,rad,A", *ROWS], columns=columns).values)
+        == COUNT
+    )
+
+
+def test_lines_count_as_an_editor_counts_them(tmp_path: Path) -> None:
+    """A form feed and a line separator of Unicode end no line."""
+    lines = ["exported\x0cby\u2028hand", "t,q,i", "s,rad,A", *ROWS, "0.2,word,1.0", *ROWS[:1]]
+    with pytest.raises(TableUnfit, match=rf"run\.csv:{4 + COUNT}, column q: found 'word'"):
+        _read(tmp_path, lines, skip_rows=1)
+    with pytest.raises(TableUnfit, match=r"run\.csv:3, column q: found unit 'deg'"):
+        _read(tmp_path, [*lines[:2], "s,deg,A", *ROWS], skip_rows=1)
+
+
+def test_a_header_of_numbers_is_named_by_its_line_where_units_follow(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match=r"run\.csv:2: found a header of numbers, 3, 7, 4"):
+        _read(
+            tmp_path,
+            ["exported by X", "3,7,4", "s,rad,A", *ROWS],
+            stamps="3",
+            columns=("7", "4"),
+            skip_rows=1,
+        )
 
 
 @pytest.mark.parametrize("unit", ["deg/s", "rpm", "mm/s"])
@@ -131,7 +193,9 @@ def test_letters_in_a_name_that_may_be_no_unit_say_nothing(tmp_path: Path) -> No
     assert len(_read(tmp_path, ["t,q [A],i [N]", *ROWS], columns=names).values) == COUNT
 
 
-@pytest.mark.parametrize(("units", "factor"), [("s,rad,Nm", 0.5), ("s,rad,%", 0.12), ("s,rad,A", 1.414)])
+@pytest.mark.parametrize(
+    ("units", "factor"), [("s,rad,Nm", 0.5), ("s,rad,%", 0.12), ("s,rad,A", 1.414)]
+)
 def test_a_factor_may_convert_another_quantity(tmp_path: Path, units: str, factor: float) -> None:
     assert len(_read(tmp_path, ["t,q,i", units, *ROWS], factor=factor).values) == COUNT
 
@@ -185,7 +249,16 @@ def test_the_advice_for_a_second_header_is_the_setting_that_reads_it(tmp_path: P
 
 @pytest.mark.parametrize("sign", ["#", "%", "//"])
 def test_comments_before_and_after_the_rows_are_left_out(tmp_path: Path, sign: str) -> None:
-    lines = [f"{sign} trace of a drive", "", "t,q,i", f"{sign} 100 Hz", *ROWS, "", f"{sign} {COUNT} samples", ""]
+    lines = [
+        f"{sign} trace of a drive",
+        "",
+        "t,q,i",
+        f"{sign} 100 Hz",
+        *ROWS,
+        "",
+        f"{sign} {COUNT} samples",
+        "",
+    ]
     table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
     assert table.remarks == (f"run.csv: left out after the rows: 1 line, '{sign} {COUNT} samples'",)
@@ -195,7 +268,9 @@ def test_comments_before_and_after_the_rows_are_left_out(tmp_path: Path, sign: s
 @pytest.mark.parametrize("comments", [[], ["# a note, about i"]])
 def test_a_header_may_begin_as_a_comment(tmp_path: Path, header: str, comments: list[str]) -> None:
     np.testing.assert_array_equal(_read(tmp_path, [*comments, header, *ROWS]).values, READ)
-    np.testing.assert_array_equal(_read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values, READ)
+    np.testing.assert_array_equal(
+        _read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values, READ
+    )
 
 
 def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> None:
@@ -208,11 +283,21 @@ def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     ("line", "place"),
-    [("# marker: payload on", 5), ("MARK begin", 5), ("// pause", 5), ("MARK end", COUNT), ("end of trace", COUNT)],
+    [
+        ("# marker: payload on", 5),
+        ("MARK begin", 5),
+        ("// pause", 5),
+        ("MARK end", COUNT),
+        ("end of trace", COUNT),
+    ],
 )
 def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, place: int) -> None:
     lines = ["t,q,i", *ROWS[:place], line, *ROWS[place:]]
-    with pytest.raises(TableUnfit, match=rf"run\.csv:{place + 2}: found .*a line that is no row of numbers") as caught:
+    with pytest.raises(
+        TableUnfit,
+        match=rf"run\.csv:{place + 2}: found .*a line that is no row "
+        r"of numbers",
+    ) as caught:
         _read(tmp_path, lines)
     assert "delimiter" not in caught.value.remedy
     assert f"`keep: {{to_row: {place}}}`" in caught.value.remedy
@@ -267,16 +352,26 @@ def test_the_minus_sign_of_typography_is_read(tmp_path: Path) -> None:
     assert table.remarks == ("run.csv: the minus sign U+2212 was read as -",)
 
 
-def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(tmp_path: Path) -> None:
+def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(
+    tmp_path: Path,
+) -> None:
     lines = ["t,q,i", *ROWS, "0.12,0.3"]
     with pytest.raises(TableUnfit, match=rf"the file ends early.*`keep: \{{to_row: {COUNT}\}}`"):
         _read(tmp_path, lines, end="")
-    np.testing.assert_array_equal(_read(tmp_path, lines, end="", keep=KeptPart(to_row=COUNT)).values, READ)
+    np.testing.assert_array_equal(
+        _read(tmp_path, lines, end="", keep=KeptPart(to_row=COUNT)).values, READ
+    )
 
 
-def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(tmp_path: Path) -> None:
+def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
+    tmp_path: Path,
+) -> None:
     lines = ["t,q,i", *ROWS, "t,q,i", *ROWS]
-    with pytest.raises(TableUnfit, match=r"run\.csv:14, column t.*the header is there once more") as caught:
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:14, column t.*the header is there "
+        r"once more",
+    ) as caught:
         _read(tmp_path, lines)
     assert f"{{to_row: {COUNT}}}" in caught.value.remedy
     assert f"{{from_row: {COUNT + 2}}}" in caught.value.remedy
@@ -285,7 +380,9 @@ def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(tm
 
 
 def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Path) -> None:
-    """Which of the two is right only the file's owner knows: advice to keep one of them would exchange columns."""
+    """Which of the two is right only the file's owner knows:
+    advice to keep one of them would exchange columns.
+    """
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column .*a second header") as caught:
         _read(tmp_path, ["t,i,q", "t,q,i", *ROWS])
     assert "`keep" not in caught.value.remedy
@@ -295,17 +392,30 @@ def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Pa
 def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
     tmp_path: Path, first: int, last: int
 ) -> None:
-    rows = [ROWS[row] if not first <= row <= last else f"{0.01 * row:.2f},nan,nan" for row in range(COUNT)]
-    setting = f"from_row: {last + 2}" if first == 0 else f"to_row: {first}"
+    rows = [
+        ROWS[row] if not first <= row <= last else f"{0.01 * row:.2f},nan,nan"
+        for row in range(COUNT)
+    ]
+    if first == 0:
+        setting = f"from_row: {last + 2}"
+    else:
+        setting = f"to_row: {first}"
     with pytest.raises(TableUnfit, match=rf"`keep: \{{{setting}\}}`"):
         _read(tmp_path, ["t,q,i", *rows])
-    part = KeptPart(from_row=last + 2) if first == 0 else KeptPart(to_row=first)
+    if first == 0:
+        part = KeptPart(from_row=last + 2)
+    else:
+        part = KeptPart(to_row=first)
     kept = READ[last + 1 :] if first == 0 else READ[:first]
     np.testing.assert_array_equal(_read(tmp_path, ["t,q,i", *rows], keep=part).values, kept)
 
 
-@pytest.mark.parametrize(("from_s", "to_s", "rows"), [(0.03, None, slice(3, None)), (None, 0.05, slice(0, 6))])
-def test_times_are_kept(tmp_path: Path, from_s: float | None, to_s: float | None, rows: slice) -> None:
+@pytest.mark.parametrize(
+    ("from_s", "to_s", "rows"), [(0.03, None, slice(3, None)), (None, 0.05, slice(0, 6))]
+)
+def test_times_are_kept(
+    tmp_path: Path, from_s: float | None, to_s: float | None, rows: slice
+) -> None:
     table = _read(tmp_path, ["t,q,i", *ROWS], keep=KeptPart(from_s=from_s, to_s=to_s))
     np.testing.assert_array_equal(table.values, READ[rows])
     assert table.stamps is not None
@@ -333,7 +443,9 @@ PARTS = (None, KeptPart(from_row=2), KeptPart(to_row=3), KeptPart(from_s=0.01), 
 
 @settings(max_examples=300, deadline=None)
 @given(
-    lines=st.lists(st.one_of(st.sampled_from(PIECES), st.text("0123456789.,-e #%;", max_size=12)), max_size=12),
+    lines=st.lists(
+        st.one_of(st.sampled_from(PIECES), st.text("0123456789.,-e #%;", max_size=12)), max_size=12
+    ),
     time=st.sampled_from((None, TimeUnit.SECOND, TimeUnit.CLOCK)),
     part=st.sampled_from(PARTS),
     comment=st.sampled_from((None, "#", "a")),
@@ -360,5 +472,9 @@ def test_any_lines_are_read_or_refused(
 
 @pytest.mark.parametrize("part", [KeptPart(from_row=100), KeptPart(from_s=5.0)])
 def test_a_part_with_nothing_in_it_is_refused(tmp_path: Path, part: KeptPart) -> None:
-    with pytest.raises(TableUnfit, match=rf"found {COUNT} rows.*none of them in `keep`.*correct `keep`"):
+    with pytest.raises(
+        TableUnfit,
+        match=rf"found {COUNT} rows.*none of them in "
+        r"`keep`.*correct `keep`",
+    ):
         _read(tmp_path, ["t,q,i", *ROWS], keep=part)

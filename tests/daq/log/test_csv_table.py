@@ -29,7 +29,11 @@ VALUES = np.array([[float(field) for field in row.split(",")] for row in ROWS])
 
 
 def _read(
-    tmp_path: Path, data: bytes, columns: tuple[str | int, ...], time: TimeUnit | None = None, **layout: Any
+    tmp_path: Path,
+    data: bytes,
+    columns: tuple[str | int, ...],
+    time: TimeUnit | None = None,
+    **layout: Any,
 ) -> Table:
     path = tmp_path / "run.csv"
     path.write_bytes(data)
@@ -37,10 +41,17 @@ def _read(
         name="run",
         cell="cell.yaml",
         table=CsvLayout(**layout),
-        position=PositionColumns(file="run.csv", columns=columns[:1], unit=PositionUnit.DEG, side=Side.JOINT),
+        position=PositionColumns(
+            file="run.csv", columns=columns[:1], unit=PositionUnit.DEG, side=Side.JOINT
+        ),
         current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A"),
     )
-    return read_csv(path, wanted, columns, None if time is None else TimeColumn(file="run.csv", column=1, unit=time))
+    return read_csv(
+        path,
+        wanted,
+        columns,
+        None if time is None else TimeColumn(file="run.csv", column=1, unit=time),
+    )
 
 
 def _text(*rows: str, header: str = "Winkel [°],Strom [µA]") -> str:
@@ -60,7 +71,9 @@ def _text(*rows: str, header: str = "Winkel [°],Strom [µA]") -> str:
 def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> None:
     table = _read(tmp_path, bom + _text(*ROWS).encode(encoding), ("Winkel [°]", "Strom [µA]"))
     assert np.array_equal(table.values, VALUES)
-    assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == [True] * bool(remark)
+    assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == [
+        True
+    ] * bool(remark)
 
 
 @pytest.mark.parametrize(
@@ -69,6 +82,11 @@ def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> No
         (_text(*ROWS, header="a,b").encode("utf-16-le"), "byte 1 is NUL"),
         (b"\xff\xfe" + _text(*ROWS).encode("utf-16-le")[:-1], "no UTF-16"),
         (b"a,b\n\x81\x8d,1\n", "byte 4 is no UTF-8"),
+        ("\u03b1,b\n1,\0\n".encode(), "byte 7 is NUL"),
+        ("\u03b1,b\n1,\0\n".encode("utf-8-sig"), "byte 10 is NUL"),
+        (b"\xef\xbb\xbfa,b\n\xe9,1\n", "byte 7 is no UTF-8"),
+        (b"\xff\xfe" + "a,b\n1,\0\n".encode("utf-16-le"), "byte 14 is NUL"),
+        (b"\xfe\xff" + "\U0001f916,b\n1,\0\n".encode("utf-16-be"), "byte 16 is NUL"),
     ],
 )
 def test_what_is_no_text(tmp_path: Path, data: bytes, found: str) -> None:
@@ -79,7 +97,9 @@ def test_what_is_no_text(tmp_path: Path, data: bytes, found: str) -> None:
 
 def test_a_decimal_comma_has_to_be_declared(tmp_path: Path) -> None:
     data = _text(*(row.replace(",", ";").replace(".", ",") for row in ROWS), header="q;i").encode()
-    assert np.array_equal(_read(tmp_path, data, ("q", "i"), delimiter=";", decimal=",").values, VALUES)
+    assert np.array_equal(
+        _read(tmp_path, data, ("q", "i"), delimiter=";", decimal=",").values, VALUES
+    )
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column q") as caught:
         _read(tmp_path, data, ("q", "i"), delimiter=";")
     assert 'write `decimal: ","`' in caught.value.remedy
@@ -87,24 +107,40 @@ def test_a_decimal_comma_has_to_be_declared(tmp_path: Path) -> None:
 
 def test_a_point_under_a_decimal_comma_is_refused(tmp_path: Path) -> None:
     """Whole mA as 1.234 would be 1.234 A."""
-    rows = [f"{0.5 * k};{1000 + k:,}".replace(".", "_").replace(",", ".").replace("_", ",") for k in range(20)]
+    rows = [
+        f"{0.5 * k};{1000 + k:,}".replace(".", "_").replace(",", ".").replace("_", ",")
+        for k in range(20)
+    ]
     data = _text(*rows, header="q;i").encode()
-    with pytest.raises(TableUnfit, match=r"run\.csv:2, column i: found '1\.000', with a point") as caught:
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:2, column i: found '1\.000', "
+        r"with a point",
+    ) as caught:
         _read(tmp_path, data, ("q", "i"), delimiter=";", decimal=",")
     assert "without them" in caught.value.remedy
-    assert len(_read(tmp_path, data, ("q",), delimiter=";", decimal=",").values) == 20  # another column may have points
+    # Another column may have points
+    assert len(_read(tmp_path, data, ("q",), delimiter=";", decimal=",").values) == 20
 
 
 @pytest.mark.parametrize("decimal", [".", ","])
-def test_thousands_that_are_grouped_by_the_decimal_sign_are_refused(decimal: str, tmp_path: Path) -> None:
+def test_thousands_that_are_grouped_by_the_decimal_sign_are_refused(
+    decimal: str, tmp_path: Path
+) -> None:
     grouped = [f"{value:,}".replace(",", decimal) for value in range(-1500, 1500, 37)]
     data = _text(*(f"0{decimal}5;{text}" for text in grouped), header="q;i").encode()
-    with pytest.raises(TableUnfit, match=r"column i: found '-1[.,]500' beside '-982': three digits behind every"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"column i: found '-1[.,]500' beside '-982': three digits "
+        r"behind every",
+    ):
         _read(tmp_path, data, ("q", "i"), delimiter=";", decimal=decimal)
 
 
 @given(st.lists(st.integers(-9999, 9999), min_size=2, max_size=50))
-def test_decimals_of_one_width_are_no_groups(tmp_path_factory: pytest.TempPathFactory, values: list[int]) -> None:
+def test_decimals_of_one_width_are_no_groups(
+    tmp_path_factory: pytest.TempPathFactory, values: list[int]
+) -> None:
     data = _text(*(f"0.5;{value / 1000:.3f}" for value in values), header="q;i").encode()
     read = _read(tmp_path_factory.mktemp("csv"), data, ("i",), delimiter=";").values[:, 0]
     assert np.array_equal(read, np.array(values) / 1000)
@@ -119,7 +155,11 @@ def test_a_comma_under_a_decimal_point_may_group_thousands(tmp_path: Path) -> No
 def test_a_file_without_a_header(tmp_path: Path) -> None:
     data = ("\n".join(ROWS) + "\n").encode()
     assert np.array_equal(_read(tmp_path, data, (1, 2), header=False).values, VALUES)
-    with pytest.raises(TableUnfit, match=r"run\.csv:1: found a header of numbers, 0\.125, 1\.50") as caught:
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:1: found a header of numbers, "
+        r"0\.125, 1\.50",
+    ) as caught:
         _read(tmp_path, data, (1, 2))
     assert "write `header: false`" in caught.value.remedy
 
@@ -131,11 +171,15 @@ def test_a_header_that_is_not_declared(tmp_path: Path) -> None:
 
 
 def test_columns_may_be_called_by_numbers(tmp_path: Path) -> None:
-    assert np.array_equal(_read(tmp_path, _text(*ROWS, header="0,1").encode(), ("0", "1")).values, VALUES)
+    assert np.array_equal(
+        _read(tmp_path, _text(*ROWS, header="0,1").encode(), ("0", "1")).values, VALUES
+    )
 
 
 @pytest.mark.parametrize("last", ["0.625,0.50", "0.625,0.5000"])
-def test_a_last_line_without_its_end_is_taken_when_it_is_complete(tmp_path: Path, last: str) -> None:
+def test_a_last_line_without_its_end_is_taken_when_it_is_complete(
+    tmp_path: Path, last: str
+) -> None:
     table = _read(tmp_path, _text(*ROWS, last).encode()[:-1], (1, 2))
     assert table.values[-1].tolist() == [0.625, 0.5]
     assert "no end of line" in table.remarks[0]
@@ -163,14 +207,23 @@ STEP_NS = 12_000_001
 
 
 def _stamped(tmp_path: Path, unit: TimeUnit, stamps: list[str]) -> Table:
-    return _read(tmp_path, _text(*(f"{stamp},1,2" for stamp in stamps), header="t,q,i").encode(), ("q", "i"), unit)
+    return _read(
+        tmp_path,
+        _text(*(f"{stamp},1,2" for stamp in stamps), header="t,q,i").encode(),
+        ("q", "i"),
+        unit,
+    )
 
 
-@pytest.mark.parametrize("unit", [TimeUnit.SECOND, TimeUnit.MILLISECOND, TimeUnit.MICROSECOND, TimeUnit.NANOSECOND])
+@pytest.mark.parametrize(
+    "unit", [TimeUnit.SECOND, TimeUnit.MILLISECOND, TimeUnit.MICROSECOND, TimeUnit.NANOSECOND]
+)
 def test_stamps_since_1970_are_exact_in_every_unit(tmp_path: Path, unit: TimeUnit) -> None:
     digits = 9 - unit.digits
     whole = [START_NS + STEP_NS * index for index in range(4)]
-    texts = [f"{ns // 10**digits}.{ns % 10**digits:0{digits}d}" if digits else str(ns) for ns in whole]
+    texts = [
+        f"{ns // 10**digits}.{ns % 10**digits:0{digits}d}" if digits else str(ns) for ns in whole
+    ]
     stamps = _stamped(tmp_path, unit, texts).stamps
     assert stamps is not None
     assert stamps.first_ns == START_NS
@@ -190,7 +243,9 @@ def test_dates_with_a_zone(tmp_path: Path) -> None:
     assert stamps.time_s == pytest.approx([0.0, 0.011543211, 0.876543211, 1.376543211], abs=1e-12)
 
 
-@pytest.mark.parametrize("text", ["2026-03-01T07:00:00.1", "2026-13-01T07:00:00Z", "7:00", "1772348400.1"])
+@pytest.mark.parametrize(
+    "text", ["2026-03-01T07:00:00.1", "2026-13-01T07:00:00Z", "7:00", "1772348400.1"]
+)
 def test_a_date_without_a_zone_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1") as caught:
         _stamped(tmp_path, TimeUnit.ISO_8601, [text] * 3)
@@ -219,7 +274,9 @@ def test_a_delimiter_in_quotes_belongs_to_its_field(tmp_path: Path, delimiter: s
 
     rows = [line(*row.split(",")).replace("state", "run auto") for row in ROWS]
     data = "\n".join((line('"q 1"', "i"), *rows, "")).encode()
-    np.testing.assert_array_equal(_read(tmp_path, data, ("q 1", "i"), delimiter=delimiter).values, VALUES)
+    np.testing.assert_array_equal(
+        _read(tmp_path, data, ("q 1", "i"), delimiter=delimiter).values, VALUES
+    )
     np.testing.assert_array_equal(_read(tmp_path, data, (2, 3), delimiter=delimiter).values, VALUES)
 
 
@@ -245,7 +302,11 @@ def test_a_column_by_name_and_by_number_is_one(tmp_path: Path) -> None:
     [
         (["08:59:00.000", "08:59:00.010", "08:59:00.02"], 32_340_000_000_000, [0.0, 0.01, 0.02]),
         (["8:59:59,99", "9:00:00,00", "9:00:00,01"], 32_399_990_000_000, [0.0, 0.01, 0.02]),
-        (["2026-03-01 23:59:59.5", "2026-03-02 00:00:00.0", "2026-03-02T00:00:00.5"], 86_399_500_000_000, [0, 0.5, 1]),
+        (
+            ["2026-03-01 23:59:59.5", "2026-03-02 00:00:00.0", "2026-03-02T00:00:00.5"],
+            86_399_500_000_000,
+            [0, 0.5, 1],
+        ),
     ],
 )
 def test_times_of_day_are_stamps_since_midnight(
@@ -261,27 +322,42 @@ def test_times_of_day_are_stamps_since_midnight(
 
 
 def test_times_of_day_go_on_over_midnight(tmp_path: Path) -> None:
-    table = _stamped(tmp_path, TimeUnit.CLOCK, ["23:59:59.98", "23:59:59.99", "00:00:00.00", "00:00:00.01"])
+    table = _stamped(
+        tmp_path, TimeUnit.CLOCK, ["23:59:59.98", "23:59:59.99", "00:00:00.00", "00:00:00.01"]
+    )
     assert table.stamps is not None
     assert table.stamps.time_s == pytest.approx([0.0, 0.01, 0.02, 0.03], abs=1e-9)
     assert "times of day that pass midnight" in table.remarks[0]
 
 
 def test_dates_that_go_back_a_day_do_not_pass_midnight(tmp_path: Path) -> None:
-    texts = ["2026-03-02 23:59:59.98", "2026-03-02 23:59:59.99", "2026-03-02 00:00:00.00", "2026-03-02 00:00:00.01"]
+    texts = [
+        "2026-03-02 23:59:59.98",
+        "2026-03-02 23:59:59.99",
+        "2026-03-02 00:00:00.00",
+        "2026-03-02 00:00:00.01",
+    ]
     table = _stamped(tmp_path, TimeUnit.CLOCK, texts)
     assert table.stamps is not None
     assert np.diff(table.stamps.time_s).min() < -86_000.0
     assert table.remarks == ()
 
 
-@pytest.mark.parametrize("text", ["8:59 AM", "24:00:00", "08:59", "2026-02-30 08:00:00", "08:60:00", "5.0"])
+@pytest.mark.parametrize(
+    "text", ["8:59 AM", "24:00:00", "08:59", "2026-02-30 08:00:00", "08:60:00", "5.0"]
+)
 def test_what_is_no_time_of_day_is_refused(tmp_path: Path, text: str) -> None:
-    with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1: .*expected a time of day of 24 hours"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"run\.csv:2, column 1: .*expected a time of day "
+        r"of 24 hours",
+    ):
         _stamped(tmp_path, TimeUnit.CLOCK, [text] * 3)
 
 
-@pytest.mark.parametrize("text", ["08:59:00.000", "2026-03-01 08:59:00.000", "2026-03-01T08:59:00.000Z"])
+@pytest.mark.parametrize(
+    "text", ["08:59:00.000", "2026-03-01 08:59:00.000", "2026-03-01T08:59:00.000Z"]
+)
 def test_a_time_of_day_where_a_number_is_expected_names_the_unit(tmp_path: Path, text: str) -> None:
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column t.*`unit: clock`.*`unit: iso8601`"):
         _stamped(tmp_path, TimeUnit.SECOND, [text] * 3)
@@ -300,7 +376,9 @@ def test_a_time_of_day_where_a_number_is_expected_names_the_unit(tmp_path: Path,
 def test_a_counter_of_time_that_wraps_goes_on(
     tmp_path: Path, unit: TimeUnit, bits: int, step: int, signed: bool
 ) -> None:
-    """The case of a microsecond counter of 32 bits that is written in seconds is the first one, in another unit."""
+    """The case of a microsecond counter of 32 bits that is written in seconds is the first one,
+    in another unit.
+    """
     half = 2 ** (bits - 1) if signed else 0
     counts = [(2**bits - 3 * step + step * row - 1) % 2**bits - half for row in range(8)]
     assert min(np.diff(counts)) < 0

@@ -51,7 +51,9 @@ def _numbers(column: Sequence[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.array([float(text) for text in column])
 
 
-def test_csv_has_the_numbers_that_a_fit_gets(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_has_the_numbers_that_a_fit_gets(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "bare.csv"
     assert main(["export", "log", str(log), "--csv", "--out", str(out), "--json"]) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
@@ -60,7 +62,15 @@ def test_csv_has_the_numbers_that_a_fit_gets(log: Path, tmp_path: Path, capsys: 
     assert (said["rows"], said["columns"], said["valid"]) == (ROWS, list(table), True)
     assert list(table)[:4] == ["cycle", "time_ns", "time_s", "move"]
     assert list(table)[4:10] == [
-        f"J1.{name}" for name in ("position_rad", "current_A", "motor_counts", "current_raw", "statusword", "answered")
+        f"J1.{name}"
+        for name in (
+            "position_rad",
+            "current_A",
+            "motor_counts",
+            "current_raw",
+            "statusword",
+            "answered",
+        )
     ]
     # repr gives back the very numbers.
     for index in range(6):
@@ -79,15 +89,21 @@ def test_a_counter_that_wraps_goes_on_from_block_to_block(tmp_path: Path, checko
     step = 2**20
     true = [step * row for row in range(ROWS)]
     rows = [[(count + 2**31) % 2**32 - 2**31] * 6 for count in true]
-    bare = [Sample(10 + k, START_NS + k * 1_000_000, tuple(row), (0,) * 6, (0,) * 6, 0) for k, row in enumerate(rows)]
+    bare = [
+        Sample(10 + k, START_NS + k * 1_000_000, tuple(row), (0,) * 6, (0,) * 6, 0)
+        for k, row in enumerate(rows)
+    ]
     log = write(tmp_path / "wrapping.mcap", demo_content(checkout), bare)
     export_log(log, tmp_path / "out.csv", TableFormat.CSV)
     assert [int(text) for text in _table(tmp_path / "out.csv")["J4.motor_counts"]] == true
 
 
-def test_torques_and_temperatures_are_in_the_row_of_their_sync(tmp_path: Path, checkout: Path) -> None:
+def test_torques_and_temperatures_are_in_the_row_of_their_sync(
+    tmp_path: Path, checkout: Path
+) -> None:
     """Also where blocks meet, and before and after the samples."""
-    path, last = tmp_path / "warm.mcap", START_NS + (ROWS - 1) * 1_000_000
+    path = tmp_path / "warm.mcap"
+    last = START_NS + (ROWS - 1) * 1_000_000
     edge = START_NS + (BLOCK_SAMPLES - 1) * 1_000_000 + 500_000
     with LogWriter(path, demo_content(checkout), joints, clock_ns=lambda: 0) as log:
         for time_ns, value in ((START_NS - 5, 20.0), (last + 10**9, 21.0)):
@@ -99,7 +115,10 @@ def test_torques_and_temperatures_are_in_the_row_of_their_sync(tmp_path: Path, c
         log.conclude(True)
     export_log(path, tmp_path / "warm.csv", TableFormat.CSV)
     table = _table(tmp_path / "warm.csv")
-    found = {name: {row: text for row, text in enumerate(table[name]) if text} for name in list(table)[-2:]}
+    found = {
+        name: {row: text for row, text in enumerate(table[name]) if text}
+        for name in list(table)[-2:]
+    }
     assert found == {
         "J1.motor_torque_Nm": {3: "0.5", BLOCK_SAMPLES - 1: "0.75"},
         "J3.temperature_degC": {0: "20.0", ROWS - 1: "21.0"},
@@ -122,7 +141,10 @@ def test_without_its_package_parquet_says_what_to_install(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("daq.log.export.find_spec", lambda _name: None)
-    assert main(["export", "log", str(log), "--parquet", "--out", str(tmp_path / "x")]) == ExitCode.CONFIGURATION
+    assert (
+        main(["export", "log", str(log), "--parquet", "--out", str(tmp_path / "x")])
+        == ExitCode.CONFIGURATION
+    )
     assert "drivegain[parquet]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -157,13 +179,21 @@ def test_an_invalid_log_is_exported_and_called_invalid(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = write(
-        tmp_path / "bad.mcap", demo_content(checkout), samples([[0] * 6] * 3), verdict=(False, "2 late answers")
+        tmp_path / "bad.mcap",
+        demo_content(checkout),
+        samples([[0] * 6] * 3),
+        verdict=(False, "2 late answers"),
     )
-    assert main(["export", "log", str(log), "--csv", "--out", str(tmp_path / "bad.csv")]) == ExitCode.OK
+    assert (
+        main(["export", "log", str(log), "--csv", "--out", str(tmp_path / "bad.csv")])
+        == ExitCode.OK
+    )
     assert "INVALID: 2 late answers" in capsys.readouterr().err
 
 
-def test_a_link_in_the_place_of_the_unfinished_table_is_not_followed(log: Path, tmp_path: Path) -> None:
+def test_a_link_in_the_place_of_the_unfinished_table_is_not_followed(
+    log: Path, tmp_path: Path
+) -> None:
     target = tmp_path / "elsewhere"
     target.write_text("mine")
     (tmp_path / "bare.csv.part").symlink_to(target)

@@ -49,7 +49,9 @@ def cell(checkout: Path) -> Cell:
 
 @pytest.fixture
 def cell_file(tmp_path: Path) -> Path:
-    """A path of its own, so that the feeds of two tests have different addresses; it is not read."""
+    """A path of its own, so that the feeds of two tests have different addresses;
+    it is not read.
+    """
     return tmp_path / "cell.yaml"
 
 
@@ -75,20 +77,24 @@ def test_a_console_gets_every_sample_and_event_in_their_order(cell_file: Path, c
     heads = [HEAD.unpack_from(packet) for packet in packets]
     assert json.loads(packets[0][HEAD.size :])["run"]["axes"] == list(cell.axis_names)
     assert [number - heads[0][1] for _, number, *_ in heads] == [0, 1, 2, 3, 4, 5]
-    kinds = ["samples" if kind == SAMPLES else next(iter(json.loads(packet[HEAD.size :]))) for packet, (kind, *_) in
+    kinds = ["samples" if kind == SAMPLES else next(iter(json.loads(packet[HEAD.size :]))) for packet, (kind, *_) in  # noqa: E501
              zip(packets, heads, strict=True)]  # fmt: skip
     assert kinds == ["run", "samples", "samples", "samples", "events", "samples"]
     cycles = [
         cycle
         for packet, head in zip(packets, heads, strict=True)
         if head[0] == SAMPLES
-        for cycle in np.frombuffer(packet[HEAD.size :], packet_dtype(len(cell.axes)))["cycle"].tolist()
+        for cycle in np.frombuffer(packet[HEAD.size :], packet_dtype(len(cell.axes)))[
+            "cycle"
+        ].tolist()
     ]
     assert cycles == list(range(5, 40))
     assert heads[-1][2] == 40  # all samples of the run, also those from before
 
 
-def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(cell_file: Path, cell: Cell) -> None:
+def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(
+    cell_file: Path, cell: Cell
+) -> None:
     with Feed(cell_file) as feed:
         recording = Recording(feed, cell, cell_file)
         with _console(cell_file, feed) as console:
@@ -123,7 +129,9 @@ def test_a_monitor_asks_a_recorder_for_the_facts_of_its_run(cell_file: Path, cel
         assert not feed._consoles
 
 
-def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell_file: Path, cell: Cell) -> None:
+def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(
+    cell_file: Path, cell: Cell
+) -> None:
     stopped = threading.Event()
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.settimeout(10)
@@ -136,11 +144,16 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(cell
             assert asking.recv(len(ACCEPTED)) == ACCEPTED
             assert stopped.wait(10)
             feed.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
-        assert json.loads(asking.recv(4096)) == {"ok": False, "axes_stopped": True, "text": "stopped"}
+        assert json.loads(asking.recv(4096)) == {
+            "ok": False,
+            "axes_stopped": True,
+            "text": "stopped",
+        }
 
 
 def test_silent_clients_delay_no_stop(cell_file: Path) -> None:
-    stopped, name = threading.Event(), socket_names(cell_file).stop
+    stopped = threading.Event()
+    name = socket_names(cell_file).stop
     with ExitStack() as closing, Feed(cell_file, stopped.set):
         clients = [connected(name, socket.SOCK_STREAM, 10.0) for _ in range(2 * LARGEST_CONSOLES)]
         for silent in clients:
@@ -173,11 +186,13 @@ def _without_descriptors() -> Iterator[None]:
 
 
 def test_a_process_without_descriptors_serves_a_stop_once_it_has_one(cell_file: Path) -> None:
-    stopped, name = threading.Event(), socket_names(cell_file).stop
+    stopped = threading.Event()
+    name = socket_names(cell_file).stop
     with Feed(cell_file, stopped.set), socket.socket(socket.AF_UNIX) as asking:
         asking.settimeout(10)
         with _without_descriptors():
-            assert connected(name, socket.SOCK_STREAM, 1.0) is None  # no console of this process either
+            # No console of this process either
+            assert connected(name, socket.SOCK_STREAM, 1.0) is None
             asking.connect(name)
             asking.sendall(STOP)
             assert not stopped.wait(3 * feeds.ACCEPT_AGAIN_S)
@@ -185,7 +200,9 @@ def test_a_process_without_descriptors_serves_a_stop_once_it_has_one(cell_file: 
         assert stopped.wait(10)
 
 
-def test_a_feed_without_descriptors_says_so_and_one_that_ends_without_them_ends(cell_file: Path) -> None:
+def test_a_feed_without_descriptors_says_so_and_one_that_ends_without_them_ends(
+    cell_file: Path,
+) -> None:
     with _without_descriptors(), Feed(cell_file) as feed:
         assert "too many open files" in feed.remark.lower()
     feed = Feed(cell_file)
@@ -198,7 +215,10 @@ def test_a_feed_without_descriptors_says_so_and_one_that_ends_without_them_ends(
 
 
 def test_another_word_stops_nothing(cell_file: Path) -> None:
-    with Feed(cell_file, stop=lambda: pytest.fail("stopped")), socket.socket(socket.AF_UNIX) as asking:
+    with (
+        Feed(cell_file, stop=lambda: pytest.fail("stopped")),
+        socket.socket(socket.AF_UNIX) as asking,
+    ):
         asking.settimeout(10)
         asking.connect(socket_names(cell_file).stop)
         asking.sendall(b"GET /")
@@ -215,7 +235,9 @@ def test_other_users_are_not_served(cell_file: Path, monkeypatch: pytest.MonkeyP
         assert not feeds.of_this_user(fake)
 
 
-def test_a_second_program_on_a_cell_publishes_nothing_and_goes_on(cell_file: Path, cell: Cell) -> None:
+def test_a_second_program_on_a_cell_publishes_nothing_and_goes_on(
+    cell_file: Path, cell: Cell
+) -> None:
     with Feed(cell_file), Feed(cell_file) as second:
         Recording(second, cell, cell_file).run(20)
         assert "no console can watch" in second.remark
@@ -229,7 +251,8 @@ def test_what_a_stop_could_not_confirm_is_in_its_end() -> None:
     assert end_of(error) == {
         "ok": False,
         "axes_stopped": False,
-        "text": "node 3; while stopping: node 2 does not answer; not confirmed without power: node 2",
+        "text": "node 3; while stopping: node 2 does not answer; not confirmed without "
+        "power: node 2",
     }
     assert end_of(None) == {"ok": True, "axes_stopped": True, "text": ""}
 
@@ -270,7 +293,9 @@ def _end_at(console: socket.socket) -> dict[str, object]:
             return asdict(packet.message.end)
 
 
-def test_samples_that_cannot_be_sent_do_not_keep_the_end_from_a_console(cell_file: Path, cell: Cell) -> None:
+def test_samples_that_cannot_be_sent_do_not_keep_the_end_from_a_console(
+    cell_file: Path, cell: Cell
+) -> None:
     feed = Feed(cell_file)
     with ExitStack() as closing:
         with pytest.raises(SetupRefused), feed:
@@ -279,4 +304,8 @@ def test_samples_that_cannot_be_sent_do_not_keep_the_end_from_a_console(cell_fil
             feed._packed = ["no bytes"]  # type: ignore[list-item]
             raise _behind(SdoAbortedError(0x0601_0002))
         end = _end_at(console)
-    assert end == {"ok": False, "axes_stopped": True, "text": "node 2: TPDO1: writing 0x0 to 1A00h:00: aborted"}
+    assert end == {
+        "ok": False,
+        "axes_stopped": True,
+        "text": "node 2: TPDO1: writing 0x0 to 1A00h:00: aborted",
+    }

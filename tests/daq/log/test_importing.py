@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
+from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
@@ -31,6 +32,7 @@ from daq.report.document import json_tree
 from daq.report.log import info_report
 from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
+from ident.model.robot import Motion
 from tests.studies.real_runs import ur10
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -60,7 +62,10 @@ class Bench:
 
     def write_csv(self, values: FloatArray, delimiter: str = ",") -> None:
         """The recording, positions before currents."""
-        lines = [delimiter.join(NAMES), *(delimiter.join(map(repr, row)) for row in values.tolist())]
+        lines = [
+            delimiter.join(NAMES),
+            *(delimiter.join(map(repr, row)) for row in values.tolist()),
+        ]
         (self.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def spoil_csv(self, old: str, new: str) -> None:
@@ -86,12 +91,15 @@ class Bench:
         }
         document.update(changes)
         self.description.write_text(
-            json.dumps({key: value for key, value in document.items() if value is not None}), encoding="utf-8"
+            json.dumps({key: value for key, value in document.items() if value is not None}),
+            encoding="utf-8",
         )
 
     def run(self) -> int:
         """The command; its exit code."""
-        return main(["import", str(self.description), "--data", str(self.data), "--out", str(self.out)])
+        return main(
+            ["import", str(self.description), "--data", str(self.data), "--out", str(self.out)]
+        )
 
     @property
     def left(self) -> list[str]:
@@ -122,10 +130,14 @@ def test_motor_radians_counts_and_joint_degrees_are_the_same_run(bench: Bench) -
     counts = np.rint(motor_rad / (2 * pi) * 65536)
     for unit, values in (("rad", motor_rad), ("counts", counts)):
         bench.write_csv(np.hstack((values, bench.current_a)))
-        bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": "motor"})
+        bench.describe(
+            position={"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": "motor"}
+        )
         bench.out.unlink(missing_ok=True)
         assert bench.run() == 0
-        np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=3e-6)
+        np.testing.assert_allclose(
+            load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=3e-6
+        )
 
 
 def load_run_of(bench: Bench) -> FloatArray:
@@ -137,7 +149,9 @@ def load_run_of(bench: Bench) -> FloatArray:
 def test_column_numbers_semicolons_and_decimal_commas(bench: Bench) -> None:
     bench.write_csv(np.hstack((bench.joint_deg, 1000.0 * bench.current_a)), delimiter=";")
     path = bench.data / "run.csv"
-    path.write_text("exported by X\n" + path.read_text(encoding="utf-8").replace(".", ","), encoding="utf-8-sig")
+    path.write_text(
+        "exported by X\n" + path.read_text(encoding="utf-8").replace(".", ","), encoding="utf-8-sig"
+    )
     bench.describe(
         table={"delimiter": ";", "decimal": ",", "skip_rows": 1},
         position={"file": "run.csv", "columns": [1, 2, 3, 4, 5, 6], "unit": "deg", "side": "joint"},
@@ -150,6 +164,24 @@ def test_column_numbers_semicolons_and_decimal_commas(bench: Bench) -> None:
     np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
     assert run.payload is not None
     assert run.payload.known == {"m": 4.59}
+
+
+def test_a_robot_with_a_joint_that_follows_an_axis_is_imported_by_its_axes(bench: Bench) -> None:
+    urdf = bench.folder / "configs/robots/tx40.urdf"
+    follower = """<link name="behind"/><joint name="rod" type="revolute"><origin xyz="0 0 0.1"/>
+      <parent link="link6"/><child link="behind"/><axis xyz="0 1 0"/>
+      <limit lower="-9" upper="9" velocity="1" effort="1"/>
+      <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
+    text = urdf.read_text(encoding="utf-8")
+    urdf.write_text(text.replace("</robot>", follower), encoding="utf-8")
+    assert bench.run() == 0
+    run, cell = load_run(bench.out)
+    still = np.zeros_like(run.position_rad)
+    joints = model_of(cell).follow(Motion(run.position_rad, still, still)).joints
+    np.testing.assert_allclose(joints.position_rad[:, :6], np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(
+        joints.position_rad[:, 6], 0.1 - 0.5 * np.radians(bench.joint_deg[:, 4]), atol=2e-9
+    )
 
 
 def test_the_same_files_give_the_same_log(bench: Bench) -> None:
@@ -182,7 +214,9 @@ def test_wrong_columns(
 ) -> None:
     if old == "\n20.0,":
         rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
-        old, new, said = rows[7], rows[7].partition(",")[2], ("run.csv:8", "11 columns", "12, as in the header")
+        old = rows[7]
+        new = rows[7].partition(",")[2]
+        said = ("run.csv:8", "11 columns", "12, as in the header")
     bench.spoil_csv(old, new)
     _refused(bench, capsys, 4, *said)
 
@@ -199,7 +233,9 @@ def _refused(bench: Bench, capsys: pytest.CaptureFixture[str], code: int, *said:
 
 
 @pytest.mark.parametrize("word", ["nan", "inf", "-inf", "", "n/a", "1.2.3", "1e999"])
-def test_a_field_that_is_no_finite_number(bench: Bench, capsys: pytest.CaptureFixture[str], word: str) -> None:
+def test_a_field_that_is_no_finite_number(
+    bench: Bench, capsys: pytest.CaptureFixture[str], word: str
+) -> None:
     rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
     fields = rows[41].split(",")
     fields[8] = word
@@ -214,10 +250,18 @@ def test_two_axes_with_the_same_numbers_are_refused(
     values = np.hstack((bench.joint_deg, bench.current_a))
     values[:, copied] = values[:, original]
     bench.write_csv(values)
-    _refused(bench, capsys, 4, f"column {NAMES[copied]}", f"the same number as column {NAMES[original]} of run.csv")
+    _refused(
+        bench,
+        capsys,
+        4,
+        f"column {NAMES[copied]}",
+        f"the same number as column {NAMES[original]} of run.csv",
+    )
 
 
-def test_a_copy_of_a_file_is_no_other_axis(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_copy_of_a_file_is_no_other_axis(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     _file_of_each_axis(bench)
     first = sorted(bench.data.glob("*1.csv"))[0]
     second = sorted(bench.data.glob("*2.csv"))[0]
@@ -247,7 +291,9 @@ def test_an_empty_file(bench: Bench, capsys: pytest.CaptureFixture[str], text: s
     _refused(bench, capsys, 4, "before the numbers", "a line of numbers for each sample")
 
 
-def test_every_truncation_that_shows_is_refused(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_truncation_that_shows_is_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     data = (bench.data / "run.csv").read_bytes().rstrip(b"\n")
     last = data.rpartition(b"\n")[2]
     for keep in (3, len(last) // 2, last.rindex(b","), last.rindex(b",") + 1):
@@ -261,7 +307,9 @@ def test_binary_is_no_csv(bench: Bench, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_degrees_declared_as_radians(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "rad", "side": "joint"})
+    bench.describe(
+        position={"file": "run.csv", "columns": NAMES[:6], "unit": "rad", "side": "joint"}
+    )
     _refused(bench, capsys, 4, "degrees were taken for radians")
 
 
@@ -271,7 +319,9 @@ def test_radians_declared_as_degrees(bench: Bench, capsys: pytest.CaptureFixture
 
 
 def test_fractional_counts(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"})
+    bench.describe(
+        position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    )
     _refused(bench, capsys, 4, "run.csv:2, column q2", "a whole number of encoder counts")
 
 
@@ -285,28 +335,66 @@ def test_files_of_different_length(bench: Bench, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"rat_hz": 1000, "rate_hz": None}, ("unknown key 'rat_hz'", "rate_hz (did you mean that?)")),
+        (
+            {"rat_hz": 1000, "rate_hz": None},
+            ("unknown key 'rat_hz'", "rate_hz (did you mean that?)"),
+        ),
         ({"rate_hz": None}, ("neither rate_hz nor time",)),
         ({"time": {"file": "run.csv", "column": "q1", "unit": "s"}}, ("both rate_hz and time",)),
         ({"rate_hz": "1000"}, ("rate_hz", 'text "1000"', "a valid number")),
         ({"payload": "brick"}, ("'brick'", "disc at flange-a")),
         ({"cell": "../cells/none.yaml"}, ("none.yaml", "no such file")),
-        ({"position": {"file": "run.csv", "columns": NAMES[:6], "unit": "grad", "side": "joint"}}, ("position.unit",)),
-        ({"position": {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "joint"}}, ("motor",)),
-        ({"current": {"file": "run.csv", "columns": NAMES[6:], "unit": "mA"}}, ("'mA'", "current in 'A'", "factor")),
-        ({"current": {"file": "run.csv", "columns": NAMES[6:11], "unit": "A"}}, ("5 columns", "6, as many")),
+        (
+            {
+                "position": {
+                    "file": "run.csv",
+                    "columns": NAMES[:6],
+                    "unit": "grad",
+                    "side": "joint",
+                }
+            },
+            ("position.unit",),
+        ),
+        (
+            {
+                "position": {
+                    "file": "run.csv",
+                    "columns": NAMES[:6],
+                    "unit": "counts",
+                    "side": "joint",
+                }
+            },
+            ("motor",),
+        ),
+        (
+            {"current": {"file": "run.csv", "columns": NAMES[6:], "unit": "mA"}},
+            ("'mA'", "current in 'A'", "factor"),
+        ),
+        (
+            {"current": {"file": "run.csv", "columns": NAMES[6:11], "unit": "A"}},
+            ("5 columns", "6, as many"),
+        ),
     ],
 )
 def test_a_wrong_description(
-    bench: Bench, capsys: pytest.CaptureFixture[str], changes: dict[str, object], said: tuple[str, ...]
+    bench: Bench,
+    capsys: pytest.CaptureFixture[str],
+    changes: dict[str, object],
+    said: tuple[str, ...],
 ) -> None:
     bench.describe(**changes)
     _refused(bench, capsys, 6, *said)
 
 
-def test_a_duplicate_key_in_the_description(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.description.write_text(bench.description.read_text(encoding="utf-8") + "\n", encoding="utf-8")
-    text = bench.description.read_text(encoding="utf-8").replace('"rate_hz": 1000', '"rate_hz": 1000,\n"rate_hz": 500')
+def test_a_duplicate_key_in_the_description(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.description.write_text(
+        bench.description.read_text(encoding="utf-8") + "\n", encoding="utf-8"
+    )
+    text = bench.description.read_text(encoding="utf-8").replace(
+        '"rate_hz": 1000', '"rate_hz": 1000,\n"rate_hz": 500'
+    )
     bench.description.write_text(text, encoding="utf-8")
     _refused(bench, capsys, 6, "run.yaml:2", "duplicate key 'rate_hz', first on line 1")
 
@@ -333,7 +421,9 @@ def test_a_full_disk_leaves_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatc
     assert bench.left == []
 
 
-def test_a_rate_that_makes_the_joints_too_fast(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rate_that_makes_the_joints_too_fast(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     bench.describe(rate_hz=100_000.0)
     _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
 
@@ -377,21 +467,37 @@ def test_currents_without_their_sign_are_noticed(
 
 
 @pytest.mark.parametrize("back", [False, True])
-def test_a_step_that_no_motor_makes(bench: Bench, capsys: pytest.CaptureFixture[str], back: bool) -> None:
+def test_a_step_that_no_motor_makes(
+    bench: Bench, capsys: pytest.CaptureFixture[str], back: bool
+) -> None:
     """A step of 0.5 rad in one sample: the speeds over many samples do not show it."""
     bench.joint_deg[120 : 121 if back else None, 2] += np.degrees(0.5)
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     _refused(
-        bench, capsys, 4, "run.csv:122, column q3, axis J3", "in one sample", "the limit in the cell configuration"
+        bench,
+        capsys,
+        4,
+        "run.csv:122, column q3, axis J3",
+        "in one sample",
+        "the limit in the cell configuration",
     )
 
 
-def test_a_step_of_an_axis_that_rests_is_refused_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_step_of_an_axis_that_rests_is_refused_too(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Nothing else of that axis changes, and the step itself is no noise to compare it with."""
     bench.joint_deg[:, 2] = 60.0
     bench.joint_deg[120, 2] += np.degrees(0.5)
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
-    _refused(bench, capsys, 4, "column q3, axis J3", "in one sample", "the limit in the cell configuration")
+    _refused(
+        bench,
+        capsys,
+        4,
+        "column q3, axis J3",
+        "in one sample",
+        "the limit in the cell configuration",
+    )
 
 
 SMALL_GLITCH_DEG = 1.5
@@ -436,7 +542,9 @@ def test_an_axis_at_rest_may_have_no_current(bench: Bench) -> None:
     assert bench.run() == 0
 
 
-def test_a_step_is_found_in_resampled_samples_too(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_step_is_found_in_resampled_samples_too(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
     bench.joint_deg[150:, 3] += np.degrees(0.5)
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
@@ -460,8 +568,12 @@ def test_a_counter_of_fewer_than_32_bits_that_wraps(
     assert np.abs(np.diff(wrapped)).max() > 2 ** (bits - 1)
     counts[:, 0] = wrapped
     bench.write_csv(np.hstack((counts, bench.current_a)))
-    bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"})
-    _refused(bench, capsys, 4, "column q1", f"a counter of {bits} bits that wraps", "unwrap the column")
+    bench.describe(
+        position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    )
+    _refused(
+        bench, capsys, 4, "column q1", f"a counter of {bits} bits that wraps", "unwrap the column"
+    )
 
 
 @pytest.mark.parametrize("rows", [1, 2])
@@ -472,17 +584,29 @@ def test_a_row_or_two_are_no_recording(
     if timed:
         _with_time(bench, np.arange(300.0))
     path = bench.data / "run.csv"
-    path.write_text("".join(path.read_text(encoding="utf-8").splitlines(keepends=True)[: rows + 1]), encoding="utf-8")
+    path.write_text(
+        "".join(path.read_text(encoding="utf-8").splitlines(keepends=True)[: rows + 1]),
+        encoding="utf-8",
+    )
     _refused(bench, capsys, 4, f"{rows} rows of numbers", "was the export interrupted?")
 
 
 @pytest.mark.parametrize("change", [0.2, 0.4, -0.3])
 @pytest.mark.parametrize("sudden", [False, True])
-def test_a_rate_that_drifts(bench: Bench, capsys: pytest.CaptureFixture[str], change: float, sudden: bool) -> None:
+def test_a_rate_that_drifts(
+    bench: Bench, capsys: pytest.CaptureFixture[str], change: float, sudden: bool
+) -> None:
     """The drift scales velocities, and gains by up to 17 %, while every single step looks right."""
     share = (np.arange(299) > 150) if sudden else np.linspace(0.0, 1.0, 299)
     _with_time(bench, np.concatenate(([0.0], np.cumsum(4.0 * (1.0 + change * share)))))
-    _refused(bench, capsys, 4, "run.csv, column t", "Hz in parts of the recording", "give rate_hz instead of time")
+    _refused(
+        bench,
+        capsys,
+        4,
+        "run.csv, column t",
+        "Hz in parts of the recording",
+        "give rate_hz instead of time",
+    )
 
 
 def test_an_import_that_is_terminated_leaves_nothing(bench: Bench) -> None:
@@ -502,7 +626,11 @@ def test_an_import_that_is_terminated_leaves_nothing(bench: Bench) -> None:
     )
     words = ["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out)]
     done = subprocess.run(
-        [sys.executable, "-c", script, *words], cwd=bench.checkout, check=False, capture_output=True, text=True
+        [sys.executable, "-c", script, *words],
+        cwd=bench.checkout,
+        check=False,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == ExitCode.INTERRUPTED
     assert bench.left == []
@@ -517,33 +645,47 @@ def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize(("value", "words"), [(0.0, "zero in every row"), (3.0, "3 in every row")])
-def test_a_dead_channel(bench: Bench, capsys: pytest.CaptureFixture[str], value: float, words: str) -> None:
+def test_a_dead_channel(
+    bench: Bench, capsys: pytest.CaptureFixture[str], value: float, words: str
+) -> None:
     bench.current_a[:, 2] = value
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     _refused(bench, capsys, 4, "column i3", words)
 
 
-def test_a_last_number_that_may_lack_digits(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_last_number_that_may_lack_digits(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = bench.data / "run.csv"
     path.write_bytes(path.read_bytes()[:-3])
     _refused(bench, capsys, 4, "without an end of line")
 
 
 @pytest.mark.parametrize("change", [{"rate_hz": 1e-9}, {"rate_hz": 1e9}])
-def test_rates_beyond_reason(bench: Bench, capsys: pytest.CaptureFixture[str], change: dict[str, object]) -> None:
+def test_rates_beyond_reason(
+    bench: Bench, capsys: pytest.CaptureFixture[str], change: dict[str, object]
+) -> None:
     bench.describe(**change)
     _refused(bench, capsys, 6, "rate_hz")
 
 
-def _with_time(bench: Bench, time_s: np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]) -> None:
+def _with_time(
+    bench: Bench, time_s: np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]
+) -> None:
     lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
-    timed = ["t," + lines[0], *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True))]
+    timed = [
+        "t," + lines[0],
+        *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True)),
+    ]
     (bench.data / "run.csv").write_text("\n".join(timed) + "\n", encoding="utf-8")
     bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "ms"})
 
 
 def test_the_rate_of_a_time_column(bench: Bench) -> None:
-    _with_time(bench, 5000.0 + 4.0 * np.arange(300) + 0.3 * np.sin(np.arange(300)) * (np.arange(300) % 299 != 0))
+    _with_time(
+        bench,
+        5000.0 + 4.0 * np.arange(300) + 0.3 * np.sin(np.arange(300)) * (np.arange(300) % 299 != 0),
+    )
     assert bench.run() == 0
     assert load_run(bench.out)[0].rate_hz == pytest.approx(250.0)
 
@@ -556,7 +698,9 @@ def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> No
     assert bench.left == []
 
 
-UNEVEN_MS = np.concatenate(([0], np.cumsum(np.random.default_rng(3).choice([3, 5], 299)))).astype(np.float64)
+UNEVEN_MS = np.concatenate(([0], np.cumsum(np.random.default_rng(3).choice([3, 5], 299)))).astype(
+    np.float64
+)
 
 
 def test_a_uniform_time_column_gives_the_samples_of_a_rate(bench: Bench) -> None:
@@ -570,27 +714,49 @@ def test_a_uniform_time_column_gives_the_samples_of_a_rate(bench: Bench) -> None
         assert np.array_equal(getattr(found, name), getattr(expected, name))
 
 
-def test_jittered_stamps_are_the_sample_times(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_jittered_stamps_are_the_sample_times(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
     bench.current_a = np.cos(UNEVEN_MS[:, None] / 280.0 + np.arange(6))
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
     _with_time(bench, UNEVEN_MS)
-    assert main(["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out), "--json"]) == 0
+    assert (
+        main(
+            [
+                "import",
+                str(bench.description),
+                "--data",
+                str(bench.data),
+                "--out",
+                str(bench.out),
+                "--json",
+            ]
+        )
+        == 0
+    )
     document = json.loads(capsys.readouterr().out)
     assert document["timing"]["resampled"] is True
     assert document["timing"]["longest_step_s"] == pytest.approx(0.005)
     assert json_tree(info_report(bench.out))["timing"] == document["timing"]
     run = load_run(bench.out)[0]
     at_ms = 1e3 * run.time_s[:, None]
-    assert np.abs(np.degrees(run.position_rad) - 20.0 * np.sin(at_ms / 160.0 + np.arange(6))).max() < 1e-3
-    np.testing.assert_allclose(run.current_a, np.cos(at_ms / 280.0 + np.arange(6)), atol=(5.0 / 280.0) ** 2 / 8)
+    assert (
+        np.abs(np.degrees(run.position_rad) - 20.0 * np.sin(at_ms / 160.0 + np.arange(6))).max()
+        < 1e-3
+    )
+    np.testing.assert_allclose(
+        run.current_a, np.cos(at_ms / 280.0 + np.arange(6)), atol=(5.0 / 280.0) ** 2 / 8
+    )
 
 
 TURN_WITH_WRAPS = np.array([2**30, *[1024] * 5])
 
 
 def _with_counts_that_wrap(bench: Bench, joint_rad: FloatArray) -> None:
-    """Write counts of an encoder of 30 bits on the first motor, which wraps after two turns, and 10 bits elsewhere."""
+    """Write counts of an encoder of 30 bits on the first motor, which wraps after two turns,
+    and 10 bits elsewhere.
+    """
     cell = bench.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8").replace("revolution: 65536", f"revolution: {2**30}", 1)
     cell.write_text(text.replace("revolution: 65536", "revolution: 1024"), encoding="utf-8")
@@ -600,7 +766,9 @@ def _with_counts_that_wrap(bench: Bench, joint_rad: FloatArray) -> None:
     bench.write_csv(np.hstack((counts, bench.current_a)))
 
 
-def test_counts_at_a_rate_go_on_over_a_wrap(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_counts_at_a_rate_go_on_over_a_wrap(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The checks see the motion, not the jumps of the counter; what is too fast is so still."""
     joint_rad = np.radians(30.0 * np.sin(np.arange(300)[:, None] / 160.0 + np.arange(6)))
     _with_counts_that_wrap(bench, joint_rad)
@@ -613,8 +781,12 @@ def test_counts_at_a_rate_go_on_over_a_wrap(bench: Bench, capsys: pytest.Capture
     np.testing.assert_allclose(run.position_rad[:, 0], joint_rad[:, 0], atol=1e-8)
 
 
-def test_counts_without_a_sign_are_those_with_one(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    """A drive's counter of 32 bits that a tool reads as unsigned jumps by 2³² at zero; one column stays above it."""
+def test_counts_without_a_sign_are_those_with_one(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A drive's counter of 32 bits that a tool reads as unsigned jumps by 2³² at zero;
+    one column stays above it.
+    """
     motor_rad = np.radians(bench.joint_deg) @ load_run_of(bench).T
     counts = np.rint(motor_rad / (2 * pi) * 65536)
     counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
@@ -628,16 +800,23 @@ def test_counts_without_a_sign_are_those_with_one(bench: Bench, capsys: pytest.C
     bench.write_csv(np.hstack((unsigned, bench.current_a)))
     capsys.readouterr()
     assert bench.run() == 0
-    assert "column q1: counts of 32 bits without a sign, read as counts with one" in capsys.readouterr().out
+    assert (
+        "column q1: counts of 32 bits without a sign, read as counts with one"
+    ) in capsys.readouterr().out
     np.testing.assert_array_equal(load_run(bench.out)[0].position_rad, expected)
 
 
 def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
-    turn, ratio = TURN_WITH_WRAPS, load_run_of(bench)
-    _with_counts_that_wrap(bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))))
+    turn = TURN_WITH_WRAPS
+    ratio = load_run_of(bench)
+    _with_counts_that_wrap(
+        bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6)))
+    )
     _with_time(bench, UNEVEN_MS)
     counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
-    bench.describe(rate_hz=None, position=counted, time={"file": "run.csv", "column": "t", "unit": "ms"})
+    bench.describe(
+        rate_hz=None, position=counted, time={"file": "run.csv", "column": "t", "unit": "ms"}
+    )
     assert bench.run() == 0
     run = load_run(bench.out)[0]
     expected = np.radians(30.0 * np.sin(1e3 * run.time_s[:, None] / 160.0 + np.arange(6)))
@@ -649,7 +828,11 @@ def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Be
 
 @pytest.mark.parametrize(
     ("first", "unit", "started_s", "recorded"),
-    [(0.0, "ms", 0.0, False), (512_300.0, "ms", 512.3, False), (1_772_348_400_000.0, "ms", 1_772_348_400.0, True)],
+    [
+        (0.0, "ms", 0.0, False),
+        (512_300.0, "ms", 512.3, False),
+        (1_772_348_400_000.0, "ms", 1_772_348_400.0, True),
+    ],
 )
 def test_the_first_stamp_is_when_the_run_began(
     bench: Bench, first: float, unit: str, started_s: float, recorded: bool
@@ -675,8 +858,12 @@ def test_a_date_in_a_file_is_when_the_run_began(bench: Bench) -> None:
     _with_time(bench, np.arange(300.0))
     path = bench.data / "run.csv"
     head, *rows = path.read_text(encoding="utf-8").splitlines()
-    dated = [f"2026-03-01T08:00:{index // 100:02d}.{index % 100:02d}+01:00," for index in range(300)]
-    text = "\n".join([head, *(date + row.partition(",")[2] for date, row in zip(dated, rows, strict=True))])
+    dated = [
+        f"2026-03-01T08:00:{index // 100:02d}.{index % 100:02d}+01:00," for index in range(300)
+    ]
+    text = "\n".join(
+        [head, *(date + row.partition(",")[2] for date, row in zip(dated, rows, strict=True))]
+    )
     path.write_text(text + "\n", encoding="utf-8")
     bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "iso8601"})
     assert bench.run() == 0
@@ -696,13 +883,17 @@ def test_a_first_row_that_is_there_twice(bench: Bench, capsys: pytest.CaptureFix
     bench.spoil_csv(rows[1], f"{rows[1]}\n{rows[1]}")
     assert bench.run() == 0
     assert "1 duplicated and dropped" in capsys.readouterr().out
-    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(
+        load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=2e-9
+    )
 
 
 def test_zero_offsets_count_on_the_joint_side_too(bench: Bench) -> None:
     cell = bench.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8")
-    cell.write_text(text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 30.0", 1), encoding="utf-8")
+    cell.write_text(
+        text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 30.0", 1), encoding="utf-8"
+    )
     assert bench.run() == 0
     expected = np.radians(bench.joint_deg + np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(load_run(bench.out)[0].position_rad, expected, atol=2e-9)
@@ -715,7 +906,9 @@ def test_a_factor_for_each_axis(bench: Bench, mapping: bool) -> None:
     factor = named if mapping else factors
     bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor})
     assert bench.run() == 0
-    np.testing.assert_allclose(load_run(bench.out)[0].current_a, bench.current_a * factors, atol=3e-9)
+    np.testing.assert_allclose(
+        load_run(bench.out)[0].current_a, bench.current_a * factors, atol=3e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -742,7 +935,13 @@ def _with_velocity(bench: Bench, velocity_deg_s: FloatArray, **changes: object) 
     values = np.hstack((bench.joint_deg, bench.current_a, velocity_deg_s))
     np.savetxt(bench.data / "run.csv", values, delimiter=",", header=header, comments="")
     bench.describe(
-        velocity={"file": "run.csv", "columns": SPEEDS, "unit": "deg/s", "side": "joint", **changes},
+        velocity={
+            "file": "run.csv",
+            "columns": SPEEDS,
+            "unit": "deg/s",
+            "side": "joint",
+            **changes,
+        },
     )
 
 
@@ -758,7 +957,12 @@ def test_velocities_that_agree_change_nothing(bench: Bench, side: str, unit: str
     bench.out.unlink()
     velocity = _velocity_deg_s() + np.random.default_rng(0).normal(scale=20.0, size=(300, 6))
     velocity = velocity if unit == "deg/s" else np.radians(velocity)
-    _with_velocity(bench, velocity if side == "joint" else velocity @ load_run_of(bench).T, side=side, unit=unit)
+    _with_velocity(
+        bench,
+        velocity if side == "joint" else velocity @ load_run_of(bench).T,
+        side=side,
+        unit=unit,
+    )
     assert bench.run() == 0
     assert np.array_equal(read_log(bench.out).samples.position_counts, expected)
 
@@ -766,13 +970,19 @@ def test_velocities_that_agree_change_nothing(bench: Bench, side: str, unit: str
 @pytest.mark.parametrize(
     ("factors", "said"),
     [
-        ((1, 1, -1, 1, 1, 1), ("column v3, axis J3", "move -1 times as fast", "agree with the positions to 20 %")),
+        (
+            (1, 1, -1, 1, 1, 1),
+            ("column v3, axis J3", "move -1 times as fast", "agree with the positions to 20 %"),
+        ),
         ((1, 1, 1, 1, pi / 180, 1), ("axis J5", "move 57.3 times as fast")),
         ((0, 1, 1, 1, 1, 1), ("axis J1", "differ from it by 100 %")),
     ],
 )
 def test_velocities_that_disagree_name_the_axis(
-    bench: Bench, capsys: pytest.CaptureFixture[str], factors: tuple[float, ...], said: tuple[str, ...]
+    bench: Bench,
+    capsys: pytest.CaptureFixture[str],
+    factors: tuple[float, ...],
+    said: tuple[str, ...],
 ) -> None:
     _with_velocity(bench, _velocity_deg_s() * factors)
     _refused(bench, capsys, 4, *said)
@@ -793,7 +1003,10 @@ def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> Non
     """Nine seconds of a real arm: every number of the files is in the log to half a count."""
     out = tmp_path / "tx40.mcap"
     description = checkout / "configs/imports/tx40.yaml"
-    assert main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(out)]) == 0
+    assert (
+        main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(out)])
+        == 0
+    )
     run, cell = load_run(out)
     motor_rad = np.loadtxt(shared_data / "tx40/pos_read_data.csv", delimiter=",", skiprows=1)
     current = np.loadtxt(shared_data / "tx40/curr_data.csv", delimiter=",", skiprows=1)
@@ -801,10 +1014,13 @@ def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> Non
     assert run.rate_hz == pytest.approx(5000.0)
     offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
     np.testing.assert_allclose(
-        (run.position_rad - offset_rad) @ cell.ratio.T, motor_rad, atol=1e-9 * np.abs(motor_rad).max()
+        (run.position_rad - offset_rad) @ cell.ratio.T,
+        motor_rad,
+        atol=1e-9 * np.abs(motor_rad).max(),
     )
     np.testing.assert_allclose(run.current_a, current, atol=1e-9 * np.abs(current).max())
-    # NOTICE: q2 has an offset of −π/2, q3 of +π/2; the arm starts stretched up, both URDF angles near zero.
+    # NOTICE: q2 has an offset of −π/2, q3 of +π/2; the arm starts stretched up, both URDF angles
+    # near zero.
     np.testing.assert_allclose(run.position_rad[0, 1:3], 0.0, atol=1e-3)
 
 
@@ -837,10 +1053,13 @@ def test_a_full_disk_is_not_reported_as_a_recording(bench: Bench) -> None:
     assert "record" not in str(caught.value)
 
 
-# -- the controller's own torque, and temperatures -------------------------------------------------------------------
+# -- the controller's own torque, and temperatures
+# -------------------------------------------------------------------
 
 
-def with_slow_columns(bench: Bench, torque_nm: FloatArray, temperature_c: FloatArray, **torque: object) -> None:
+def with_slow_columns(
+    bench: Bench, torque_nm: FloatArray, temperature_c: FloatArray, **torque: object
+) -> None:
     """Add a file of torques and temperatures."""
     names = [f"t{i}" for i in range(1, 7)] + [f"c{i}" for i in range(1, 7)]
     values = np.hstack((torque_nm, temperature_c)).tolist()
@@ -854,8 +1073,11 @@ def with_slow_columns(bench: Bench, torque_nm: FloatArray, temperature_c: FloatA
 
 
 @pytest.mark.parametrize("side", ["motor", "joint"])
-def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(bench: Bench, side: str) -> None:
-    ratio, gain = load_run_of(bench), np.array([33.0, 32.0, 24.0, -9.0, 16.0, 6.8])
+def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(
+    bench: Bench, side: str
+) -> None:
+    ratio = load_run_of(bench)
+    gain = np.array([33.0, 32.0, 24.0, -9.0, 16.0, 6.8])
     motor_nm = gain * bench.current_a / np.diag(ratio)
     torque = motor_nm if side == "motor" else motor_nm @ ratio
     temperature_c = np.linspace(25.0, 31.0, 300)[:, None] + np.arange(6)
@@ -891,7 +1113,11 @@ def test_a_torque_column_too_few_and_a_factor_of_zero_are_refused(bench: Bench) 
 def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
     columns = [*SPEEDS[:3], "i4", *SPEEDS[4:]]
     bench.describe(torque={"file": "./run.csv", "columns": columns, "side": "motor"})
-    with pytest.raises(ConfigurationInconsistent, match=r"torque\.columns: found i4 of .*, which current is read from"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"torque\.columns: found i4 of .*, which "
+        r"current is read from",
+    ):
         import_recording(bench.description, bench.data, bench.out, software="test")
 
 
@@ -915,9 +1141,12 @@ def test_an_import_without_them_has_neither(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "columns"), [("position", [*NAMES[:5], "q1"]), ("current", NAMES[:6]), ("temperature", NAMES[6:])]
+    ("key", "columns"),
+    [("position", [*NAMES[:5], "q1"]), ("current", NAMES[:6]), ("temperature", NAMES[6:])],
 )
-def test_a_column_is_read_as_one_thing(checkout: Path, tmp_path: Path, key: str, columns: list[str]) -> None:
+def test_a_column_is_read_as_one_thing(
+    checkout: Path, tmp_path: Path, key: str, columns: list[str]
+) -> None:
     bench = Bench(checkout, tmp_path).prepare()
     section = {"position": {"unit": "deg", "side": "joint"}, "current": {"unit": "A"}}.get(key, {})
     bench.describe(**{key: {"file": "run.csv", "columns": columns, **section}})
@@ -926,7 +1155,9 @@ def test_a_column_is_read_as_one_thing(checkout: Path, tmp_path: Path, key: str,
 
 
 @pytest.mark.parametrize("step", [4_000_000, 4_000, 4])
-def test_stamps_in_another_unit_have_no_rate_of_a_robot(checkout: Path, tmp_path: Path, step: int) -> None:
+def test_stamps_in_another_unit_have_no_rate_of_a_robot(
+    checkout: Path, tmp_path: Path, step: int
+) -> None:
     bench = Bench(checkout, tmp_path).prepare()
     rows = np.hstack((step * np.arange(300.0)[:, None], bench.joint_deg, bench.current_a))
     lines = [",".join(("t", *NAMES)), *(",".join(map(repr, row)) for row in rows.tolist())]
@@ -976,7 +1207,9 @@ def test_times_that_are_kept_are_rows_of_the_other_file(bench: Bench) -> None:
 def test_rows_are_kept_at_a_stated_rate(bench: Bench, keep: dict[str, float], rows: slice) -> None:
     bench.describe(keep=keep)
     assert bench.run() == 0
-    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg[rows]), atol=2e-9)
+    np.testing.assert_allclose(
+        load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg[rows]), atol=2e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -1001,23 +1234,32 @@ def test_a_held_out_end_becomes_a_log_of_its_own(bench: Bench, timed: bool) -> N
     if timed:
         _with_time(bench, 1_772_348_400_000.0 + 4.0 * np.arange(300))
     part = {"from_s": 0.8 if timed else 0.2}
-    time = {"file": "run.csv", "column": "t", "unit": "ms"} if timed else None
+    if timed:
+        time = {"file": "run.csv", "column": "t", "unit": "ms"}
+    else:
+        time = None
     bench.describe(rate_hz=None if timed else 1000, time=time, holdout=part)
     held_out = bench.out.with_name("held-out.mcap")
-    imported = import_recording(bench.description, bench.data, bench.out, software="test", holdout=held_out)
+    imported = import_recording(
+        bench.description, bench.data, bench.out, software="test", holdout=held_out
+    )
     assert imported.statistics.samples == 200
     assert imported.holdout is not None
     assert imported.holdout.samples == 100
     runs = [load_run(path)[0] for path in (bench.out, held_out)]
     joined = np.vstack([run.position_rad for run in runs])
     np.testing.assert_allclose(joined, np.radians(bench.joint_deg), atol=2e-9)
-    np.testing.assert_allclose(np.vstack([run.current_a for run in runs]), bench.current_a, atol=1e-9)
+    np.testing.assert_allclose(
+        np.vstack([run.current_a for run in runs]), bench.current_a, atol=1e-9
+    )
     if timed:
         assert runs[1].started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
     assert read_log(bench.out).head.run.run_id != read_log(held_out).head.run.run_id
 
 
-def test_the_command_writes_both_logs_and_reports_them(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_both_logs_and_reports_them(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     bench.describe(holdout={"from_s": 0.2})
     held_out = bench.out.with_name("held-out.mcap")
     command = ["import", str(bench.description), "--data", str(bench.data), "--out", str(bench.out)]
@@ -1042,7 +1284,9 @@ def test_a_held_out_part_that_is_none_is_refused(
     bench.describe(holdout=part)
     held_out = bench.out.with_name("held-out.mcap") if named else None
     with pytest.raises(error, match=said):
-        import_recording(bench.description, bench.data, bench.out, software="test", holdout=held_out)
+        import_recording(
+            bench.description, bench.data, bench.out, software="test", holdout=held_out
+        )
     assert bench.left == []
 
 
@@ -1051,7 +1295,11 @@ def test_a_log_that_cannot_be_written_leaves_no_held_out_part(bench: Bench) -> N
     bench.out.write_bytes(b"mine")
     with pytest.raises(UsageError):
         import_recording(
-            bench.description, bench.data, bench.out, software="test", holdout=bench.out.with_name("held-out.mcap")
+            bench.description,
+            bench.data,
+            bench.out,
+            software="test",
+            holdout=bench.out.with_name("held-out.mcap"),
         )
     assert bench.left == ["run.mcap"]
 
@@ -1105,7 +1353,9 @@ def test_axes_come_from_a_file_each(bench: Bench) -> None:
     np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
 
 
-def test_an_error_names_the_file_of_its_axis(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_names_the_file_of_its_axis(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     _file_of_each_axis(bench)
     path = bench.data / "axis4.csv"
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -1123,10 +1373,19 @@ def test_files_of_axes_whose_dates_differ_are_refused(
     bench: Bench, capsys: pytest.CaptureFixture[str], later_s: float
 ) -> None:
     _file_of_each_axis(bench, later_s, began_s=1_772_000_000.0)
-    _refused(bench, capsys, 4, "axis3.csv", f"{later_s:.6g} s after those of axis1.csv", "of different times")
+    _refused(
+        bench,
+        capsys,
+        4,
+        "axis3.csv",
+        f"{later_s:.6g} s after those of axis1.csv",
+        "of different times",
+    )
 
 
-def test_files_of_axes_belong_together_by_their_stamps(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_of_axes_belong_together_by_their_stamps(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A row that one file lacks would shift its axis; a clock that begins elsewhere is said."""
     _file_of_each_axis(bench, later_s=0.1)
     assert bench.run() == 0
@@ -1135,7 +1394,9 @@ def test_files_of_axes_belong_together_by_their_stamps(bench: Bench, capsys: pyt
     path = bench.data / "axis3.csv"
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text("\n".join([*lines[:50], *lines[51:], "1.3,0.0,0.0"]) + "\n", encoding="utf-8")
-    _refused(bench, capsys, 4, "axis3.csv:51, column time", "rows of the same instants in both files")
+    _refused(
+        bench, capsys, 4, "axis3.csv:51, column time", "rows of the same instants in both files"
+    )
 
 
 @pytest.mark.parametrize(
@@ -1146,7 +1407,11 @@ def test_files_of_axes_belong_together_by_their_stamps(bench: Bench, capsys: pyt
     ],
 )
 def test_files_and_columns_that_do_not_match_are_refused(
-    bench: Bench, capsys: pytest.CaptureFixture[str], files: list[str], columns: list[str], said: str
+    bench: Bench,
+    capsys: pytest.CaptureFixture[str],
+    files: list[str],
+    columns: list[str],
+    said: str,
 ) -> None:
     _file_of_each_axis(bench)
     bench.describe(current={"file": files, "columns": columns, "unit": "A"})
@@ -1165,14 +1430,24 @@ def test_currents_of_one_cell_may_have_several_units(bench: Bench, kind: str) ->
         first += f'nameplate_gain: {gain.strip()}\n    gain_unit: "{unit}"' + rest[2 * axis + 1]
     cell.write_text(first, encoding="utf-8")
     units = {f"J{axis + 1}": "N" if axis == 1 else "Nm" for axis in range(6)}
-    stated: object = units if kind == "mapping" else list(units.values())
+    stated: object
+    if kind == "mapping":
+        stated = units
+    else:
+        stated = list(units.values())
     bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": stated})
     assert bench.run() == 0
-    assert [axis.gain_unit for axis in load_run(bench.out)[1].axes][:3] == ["Nm/Nm", "Nm/N", "Nm/Nm"]
+    assert [axis.gain_unit for axis in load_run(bench.out)[1].axes][:3] == [
+        "Nm/Nm",
+        "Nm/N",
+        "Nm/Nm",
+    ]
 
 
 @pytest.mark.parametrize("unit", ["Nm", ["Nm"] * 5, {"J1": "Nm"}])
-def test_units_of_other_axes_are_refused(bench: Bench, capsys: pytest.CaptureFixture[str], unit: object) -> None:
+def test_units_of_other_axes_are_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], unit: object
+) -> None:
     bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": unit})
     _refused(bench, capsys, 6, "current.unit")
 
@@ -1214,8 +1489,16 @@ def test_velocities_have_signs_of_their_own(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("key", ["position", "velocity"])
-def test_a_reversed_axis_that_is_none_is_refused(bench: Bench, capsys: pytest.CaptureFixture[str], key: str) -> None:
-    section = {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint", "reversed": ["J9"]}
+def test_a_reversed_axis_that_is_none_is_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], key: str
+) -> None:
+    section = {
+        "file": "run.csv",
+        "columns": NAMES[:6],
+        "unit": "deg",
+        "side": "joint",
+        "reversed": ["J9"],
+    }
     if key == "velocity":
         section |= {"unit": "deg/s", "columns": [f"v{axis}" for axis in range(6)]}
     bench.describe(**{key: section})

@@ -1,4 +1,6 @@
-"""A robot of one linear axis, with a cell file as short as possible: its recording imports in m or mm."""
+"""A robot of one linear axis, with a cell file as short as possible:
+its recording imports in m or mm.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ axes:
   - {name: X, nameplate_gain: 35.0, gain_unit: N/V,
      limits: {position_mm: [-800, 800], velocity_mm_s: 2000, acceleration_mm_s2: 20000}}
 """
-MASS_KG, GAIN_N_V = 95.0, 35.0
+MASS_KG = 95.0
+GAIN_N_V = 35.0
 
 
 @pytest.fixture
@@ -37,12 +40,19 @@ def slide(tmp_path: Path) -> Path:
     (tmp_path / "cell.yaml").write_text(CELL)
     time_s = np.arange(0.0, 30.0, 0.002)
     phase = np.minimum(time_s % 1.5, 1.0)
-    way, there = (1.0 - np.cos(np.pi * phase)) / 2.0, np.floor(time_s / 1.5)
+    way = (1.0 - np.cos(np.pi * phase)) / 2.0
+    there = np.floor(time_s / 1.5)
     ends = 0.3 * np.sin(1.0 + 2.0 * np.arange(40))
-    position_m = ends[there.astype(int)] + way * (ends[there.astype(int) + 1] - ends[there.astype(int)])
-    force = MASS_KG * np.gradient(np.gradient(position_m, time_s), time_s) + 20.0 * np.sign(np.gradient(position_m))
+    position_m = ends[there.astype(int)] + way * (
+        ends[there.astype(int) + 1] - ends[there.astype(int)]
+    )
+    force = MASS_KG * np.gradient(np.gradient(position_m, time_s), time_s) + 20.0 * np.sign(
+        np.gradient(position_m)
+    )
     table = np.column_stack((time_s, position_m, 1000.0 * position_m, force / GAIN_N_V))
-    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="t,m,mm,V", comments="", fmt="%.9g")
+    np.savetxt(
+        tmp_path / "run.csv", table, delimiter=",", header="t,m,mm,V", comments="", fmt="%.9g"
+    )
     return tmp_path
 
 
@@ -56,7 +66,16 @@ def _import(folder: Path, unit: str) -> int:
         "rate_hz": 500,
     }
     (folder / f"{unit}.yaml").write_text(json.dumps(description))
-    return main(["import", str(folder / f"{unit}.yaml"), "--data", str(folder), "--out", str(folder / f"{unit}.mcap")])
+    return main(
+        [
+            "import",
+            str(folder / f"{unit}.yaml"),
+            "--data",
+            str(folder),
+            "--out",
+            str(folder / f"{unit}.mcap"),
+        ]
+    )
 
 
 def test_metres_and_millimetres_are_the_same_run(slide: Path) -> None:
@@ -64,7 +83,13 @@ def test_metres_and_millimetres_are_the_same_run(slide: Path) -> None:
     (first, cell), (second, _) = load_run(slide / "m.mcap"), load_run(slide / "mm.mcap")
     np.testing.assert_allclose(first.position_rad, second.position_rad, atol=2e-9)
     assert np.ptp(first.position_rad) == pytest.approx(0.6, abs=0.02)
-    found = identify(model_of(cell), [first], cell.conditioning, method=Method.ML, fixed_gains=np.array([GAIN_N_V]))
+    found = identify(
+        model_of(cell),
+        [first],
+        cell.conditioning,
+        method=Method.ML,
+        fixed_gains=np.array([GAIN_N_V]),
+    )
     names = [column.name for column in found.estimate.unknowns]
     units = [column.unit for column in found.estimate.unknowns]
     assert found.estimate.parameters[names.index("fs1")] == pytest.approx(20.0, rel=0.05)
@@ -80,7 +105,8 @@ def test_metres_of_an_axis_that_turns(slide: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize(
-    ("section", "number", "factor"), [("position", 1.5e308, 1.0), ("current", 1e305, 1e9), ("torque", 1e305, 1e9)]
+    ("section", "number", "factor"),
+    [("position", 1.5e308, 1.0), ("current", 1e305, 1e9), ("torque", 1e305, 1e9)],
 )
 def test_a_number_that_no_robot_has(
     section: str, number: float, factor: float, slide: Path, capsys: pytest.CaptureFixture[str]
@@ -93,12 +119,19 @@ def test_a_number_that_no_robot_has(
         "name": "run",
         "cell": "cell.yaml",
         "position": {"file": "run.csv", "columns": ["m"], "unit": "m", "side": "joint"},
-        "current": {"file": "run.csv", "columns": ["V"], "unit": "V", "factor": factor if section == "current" else 1},
+        "current": {
+            "file": "run.csv",
+            "columns": ["V"],
+            "unit": "V",
+            "factor": factor if section == "current" else 1,
+        },
         "torque": {"file": "run.csv", "columns": ["mm"], "side": "joint", "factor": factor},
         "rate_hz": 500,
     }
     (slide / "run.yaml").write_text(json.dumps(description))
-    code = main(["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")])
+    code = main(
+        ["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")]
+    )
     assert code == ExitCode.DATA_UNFIT
     assert f"as {section}" in capsys.readouterr().err
     assert not list(slide.glob("run.mcap*"))
@@ -117,6 +150,8 @@ def test_kelvin_are_no_celsius(slide: Path, capsys: pytest.CaptureFixture[str]) 
         "rate_hz": 500,
     }
     (slide / "run.yaml").write_text(json.dumps(description))
-    code = main(["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")])
+    code = main(
+        ["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")]
+    )
     assert code == ExitCode.DATA_UNFIT
     assert "from -60 to 250" in capsys.readouterr().err

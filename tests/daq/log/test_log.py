@@ -79,15 +79,20 @@ def test_slow_readings_come_back_and_leave_the_samples_alone(
 ) -> None:
     axes, rows = recording
     with TemporaryDirectory() as folder:
-        path, bare = Path(folder) / "a.mcap", write(Path(folder) / "b.mcap", content(axes), rows)
+        path = Path(folder) / "a.mcap"
+        bare = write(Path(folder) / "b.mcap", content(axes), rows)
         with LogWriter(path, content(axes), joints, clock_ns=lambda: 0) as writer:
             writer.readings(readings)
             for sample in rows:
                 writer.write(sample)
             writer.conclude(valid=True)
-        found, without = read_log(path), read_log(bare)
+        found = read_log(path)
+        without = read_log(bare)
         # Such topics are in a log only where it has some.
-        assert [b"AxisReading" in log.read_bytes() for log in (path, bare)] == [bool(readings), False]
+        assert [b"AxisReading" in log.read_bytes() for log in (path, bare)] == [
+            bool(readings),
+            False,
+        ]
     assert found.readings == tuple(readings)
     assert without.readings == ()
     assert found.samples.position_counts.tolist() == without.samples.position_counts.tolist()
@@ -99,13 +104,19 @@ def test_a_reading_of_an_axis_that_the_log_lacks_is_refused(tmp_path: Path) -> N
         for sample in samples([(1, 2), (3, 4)]):
             log.write(sample)
         log.conclude(valid=True)
-    with pytest.raises(LogIncomplete, match="temperature of axis 2, counted from 0; expected those of 2 axes"):
+    with pytest.raises(
+        LogIncomplete, match="temperature of axis 2, counted from 0; expected those of 2 axes"
+    ):
         read_log(tmp_path / "a.mcap")
 
 
 def test_an_event_that_names_a_file_whose_name_is_no_utf_8_is_logged(tmp_path: Path) -> None:
-    """The error of a full disk names the log: were it not logged, it would hide why the axes were stopped."""
-    event = CellEvent(START_NS, None, EventKind.ENDED, 0, "OutputFailed: \udcff.mcap: no space left")
+    """The error of a full disk names the log:
+    were it not logged, it would hide why the axes were stopped.
+    """
+    event = CellEvent(
+        START_NS, None, EventKind.ENDED, 0, "OutputFailed: \udcff.mcap: no space left"
+    )
     log = read_log(write(tmp_path / "a.mcap", content(2), samples([[0, 0]]), [event]))
     assert [found.text for found in log.events] == [r"OutputFailed: \udcff.mcap: no space left"]
 
@@ -128,13 +139,20 @@ def test_round_trip(recording: tuple[int, list[Sample]], events: list[CellEvent]
 @pytest.mark.parametrize("axes", [1, 2, 5, 6])
 def test_the_start_and_the_end_come_back(tmp_path: Path, axes: int) -> None:
     start = content(axes, DISC)
-    rows = [Sample(k, k, (1,) * axes, (2,) * axes, (3,) * axes, missing) for k, missing in ((3, 0), (4, 1), (9, 1))]
+    rows = [
+        Sample(k, k, (1,) * axes, (2,) * axes, (3,) * axes, missing)
+        for k, missing in ((3, 0), (4, 1), (9, 1))
+    ]
     log = read_log(write(tmp_path / "a.mcap", start, rows, verdict=(False, "emergency stop")))
     assert log.head.run == start.run
     assert log.head.readback == start.readback
     assert log.head.files["cell.yaml"] == start.files["cell.yaml"]
     statistics = log.statistics
-    assert (statistics.samples, statistics.lost_cycles, statistics.missing) == (3, 4, (2,) + (0,) * (axes - 1))
+    assert (statistics.samples, statistics.lost_cycles, statistics.missing) == (
+        3,
+        4,
+        (2,) + (0,) * (axes - 1),
+    )
     assert (statistics.valid, statistics.reason) == (False, "emergency stop")
     assert not (tmp_path / "a.mcap.part").exists()
 
@@ -149,7 +167,10 @@ def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
         for schema, channel, _, message in reader.iter_decoded_messages():
-            assert (schema.encoding if schema else "", channel.message_encoding) == ("ros2msg", "cdr")
+            assert (schema.encoding if schema else "", channel.message_encoding) == (
+                "ros2msg",
+                "cdr",
+            )
             decoded.setdefault(channel.topic, []).append(message)
     assert len(decoded["/cell/samples"]) == len(rows)
     for message, sample in zip(decoded["/cell/samples"], rows, strict=True):
@@ -167,7 +188,9 @@ def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
     assert list(state.position) == pytest.approx(joints(rows[20].position_counts))
 
 
-def test_samples_are_on_disk_within_200_ms_of_recorded_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_on_disk_within_200_ms_of_recorded_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
     rows = samples([[k] for k in range(1000)])
     reader = LogReader(tmp_path / "a.mcap")
@@ -191,7 +214,10 @@ def test_samples_are_on_disk_within_200_ms_of_wall_time(tmp_path: Path) -> None:
 
 def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with pytest.raises(RuntimeError, match="bus gone"), LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log:
+    with (
+        pytest.raises(RuntimeError, match="bus gone"),
+        LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log,
+    ):
         for sample in samples([[k] for k in range(7)]):
             log.write(sample)
         raise RuntimeError("bus gone")
@@ -262,7 +288,11 @@ def _without_hard_links(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     "sample",
-    [Sample(0, 0, (1, 2), (1, 2), (0, 0)), Sample(0, 0, (2**31,), (0,), (0,)), Sample(-1, 0, (0,), (0,), (0,))],
+    [
+        Sample(0, 0, (1, 2), (1, 2), (0, 0)),
+        Sample(0, 0, (2**31,), (0,), (0,)),
+        Sample(-1, 0, (0,), (0,), (0,)),
+    ],
 )
 def test_a_sample_that_does_not_fit_is_refused(tmp_path: Path, sample: Sample) -> None:
     with pytest.raises(ValueError, match="does not fit a log of 1 axes"):
@@ -278,12 +308,16 @@ def test_samples_have_chunks_of_their_own(tmp_path: Path, monkeypatch: pytest.Mo
     """A constant layout, so that a chunk is one `frombuffer`."""
     monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
     events = [CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")]
-    file = RecordFile(write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events))
+    file = RecordFile(
+        write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events)
+    )
     sizes = [chunk.uncompressed_size for offset, chunk in file if isinstance(chunk, Chunk)]
     blocks = list(LogReader(tmp_path / "a.mcap"))
     assert [len(block.cycle) for block in blocks] == [1, *[150] * 5, 149]
     assert len(sizes) == 2 * len(blocks)
-    np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))
+    np.testing.assert_array_equal(
+        np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900)
+    )
 
 
 @pytest.mark.parametrize("size", [1, 7, 149, 151, 10_000])
@@ -294,7 +328,9 @@ def test_the_size_of_a_block_changes_nothing_but_the_blocks(
     path = write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]))
     blocks = list(LogReader(path))
     assert max(len(block.cycle) for block in blocks) <= size + 149
-    np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))
+    np.testing.assert_array_equal(
+        np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900)
+    )
     whole = LogReader(path)
     assert (len(list(whole.until_damage())), whole.damage) == (len(blocks), None)
     path.write_bytes(path.read_bytes()[: whole.whole_bytes - 5])

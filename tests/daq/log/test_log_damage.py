@@ -14,7 +14,14 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from daq.errors import LogCorrupt, LogForeign, LogIncomplete, LogMissing, LogTruncated, LogUnreadable
+from daq.errors import (
+    LogCorrupt,
+    LogForeign,
+    LogIncomplete,
+    LogMissing,
+    LogTruncated,
+    LogUnreadable,
+)
 from daq.log.container import MAGIC
 from daq.log.reader import Log, read_log
 from tests.daq.logs import content, samples, write
@@ -28,13 +35,16 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _same(one: Log, other: Log) -> bool:
-    pairs = [(getattr(one.samples, n), getattr(other.samples, n)) for n in type(one.samples).__slots__]
+    pairs = [
+        (getattr(one.samples, n), getattr(other.samples, n)) for n in type(one.samples).__slots__
+    ]
     heads = (one.head, one.events, one.statistics) == (other.head, other.events, other.statistics)
     return heads and all(np.array_equal(a, b) for a, b in pairs)
 
 
 def test_no_flipped_bit_gives_other_data(good: Path, tmp_path: Path) -> None:
-    original, data = read_log(good), good.read_bytes()
+    original = read_log(good)
+    data = good.read_bytes()
     chance = random.Random(7)
     refused = 0
     for offset in sorted({*range(0, 200), *(chance.randrange(len(data)) for _ in range(500))}):
@@ -52,7 +62,16 @@ def test_no_flipped_bit_gives_other_data(good: Path, tmp_path: Path) -> None:
 def test_no_cut_off_file_is_read(good: Path, tmp_path: Path) -> None:
     data = good.read_bytes()
     chance = random.Random(8)
-    for size in {0, 1, 7, 8, 9, 16, len(data) - 1, *(chance.randrange(len(data)) for _ in range(100))}:
+    for size in {
+        0,
+        1,
+        7,
+        8,
+        9,
+        16,
+        len(data) - 1,
+        *(chance.randrange(len(data)) for _ in range(100)),
+    }:
         path = tmp_path / "cut.mcap"
         path.write_bytes(data[:size])
         with pytest.raises((LogTruncated, LogForeign)):
@@ -74,7 +93,9 @@ def test_a_missing_file(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-@pytest.mark.parametrize("text", [b"time,q1\n0,1\n", b"\x89HDF\r\n\x1a\n" + b"\0" * 100, b"\0" * 1000])
+@pytest.mark.parametrize(
+    "text", [b"time,q1\n0,1\n", b"\x89HDF\r\n\x1a\n" + b"\0" * 100, b"\0" * 1000]
+)
 def test_a_foreign_file(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(text)
@@ -95,7 +116,11 @@ def _foreign(path: Path, profile: str, topic: str, schema: str) -> Path:
 
 def test_mcap_of_others(tmp_path: Path) -> None:
     for profile in ("ros1", "ros2"):
-        with pytest.raises(LogForeign, match=r"a bag of mcap-python.* with /x; expected a log of drivegain"):
+        with pytest.raises(
+            LogForeign,
+            match=r"a bag of mcap-python.* with /x; expected a log of "
+            r"drivegain",
+        ):
             read_log(_foreign(tmp_path / "a.mcap", profile, "/x", "a/msg/B"))
     with pytest.raises(LogForeign, match="/cell/samples as a/msg/B"):
         read_log(_foreign(tmp_path / "b.mcap", "ros2", "/cell/samples", "a/msg/B"))
@@ -144,7 +169,8 @@ def test_a_log_packed_anew_by_another_tool_is_the_same(good: Path, tmp_path: Pat
     """Samples, events and viewers' topics in common chunks: slower, and equal."""
     path = tmp_path / "anew.mcap"
     with good.open("rb") as source, path.open("wb") as target:
-        reader, writer = make_reader(source), Writer(target, enable_data_crcs=True)
+        reader = make_reader(source)
+        writer = Writer(target, enable_data_crcs=True)
         writer.start("ros2")
         for attachment in reader.iter_attachments():
             writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
@@ -154,7 +180,11 @@ def test_a_log_packed_anew_by_another_tool_is_the_same(good: Path, tmp_path: Pat
         for schema, channel, message in reader.iter_messages():
             if schema is not None and channel.id not in channels:
                 identifier = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, identifier)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, identifier
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time
+            )
         writer.finish()
     assert _same(read_log(path), read_log(good))

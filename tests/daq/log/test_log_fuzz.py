@@ -1,7 +1,8 @@
 """Foreign and damaged files: a reader returns a log of the same numbers or raises a named error.
 
-Three kinds of attack: damage to a genuine log, records made up with right checksums, and genuine chunks with made-up
-messages inside. Bounded in time by the number of examples; derandomised, so that a failure is one tomorrow too.
+Three kinds of attack: damage to a genuine log, records made up with right checksums, and genuine
+chunks with made-up messages inside. Bounded in time by the number of examples; derandomised, so
+that a failure is one tomorrow too.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ from tests.daq.log.records import (
 from tests.daq.logs import START_NS, content, samples, write
 
 FUZZ = settings(
-    deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 BITS64, BITS32, BITS16 = (st.integers(0, 2**bits - 1) for bits in (64, 32, 16))
 
@@ -48,7 +52,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _attack(path: Path, original: Log | None) -> None:
-    """Read as a fit does and as salvage does; only a named error, or the numbers of the original, may come of it."""
+    """Read as a fit does and as salvage does;
+    only a named error, or the numbers of the original, may come of it.
+    """
     try:
         log = read_log(path)
     except LogUnreadable:
@@ -73,7 +79,9 @@ def _attack(path: Path, original: Log | None) -> None:
 
 def _same(one: Log, other: Log) -> bool:
     heads = (one.head, one.events, one.statistics) == (other.head, other.events, other.statistics)
-    pairs = ((getattr(one.samples, name), getattr(other.samples, name)) for name in SampleBlock.__slots__)
+    pairs = (
+        (getattr(one.samples, name), getattr(other.samples, name)) for name in SampleBlock.__slots__
+    )
     return heads and all(np.array_equal(*pair) for pair in pairs)
 
 
@@ -95,7 +103,8 @@ DAMAGE = st.lists(
 def test_no_damage_gives_other_numbers(
     good: Path, tmp_path: Path, damage: list[tuple[str, float, int, int, bytes]]
 ) -> None:
-    original, data = read_log(good), bytearray(good.read_bytes())
+    original = read_log(good)
+    data = bytearray(good.read_bytes())
     for kind, where, bit, length, noise in damage:
         at = int(where * len(data))
         if not data:
@@ -131,7 +140,10 @@ def _records(draw: st.DrawFn) -> bytes:
         return raw_record(draw(st.integers(1, 15)), draw(st.binary(max_size=20)), draw(BITS64))
     if kind == "metadata":
         start = content(2)
-        base = run_record(start.run) if draw(st.booleans()) else {"samples": "1", "missing": "[0, 0]", "valid": "true"}
+        if draw(st.booleans()):
+            base = run_record(start.run)
+        else:
+            base = {"samples": "1", "missing": "[0, 0]", "valid": "true"}
         entries = base | draw(st.dictionaries(st.sampled_from(sorted(base)), TEXTS, max_size=3))
         entries = sealed(entries) if draw(st.booleans()) else entries
         return metadata_record(draw(st.sampled_from((RUN, STATISTICS))), entries)
@@ -139,12 +151,16 @@ def _records(draw: st.DrawFn) -> bytes:
         data = draw(st.binary(max_size=50) | TEXTS.map(str.encode) | st.just(b"[" * 100_000))
         return attachment_record(draw(st.sampled_from((READBACK, "cell.yaml", ""))), data)
     size = draw(st.none() | BITS64)
-    return chunk_record(draw(st.binary(max_size=80)), size, draw(st.sampled_from(("zstd", "", "lz4", "\0"))))
+    return chunk_record(
+        draw(st.binary(max_size=80)), size, draw(st.sampled_from(("zstd", "", "lz4", "\0")))
+    )
 
 
 @settings(FUZZ, max_examples=200)
 @given(st.lists(_records(), max_size=5))
-def test_records_made_up_with_right_checksums_are_read_or_named(tmp_path: Path, records: list[bytes]) -> None:
+def test_records_made_up_with_right_checksums_are_read_or_named(
+    tmp_path: Path, records: list[bytes]
+) -> None:
     path = finished_file(tmp_path / "made.mcap", [HEADER, *records])
     _attack(path, None)
 
@@ -156,7 +172,11 @@ def _messages(draw: st.DrawFn) -> bytes:
     if kind == "sample":
         axes = draw(st.integers(1, 3))
         record = np.zeros(1, dtype=sample_dtype(axes))
-        record["opcode"], record["length"], record["channel"] = Opcode.MESSAGE, sample_dtype(axes).itemsize - 9, channel
+        record["opcode"], record["length"], record["channel"] = (
+            Opcode.MESSAGE,
+            sample_dtype(axes).itemsize - 9,
+            channel,
+        )
         record["encapsulation"] = draw(st.sampled_from((0x100, 0x100, 0)))
         for name in ("positions", "currents", "statuswords"):
             record[name] = draw(st.sampled_from((axes, axes, axes, 2**32 - 1)))
@@ -166,8 +186,16 @@ def _messages(draw: st.DrawFn) -> bytes:
     if kind == "event":
         words = draw(st.sampled_from(("emcy", "stop", "nonsense", "")))
         length = draw(st.sampled_from((len(words) + 1, 0, 2**32 - 1)))
-        body = struct.pack("<4siIh2x", b"\0\1\0\0", draw(st.integers(-5, 5)), draw(BITS32), draw(st.integers(-2, 40)))
-        data = body + struct.pack("<I", length) + words.encode() + b"\0" + draw(st.binary(max_size=20))
+        body = struct.pack(
+            "<4siIh2x",
+            b"\0\1\0\0",
+            draw(st.integers(-5, 5)),
+            draw(BITS32),
+            draw(st.integers(-2, 40)),
+        )
+        data = (
+            body + struct.pack("<I", length) + words.encode() + b"\0" + draw(st.binary(max_size=20))
+        )
     else:
         data = draw(st.binary(max_size=60))
     head = struct.pack("<HIQQ", channel, 0, draw(BITS64), draw(BITS64))
@@ -181,11 +209,25 @@ def test_messages_made_up_in_genuine_chunks_are_read_or_named(
     tmp_path: Path, messages: list[bytes], defined: bool, count: str
 ) -> None:
     start = content(2)
-    readback = b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
-    statistics = {"samples": count, "lost_cycles": "0", "missing": "[0, 0]", "valid": "true", "reason": ""}
-    before = [HEADER, attachment_record(READBACK, readback), metadata_record(RUN, sealed(run_record(start.run)))]
+    readback = (
+        b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
+    )
+    statistics = {
+        "samples": count,
+        "lost_cycles": "0",
+        "missing": "[0, 0]",
+        "valid": "true",
+        "reason": "",
+    }
+    before = [
+        HEADER,
+        attachment_record(READBACK, readback),
+        metadata_record(RUN, sealed(run_record(start.run))),
+    ]
     chunk = chunk_record((TOPICS if defined else b"") + b"".join(messages))
-    path = finished_file(tmp_path / "made.mcap", [*before, chunk, metadata_record(STATISTICS, sealed(statistics))])
+    path = finished_file(
+        tmp_path / "made.mcap", [*before, chunk, metadata_record(STATISTICS, sealed(statistics))]
+    )
     _attack(path, None)
 
 
@@ -194,14 +236,29 @@ def test_the_made_up_files_are_ones_that_a_reader_takes(good: Path, tmp_path: Pa
     log = read_log(good)
     start = content(2)
     record = np.zeros(1, dtype=sample_dtype(2))
-    for name, value in (("opcode", 5), ("length", record.itemsize - 9), ("channel", 1), ("encapsulation", 0x100)):
+    for name, value in (
+        ("opcode", 5),
+        ("length", record.itemsize - 9),
+        ("channel", 1),
+        ("encapsulation", 0x100),
+    ):
         record[name] = value
     for name in ("positions", "currents", "statuswords"):
         record[name] = 2
     statistics = sealed({**statistics_record(log.statistics), "samples": "1", "missing": "[0, 0]"})
-    readback = b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
-    before = [HEADER, attachment_record(READBACK, readback), metadata_record(RUN, sealed(run_record(start.run)))]
-    made = [*before, chunk_record(TOPICS + record.tobytes()), metadata_record(STATISTICS, statistics)]
+    readback = (
+        b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
+    )
+    before = [
+        HEADER,
+        attachment_record(READBACK, readback),
+        metadata_record(RUN, sealed(run_record(start.run))),
+    ]
+    made = [
+        *before,
+        chunk_record(TOPICS + record.tobytes()),
+        metadata_record(STATISTICS, statistics),
+    ]
     assert len(read_log(finished_file(tmp_path / "made.mcap", made)).samples.cycle) == 1
 
 
@@ -232,7 +289,9 @@ def test_a_log_is_closed_although_its_error_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
-    """Each chunk keeps its own bound; together they keep one that goes with the size of the file."""
+    """Each chunk keeps its own bound; together they keep one that goes with the size of the
+    file.
+    """
     record = np.zeros(500_000, dtype=sample_dtype(2))
     for name, value in (("opcode", 5), ("length", sample_dtype(2).itemsize - 9), ("channel", 1)):
         record[name] = value
@@ -241,7 +300,9 @@ def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
         record[name] = 2
     chunk = chunk_record(record.tobytes())
     assert len(chunk) * 200 < record.nbytes
-    path = finished_file(tmp_path / "bomb.mcap", [HEADER, chunk_record(TOPICS + record[:1].tobytes()), *[chunk] * 8])
+    path = finished_file(
+        tmp_path / "bomb.mcap", [HEADER, chunk_record(TOPICS + record[:1].tobytes()), *[chunk] * 8]
+    )
     taken = 0
     with pytest.raises(LogUnreadable, match="times the file"):
         for block in LogReader(path):

@@ -50,7 +50,13 @@ def test_matrices_vectors_and_fields_are_read(packed: bool, tmp_path: Path) -> N
     savemat(path, variables, do_compression=packed)
     time = TimeColumn(file="run.mat", column="run.t", unit=TimeUnit.NANOSECOND)
     table = read(path, "q.1", "q.6", "turned.2", "run.counts.3", "t", time=time)
-    expected = (Q[:, 0], Q[:, 5], CURRENT[:, 1].astype(np.float32), (1000.0 * Q[:, 2]).astype(np.int16), seconds)
+    expected = (
+        Q[:, 0],
+        Q[:, 5],
+        CURRENT[:, 1].astype(np.float32),
+        (1000.0 * Q[:, 2]).astype(np.int16),
+        seconds,
+    )
     np.testing.assert_array_equal(table.values, np.column_stack(expected))
     assert table.stamps is not None
     assert table.stamps.first_ns == int(clock_ns[0])
@@ -71,7 +77,9 @@ def test_matrices_vectors_and_fields_are_read(packed: bool, tmp_path: Path) -> N
     ),
     packed=st.booleans(),
 )
-def test_any_matrix_comes_back(values: np.ndarray[Any, Any], packed: bool, tmp_path_factory: Any) -> None:
+def test_any_matrix_comes_back(
+    values: np.ndarray[Any, Any], packed: bool, tmp_path_factory: Any
+) -> None:
     path = tmp_path_factory.getbasetemp() / "any.mat"
     savemat(path, {"q": values}, do_compression=packed)
     rows = values if values.shape[0] >= values.shape[1] else values.T
@@ -79,14 +87,22 @@ def test_any_matrix_comes_back(values: np.ndarray[Any, Any], packed: bool, tmp_p
     if np.isfinite(values).all():
         np.testing.assert_array_equal(read(path, *columns).values, rows.astype(np.float64))
     else:
-        with pytest.raises(TableUnfit, match=r"row .*, column q.*: found (nan|-?inf); expected a finite number"):
+        with pytest.raises(
+            TableUnfit,
+            match=r"row .*, column q.*: found (nan|-?inf); expected a "
+            r"finite number",
+        ):
             read(path, *columns)
 
 
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        (("i.1",), r"no variable 'i'; expected one of q \(300×6\), t \(1×300\), run \(1×1 struct\), note \(text\)"),
+        (
+            ("i.1",),
+            r"no variable 'i'; expected one of q \(300×6\), t \(1×300\), run \(1×1 "
+            r"struct\), note \(text\)",
+        ),
         ((1,), "no variable '1'"),
         (("q",), r"column q, and q has 6 columns; expected one of q.1 to q.6"),
         (("q.7",), "column q.7"),
@@ -105,12 +121,14 @@ def test_any_matrix_comes_back(values: np.ndarray[Any, Any], packed: bool, tmp_p
         (("q.1", "short"), "300 values in q.1, 299 values in short; expected as many in each"),
     ],
 )
-def test_what_is_no_column_of_numbers_is_named(columns: tuple[str, ...], message: str, tmp_path: Path) -> None:
+def test_what_is_no_column_of_numbers_is_named(
+    columns: tuple[str, ...], message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "run.mat"
     many = np.zeros((1, 2), dtype=[("q", object)])
     cell = np.array([1.0, "a"], dtype=object)
-    savemat(path, {"q": Q, "t": Q[:, 0], "run": {"q": Q}, "note": "text", "many": many, "z": 1j * Q, "cell": cell,
-                   "one": 1.0, "none": Q[:0], "block": np.ones((3, 4, 5)), "short": Q[1:, 0]})  # fmt: skip
+    savemat(path, {"q": Q, "t": Q[:, 0], "run": {"q": Q}, "note": "text", "many": many, "z": 1j * Q, "cell": cell,  # noqa: E501
+                   "one": 1.0, "none": Q[:0], "block": np.ones((3, 4, 5)), "short": Q[1:, 0]})  # fmt: skip  # noqa: E501
     with pytest.raises(TableUnfit, match=message):
         read(path, *columns)
 
@@ -118,8 +136,14 @@ def test_what_is_no_column_of_numbers_is_named(columns: tuple[str, ...], message
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n", "7.3 .HDF5.; .* '-v7'"),
-        (pickle.dumps({"q": [1, 2]}), "first bytes .*; expected a MATLAB file of format 5, as `save -v7` writes it"),
+        (
+            b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512) + b"\x89HDF\r\n\x1a\n",
+            "7.3 .HDF5.; .* '-v7'",
+        ),
+        (
+            pickle.dumps({"q": [1, 2]}),
+            "first bytes .*; expected a MATLAB file of format 5, as `save -v7` writes it",
+        ),
         (b"", "first bytes b''"),
         (b"MATLAB 5.0 MAT-file".ljust(126) + b"IM", "no variable 'q'; expected one of none"),
     ],
@@ -140,7 +164,8 @@ HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
 
 def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
     """scipy.io.loadmat follows each of them on the stack, and the process ends."""
-    depth, size = 20_000, 0
+    depth = 20_000
+    size = 0
     heads = []
     for level in range(depth):
         name = _element(1, b"q" if level == depth - 1 else b"")
@@ -156,15 +181,25 @@ def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
 
 def test_an_object_is_named(tmp_path: Path) -> None:
     """MATLAB's table, timetable and timeseries have no dimensions and no numbers of their own."""
-    body = _element(6, struct.pack("<II", 17, 0)) + b"".join(_element(1, word) for word in (b"run", b"MCOS", b"table"))
+    body = _element(6, struct.pack("<II", 17, 0)) + b"".join(
+        _element(1, word) for word in (b"run", b"MCOS", b"table")
+    )
     path = tmp_path / "table.mat"
     path.write_bytes(HEADER + _element(14, body))
-    with pytest.raises(TableUnfit, match=r"run, an object \(a table, timetable, .*; expected real numbers"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"run, an object \(a table, timetable, .*; expected "
+        r"real numbers",
+    ):
         read(path, "run")
 
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
-    head = _element(6, struct.pack("<II", 6, 0)) + _element(5, struct.pack("<2i", 2**27, 1)) + _element(1, b"q")
+    head = (
+        _element(6, struct.pack("<II", 6, 0))
+        + _element(5, struct.pack("<2i", 2**27, 1))
+        + _element(1, b"q")
+    )
     packed = zlib.compress(struct.pack("<II", 14, 2**30) + head + bytes(2**20))
     path = tmp_path / "bomb.mat"
     path.write_bytes(HEADER + struct.pack("<II", 15, len(packed)) + packed)
@@ -204,7 +239,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
 
 def test_a_matrix_is_imported_with_its_columns_as_axes(checkout: Path, tmp_path: Path) -> None:
     savemat(tmp_path / "run.mat", {"q": Q, "run": {"i": CURRENT, "t": np.arange(ROWS) * 1e-3}})
-    description, out = tmp_path / "run.yaml", tmp_path / "log.mcap"
+    description = tmp_path / "run.yaml"
+    out = tmp_path / "log.mcap"
     document = {
         "name": "run",
         "cell": str(checkout / "configs/cells/demo.yaml"),

@@ -1,4 +1,6 @@
-"""An encoder glitch in a log of our own is judged as in an import, wherever the log is read or called valid."""
+"""An encoder glitch in a log of our own is judged as in an import,
+wherever the log is read or called valid.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ from tests.conftest import CHECKOUT
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import START_NS, demo_content, write
 
-COUNT, RATE_HZ, AXES = 5000, 1000.0, 6
+COUNT = 5000
+RATE_HZ = 1000.0
+AXES = 6
 GLITCH_RAD = 0.9
 CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
 REST_RAD = np.array([0.0, 0.0, radians(60.0), 0.0, 0.0, 0.0])  # the elbow's limits leave zero out
@@ -55,9 +59,20 @@ def _samples(joint_rad: FloatArray, missing: Callable[[int], int] = lambda _: 0)
     """Samples of the demo cell at these positions, with a smooth current."""
     motor_rad = joint_rad @ CELL.ratio.T
     counts = np.rint(motor_rad / (2.0 * np.pi) * 65536).astype(np.int64).tolist()
-    current = np.rint(200.0 * np.cos(np.arange(COUNT)[:, None] / 90.0 + np.arange(AXES))).astype(np.int64).tolist()
+    current = (
+        np.rint(200.0 * np.cos(np.arange(COUNT)[:, None] / 90.0 + np.arange(AXES)))
+        .astype(np.int64)
+        .tolist()
+    )
     return [
-        Sample(10 + k, START_NS + k * 1_000_000, tuple(counts[k]), tuple(current[k]), (0x1237,) * AXES, missing(k))
+        Sample(
+            10 + k,
+            START_NS + k * 1_000_000,
+            tuple(counts[k]),
+            tuple(current[k]),
+            (0x1237,) * AXES,
+            missing(k),
+        )
         for k in range(COUNT)
     ]
 
@@ -102,7 +117,9 @@ def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
     assert refused.value.subject == f"{log}, axis J2"
     assert "deg in one sample, 51" in refused.value.found  # 0.9 rad in 1 ms
     assert when in refused.value.found
-    assert refused.value.expected == "at most 600 deg/s, 3 times 200 deg/s, the limit in the cell configuration"
+    assert refused.value.expected == (
+        "at most 600 deg/s, 3 times 200 deg/s, the limit in the cell configuration"
+    )
     reason = f"axis J2: {refused.value.found}"
     described = info_report(log)
     assert (described.valid, described.reason) == (False, reason)
@@ -127,7 +144,10 @@ def test_every_verb_refuses_a_glitch(
     joint_rad = _joints()
     joint_rad[1500, 1] += GLITCH_RAD
     log = str(_log(tmp_path / "a.mcap", _samples(joint_rad)))
-    arguments = [log, log] if verb in {"fit", "residual"} else [str(full_calibration), log]
+    if verb in {"fit", "residual"}:
+        arguments = [log, log]
+    else:
+        arguments = [str(full_calibration), log]
     assert main([verb, *arguments]) == ExitCode.DATA_UNFIT
     said = " ".join(capsys.readouterr().err.split())
     assert "a step of" in said
@@ -156,7 +176,9 @@ def test_a_glitch_that_no_limit_rules_out_is_filled_in_and_the_log_valid(tmp_pat
 
 
 def _differentiated(run: Run, cell: Cell) -> Dataset:
-    return differentiate(run, model_of(cell).drive_train, Conditioning(standstill_rad_s=(0.03,) * AXES))
+    return differentiate(
+        run, model_of(cell).drive_train, Conditioning(standstill_rad_s=(0.03,) * AXES)
+    )
 
 
 def _frozen(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
@@ -182,7 +204,10 @@ def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: 
     current = np.array([row.current_raw for row in rows])
     FAULTS[kind](joint_rad, current)
     moved = _samples(joint_rad)
-    rows = [replace(row, current_raw=tuple(own)) for row, own in zip(moved, current.tolist(), strict=True)]
+    rows = [
+        replace(row, current_raw=tuple(own))
+        for row, own in zip(moved, current.tolist(), strict=True)
+    ]
     log = _log(tmp_path / "a.mcap", rows)
     with pytest.raises(DataError) as refused:
         load_run(log)
@@ -201,11 +226,20 @@ def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path
     rows = _samples(_joints())
     (first, *others) = rows[1000].current_raw
     rows[1000] = Sample(
-        rows[1000].cycle, rows[1000].time_ns, rows[1000].position_counts, (2**30, *others), (0x1237,) * AXES, 0
+        rows[1000].cycle,
+        rows[1000].time_ns,
+        rows[1000].position_counts,
+        (2**30, *others),
+        (0x1237,) * AXES,
+        0,
     )
     assert abs(first) <= 200
     log = _log(tmp_path / "a.mcap", rows)
-    with pytest.raises(CurrentImplausible, match=r"axis J1: found a current of .*at 1 s; expected a current"):
+    with pytest.raises(
+        CurrentImplausible,
+        match=r"axis J1: found a current of .*at 1 s; expected "
+        r"a current",
+    ):
         load_run(log)
     described = info_report(log)
     assert not described.valid
@@ -224,16 +258,21 @@ def test_a_short_motion_after_a_long_rest_is_no_outlier() -> None:
 
 
 def test_answers_that_are_missing_are_no_steps(tmp_path: Path) -> None:
-    """Where an axis did not answer, a log has a number that means nothing; the next answer is some periods away."""
+    """Where an axis did not answer, a log has a number that means nothing;
+    the next answer is some periods away.
+    """
     joint_rad = _joints()
     gap = range(1500, 1540)
     joint_rad[1500:1540, 1] = 0.0
     rows = _samples(joint_rad, lambda k: 2 if k in gap else 0)
-    log = write(tmp_path / "a.mcap", demo_content(CHECKOUT), rows, verdict=(False, "40 missing answers"))
+    log = write(
+        tmp_path / "a.mcap", demo_content(CHECKOUT), rows, verdict=(False, "40 missing answers")
+    )
     run, _ = load_run(log, lossy=LossyLogs.ACCEPTED)
     assert run.valid is not None
     assert not run.valid[1500:1540, 1].any()
-    joint_rad[1540:, 1] += GLITCH_RAD  # 22 mrad for each of the 41 periods are too fast all the same
+    # 22 mrad for each of the 41 periods are too fast all the same
+    joint_rad[1540:, 1] += GLITCH_RAD
     wrong = write(
         tmp_path / "b.mcap",
         demo_content(CHECKOUT),
@@ -267,7 +306,9 @@ def test_a_coarse_encoder_that_hardly_moves_has_no_glitch() -> None:
     assert (found.axis, found.row) == (0, 1000)
 
 
-def test_an_import_and_a_recording_are_judged_by_one_function(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_import_and_a_recording_are_judged_by_one_function(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Both refuse what `impossible_step` refuses, whatever it is."""
     log = _log(tmp_path / "a.mcap", _samples(_joints()))
     load_run(log)

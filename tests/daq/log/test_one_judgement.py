@@ -1,4 +1,6 @@
-"""Every verb judges a log alike, and each is bounded: a log with right checksums may still be made up."""
+"""Every verb judges a log alike, and each is bounded:
+a log with right checksums may still be made up.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ class MadeUp:
 
     checkout: Path
     cycle: list[int] = field(default_factory=lambda: list(range(10, 310)))
-    time_ns: list[int] = field(default_factory=lambda: [START_NS + k * 1_000_000 for k in range(300)])
+    time_ns: list[int] = field(
+        default_factory=lambda: [START_NS + k * 1_000_000 for k in range(300)]
+    )
     extra: list[bytes] = field(default_factory=list)  #: records before the samples
     after: list[bytes] = field(default_factory=list)  #: records behind the samples
     run: dict[str, str] = field(default_factory=dict)  #: entries instead of the genuine ones
@@ -81,7 +85,9 @@ class MadeUp:
         """The file, with right checksums."""
         start = demo_content(self.checkout)
         chunks = [
-            chunk_record(TOPICS + sample_records(self.cycle[k : k + CHUNK], self.time_ns[k : k + CHUNK]))
+            chunk_record(
+                TOPICS + sample_records(self.cycle[k : k + CHUNK], self.time_ns[k : k + CHUNK])
+            )
             for k in range(0, len(self.cycle), CHUNK)
         ]
         genuine = statistics_record(RunStatistics(300, 0, (0,) * 6, valid=True))
@@ -114,13 +120,17 @@ READERS: dict[str, Callable[[Path, Path], object]] = {
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_the_log_that_the_others_are_made_of_is_sound(reader: str, made: MadeUp, tmp_path: Path) -> None:
+def test_the_log_that_the_others_are_made_of_is_sound(
+    reader: str, made: MadeUp, tmp_path: Path
+) -> None:
     READERS[reader](made.write(tmp_path / "a.mcap"), tmp_path)
     assert info_report(tmp_path / "a.mcap").valid
 
 
 @pytest.mark.parametrize("start_ns", [0, START_NS])
-def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(start_ns: int, checkout: Path, tmp_path: Path) -> None:
+def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(
+    start_ns: int, checkout: Path, tmp_path: Path
+) -> None:
     count = 2 * BLOCK_SAMPLES
     log = MadeUp(checkout, list(range(count)), [start_ns + k * 1_000_000 for k in range(count)])
     log.counted()
@@ -144,7 +154,10 @@ def _second(record: bytes, *, behind: bool = False) -> Callable[[MadeUp], None]:
 
 
 CONTRADICTIONS: dict[str, tuple[Callable[[MadeUp], None], str]] = {
-    "chunks cut out": (lambda made: made.cut(50, 250), "100 samples; expected 300, as its recorder counted"),
+    "chunks cut out": (
+        lambda made: made.cut(50, 250),
+        "100 samples; expected 300, as its recorder counted",
+    ),
     "chunks cut out and not counted": (
         _cut_and_counted,
         "100 lost cycles; expected 0, as its recorder counted",
@@ -156,8 +169,14 @@ CONTRADICTIONS: dict[str, tuple[Callable[[MadeUp], None], str]] = {
         r"\[0, 0, 0, 0, 0, 0\] missing answers of its axes; expected \[0, 1",
     ),
     "no samples": (lambda made: made.cut(0, 300), "no samples"),
-    "a second readback": (_second(attachment_record(READBACK, b'{"axes": []}')), "a second attachment 'readback.json'"),
-    "a second run": (_second(metadata_record(RUN, sealed({"rate_hz": "1"}))), "a second metadata 'drivegain.run'"),
+    "a second readback": (
+        _second(attachment_record(READBACK, b'{"axes": []}')),
+        "a second attachment 'readback.json'",
+    ),
+    "a second run": (
+        _second(metadata_record(RUN, sealed({"rate_hz": "1"}))),
+        "a second metadata 'drivegain.run'",
+    ),
     "a second summary": (
         _second(metadata_record(STATISTICS, sealed({"valid": "true"})), behind=True),
         "a second metadata 'drivegain.statistics'",
@@ -167,7 +186,9 @@ CONTRADICTIONS: dict[str, tuple[Callable[[MadeUp], None], str]] = {
 
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("kind", CONTRADICTIONS)
-def test_a_log_that_contradicts_itself_is_refused_by_all(kind: str, reader: str, made: MadeUp, tmp_path: Path) -> None:
+def test_a_log_that_contradicts_itself_is_refused_by_all(
+    kind: str, reader: str, made: MadeUp, tmp_path: Path
+) -> None:
     change, message = CONTRADICTIONS[kind]
     change(made)
     log = made.write(tmp_path / "a.mcap")
@@ -192,8 +213,16 @@ def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
 
 LOSSES: dict[str, tuple[Callable[[MadeUp], object], int, str]] = {
     "lost cycles": (lambda made: made.cut(100, 200), 100, "cycle 210 after 109 (1 gaps)"),
-    "a chunk twice, counted": (lambda made: made.repeat(100, 150), 0, "cycle 110 after 159 (1 gaps)"),
-    "renumbered and counted": (_renumbered, 0, "cycle 110 101 ms after cycle 109, its most uneven step"),
+    "a chunk twice, counted": (
+        lambda made: made.repeat(100, 150),
+        0,
+        "cycle 110 after 159 (1 gaps)",
+    ),
+    "renumbered and counted": (
+        _renumbered,
+        0,
+        "cycle 110 101 ms after cycle 109, its most uneven step",
+    ),
 }
 
 
@@ -210,16 +239,20 @@ def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
     assert refused.value.found == reason
     described = info_report(log)
     assert (described.valid, described.reason) == (False, reason)
-    table, bag = export_log(log, tmp_path / "a.csv", TableFormat.CSV), export_bag(log, tmp_path / "bag")
+    table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
+    bag = export_bag(log, tmp_path / "bag")
     assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
     part = log.rename(tmp_path / "a.mcap.part")
     saved = salvage(part, tmp_path / "saved.mcap")
     assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
-    assert main(["export", "log", str(part), "--csv", "--out", str(tmp_path / "b.csv")]) == ExitCode.OK
+    assert (
+        main(["export", "log", str(part), "--csv", "--out", str(tmp_path / "b.csv")]) == ExitCode.OK
+    )
     assert "INVALID" in capsys.readouterr().err
 
 
-# -- bounds ------------------------------------------------------------------------------------------------------------
+# -- bounds
+# ------------------------------------------------------------------------------------------------------------  # noqa: E501
 
 
 def _serial(made: MadeUp) -> None:
@@ -228,8 +261,12 @@ def _serial(made: MadeUp) -> None:
     made.readback = json.dumps(tree).encode()
 
 
-@pytest.mark.parametrize("key", ["rate_hz", "speed", "payload_entered_kg", "started_wall_ns", "started_monotonic_ns"])
-def test_a_number_of_400_digits_in_the_metadata_is_refused(key: str, made: MadeUp, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "key", ["rate_hz", "speed", "payload_entered_kg", "started_wall_ns", "started_monotonic_ns"]
+)
+def test_a_number_of_400_digits_in_the_metadata_is_refused(
+    key: str, made: MadeUp, tmp_path: Path
+) -> None:
     made.run[key] = ATTACKER_DIGITS
     log = made.write(tmp_path / "a.mcap")
     for read in READERS.values():
@@ -238,7 +275,9 @@ def test_a_number_of_400_digits_in_the_metadata_is_refused(key: str, made: MadeU
 
 
 @pytest.mark.parametrize("key", ["samples", "lost_cycles", "wall_minus_monotonic_ns"])
-def test_a_number_of_400_digits_in_the_summary_is_refused(key: str, made: MadeUp, tmp_path: Path) -> None:
+def test_a_number_of_400_digits_in_the_summary_is_refused(
+    key: str, made: MadeUp, tmp_path: Path
+) -> None:
     made.statistics[key] = ATTACKER_DIGITS
     log = made.write(tmp_path / "a.mcap")
     for read in READERS.values():
@@ -255,15 +294,25 @@ def test_a_serial_number_of_400_digits_is_none(made: MadeUp, tmp_path: Path) -> 
 
 LARGE: dict[str, tuple[Callable[[MadeUp], object], str]] = {
     "attachments": (
-        lambda made: made.extra.extend(attachment_record(f"a{k}", b"") for k in range(LARGEST_ENTRIES)),
+        lambda made: made.extra.extend(
+            attachment_record(f"a{k}", b"") for k in range(LARGEST_ENTRIES)
+        ),
         f"more than {LARGEST_ENTRIES} attachments",
     ),
     "metadata": (
-        lambda made: made.extra.extend(metadata_record(f"a{k}", {}) for k in range(LARGEST_ENTRIES)),
+        lambda made: made.extra.extend(
+            metadata_record(f"a{k}", {}) for k in range(LARGEST_ENTRIES)
+        ),
         f"more than {LARGEST_ENTRIES} attachments",
     ),
-    "a text among the metadata": (lambda made: made.run.update(operator="x" * 30_000_000), "of 30000[0-9]+ bytes"),
-    "a text as its reason": (lambda made: made.statistics.update(reason="x" * 30_000_000), "of 30000[0-9]+ bytes"),
+    "a text among the metadata": (
+        lambda made: made.run.update(operator="x" * 30_000_000),
+        "of 30000[0-9]+ bytes",
+    ),
+    "a text as its reason": (
+        lambda made: made.statistics.update(reason="x" * 30_000_000),
+        "of 30000[0-9]+ bytes",
+    ),
     "an attachment": (
         lambda made: made.extra.append(attachment_record("notes", b"x" * 30_000_000)),
         "'notes' of 30000000 bytes",
@@ -272,7 +321,9 @@ LARGE: dict[str, tuple[Callable[[MadeUp], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", LARGE)
-def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(kind: str, made: MadeUp, tmp_path: Path) -> None:
+def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(
+    kind: str, made: MadeUp, tmp_path: Path
+) -> None:
     change, message = LARGE[kind]
     change(made)
     log = made.write(tmp_path / "a.mcap")
@@ -292,7 +343,12 @@ EVENT = event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, ""))
     ("message", "allowed"),
     [
         (_messages(2, EVENT, 1), RECORDS // 2),
-        (_messages(2, event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, "x" * 6_400)), 1), RECORDS // 100),
+        (
+            _messages(
+                2, event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, "x" * 6_400)), 1
+            ),
+            RECORDS // 100,
+        ),
         (_messages(9, b"", 1), RECORDS),
         (raw_record(0x80, b""), RECORDS),
     ],
@@ -312,7 +368,8 @@ def test_few_bytes_of_equal_messages_take_neither_gigabytes_nor_minutes(
     assert len(reader.events) <= 2 * allowed // 100
 
 
-# -- columns of an export ----------------------------------------------------------------------------------------------
+# -- columns of an export
+# ----------------------------------------------------------------------------------------------
 
 NAMES = st.lists(st.text("A1_+-.", min_size=1, max_size=4), min_size=6, max_size=6, unique=True)
 

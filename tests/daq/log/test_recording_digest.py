@@ -33,7 +33,9 @@ def _said(configs: Path, text: str) -> None:
         "# K. has reviewed it.\n",
     ],
 )
-def test_what_becomes_of_a_calibration_and_comments_make_no_other_recording(configs: Path, afterwards: str) -> None:
+def test_what_becomes_of_a_calibration_and_comments_make_no_other_recording(
+    configs: Path, afterwards: str
+) -> None:
     before = load_cell(configs / DEMO)
     _said(configs, afterwards)
     after = load_cell(configs / DEMO)
@@ -58,7 +60,9 @@ def test_neither_do_comments_and_line_breaks_of_a_drive_profile(configs: Path) -
 
 
 def test_nor_does_what_a_drive_profile_names_beside_the_samples(configs: Path) -> None:
-    """A profile of an earlier version has neither torque nor temperature: its calibrations stay valid."""
+    """A profile of an earlier version has neither torque nor temperature:
+    its calibrations stay valid.
+    """
     before = load_cell(configs / DEMO)
     profile = configs / "drives" / "generic-cia402.yaml"
     text = profile.read_text()
@@ -82,7 +86,9 @@ def test_nor_does_what_a_drive_profile_names_beside_the_samples(configs: Path) -
         ("drives/generic-cia402.yaml", "amplitude: rms", "amplitude: peak"),
     ],
 )
-def test_whatever_else_changes_is_another_recording(configs: Path, file: str, was: str, becomes: str) -> None:
+def test_whatever_else_changes_is_another_recording(
+    configs: Path, file: str, was: str, becomes: str
+) -> None:
     files = bundle(configs / DEMO)
     before = cell_from_bundle(files)
     member = {DEMO: "cell.yaml", "robots/tx40.urdf": "robot.urdf"}.get(file, file)

@@ -1,4 +1,6 @@
-"""Time stamps: uniform ones leave the samples alone, uneven ones are taken for what they are, gaps are refused."""
+"""Time stamps: uniform ones leave the samples alone, uneven ones are taken for what they are,
+gaps are refused.
+"""
 
 from __future__ import annotations
 
@@ -22,22 +24,29 @@ AnyFloats = np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]
 WANTED = TimeColumn(file="run.csv", column="t", unit=TimeUnit.SECOND)
 
 
-def _clock(time_s: AnyFloats, wanted: TimeColumn = WANTED, numbers: FloatArray | None = None) -> Clock:
+def _clock(
+    time_s: AnyFloats, wanted: TimeColumn = WANTED, numbers: FloatArray | None = None
+) -> Clock:
     """The clock of these stamps; every row has numbers of its own unless they are given."""
-    numbers = np.arange(float(len(time_s)))[:, None] if numbers is None else numbers
+    if numbers is None:
+        numbers = np.arange(float(len(time_s)))[:, None]
     stamps = Stamps(np.asarray(time_s, dtype=np.float64), 0)
     lines = range(2, 2 + len(time_s))
     return clock_of(Table(Path("run.csv"), (), numbers, "", stamps, lines), wanted, numbers)
 
 
-def _steps(rng: np.random.Generator, count: int, steps_ms: tuple[int, ...] = (10, 12)) -> FloatArray:
+def _steps(
+    rng: np.random.Generator, count: int, steps_ms: tuple[int, ...] = (10, 12)
+) -> FloatArray:
     """Stamps with random steps [s]."""
     return np.concatenate(([0.0], np.cumsum(rng.choice(steps_ms, count)))) * 1e-3
 
 
 @example(0.029366597839968218, 4, True, 0.0)
 @given(st.floats(0.2e-3, 0.1), st.integers(2, 7), st.booleans(), st.floats(0.0, 1.0))
-def test_a_uniform_clock_is_one_with_rounded_stamps_too(period_s: float, digits: int, down: bool, phase: float) -> None:
+def test_a_uniform_clock_is_one_with_rounded_stamps_too(
+    period_s: float, digits: int, down: bool, phase: float
+) -> None:
     """Stamps of 2.5 ms in whole ms are 0, 2, 5, 7, 10: rounded, not uneven."""
     digit_s = 10.0**-digits
     if digit_s > 0.5 * period_s:
@@ -52,7 +61,8 @@ def test_a_uniform_clock_is_one_with_rounded_stamps_too(period_s: float, digits:
 
 def test_stamps_that_are_uniform_leave_the_samples_alone() -> None:
     time_s = np.arange(100) * 0.004
-    clock, values = _clock(time_s), np.random.default_rng(0).normal(size=(100, 2))
+    clock = _clock(time_s)
+    values = np.random.default_rng(0).normal(size=(100, 2))
     assert clock.positions(values) is values
     assert clock.currents(values) is values
     assert clock.timing.rate_hz == 99 / time_s[-1]
@@ -79,7 +89,10 @@ def test_steps_of_10_and_12_ms() -> None:
     error = np.abs(clock.positions(motion(time_s)) - motion(clock.tick_s)).max()
     assert error < 2e-6  # (ω h)⁴ / 384 of the quicker one, and a little at the ends
     assert np.abs(motion(time_s) - motion(clock.tick_s)).max() > 100 * error
-    assert np.abs(clock.currents(motion(time_s)) - motion(clock.tick_s)).max() <= (7.0 * 0.012) ** 2 / 8
+    assert (
+        np.abs(clock.currents(motion(time_s)) - motion(clock.tick_s)).max()
+        <= (7.0 * 0.012) ** 2 / 8
+    )
 
 
 def test_missing_samples_are_interpolated_and_the_others_stay() -> None:
@@ -104,12 +117,20 @@ def test_a_row_that_is_there_twice_counts_once(row: int) -> None:
 
 
 def test_a_stamp_that_is_there_twice_with_other_numbers_is_refused() -> None:
-    with pytest.raises(TableUnfit, match=r"run.csv:42, column t: found the stamp of the row above, with other numbers"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"run.csv:42, column t: found the stamp of the row above, "
+        r"with other numbers",
+    ):
         _clock(np.insert(np.arange(99), 40, 39) * 0.01)
 
 
 def test_stamps_that_go_back_are_refused() -> None:
-    with pytest.raises(TableUnfit, match=r"run.csv:52, column t: found a stamp 0.49 s before") as caught:
+    with pytest.raises(
+        TableUnfit,
+        match=r"run.csv:52, column t: found a stamp "
+        r"0.49 s before",
+    ) as caught:
         _clock(np.concatenate((np.arange(50), np.arange(50))) * 0.01)
     assert "two recordings" in caught.value.remedy
 
@@ -129,13 +150,19 @@ def test_gaps(periods: int, allowed: float) -> None:
     if periods <= allowed:
         assert _clock(time_s, wanted).timing.missing == periods - 1
         return
-    with pytest.raises(TableUnfit, match=rf"run.csv:102, column t: found {periods * 0.01:g} s after") as caught:
+    with pytest.raises(
+        TableUnfit,
+        match=r"run.csv:102, column t: found "
+        rf"{periods * 0.01:g} s after",
+    ) as caught:
         _clock(time_s, wanted)
     assert caught.value.expected == "at most 3 times the usual 0.01 s"
     assert "`largest_gap_periods`" in caught.value.remedy
 
 
-@pytest.mark.parametrize(("rate_hz", "resampled"), [(100.0, False), (100.001, False), (100.5, True), (125.0, True)])
+@pytest.mark.parametrize(
+    ("rate_hz", "resampled"), [(100.0, False), (100.001, False), (100.5, True), (125.0, True)]
+)
 def test_a_stated_rate(rate_hz: float, resampled: bool) -> None:
     clock = _clock(np.arange(1001) * 0.01, replace(WANTED, rate_hz=rate_hz))
     assert clock.timing.rate_hz == rate_hz

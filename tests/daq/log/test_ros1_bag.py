@@ -1,4 +1,6 @@
-"""ROS 1 bags as `rosbags` writes them: the same numbers, the nodes that published them, or an error."""
+"""ROS 1 bags as `rosbags` writes them:
+the same numbers, the nodes that published them, or an error.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,16 @@ from daq.log.container import LARGEST_CHUNK
 from daq.log.importing import reader_of
 from daq.log.message import JOINTS_SCHEMA
 from daq.log.ros1_bag import unpack_chunk
-from tests.daq.log.test_bag import EFFORT, JOINTS, POSITION, ROWS, START_NS, STEP_NS, assert_whole, read
+from tests.daq.log.test_bag import (
+    EFFORT,
+    JOINTS,
+    POSITION,
+    ROWS,
+    START_NS,
+    STEP_NS,
+    assert_whole,
+    read,
+)
 from tests.daq.logs import damaged
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -32,15 +43,25 @@ COMPRESSIONS = (None, *Writer.CompressionFormat)
 
 
 def record(
-    path: Path, compression: Writer.CompressionFormat | None = None, *, second: bool = False, rows: int = ROWS
+    path: Path,
+    compression: Writer.CompressionFormat | None = None,
+    *,
+    second: bool = False,
+    rows: int = ROWS,
 ) -> Path:
-    """The recording of `test_bag`; a second node sends zeros between the messages of the first one."""
+    """The recording of `test_bag`; a second node sends zeros between the messages of the first
+    one.
+    """
     writer = Writer(path)
     if compression is not None:
         writer.set_compression(compression)
     with writer:
-        arm = writer.add_connection("/joint_states", JOINTS_SCHEMA, typestore=TYPES, callerid="/arm_driver")
-        other = writer.add_connection("/joint_states", JOINTS_SCHEMA, typestore=TYPES, callerid="/fake_controller")
+        arm = writer.add_connection(
+            "/joint_states", JOINTS_SCHEMA, typestore=TYPES, callerid="/arm_driver"
+        )
+        other = writer.add_connection(
+            "/joint_states", JOINTS_SCHEMA, typestore=TYPES, callerid="/fake_controller"
+        )
         chatter = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=TYPES)
         for row in range(rows):
             time_ns = START_NS + row * STEP_NS
@@ -48,7 +69,9 @@ def record(
             writer.write(chatter, time_ns, b"\x02\x00\x00\x00hi")
             if second:
                 between_ns = time_ns + STEP_NS // 2
-                writer.write(other, between_ns, _serialised(row, between_ns, np.zeros(6), np.zeros(6)))
+                writer.write(
+                    other, between_ns, _serialised(row, between_ns, np.zeros(6), np.zeros(6))
+                )
     return path
 
 
@@ -59,7 +82,9 @@ def _serialised(row: int, time_ns: int, position: Any, effort: Any) -> bytes:
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS, ids=str)
-def test_a_bag_of_ros_1_has_the_same_numbers(compression: Writer.CompressionFormat | None, tmp_path: Path) -> None:
+def test_a_bag_of_ros_1_has_the_same_numbers(
+    compression: Writer.CompressionFormat | None, tmp_path: Path
+) -> None:
     bag = record(tmp_path / "run.bag", compression)
     assert reader_of(bag) is read_bag
     assert_whole(read(bag))
@@ -71,13 +96,19 @@ def test_a_bag_of_ros_1_has_the_same_numbers(compression: Writer.CompressionForm
 def test_the_nodes_that_publish_the_same_joints_are_named(tmp_path: Path) -> None:
     """Frame, joints and fields are the same; the bag knows the nodes."""
     bag = record(tmp_path / "run.bag", second=True)
-    with pytest.raises(TableUnfit, match=r"1: /arm_driver, position and effort .*; 2: /fake_controller, position"):
+    with pytest.raises(
+        TableUnfit,
+        match=r"1: /arm_driver, position and effort .*; 2: "
+        r"/fake_controller, position",
+    ):
         read(bag)
     assert_whole(read(bag, publisher=1))
     assert not read(bag, publisher=2).values.any()
 
 
-def test_without_the_package_its_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_its_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bag = record(tmp_path / "run.bag")
     monkeypatch.setattr(environment, "find_spec", lambda _: None)
     with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[ros1\]'"):
@@ -105,7 +136,10 @@ def test_a_chunk_that_unfolds_to_more_than_a_chunk_is_refused(size: int) -> None
 def bags(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, ...]:
     """A bag of each compression."""
     folder = tmp_path_factory.mktemp("ros1")
-    return tuple(record(folder / f"{number}.bag", one, rows=20).read_bytes() for number, one in enumerate(COMPRESSIONS))
+    return tuple(
+        record(folder / f"{number}.bag", one, rows=20).read_bytes()
+        for number, one in enumerate(COMPRESSIONS)
+    )
 
 
 @settings(max_examples=150, deadline=None)

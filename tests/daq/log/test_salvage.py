@@ -19,7 +19,12 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.documents.calibration_file import as_document, decode_calibration, encode_calibration, save_calibration
+from daq.documents.calibration_file import (
+    as_document,
+    decode_calibration,
+    encode_calibration,
+    save_calibration,
+)
 from daq.errors import (
     ExitCode,
     LogCorrupt,
@@ -43,14 +48,21 @@ from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
 
 ROWS = samples([[100 * k + axis for axis in range(6)] for k in range(700)])
-MOVES = [CellEvent(START_NS + 50_000_000 * k, None, EventKind.MOVE_START, k, f"move {k}") for k in range(3)]
+MOVES = [
+    CellEvent(START_NS + 50_000_000 * k, None, EventKind.MOVE_START, k, f"move {k}")
+    for k in range(3)
+]
 
-READINGS = [SlowReading(START_NS + 300_000_000 * k, 2, Quantity.TEMPERATURE, 25.0 + k) for k in range(2)]
+READINGS = [
+    SlowReading(START_NS + 300_000_000 * k, 2, Quantity.TEMPERATURE, 25.0 + k) for k in range(2)
+]
 
 
 @pytest.fixture
 def part(tmp_path: Path, checkout: Path) -> Path:
-    """Return the `.part` of a recording of 700 samples that failed: all of it, because the writer caught the error."""
+    """Return the `.part` of a recording of 700 samples that failed:
+    all of it, because the writer caught the error.
+    """
     return _broken_off(tmp_path / "run.mcap", checkout)
 
 
@@ -77,7 +89,10 @@ def _same(found: SampleBlock, count: int) -> bool:
         np.array([s.statusword for s in ROWS[:count]], dtype=np.uint16),
         np.array([s.missing for s in ROWS[:count]], dtype=np.uint32),
     )
-    return all(np.array_equal(getattr(found, name), getattr(wanted, name)) for name in SampleBlock.__slots__)
+    return all(
+        np.array_equal(getattr(found, name), getattr(wanted, name))
+        for name in SampleBlock.__slots__
+    )
 
 
 def test_what_was_recorded_comes_back_and_is_labelled(part: Path, tmp_path: Path) -> None:
@@ -96,8 +111,12 @@ def test_what_was_recorded_comes_back_and_is_labelled(part: Path, tmp_path: Path
     assert saved.left_out_bytes == 0
 
 
-def test_at_most_the_last_150_ms_are_not_on_disk_when_a_recorder_is_killed(tmp_path: Path, checkout: Path) -> None:
-    """Whatever the writer has been given, the file alone gives back all but less than 150 samples of 1 ms."""
+def test_at_most_the_last_150_ms_are_not_on_disk_when_a_recorder_is_killed(
+    tmp_path: Path, checkout: Path
+) -> None:
+    """Whatever the writer has been given, the file alone gives back all but less than 150 samples
+    of 1 ms.
+    """
     content = demo_content(checkout)
     with LogWriter(tmp_path / "run.mcap", content, joints, clock_ns=lambda: 0) as log:
         for number, sample in enumerate(ROWS, start=1):
@@ -110,14 +129,18 @@ def test_at_most_the_last_150_ms_are_not_on_disk_when_a_recorder_is_killed(tmp_p
 
 
 def test_a_process_that_is_killed_loses_no_more(tmp_path: Path, checkout: Path) -> None:
-    """The promise itself: SIGKILL, from the process's own hand so that what it had written is known."""
+    """The promise itself: SIGKILL, from the process's own hand so that what it had written is
+    known.
+    """
     out = tmp_path / "run.mcap"
     script = (
         "import os, signal, sys; from pathlib import Path; from daq.log.writer import LogWriter\n"
         "from tests.daq.logs import demo_content, joints, samples\n"
-        f"log = LogWriter(Path({str(out)!r}), demo_content(Path({str(checkout)!r})), joints, clock_ns=lambda: 0)\n"
+        f"log = LogWriter(Path({str(out)!r}), demo_content(Path({str(checkout)!r})), joints, "
+        "clock_ns=lambda: 0)\n"
         "log.__enter__()\n"
-        "for row in samples([[100 * k + axis for axis in range(6)] for k in range(437)]): log.write(row)\n"
+        "for row in samples([[100 * k + axis for axis in range(6)] for k in range(437)]): "
+        "log.write(row)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=checkout, check=False)
@@ -131,7 +154,8 @@ def test_every_cut_gives_a_beginning_or_a_named_error(part: Path, tmp_path: Path
     data = part.read_bytes()
     counts = []
     for size in range(0, len(data), 997):
-        cut, out = tmp_path / "cut.mcap.part", tmp_path / "saved.mcap"
+        cut = tmp_path / "cut.mcap.part"
+        out = tmp_path / "saved.mcap"
         cut.write_bytes(data[:size])
         out.unlink(missing_ok=True)
         try:
@@ -164,16 +188,29 @@ def test_the_damaged_end_of_a_finished_log_is_left_out(tmp_path: Path, checkout:
 
 def test_a_whole_log_needs_no_salvage(tmp_path: Path, checkout: Path) -> None:
     with pytest.raises(UsageError, match="a whole log"):
-        salvage(write(tmp_path / "whole.mcap", demo_content(checkout), ROWS[:5]), tmp_path / "saved.mcap")
+        salvage(
+            write(tmp_path / "whole.mcap", demo_content(checkout), ROWS[:5]),
+            tmp_path / "saved.mcap",
+        )
 
 
-def test_a_recorder_that_died_before_it_gave_the_log_its_name(tmp_path: Path, checkout: Path) -> None:
-    """Its own verdict is kept; that the log is partial is kept too, because the reason of its death is unknown."""
+def test_a_recorder_that_died_before_it_gave_the_log_its_name(
+    tmp_path: Path, checkout: Path
+) -> None:
+    """Its own verdict is kept; that the log is partial is kept too,
+    because the reason of its death is unknown.
+    """
     part = tmp_path / "run.mcap.part"
-    write(tmp_path / "whole.mcap", demo_content(checkout), ROWS, verdict=(False, "3 late answers")).rename(part)
+    write(
+        tmp_path / "whole.mcap", demo_content(checkout), ROWS, verdict=(False, "3 late answers")
+    ).rename(part)
     assert read_log(part).partial
     log = read_log(salvage(part, tmp_path / "saved.mcap").log)
-    assert (log.partial, log.statistics.valid, log.statistics.reason) == (True, False, "3 late answers")
+    assert (log.partial, log.statistics.valid, log.statistics.reason) == (
+        True,
+        False,
+        "3 late answers",
+    )
 
 
 def test_a_running_recording_is_left_alone(part: Path, tmp_path: Path) -> None:
@@ -185,7 +222,9 @@ def test_a_running_recording_is_left_alone(part: Path, tmp_path: Path) -> None:
 
 
 def test_the_writer_holds_that_lock(tmp_path: Path, checkout: Path) -> None:
-    with LogWriter(tmp_path / "run.mcap", demo_content(checkout), joints, clock_ns=lambda: 0) as log:
+    with LogWriter(
+        tmp_path / "run.mcap", demo_content(checkout), joints, clock_ns=lambda: 0
+    ) as log:
         log.write(ROWS[0])
         log.flush()
         with pytest.raises(UsageError, match="still runs"):
@@ -212,7 +251,8 @@ def test_nothing_can_be_saved_of_nothing(tmp_path: Path, checkout: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("kind", "valid"), [(EventKind.EMCY, False), (EventKind.HEARTBEAT_LOST, False), (EventKind.STOP, True)]
+    ("kind", "valid"),
+    [(EventKind.EMCY, False), (EventKind.HEARTBEAT_LOST, False), (EventKind.STOP, True)],
 )
 def test_a_recording_that_ended_in_a_fault_is_invalid_too(
     kind: EventKind, valid: bool, tmp_path: Path, checkout: Path
@@ -224,9 +264,15 @@ def test_a_recording_that_ended_in_a_fault_is_invalid_too(
 
 
 @pytest.mark.parametrize("key", ["payload_known", "started_wall_ns", "operator", SEAL])
-def test_metadata_of_a_log_without_its_end_are_under_a_seal_of_their_own(key: str, part: Path, tmp_path: Path) -> None:
+def test_metadata_of_a_log_without_its_end_are_under_a_seal_of_their_own(
+    key: str, part: Path, tmp_path: Path
+) -> None:
     """The payload's mass scales every gain, and no chunk covers it."""
-    record: dict[str, str] = {"payload_known": '{"m": 4.59}', "started_wall_ns": "1", "operator": "Ada"}
+    record: dict[str, str] = {
+        "payload_known": '{"m": 4.59}',
+        "started_wall_ns": "1",
+        "operator": "Ada",
+    }
     whole = sealed(record)
     assert unsealed(whole) == record
     with pytest.raises(ValueError, match="sealed with"):
@@ -259,9 +305,12 @@ def test_nothing_of_it_reaches_a_controller() -> None:
     partial = replace(good, sources=(good.sources[0], replace(good.sources[1], partial=True)))
     again = decode_calibration(encode_calibration(partial), "calibration.yaml")
     assert again == partial
-    edit, now = Edit(subject="", before=b"", after=b""), datetime(2025, 1, 2, tzinfo=UTC)
+    edit = Edit(subject="", before=b"", after=b"")
+    now = datetime(2025, 1, 2, tzinfo=UTC)
     assert not check_gates(GateContext(Request(good, now), edit))
-    assert [refusal.gate for refusal in check_gates(GateContext(Request(again, now), edit))] == [Gate.PARTIAL]
+    assert [refusal.gate for refusal in check_gates(GateContext(Request(again, now), edit))] == [
+        Gate.PARTIAL
+    ]
     assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]
 
 
@@ -273,15 +322,27 @@ def test_calibrations_of_earlier_versions_have_no_partial_sources() -> None:
         json.dumps(document["sources"], sort_keys=True, separators=(",", ":")).encode()
     ).hexdigest()
     assert (
-        decode_calibration(yaml.safe_dump(document, sort_keys=False).encode(), "calibration.yaml") == demo_calibration()
+        decode_calibration(yaml.safe_dump(document, sort_keys=False).encode(), "calibration.yaml")
+        == demo_calibration()
     )
 
 
-def test_apply_ends_with_3(tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_apply_ends_with_3(
+    tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     good = demo_calibration()
-    save_calibration(replace(good, sources=(replace(good.sources[0], partial=True),)), tmp_path / "calibration.yaml")
+    save_calibration(
+        replace(good, sources=(replace(good.sources[0], partial=True),)),
+        tmp_path / "calibration.yaml",
+    )
     cell = str(checkout / "configs/cells/demo.yaml")
-    command = ["apply", str(tmp_path / "calibration.yaml"), "--cell", cell, "--configuration-changed"]
+    command = [
+        "apply",
+        str(tmp_path / "calibration.yaml"),
+        "--cell",
+        cell,
+        "--configuration-changed",
+    ]
     assert main(command) == ExitCode.CALIBRATION_REFUSED
     assert "never finished" in " ".join(capsys.readouterr().err.split())
 
@@ -292,7 +353,12 @@ def test_the_verb(part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "drivegain salvage" in capsys.readouterr().err
     assert main(["salvage", str(part), "--out", str(out), "--json"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
-    assert (document["samples"], document["partial"], document["valid"], document["left_out_bytes"]) == (
+    assert (
+        document["samples"],
+        document["partial"],
+        document["valid"],
+        document["left_out_bytes"],
+    ) == (
         700,
         True,
         True,
@@ -316,7 +382,9 @@ def test_a_log_that_is_no_regular_file_is_refused(what: str, tmp_path: Path) -> 
         salvage(log, tmp_path / "saved.mcap")
 
 
-def test_a_salvage_that_cannot_write_does_not_ask_for_a_recording(part: Path, tmp_path: Path) -> None:
+def test_a_salvage_that_cannot_write_does_not_ask_for_a_recording(
+    part: Path, tmp_path: Path
+) -> None:
     with pytest.raises(OutputFailed, match="nothing was written") as caught:
         salvage(part, tmp_path / "none" / "saved.mcap")
     assert "record again" not in str(caught.value)

@@ -1,4 +1,6 @@
-"""A log decoded as Foxglove and PlotJuggler decode it: by the definitions inside it, with software that is not ours."""
+"""A log decoded as Foxglove and PlotJuggler decode it:
+by the definitions inside it, with software that is not ours.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,12 @@ def test_the_messages_are_those_that_were_written(decoded: dict[str, list[Any]])
     first = decoded["/cell/samples"][0]
     assert first.stamp.sec * 10**9 + first.stamp.nanosec == START_NS
     (event,) = decoded["/cell/events"]
-    assert (event.axis, event.kind, event.code, event.text) == (2, "emcy", 0x8611, "node 3: following error")
+    assert (event.axis, event.kind, event.code, event.text) == (
+        2,
+        "emcy",
+        0x8611,
+        "node 3: following error",
+    )
     assert list(decoded["/joint_states"][0].name) == [f"J{number}" for number in range(1, AXES + 1)]
 
 
@@ -58,7 +65,9 @@ def _foxglove_paths() -> list[str]:
     found = []
     for panel in layout["configById"].values():
         layers = panel.get("layers", {}).values()
-        found += [layer["topic"] for layer in layers if "topic" in layer] + list(panel.get("topics", ()))
+        found += [layer["topic"] for layer in layers if "topic" in layer] + list(
+            panel.get("topics", ())
+        )
         found += [path["value"] for path in panel.get("paths", ())] + [
             panel[key] for key in ("topicPath",) if key in panel
         ]
@@ -71,16 +80,23 @@ def _plotjuggler_curves() -> list[str]:
 
 
 @pytest.mark.parametrize("path", _foxglove_paths())
-def test_every_path_of_the_foxglove_layout_leads_to_something(decoded: dict[str, list[Any]], path: str) -> None:
+def test_every_path_of_the_foxglove_layout_leads_to_something(
+    decoded: dict[str, list[Any]], path: str
+) -> None:
     topic, _, rest = path.partition(".")
-    if topic in ("/cell/predicted", "/cell/residual"):  # of the live stream alone, in messages of one type
+    # Of the live stream alone, in messages of one type
+    if topic in ("/cell/predicted", "/cell/residual"):
         topic = "/cell/currents"
     assert _walk(decoded[topic][0], re.findall(r"\w+|\[\d+\]", rest)) is not None
 
 
 @pytest.mark.parametrize("curve", _plotjuggler_curves())
-def test_every_curve_of_the_plotjuggler_layout_is_a_number(decoded: dict[str, list[Any]], curve: str) -> None:
-    """A curve is topic, slash, fields; PlotJuggler spreads a JointState out by the names of its joints."""
+def test_every_curve_of_the_plotjuggler_layout_is_a_number(
+    decoded: dict[str, list[Any]], curve: str
+) -> None:
+    """A curve is topic, slash, fields; PlotJuggler spreads a JointState out by the names of its
+    joints.
+    """
     topic = next(topic for topic in decoded if curve.startswith(f"{topic}/"))
     steps = re.findall(r"\w+|\[\d+\]", curve.removeprefix(topic))
     message = decoded[topic][0]
@@ -92,7 +108,10 @@ def test_every_curve_of_the_plotjuggler_layout_is_a_number(decoded: dict[str, li
 
 def _walk(value: Any, steps: list[str]) -> Any:
     for step in steps:
-        value = value[int(step[1:-1])] if step.startswith("[") else getattr(value, step)
+        if step.startswith("["):
+            value = value[int(step[1:-1])]
+        else:
+            value = getattr(value, step)
     return value
 
 
@@ -100,13 +119,18 @@ def test_every_panel_of_the_foxglove_layout_is_placed_once() -> None:
     layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
 
     def leaves(node: Any) -> list[str]:
-        return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
+        if isinstance(node, str):
+            return [node]
+        return leaves(node["first"]) + leaves(node["second"])
 
     assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
 
 
 def test_the_layouts_show_all_axes_and_nothing_twice() -> None:
-    for named, samples_of in ((_foxglove_paths(), "/cell/samples."), (_plotjuggler_curves(), "/cell/samples/")):
+    for named, samples_of in (
+        (_foxglove_paths(), "/cell/samples."),
+        (_plotjuggler_curves(), "/cell/samples/"),
+    ):
         plotted = [name for name in named if "[" in name]
         assert len(set(plotted)) == len(plotted)
         for field in ("position_counts", "current_raw", "statusword"):

@@ -1,4 +1,6 @@
-"""The certificate: the verdict is that of the gates, its numbers are on the page, and files cannot put code there."""
+"""The certificate: the verdict is that of the gates, its numbers are on the page,
+and files cannot put code there.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,14 @@ from daq.files import sha256
 from daq.jobs.session import Session, save, session_of
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import record_session
-from daq.report.certificate import Certificate, Origin, Verdict, certificate_report, certify, order_text
+from daq.report.certificate import (
+    Certificate,
+    Origin,
+    Verdict,
+    certificate_report,
+    certify,
+    order_text,
+)
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import compare, without_controller
 from daq.report.document import json_tree
@@ -78,20 +87,25 @@ class Reader(HTMLParser):
 def _with_smooth() -> Calibration:
     """A term without a name on J2: its torque is that of the B-splines alone."""
     placed = PlacedEffect(Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5), 1)
-    found = tuple(Parameter(c.name, 0.1 * k - 0.3, 0.02, c.unit) for k, c in enumerate(placed.columns))
+    found = tuple(
+        Parameter(c.name, 0.1 * k - 0.3, 0.02, c.unit) for k, c in enumerate(placed.columns)
+    )
     effect = AcceptedEffect(placed.effect.name, "J2", dict(placed.effect.settings), found, 5.0, 3.0)
     made = demo_calibration()
     return replace(made, effects=(effect,), parameters=(*made.parameters, *found))
 
 
 def _page(calibration: Calibration, earlier: Calibration | None = None) -> str:
-    return certificate_page(certify(calibration, without_controller(calibration, "not read", NOW), earlier))
+    return certificate_page(
+        certify(calibration, without_controller(calibration, "not read", NOW), earlier)
+    )
 
 
 def test_every_number_of_the_document_is_on_the_page() -> None:
     calibration = demo_calibration()
     certificate = certify(calibration, without_controller(calibration, "not read", NOW))
-    text, report = certificate_page(certificate), certificate_report(certificate)
+    text = certificate_page(certificate)
+    report = certificate_report(certificate)
     page = Reader(text)
     assert not set(page.tags) & {"script", "link", "iframe", "object", "a", "img"}
     assert "http" not in text.replace("http-equiv", "")
@@ -100,7 +114,8 @@ def test_every_number_of_the_document_is_on_the_page() -> None:
         identified = f"{with_deviation(gain.value, gain.std)} {gain.unit}"
         assert {f"{axis.old:.5g}", identified, axis.verdict} <= set(page.texts)
         assert axis.change_percent == pytest.approx(gain.change_percent)
-    before, after = report.nameplate_holdout_error_percent, report.holdout_error_percent
+    before = report.nameplate_holdout_error_percent
+    after = report.holdout_error_percent
     assert before is not None
     assert after is not None
     assert f"{before.total:.2f} → {after.total:.2f}" in page.texts
@@ -114,7 +129,10 @@ def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said()
     calibration = with_recordings(demo_calibration(), operator="Ada")
     texts = Reader(_page(calibration)).texts
     entered = "disc: 4.59 kg in the cell file, 4.592 and 4.588 kg on the scale"
-    assert f"{entered}; a wrong mass changes every gain, by the same share where nothing else of it is known" in texts
+    assert (
+        f"{entered}; a wrong mass changes every gain, by the same share where nothing else of "
+        "it is known"
+    ) in texts
     assert "Ada" in texts
     bare = replace(calibration, sources=(), holdout_error_percent=None, effects=())
     texts = Reader(_page(bare)).texts
@@ -126,7 +144,9 @@ def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said()
 def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_details() -> None:
     calibration = with_recordings(demo_calibration(), operator="Ada")
     gains = calibration.gains
-    alike = PayloadMass.of("disc", 4.59, [gain.value / 4.59 for gain in gains], gains).weighed_to(0.0459)
+    alike = PayloadMass.of("disc", 4.59, [gain.value / 4.59 for gain in gains], gains).weighed_to(
+        0.0459
+    )
     texts = Reader(_page(replace(calibration, payload_mass=(alike,)))).texts
     sheet = next(text for text in texts if text.startswith("disc: 4.59 kg in the cell file"))
     assert "if the mass of disc is wrong by 1 %, every gain is wrong by 1 %" in sheet
@@ -136,8 +156,14 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     # With the drawing known too, each gain has a number.
     shares = np.linspace(0.1, 0.6, len(gains))
     slopes = [share * gain.value / 4.59 for share, gain in zip(shares, gains, strict=True)]
-    drawn = replace(calibration, payload_mass=(PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),))
-    sheet = next(text for text in Reader(_page(drawn)).texts if text.startswith("disc: 4.59 kg in the cell file"))
+    drawn = replace(
+        calibration, payload_mass=(PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),)
+    )
+    sheet = next(
+        text
+        for text in Reader(_page(drawn)).texts
+        if text.startswith("disc: 4.59 kg in the cell file")
+    )
     assert f"the gains are wrong by: {gains[0].axis} 0.10 %, " in sheet
     assert "which is at most ± 0.6 % of every gain, not included in σ" in sheet
     report = json_tree(certificate_report(certify(drawn, without_controller(drawn, "", NOW))))
@@ -153,7 +179,9 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
 def test_what_files_say_is_escaped() -> None:
     made = demo_calibration()
     gains = tuple(replace(gain, axis=f"{gain.axis}{HOSTILE}") for gain in made.gains)
-    hostile = with_recordings(replace(made, cell=HOSTILE, gains=gains, software=HOSTILE), operator=HOSTILE)
+    hostile = with_recordings(
+        replace(made, cell=HOSTILE, gains=gains, software=HOSTILE), operator=HOSTILE
+    )
     text = _page(hostile)
     assert "<script" not in text
     assert f"Cell {HOSTILE}" in Reader(text).texts
@@ -170,7 +198,8 @@ def test_a_term_without_a_name_is_its_curve() -> None:
     assert curve is not None
     assert curve.half_nm is None
     assert (curve.x[0], curve.x[-1]) == (-2.38838, 1.5)
-    # The shapes leave out the constant, whose B-spline weights are all one: the weights of the curve sum to zero.
+    # The shapes leave out the constant, whose B-spline weights are all one: the weights of the
+    # curve sum to zero.
     placed = Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5)
     weights = np.linalg.lstsq(placed.shapes(curve.x).T, curve.torque_nm, rcond=None)[0]
     assert weights == pytest.approx([one.value for one in calibration.effects[0].coefficients])
@@ -181,18 +210,27 @@ def test_a_term_without_a_name_is_its_curve() -> None:
 
 
 def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
-    """The setting and the coefficient that remains of it are one number to a reader: J + d/c ± σ_d/c."""
-    loss, rest = Parameter("c", 0.1, 0.001, "Nm/Nm"), Parameter("d", 0.002, 0.004, "kg m²")
+    """The setting and the coefficient that remains of it are one number to a reader:
+    J + d/c ± σ_d/c.
+    """
+    loss = Parameter("c", 0.1, 0.001, "Nm/Nm")
+    rest = Parameter("d", 0.002, 0.004, "kg m²")
     text = named_size(LoadFriction(0, 0.58, 1), (loss, rest))
     assert (
-        text == f"{with_deviation(10.0, 0.1)} % of the load torque, beside a rotor of {with_deviation(0.6, 0.04)} kg m²"
+        text == f"{with_deviation(10.0, 0.1)} % of the load torque, beside a rotor of "
+        f"{with_deviation(0.6, 0.04)} kg m²"
     )
-    assert named_size(LoadFriction(0), (loss,)) == f"{with_deviation(10.0, 0.1)} % of the load torque"
+    assert named_size(LoadFriction(0), (loss,)) == (
+        f"{with_deviation(10.0, 0.1)} % of the load torque"
+    )
 
 
 def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
     made = _with_smooth()
-    sliding = replace(made, gains=tuple(replace(one, unit="N/A") if one.axis == "J2" else one for one in made.gains))
+    sliding = replace(
+        made,
+        gains=tuple(replace(one, unit="N/A") if one.axis == "J2" else one for one in made.gains),
+    )
     texts = Reader(_page(sliding)).texts
     assert {"force [N]", "joint position [m]"} <= set(texts)
     assert any(" N. On data" in text for text in texts)
@@ -201,9 +239,14 @@ def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
 
 def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
     calibration = demo_calibration()
-    vague = replace(calibration, gains=tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains))
+    vague = replace(
+        calibration,
+        gains=tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains),
+    )
     texts = Reader(_page(vague)).texts
-    (entry,) = (text for text in texts if text.startswith("J1, J2, J3, J4, J5, J6: found σ 20.00 %"))
+    (entry,) = (
+        text for text in texts if text.startswith("J1, J2, J3, J4, J5, J6: found σ 20.00 %")
+    )
     assert calibration.effects
     assert "residual" not in entry
     assert entry.endswith("record longer or more exciting moves, or a heavier payload.")
@@ -211,8 +254,13 @@ def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
 
 def test_the_verdict_is_that_of_the_gates() -> None:
     calibration = demo_calibration()
-    assert certify(calibration, without_controller(calibration, "", NOW)).verdict is Verdict.NOT_COMPARED
-    vague = replace(calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:]))
+    assert (
+        certify(calibration, without_controller(calibration, "", NOW)).verdict
+        is Verdict.NOT_COMPARED
+    )
+    vague = replace(
+        calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:])
+    )
     refused = certify(vague, without_controller(vague, "", NOW))
     assert refused.verdict is Verdict.REFUSED
     assert refused.sentence.startswith("Must not be written: J1: σ 14.75 %, expected at most 3 %")
@@ -220,16 +268,28 @@ def test_the_verdict_is_that_of_the_gates() -> None:
 
 
 ZERO_OFF = Diagnosis(
-    "zero-off", (), ("J2",), "the zero of J2 off by +2.00 ± 0.05 °; explained as well by J3", "the URDF's", "correct it"
+    "zero-off",
+    (),
+    ("J2",),
+    "the zero of J2 off by +2.00 ± 0.05 °; explained as well by J3",
+    "the URDF's",
+    "correct it",
 )
 REVERSED = Diagnosis(
-    "position-reversed", (), ("J2",), "a position that counts the other way: so read, it leaves 3 %", "its axis", "turn"
+    "position-reversed",
+    (),
+    ("J2",),
+    "a position that counts the other way: so read, it leaves 3 %",
+    "its axis",
+    "turn",
 )
 
 
 def test_the_verdict_names_what_is_to_be_checked() -> None:
     calibration = replace(demo_calibration(), diagnoses=(ZERO_OFF,))
-    certificate = certify(calibration, replace(without_controller(calibration, "", NOW), refusals=()))
+    certificate = certify(
+        calibration, replace(without_controller(calibration, "", NOW), refusals=())
+    )
     assert certificate.verdict is Verdict.NOT_COMPARED
     assert certificate.sentence.endswith(" But CHECK J2: the zero of J2 off by +2.00 ± 0.05 °.")
     assert "verdict act" in certificate_page(certificate)
@@ -241,7 +301,9 @@ def test_the_verdict_names_what_is_to_be_checked() -> None:
 def test_a_wrong_description_that_refuses_a_write_is_said_once() -> None:
     calibration = replace(demo_calibration(), diagnoses=(REVERSED,))
     certificate = certify(calibration, without_controller(calibration, "", NOW))
-    assert certificate.sentence == ("Must not be written: J2: a position that counts the other way, expected its axis.")
+    assert certificate.sentence == (
+        "Must not be written: J2: a position that counts the other way, expected its axis."
+    )
     assert certificate_page(certificate).count("so read, it leaves 3 %") == 1
 
 
@@ -258,11 +320,15 @@ def test_without_a_controller_no_message_names_a_current_gain() -> None:
 
 def test_gains_that_were_held_are_the_first_reason() -> None:
     calibration = demo_calibration()
-    held = replace(calibration, gains=tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains))
+    held = replace(
+        calibration,
+        gains=tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains),
+    )
     worse = replace(held, effects=(replace(held.effects[0], error_after_percent=6.2),))
     certificate = certify(worse, without_controller(worse, "", NOW))
     assert certificate.sentence == (
-        "Must not be written: the gains were held fixed (`--gains fixed`), so there is nothing to write."
+        "Must not be written: the gains were held fixed (`--gains fixed`), so there is nothing "
+        "to write."
     )
     assert certificate.comparison.refusals[0].gate is Gate.NOT_IDENTIFIED
 
@@ -270,7 +336,11 @@ def test_gains_that_were_held_are_the_first_reason() -> None:
 def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:
     calibration = demo_calibration()
     first = calibration.gains[0]
-    earlier = replace(calibration, gains=(replace(first, value=0.9 * first.value), *calibration.gains[1:]), effects=())
+    earlier = replace(
+        calibration,
+        gains=(replace(first, value=0.9 * first.value), *calibration.gains[1:]),
+        effects=(),
+    )
     texts = Reader(_page(calibration, earlier)).texts
     assert texts.count("differs from the earlier calibration") == 1
     assert "+11.1" in texts
@@ -282,20 +352,26 @@ def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:
 def test_the_verb_writes_one_page_and_never_over_another_file(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file, page = tmp_path / "calibration.yaml", tmp_path / "calibration.html"
+    file = tmp_path / "calibration.yaml"
+    page = tmp_path / "calibration.html"
     save_calibration(demo_calibration(), file)
     cell = str(checkout / "configs" / "cells" / "demo.yaml")
-    assert main(["certificate", str(file), "--cell", cell, "--beside", str(file), "--json"]) == ExitCode.OK
+    assert (
+        main(["certificate", str(file), "--cell", cell, "--beside", str(file), "--json"])
+        == ExitCode.OK
+    )
     document = json.loads(capsys.readouterr().out)
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
-    assert [axis["key"] for axis in document["axes"]] == [f"drives.J{number}.gain" for number in range(1, 7)]
+    assert [axis["key"] for axis in document["axes"]] == [
+        f"drives.J{number}.gain" for number in range(1, 7)
+    ]
     # J4 went from -11.52 to -9.21: its size decreased. The current gain is no calibration's.
     assert document["axes"][3]["change_sigmas"] < 0.0 < document["axes"][0]["change_sigmas"]
     texts = Reader(page.read_text(encoding="utf-8")).texts
     assert (
-        "More than noise: the probability that noise alone makes such a change, on any axis, is below 1 %; the current "
-        "gain is taken as exact on all axes."
+        "More than noise: the probability that noise alone makes such a change, on any axis, is "
+        "below 1 %; the current gain is taken as exact on all axes."
     ) in texts
     # Of gains that must not be written the page does not show what would be.
     assert not {axis["written"] for axis in document["axes"]} & set(texts)
@@ -343,7 +419,9 @@ def _document(certificate: Certificate) -> dict[str, Any]:
     return json_tree(certificate_report(certificate))
 
 
-def test_a_certificate_has_the_same_id_each_time_and_another_calibration_another_one(tmp_path: Path) -> None:
+def test_a_certificate_has_the_same_id_each_time_and_another_calibration_another_one(
+    tmp_path: Path,
+) -> None:
     calibration = demo_calibration()
     other = replace(calibration, created="2025-01-02T03:04:06+00:00")
     file = tmp_path / "calibration.yaml"
@@ -358,7 +436,9 @@ def test_a_certificate_has_the_same_id_each_time_and_another_calibration_another
     assert f"Calibration certificate {names[0]}" in Reader(certificate_page(certificate)).texts
 
 
-def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(cell_file: Path) -> None:
+def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
+    cell_file: Path,
+) -> None:
     certificate = _certificate(cell_file, calibration_for(cell_file))
     assert certificate.verdict is Verdict.READY
     document = _document(certificate)
@@ -370,10 +450,14 @@ def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(ce
     assert any(text.startswith("not written (as of ") for text in texts)
 
 
-def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(cell_file: Path) -> None:
+def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
+    cell_file: Path,
+) -> None:
     controller = cell_file.parents[1] / "controllers" / "demo.yaml"
     text = controller.read_text(encoding="utf-8")
-    commented = text.replace("# Nm at the joint per A", "# Nm at the joint per A, from the data sheet")
+    commented = text.replace(
+        "# Nm at the joint per A", "# Nm at the joint per A, from the data sheet"
+    )
     controller.write_text(commented, encoding="utf-8")
     calibration_file = calibration_for(cell_file)
     ready = _certificate(cell_file, calibration_file)
@@ -411,7 +495,9 @@ def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
     assert document["status"]["ended"]["who"].startswith("B. Ode")
     assert "; rolled back on " in document["status"]["text"]
     assert not document["sentence"].startswith("Written")
-    assert "What would be written into controllers/demo.yaml" in Reader(certificate_page(certificate)).texts
+    assert ("What would be written into controllers/demo.yaml") in Reader(
+        certificate_page(certificate)
+    ).texts
 
 
 def test_a_file_that_was_changed_by_hand_after_the_write_is_noticed(cell_file: Path) -> None:
@@ -434,18 +520,22 @@ def test_a_written_calibration_that_a_check_would_refuse_today_says_both(cell_fi
     certificate = _certificate(cell_file, calibration_file)
     assert certificate.verdict is Verdict.REFUSED
     assert certificate.sentence.startswith("Written on ")
-    assert ". Today a check refuses them: J1: σ 0.40 %, expected at most 0.1 % (and 5 more, below)." in (
-        certificate.sentence
-    )
+    assert (
+        ". Today a check refuses them: J1: σ 0.40 %, expected at most 0.1 % (and 5 more, below)."
+    ) in (certificate.sentence)
 
 
 def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
-    """Runs of the fit, `b` without load and `l` with it, given to it in another order than they were recorded in."""
+    """Runs of the fit, `b` without load and `l` with it,
+    given to it in another order than they were recorded in.
+    """
     sources: list[Source] = []
     for place, kind in enumerate(payloads):
         recording = replace(demo_recording(), recorded_s=1.7e9 + 60.0 * place)
         payload = "disc" if kind == "l" else None
-        sources.append(Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording))
+        sources.append(
+            Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording)
+        )
     return tuple(reversed(sources))
 
 
@@ -467,7 +557,9 @@ def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str,
 def test_with_friction_by_payload_no_order_of_runs_moves_the_gains() -> None:
     by_payload = tuple(Parameter(f"fs{axis}_loaded", -0.4, 0.1, "Nm") for axis in range(1, 7))
     declared = demo_calibration()
-    calibration = replace(declared, sources=_recorded_in_order("bbll"), parameters=(*declared.parameters, *by_payload))
+    calibration = replace(
+        declared, sources=_recorded_in_order("bbll"), parameters=(*declared.parameters, *by_payload)
+    )
     said = "bare, bare, loaded, loaded; friction by payload: its change between them moves no gain"
     assert order_text(calibration) == said
     lacking = replace(calibration, parameters=calibration.parameters[:-1])
@@ -483,9 +575,15 @@ def test_an_order_that_no_clock_tells_is_not_said() -> None:
 def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
-    details = {"session": "x", "cell": "demo", "calibration_sha256": sha256(calibration_file.read_bytes())}
+    details = {
+        "session": "x",
+        "cell": "demo",
+        "calibration_sha256": sha256(calibration_file.read_bytes()),
+    }
     audit = cell_file.with_name("demo.audit.jsonl")
-    record_session(audit, AuditAction.ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
+    record_session(
+        audit, AuditAction.ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details
+    )
     status = _document(_certificate(cell_file, calibration_file))["status"]
     assert status["state"] == "accepted"
     assert status["acceptance"] == {
@@ -498,7 +596,9 @@ def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
     assert "; accepted on 2025-01-02 03:00 UTC by A. Miller (as of " in status["text"]
 
 
-def test_a_calibration_that_new_moves_contradict_says_what_failed_and_how_to_undo_it(cell_file: Path) -> None:
+def test_a_calibration_that_new_moves_contradict_says_what_failed_and_how_to_undo_it(
+    cell_file: Path,
+) -> None:
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
     details = {
@@ -509,14 +609,18 @@ def test_a_calibration_that_new_moves_contradict_says_what_failed_and_how_to_und
         "undo": "drivegain rollback demo.yaml",
     }
     audit = cell_file.with_name("demo.audit.jsonl")
-    record_session(audit, AuditAction.NOT_ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details)
+    record_session(
+        audit, AuditAction.NOT_ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details
+    )
     certificate = _certificate(cell_file, calibration_file)
     status = _document(certificate)["status"]
     assert status["state"] == "not accepted"
     assert "; NOT ACCEPTED on 2025-01-02 03:00 UTC by A. Miller: J4 is 25 % off" in status["text"]
     assert "to undo the write: drivegain rollback demo.yaml" in status["text"]
     assert certificate.sentence.endswith(". New moves contradict them: J4 is 25 % off.")
-    assert "To undo the write: <code>drivegain rollback demo.yaml</code>" in certificate_page(certificate)
+    assert ("To undo the write: <code>drivegain rollback demo.yaml</code>") in certificate_page(
+        certificate
+    )
 
 
 def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
@@ -525,7 +629,11 @@ def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
     who = f"\x1b[2J{HOSTILE}"
-    details = {"session": "x", "cell": "demo", "calibration_sha256": sha256(calibration_file.read_bytes())}
+    details = {
+        "session": "x",
+        "cell": "demo",
+        "calibration_sha256": sha256(calibration_file.read_bytes()),
+    }
     audit = cell_file.with_name("demo.audit.jsonl")
     record_session(audit, AuditAction.ACCEPTED, at=NOW, who=who, subject="x", details=details)
     capsys.readouterr()
@@ -538,7 +646,9 @@ def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
     assert "\x1b" not in page
 
 
-def test_without_a_cell_the_status_is_not_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_cell_the_status_is_not_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), file)
     assert main(["certificate", str(file), "--json"]) == ExitCode.OK
@@ -577,7 +687,9 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page.htm", "page.html.txt"])
-def test_a_name_of_another_format_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_of_another_format_is_refused(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), file)
     out = tmp_path / name
@@ -590,7 +702,9 @@ def test_a_name_of_another_format_is_refused(name: str, tmp_path: Path, capsys: 
         assert main(["certificate", str(file), "--out", str(tmp_path / other)]) == ExitCode.OK
 
 
-def test_the_earlier_name_of_the_verb_writes_the_same_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_earlier_name_of_the_verb_writes_the_same_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), file)
     found = []

@@ -34,13 +34,19 @@ from tests.daq.calibrations import calibration_for, demo_recording
 CHROMIUM = os.environ.get("DRIVEGAIN_CHROMIUM", "")
 needs_browser = [
     pytest.mark.browser,
-    pytest.mark.skipif(not CHROMIUM, reason="DRIVEGAIN_CHROMIUM names no browser; `make test-console` does"),
+    pytest.mark.skipif(
+        not CHROMIUM, reason="DRIVEGAIN_CHROMIUM names no browser; `make test-console` does"
+    ),
 ]
 PAPERS = ("A4", "Letter")
 STATES = ("ready", "written", "refused", "not compared")
 SESSION = "20260105T060000Z"
-COMMAND = "drivegain apply press-4/cells/press-4.yaml recalibration/20260105T060000Z/calibration.yaml"
-CONSEQUENCE = "With the effects the gain of J3 is 1.2 ± 0.1 % smaller, that of J2 is the same within noise."
+COMMAND = (
+    "drivegain apply press-4/cells/press-4.yaml recalibration/20260105T060000Z/calibration.yaml"
+)
+CONSEQUENCE = (
+    "With the effects the gain of J3 is 1.2 ± 0.1 % smaller, that of J2 is the same within noise."
+)
 
 
 @pytest.fixture
@@ -51,15 +57,22 @@ def cell_file(tmp_path: Path, checkout: Path) -> Path:
 
 
 def full_calibration(cell_file: Path) -> Calibration:
-    """A calibration of six axes with as much as one has: three effects, five logs, a finding, a weighed payload."""
+    """A calibration of six axes with as much as one has:
+    three effects, five logs, a finding, a weighed payload.
+    """
     made = load_calibration(calibration_for(cell_file))
     placed = PlacedEffect(Smooth(Abscissa.POSITION, lower=-2.4, upper=1.5), 1)
-    weights = tuple(Parameter(one.name, 0.1 * k - 0.3, 0.02, one.unit) for k, one in enumerate(placed.columns))
-    smooth = AcceptedEffect(placed.effect.name, "J2", dict(placed.effect.settings), weights, 5.0, 3.0)
+    weights = tuple(
+        Parameter(one.name, 0.1 * k - 0.3, 0.02, one.unit) for k, one in enumerate(placed.columns)
+    )
+    smooth = AcceptedEffect(
+        placed.effect.name, "J2", dict(placed.effect.settings), weights, 5.0, 3.0
+    )
     of_load = made.effects[0]
     at = datetime.fromisoformat(made.created) - timedelta(hours=1)
     bare = [
-        Source(name, sha256(name.encode()), "fit", recording=demo_recording(at=at)) for name in ("bare-1", "bare-2")
+        Source(name, sha256(name.encode()), "fit", recording=demo_recording(at=at))
+        for name in ("bare-1", "bare-2")
     ]
     loaded = [
         Source(name, sha256(name.encode()), role, False, "disc", 4.59, demo_recording(4.59, at))
@@ -94,7 +107,16 @@ def page_of(state: str, cell_file: Path) -> str:
     file = cell_file.with_name("calibration.yaml")
     save_calibration(calibration, file)
     if state == "written":
-        written = ["apply", str(cell_file), str(file), "--yes", "--by", "A. Miller", "--payload-mass", "disc=4.59"]
+        written = [
+            "apply",
+            str(cell_file),
+            str(file),
+            "--yes",
+            "--by",
+            "A. Miller",
+            "--payload-mass",
+            "disc=4.59",
+        ]
         assert main(written) == ExitCode.OK
     if state == "not compared":
         (cell_file.parents[1] / "controllers" / "demo.yaml").unlink()
@@ -116,7 +138,8 @@ def page_of(state: str, cell_file: Path) -> str:
 def browser() -> Iterator[Browser]:
     """Chromium."""
     with sync_playwright() as playwright:
-        # A container's root may not make the namespaces of the browser's sandbox; it opens our own pages alone.
+        # A container's root may not make the namespaces of the browser's sandbox; it opens our own
+        # pages alone.
         started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         yield started
         started.close()
@@ -133,7 +156,9 @@ class TestInTheBrowser:
     pytestmark = needs_browser
 
     @pytest.mark.parametrize("state", STATES)
-    def test_it_is_one_page_of_each_paper(self, state: str, cell_file: Path, browser: Browser) -> None:
+    def test_it_is_one_page_of_each_paper(
+        self, state: str, cell_file: Path, browser: Browser
+    ) -> None:
         page = browser.new_page()
         page.set_content(page_of(state, cell_file))
         pages = {paper: count_pages(page.pdf(format=paper)) for paper in PAPERS}
@@ -158,7 +183,9 @@ class TestInTheBrowser:
         page.close()
 
     @pytest.mark.parametrize("width", [390, 1280])
-    def test_no_screen_scrolls_sideways(self, width: int, cell_file: Path, browser: Browser) -> None:
+    def test_no_screen_scrolls_sideways(
+        self, width: int, cell_file: Path, browser: Browser
+    ) -> None:
         page = browser.new_page(viewport={"width": width, "height": 844})
         page.set_content(page_of("written", cell_file))
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
@@ -166,7 +193,10 @@ class TestInTheBrowser:
         page.close()
 
     def test_no_grid_line_crosses_a_name_of_a_ranking(self, browser: Browser) -> None:
-        names = ["J3: a gravity compensator, or another torque that repeats with the joint", "J1: a spring"]
+        names = [
+            "J3: a gravity compensator, or another torque that repeats with the joint",
+            "J1: a spring",
+        ]
         page = browser.new_page(viewport={"width": 376, "height": 844})
         page.set_content(ranking([(name, 10.0, "full") for name in names], "Candidates", "unit"))
         crossed = page.evaluate(CROSSED)
@@ -179,8 +209,10 @@ CROSSED = """() => {
     return boxes("text").flatMap(([text, a]) => boxes("line").filter(([, b]) =>
         a.left < b.right && b.left < a.right && a.top + 2 < b.bottom && b.top < a.bottom - 2
     ).map(() => text.textContent));
-}"""
-"""Texts of a drawing whose box a line crosses; the height of a box has room above and below the letters."""
+}"""  # noqa: E501
+"""Texts of a drawing whose box a line crosses;
+the height of a box has room above and below the letters.
+"""
 
 
 def test_the_sheet_has_every_digest_and_three_lines_to_sign(cell_file: Path) -> None:
@@ -193,7 +225,11 @@ def test_the_sheet_has_every_digest_and_three_lines_to_sign(cell_file: Path) -> 
     for digest in (*digests, calibration.configuration_sha256):
         assert on_paper.count(digest) == 1
     assert ">held-out (held out)</dt>" in on_paper
-    assert re.findall("<span>(Name|Date|Signature)</span>", on_paper) == ["Name", "Date", "Signature"]
+    assert re.findall("<span>(Name|Date|Signature)</span>", on_paper) == [
+        "Name",
+        "Date",
+        "Signature",
+    ]
 
 
 def test_the_style_names_no_paper(cell_file: Path) -> None:

@@ -30,7 +30,9 @@ class Whole(Report):
     remark: str = ""
 
 
-NAMES = st.text(st.characters(min_codepoint=1, max_codepoint=0x2FF) | st.sampled_from("\udc80\udcff\\udcff"))
+NAMES = st.text(
+    st.characters(min_codepoint=1, max_codepoint=0x2FF) | st.sampled_from("\udc80\udcff\\udcff")
+)
 
 
 @given(name=NAMES)
@@ -79,7 +81,12 @@ def test_a_document_takes_the_attributes_of_its_sources_by_name_and_the_first_so
     two = Measured(Path("b"), 2.0)
     made = Measurement.of(one, two, first=two, parts=(one, two), sigma=two.sigma)
     part = {"name": "b", "sigma": 2.0}
-    assert json_tree(made) == {"first": part, "parts": [{"name": "a", "sigma": None}, part], "name": "a", "sigma": 2.0}
+    assert json_tree(made) == {
+        "first": part,
+        "parts": [{"name": "a", "sigma": None}, part],
+        "name": "a",
+        "sigma": 2.0,
+    }
 
 
 def test_a_source_that_is_none_gives_null_to_what_the_others_lack() -> None:

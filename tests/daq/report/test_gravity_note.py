@@ -33,7 +33,9 @@ def diagnosed(name: str, *axes: str, runs: tuple[str, ...] = ()) -> Diagnosis:
         (diagnosed("zero-off", "J2", runs=("held-out",)), []),
     ],
 )
-def test_another_mistake_of_the_description_is_named_beside_gravity(diagnosis: Diagnosis, expected: list[str]) -> None:
+def test_another_mistake_of_the_description_is_named_beside_gravity(
+    diagnosis: Diagnosis, expected: list[str]
+) -> None:
     robot = three_axes_truth().model.robot
     (note,) = geometry_notes(CHECK, AXES, robot, (diagnosis,))
     assert "0.18 ± 0.04°" in note

@@ -1,4 +1,6 @@
-"""The sentence of `fit` on the paper's total least squares: only where its gains say something about the model."""
+"""The sentence of `fit` on the paper's total least squares:
+only where its gains say something about the model.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from ident.estimators.method import Method
 AXES = ("crank-1", "crank-2")
 
 
-def _estimate(method: Method, gains: tuple[float, float], std: tuple[float, float] = (0.07, 0.07)) -> Estimate:
+def _estimate(
+    method: Method, gains: tuple[float, float], std: tuple[float, float] = (0.07, 0.07)
+) -> Estimate:
     return Estimate(
         method=method,
         gains=np.array(gains),
@@ -28,7 +32,9 @@ def _estimate(method: Method, gains: tuple[float, float], std: tuple[float, floa
 
 
 def test_paper_note_with_gains_far_apart_names_these_axes() -> None:
-    note = paper_note(AXES, _estimate(Method.ML, (7.352, -6.838)), _estimate(Method.TLS, (7.314, -8.113)))
+    note = paper_note(
+        AXES, _estimate(Method.ML, (7.352, -6.838)), _estimate(Method.TLS, (7.314, -8.113))
+    )
     assert note is not None
     assert "finds crank-2 -8.113 (+18.6 %)." in note
     assert "crank-1" not in note
@@ -52,4 +58,6 @@ def test_paper_note_of_another_method_than_ml_is_not_printed(method: Method) -> 
 
 def test_paper_note_with_wrong_weights_of_tls_is_not_printed() -> None:
     estimate = _estimate(Method.ML, (7.352, -6.838))
-    assert paper_note(AXES, estimate, _estimate(Method.TLS, (7.314, -8.113)), misjudged=(0,)) is None
+    assert (
+        paper_note(AXES, estimate, _estimate(Method.TLS, (7.314, -8.113)), misjudged=(0,)) is None
+    )

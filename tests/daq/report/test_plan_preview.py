@@ -22,7 +22,11 @@ from daq.workflow.plan import Plan
 from ident.model.robot import poses
 from ident.planning.clearance import BASE, Box, Checker
 
-TARGETS = ((0.0, 0.0, 1.2, 0.0, 0.0, 0.0), (0.8, 0.4, 0.6, 0.0, 0.5, 0.0), (-0.8, -0.4, 1.2, 1.0, -0.5, 2.0))
+TARGETS = (
+    (0.0, 0.0, 1.2, 0.0, 0.0, 0.0),
+    (0.8, 0.4, 0.6, 0.0, 0.5, 0.0),
+    (-0.8, -0.4, 1.2, 1.0, -0.5, 2.0),
+)
 MOVES = tuple(PlannedMove(target, 0.5, 0.5, 0.1) for target in TARGETS)
 PLAN = Plan("demo", 1, 100.0, (), 1.0, MOVES, ())
 WALL = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
@@ -67,7 +71,8 @@ def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
     capsules = checker.scene.capsules
     at = poses(checker.robot, np.array([TARGETS[0]]))
     for capsule, ends in zip(capsules, drawn["ends_m"][0], strict=True):
-        rotation, origin = at.rotation[capsule.link + 1, 0], at.origin_m[capsule.link + 1, 0]
+        rotation = at.rotation[capsule.link + 1, 0]
+        origin = at.origin_m[capsule.link + 1, 0]
         expected = [rotation @ np.array(end) + origin for end in (capsule.start_m, capsule.end_m)]
         np.testing.assert_allclose(ends, expected, atol=0.001)
     margin_m = checker.margins(np.array([TARGETS[0], TARGETS[-1]]))
@@ -76,17 +81,25 @@ def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
     assert [box["name"] for box in drawn["boxes"]] == ["wall"]
 
 
-def test_the_reach_is_that_of_every_moving_capsule_at_every_row(checker: Checker, drawn: dict[str, Any]) -> None:
+def test_the_reach_is_that_of_every_moving_capsule_at_every_row(
+    checker: Checker, drawn: dict[str, Any]
+) -> None:
     shares = np.linspace(0.0, 1.0, 21)[:, None]
-    points, radii = [], []
+    points = []
+    radii = []
     for row in drawn["ends_m"]:
         for capsule, (start, end) in zip(checker.scene.capsules, np.array(row), strict=True):
             if capsule.link != BASE:
                 points.append((1.0 - shares) * start + shares * end)
                 radii.append(np.full(21, capsule.radius_m))
-    along, radius = np.concatenate(points), np.concatenate(radii)
-    np.testing.assert_allclose(drawn["reach"]["lower_m"], (along - radius[:, None]).min(axis=0), atol=0.002)
-    np.testing.assert_allclose(drawn["reach"]["upper_m"], (along + radius[:, None]).max(axis=0), atol=0.002)
+    along = np.concatenate(points)
+    radius = np.concatenate(radii)
+    np.testing.assert_allclose(
+        drawn["reach"]["lower_m"], (along - radius[:, None]).min(axis=0), atol=0.002
+    )
+    np.testing.assert_allclose(
+        drawn["reach"]["upper_m"], (along + radius[:, None]).max(axis=0), atol=0.002
+    )
     across = (np.hypot(along[:, 0], along[:, 1]) + radius).max()
     assert drawn["reach"]["radius_m"] == pytest.approx(across, abs=0.002)
 
@@ -103,7 +116,9 @@ def test_the_page_says_what_is_not_known(cell: Cell, checker: Checker) -> None:
     assert "nothing checks the way there" in page
 
 
-def test_the_page_needs_no_other_file_and_runs_only_its_own_script(cell: Cell, checker: Checker) -> None:
+def test_the_page_needs_no_other_file_and_runs_only_its_own_script(
+    cell: Cell, checker: Checker
+) -> None:
     hostile = replace(cell, name="</script><script>alert(1)</script>")
     page = preview_page(hostile, MOVES, checker, b"plan")
     assert not re.search(r"https?:|src=|url\(", page)
@@ -116,7 +131,9 @@ def test_the_page_needs_no_other_file_and_runs_only_its_own_script(cell: Cell, c
     assert f"default-src 'none'; script-src 'sha256-{digest}'" in page
 
 
-def test_a_preview_is_found_by_the_content_of_its_plan(cell: Cell, checker: Checker, tmp_path: Path) -> None:
+def test_a_preview_is_found_by_the_content_of_its_plan(
+    cell: Cell, checker: Checker, tmp_path: Path
+) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_bytes(b"moves")
     (tmp_path / "another.html").write_text("<html>")

@@ -1,4 +1,6 @@
-"""Pictures and tables: whole files, the same bytes for the same data, and no peak lost on the way to the pixels."""
+"""Pictures and tables: whole files, the same bytes for the same data,
+and no peak lost on the way to the pixels.
+"""
 
 from __future__ import annotations
 
@@ -75,21 +77,26 @@ def test_the_picture_of_the_gains_is_whole_and_the_same_twice() -> None:
 def test_any_number_of_axes_has_its_panels(axes: int) -> None:
     time_s = np.arange(50) / 10.0
     torque_nm = np.ones((50, axes))
-    drawn = plot_torques(time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), forces=("Nm",) * axes)
+    drawn = plot_torques(
+        time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), forces=("Nm",) * axes
+    )
     assert len(drawn) == axes
     ElementTree.fromstring(sheet(drawn, "t"))
 
 
 def test_a_run_of_which_nothing_could_be_used_is_drawn_all_the_same() -> None:
     nothing = np.full((50, 2), np.nan)
-    for one in plot_torques(np.arange(50) / 10.0, nothing, nothing, ("J1", "J2"), forces=("Nm", "Nm")):
+    for one in plot_torques(
+        np.arange(50) / 10.0, nothing, nothing, ("J1", "J2"), forces=("Nm", "Nm")
+    ):
         assert "nan" not in one.partition("error nan")[2]
 
 
 @pytest.mark.parametrize("samples", [400, 6001, 300_000])
 @pytest.mark.parametrize("place", [0.0, 0.37, 1.0])
 def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_drawing(samples: int, place: float) -> None:
-    x, column = np.linspace(0.0, 1.0, samples), np.zeros(samples)
+    x = np.linspace(0.0, 1.0, samples)
+    column = np.zeros(samples)
     column[round(place * (samples - 1))] = 1.0
     column[round(0.6 * samples) : round(0.7 * samples)] = np.nan
     kept, values = visible_points(x, column)
@@ -107,12 +114,14 @@ def test_a_chart_draws_its_values_to_scale_and_breaks_at_gaps() -> None:
     """The scale of y is found from the grid lines of the drawing itself."""
     values = np.array([0.0, 10.0, np.nan, -10.0])
     drawn = ElementTree.fromstring(chart((Line(np.arange(4.0), values),), "t", ("x", "y")))
-    down = {float(t.text): float(t.attrib["y"]) - 4 for t in drawn.iter("text") if t.attrib.get("class") == "soft end"
+    down = {float(t.text): float(t.attrib["y"]) - 4 for t in drawn.iter("text") if t.attrib.get("class") == "soft end"  # noqa: E501
             and t.text and t.text.lstrip("-").replace(".", "").isdigit()}  # fmt: skip
     (path,) = drawn.iter("path")
     pieces = re.findall(r"([ML])([\d.]+) ([\d.]+)", path.attrib["d"])
     assert [pen for pen, _, _ in pieces] == ["M", "L", "M"]
-    assert [float(y) for _, _, y in pieces] == pytest.approx([down[0.0], down[10.0], down[-10.0]], abs=0.1)
+    assert [float(y) for _, _, y in pieces] == pytest.approx(
+        [down[0.0], down[10.0], down[-10.0]], abs=0.1
+    )
     x = [float(one) for _, one, _ in pieces]
     assert (x[1] - x[0]) / (x[2] - x[0]) == pytest.approx(1 / 3, abs=0.01)
 
@@ -127,20 +136,32 @@ def test_a_name_of_any_length_leaves_the_scale_free() -> None:
 
 def test_no_word_of_a_ranking_is_cut_off() -> None:
     name = "J3: a torque that depends on the predicted current and that no named effect explains"
-    drawn = ElementTree.fromstring(ranking([(name, 5846.2, "full"), ("J2: a spring", 3.2, "empty")], "t", "%"))
+    drawn = ElementTree.fromstring(
+        ranking([(name, 5846.2, "full"), ("J2: a spring", 3.2, "empty")], "t", "%")
+    )
     width, height = map(float, drawn.attrib["viewBox"].split()[2:])
-    texts = [(one.text or "", float(one.attrib["x"]), float(one.attrib["y"])) for one in drawn.iter("text")]
+    texts = [
+        (one.text or "", float(one.attrib["x"]), float(one.attrib["y"]))
+        for one in drawn.iter("text")
+    ]
     assert " ".join(text for text, _, _ in texts if text in name) == name
     assert all(8.5 * len(text) + x <= width and y <= height for text, x, y in texts if text in name)
     assert {"5846", "3.2"} <= {text for text, _, _ in texts}
 
 
 def test_no_grid_line_of_a_ranking_crosses_a_name() -> None:
-    names = ("J3: a torque that depends on the load torque and that no named effect explains", "J2: a spring")
+    names = (
+        "J3: a torque that depends on the load torque and that no named effect explains",
+        "J2: a spring",
+    )
     drawn = ElementTree.fromstring(ranking([(name, 5846.2, "full") for name in names], "t", "%"))
     lines = [(float(one.attrib["y1"]), float(one.attrib["y2"])) for one in drawn.iter("line")]
     words = " ".join(names)
-    baselines = [float(one.attrib["y"]) for one in drawn.iter("text") if one.text is not None and one.text in words]
+    baselines = [
+        float(one.attrib["y"])
+        for one in drawn.iter("text")
+        if one.text is not None and one.text in words
+    ]
     assert lines
     assert len(baselines) >= len(names) + 1
     for y in baselines:
@@ -165,7 +186,9 @@ def test_a_sum_of_parameters_is_written_for_readers(name: str, text: str) -> Non
 @given(st.lists(st.tuples(st.sampled_from("+-"), st.floats(1e-6, 1e3)), min_size=1, max_size=5))
 def test_every_factor_of_a_sum_but_one_can_be_read_back(terms: list[tuple[str, float]]) -> None:
     rounded = [(sign, round(factor, 6)) for sign, factor in terms]
-    name = "Izz1" + "".join(f" {sign} {factor}*m{number}" for number, (sign, factor) in enumerate(rounded))
+    name = "Izz1" + "".join(
+        f" {sign} {factor}*m{number}" for number, (sign, factor) in enumerate(rounded)
+    )
     shown = re.findall(r" ([+-]) (?:([0-9.e-]+)·)?m[0-9]", sum_text(name))
     assert [(sign, float(factor or 1.0)) for sign, factor in shown] == rounded
 
@@ -173,7 +196,9 @@ def test_every_factor_of_a_sum_but_one_can_be_read_back(terms: list[tuple[str, f
 def test_the_table_says_error_and_truth_within_80_columns() -> None:
     gains = demo_calibration().gains
     out = io.StringIO()
-    Console(file=out, width=80).print(gain_table(gains, {gain.axis: gain.value / 1.01 for gain in gains}))
+    Console(file=out, width=80).print(
+        gain_table(gains, {gain.axis: gain.value / 1.01 for gain in gains})
+    )
     text = out.getvalue()
     assert "…" not in text
     assert text.count("+1.00") == 6
@@ -201,7 +226,10 @@ def test_a_value_is_rounded_by_its_uncertainty(value: float, std: float, text: s
 
 def test_a_torque_of_the_drive_is_questioned_only_beyond_its_noise() -> None:
     """σ of the ratio is √2 %: 6 % are said, 4 % are not, whatever the sign of the gain."""
-    gains = [Gain(name, sign * 10.0, 0.1, "Nm/A", sign * 10.0) for name, sign in (("J1", 1), ("J2", -1), ("J3", 1))]
+    gains = [
+        Gain(name, sign * 10.0, 0.1, "Nm/A", sign * 10.0)
+        for name, sign in (("J1", 1), ("J2", -1), ("J3", 1))
+    ]
     slopes = [TorqueSlope(10.4, 0.1, 90), TorqueSlope(-10.6, 0.1, 90), None]
     (sentence,) = torque_sentences(slopes, gains)
     assert "by more than 3 σ on J2 (+6.0 %): a wrong torque constant" in sentence

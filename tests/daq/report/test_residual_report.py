@@ -1,4 +1,6 @@
-"""The report of `residual`: it needs no other file, escapes what files say, and its numbers are those of the rows."""
+"""The report of `residual`: it needs no other file, escapes what files say,
+and its numbers are those of the rows.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,9 @@ HOSTILE = '<script>alert("$x$")</script>&<img src=http://example.org/x>'
 VOID = {"meta", "img", "br", "link"}
 
 
-def finding(placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedEffect, ...] = ()) -> Finding:
+def finding(
+    placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedEffect, ...] = ()
+) -> Finding:
     return Finding(
         effect=placed.effect,
         axis=placed.axis,
@@ -129,7 +133,8 @@ class Closed:
 @pytest.fixture(scope="module")
 def shelf() -> Shelf:
     """Three runs to fit and one to hold out, all with a spring on J3."""
-    truth, rng = tx40_truth(), np.random.default_rng(3)
+    truth = tx40_truth()
+    rng = np.random.default_rng(3)
     runs = {}
     for index, name in enumerate(NAMES):
         run = record(truth, name, rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
@@ -154,7 +159,11 @@ def closed(shelved: Shelf) -> Closed:
     rival = PlacedEffect(LoadFriction(0), 1)
     limits_nm = np.array([0.5, 1.25, 0.25, 0.1, 0.2, 0.05])
     first = Step(
-        (finding(SPRING, rivals=(rival,)), finding(rival, passed=False)), (), limits_nm, finding(SPRING), after
+        (finding(SPRING, rivals=(rival,)), finding(rival, passed=False)),
+        (),
+        limits_nm,
+        finding(SPRING),
+        after,
     )
     first = replace(first, accepted=first.findings[0])
     last = Step(
@@ -168,26 +177,40 @@ def closed(shelved: Shelf) -> Closed:
     return Closed(replace(fitted, steps=steps), account(start, steps))
 
 
-def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out(closed: Closed) -> None:
+def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out(
+    closed: Closed,
+) -> None:
     """‖e‖/‖v‖ of nothing is no number."""
 
     def resting(errors: RelativeErrors) -> RelativeErrors:
         assert errors.holdout is not None
-        axes = tuple(math.nan if axis == SPRING.axis else error for axis, error in enumerate(errors.holdout.axes))
+        axes = tuple(
+            math.nan if axis == SPRING.axis else error
+            for axis, error in enumerate(errors.holdout.axes)
+        )
         return replace(errors, holdout=RelativeError(axes, errors.holdout.total))
 
     turns = tuple(
-        None if turn is None else replace(turn, before=resting(turn.before), after=resting(turn.after))
+        None
+        if turn is None
+        else replace(turn, before=resting(turn.before), after=resting(turn.after))
         for turn in closed.account.turns
     )
-    (found,) = (text for text in headline(closed.fitted, replace(closed.account, turns=turns), ()) if "J3 has" in text)
+    (found,) = (
+        text
+        for text in headline(closed.fitted, replace(closed.account, turns=turns), ())
+        if "J3 has" in text
+    )
     assert "nan" not in found
     assert "on moves left out in turn" in found
 
 
 def test_gravity_is_placed_on_all_axes_in_the_document(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    tried = replace(first, findings=(*first.findings, finding(PlacedEffect(GravityDirection(), 0), passed=False)))
+    tried = replace(
+        first,
+        findings=(*first.findings, finding(PlacedEffect(GravityDirection(), 0), passed=False)),
+    )
     document = replace(closed, fitted=replace(closed.fitted, steps=(tried, last))).document()
     found = document["turns"][0]["findings"][-1]
     assert (found["effect"], found["axis"]) == ("gravity-direction", "all axes")
@@ -271,16 +294,24 @@ def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
     reported = closed.account.total
     assert reported.before.holdout is not None
     assert reported.after.holdout is not None
-    before, after = reported.before.holdout.axes[2], reported.after.holdout.axes[2]
+    before = reported.before.holdout.axes[2]
+    after = reported.after.holdout.axes[2]
     page = shown
     first = next(text for text in page.texts if text.startswith("J3 has a spring: the error"))
     assert first.startswith(
-        f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to {after:.1f} % ("
+        f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to "
+        f"{after:.1f} % ("
     )
     assert page.texts.index(first) < page.texts.index("Errors without and with the effects")
-    assert "These data cannot distinguish it from: J2: friction that grows with the load." in page.text
+    assert (
+        "These data cannot distinguish it from: J2: friction that grows with the load."
+    ) in page.text
     assert "1.2 Nm on J2" in page.text
-    for error in (reported.before.in_sample, reported.after.cross_validated, reported.after.holdout):
+    for error in (
+        reported.before.in_sample,
+        reported.after.cross_validated,
+        reported.after.holdout,
+    ):
         assert f"{error.total:.2f}" in page.texts
     assert "scales all gains alike" in page.text
 
@@ -289,10 +320,15 @@ def test_an_effect_that_hardly_lowers_the_error_is_called_small(closed: Closed) 
     (turn, *others) = closed.account.turns
     assert turn is not None
     assert turn.before.holdout is not None
-    nearly = replace(turn.before.holdout, axes=tuple(0.95 * error for error in turn.before.holdout.axes))
+    nearly = replace(
+        turn.before.holdout, axes=tuple(0.95 * error for error in turn.before.holdout.axes)
+    )
     small = replace(turn, after=replace(turn.after, holdout=nearly))
     sentences = summary(closed.fitted, replace(closed.account, turns=(small, *others)), ())
-    assert any(one.startswith("J3 has a spring, a small effect: the error of J3 on held-out") for one in sentences)
+    assert any(
+        one.startswith("J3 has a spring, a small effect: the error of J3 on held-out")
+        for one in sentences
+    )
     assert not any("a small effect" in one for one in summary(closed.fitted, closed.account, ()))
 
 
@@ -305,20 +341,29 @@ def test_what_files_say_is_escaped(closed: Closed) -> None:
         fitted,
         cell=replace(fitted.cell, name=HOSTILE, axes=axes),
         sources=tuple(replace(source, name=HOSTILE, partial=True) for source in fitted.sources),
-        steps=tuple(replace(step, after=replace(step.after, datasets=datasets)) for step in fitted.steps),
+        steps=tuple(
+            replace(step, after=replace(step.after, datasets=datasets)) for step in fitted.steps
+        ),
     )
     text = Closed(hostile, closed.account).page()
     assert "<script" not in text
     page = Reader(text)
-    assert all((element.attributes.get("src") or "data:").startswith("data:") for element in page.elements)
+    assert all(
+        (element.attributes.get("src") or "data:").startswith("data:") for element in page.elements
+    )
     assert f"Cell {HOSTILE}" in page.texts
 
 
 def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
-    reported, document = closed.account.total, closed.document()
+    reported = closed.account.total
+    document = closed.document()
     for key, errors in (("before", reported.before), ("after", reported.after)):
-        assert document[key]["relative_error_percent"]["axes"] == pytest.approx(errors.in_sample.axes)
-        assert document[key]["cross_validated_error_percent"]["total"] == pytest.approx(errors.cross_validated.total)
+        assert document[key]["relative_error_percent"]["axes"] == pytest.approx(
+            errors.in_sample.axes
+        )
+        assert document[key]["cross_validated_error_percent"]["total"] == pytest.approx(
+            errors.cross_validated.total
+        )
         assert errors.holdout is not None
         assert document[key]["holdout_error_percent"]["axes"] == pytest.approx(errors.holdout.axes)
         assert document[key]["left_out_runs"] is None
@@ -352,7 +397,9 @@ def test_a_correction_of_the_description_is_shown_by_the_error_of_all_axes(close
         closed.fitted, closed.account, turn, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
     )
     change = error_change_text(turn.before.holdout.total, turn.after.holdout.total)
-    assert sentence == f"J2 has a zero that is off: the error of all axes on held-out runs {change}."
+    assert sentence == (
+        f"J2 has a zero that is off: the error of all axes on held-out runs {change}."
+    )
 
 
 def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed: Closed) -> None:
@@ -365,10 +412,15 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
     changed = replace(closed.account, total=replace(closed.account.total, gains=chosen))
     sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
     assert sentence in summary(closed.fitted, changed, ())
-    assert not any("choice of the effects" in text for text in summary(closed.fitted, closed.account, ()))
+    assert not any(
+        "choice of the effects" in text for text in summary(closed.fitted, closed.account, ())
+    )
     opened = replace(closed.fitted.steps[-1], left_open=(SPRING,))
     undecided = replace(closed.fitted, steps=(*closed.fitted.steps[:-1], opened))
-    more = f"{sentence} spring on J3 is not in the model and may be true: σ holds what that would move."
+    more = (
+        f"{sentence} spring on J3 is not in the model and may be true: σ holds what that "
+        "would move."
+    )
     assert more in summary(undecided, changed, ())
     document = Closed(closed.fitted, changed).document()
     assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
@@ -376,15 +428,30 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
 
 def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) -> None:
     document = closed.document()
-    finding, turn = document["turns"][0]["findings"][0], document["turns"][0]
+    finding = document["turns"][0]["findings"][0]
+    turn = document["turns"][0]
     described = (checkout / "docs" / "reference" / "residual-json.md").read_text(encoding="utf-8")
     floors = document["noise_floor"]
-    named = (document, turn, finding, document["before"], document["gain_changes"][0], floors, floors["motors"][0])
+    named = (
+        document,
+        turn,
+        finding,
+        document["before"],
+        document["gain_changes"][0],
+        floors,
+        floors["motors"][0],
+    )
     for key in {key for part in named for key in part}:
         assert f"`{key}`" in described, key
-    assert document["filter"]["position_cutoff_hz"] == closed.fitted.cell.conditioning.position_cutoff_hz
+    assert (
+        document["filter"]["position_cutoff_hz"]
+        == closed.fitted.cell.conditioning.position_cutoff_hz
+    )
     assert set(document["before"]) == set(document["after"]) == set(turn["before"])
-    assert ResidualReport.model_validate_json(json_text(closed.report()), strict=False) == closed.report()
+    assert (
+        ResidualReport.model_validate_json(json_text(closed.report()), strict=False)
+        == closed.report()
+    )
 
 
 def test_the_document_has_the_calibration_as_its_file_has_it(closed: Closed) -> None:
@@ -402,21 +469,38 @@ def test_what_to_check_comes_first(closed: Closed) -> None:
     assert document["diagnoses"][0]["runs"] == ["loaded-2"]
 
 
-def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(closed: Closed) -> None:
+def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(
+    closed: Closed,
+) -> None:
     left_a = closed.account.left_a
     floors = (
         MotorNoiseFloor(4.0 * float(left_a[0]), FloorSource.STANDSTILL, 20, 100.0),
         MotorNoiseFloor(2.0 * float(left_a[1]), FloorSource.REPEATED_MOVES, 20, 100.0),
-        MotorNoiseFloor(0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True),
+        MotorNoiseFloor(
+            0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True
+        ),
         MotorNoiseFloor(0.9 * float(left_a[3]), FloorSource.STANDSTILL, 12, 100.0),
         *(None,) * 2,
     )
     refuted = Closed(closed.fitted, replace(closed.account, floors=floors))
-    first, second = (line for line in summary(refuted.fitted, refuted.account, ()) if "no noise floor" in line)
-    assert first.startswith("J1 has no noise floor: its current at standstill scatters 4.0 times as much as")
-    assert second.startswith("J2 has no noise floor: its current between repeated moves scatters 2.0 times")
+    first, second = (
+        line for line in summary(refuted.fitted, refuted.account, ()) if "no noise floor" in line
+    )
+    assert first.startswith(
+        "J1 has no noise floor: its current at standstill scatters 4.0 times as much as"
+    )
+    assert second.startswith(
+        "J2 has no noise floor: its current between repeated moves scatters 2.0 times"
+    )
     motors = refuted.document()["noise_floor"]["motors"]
-    assert [motor and motor["refuted"] for motor in motors] == [True, True, False, False, None, None]
+    assert [motor and motor["refuted"] for motor in motors] == [
+        True,
+        True,
+        False,
+        False,
+        None,
+        None,
+    ]
     assert motors[2]["least"] == floors[2].least_a
     assert motors[3]["least"] is None
     assert [motor["dwells"] for motor in motors[:3]] == [20, None, None]
@@ -426,7 +510,9 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(c
 
 def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed) -> None:
     """Least squares are certain of −3 ms in each of these."""
-    biased = CurrentDelay(4e-5, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=False, is_in_model=False)
+    biased = CurrentDelay(
+        4e-5, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=False, is_in_model=False
+    )
     confirmed = replace(biased, seconds=-2e-3, confirmed=True)
     sentence = "Currents were sampled 2.00 ± 0.06 ms before the positions, the same on every axis"
     for skew, stated in ((None, False), (biased, False), (confirmed, True)):
@@ -444,9 +530,13 @@ def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed)
         if skew is not None:
             assert tested == asdict(skew)
     unknown, unconfirmed = (
-        statistical_sentences(closed.fitted, replace(closed.account, skew=skew)) for skew in (None, biased)
+        statistical_sentences(closed.fitted, replace(closed.account, skew=skew))
+        for skew in (None, biased)
     )
-    assert any(text.startswith("A time skew between currents and positions is not known") for text in unknown)
+    assert any(
+        text.startswith("A time skew between currents and positions is not known")
+        for text in unknown
+    )
     assert any(
         text.endswith("is not confirmed: instruments from the demanded motion give 0.04 ± 0.06 ms.")
         for text in unconfirmed
@@ -467,7 +557,13 @@ class Screen:
 def _on_screen(parts: Iterable[RenderableType], columns: int) -> Screen:
     out = StringIO()
     console = Console(
-        file=out, width=columns, soft_wrap=True, highlight=False, markup=False, force_terminal=True, color_system=None
+        file=out,
+        width=columns,
+        soft_wrap=True,
+        highlight=False,
+        markup=False,
+        force_terminal=True,
+        color_system=None,
     )
     for part in parts:
         console.print(part)
@@ -475,15 +571,23 @@ def _on_screen(parts: Iterable[RenderableType], columns: int) -> Screen:
 
 
 def _with_three_effects(closed: Closed) -> Closed:
-    """Two more effects with every kind of sentence: diagnoses, a skew, a refutation, findings that did not join."""
+    """Two more effects with every kind of sentence:
+    diagnoses, a skew, a refutation, findings that did not join.
+    """
     first, last = closed.fitted.steps
     places = (PlacedEffect(LoadFriction(0), 1), PlacedEffect(Smooth(Abscissa.POSITION), 4))
     after = replace(first.after, effects=(SPRING, *places))
     (turn, _) = closed.account.turns
     assert turn is not None
     found = [finding(place, rivals=(SPRING, places[0])) for place in places]
-    asides = tuple(SetAside(finding(PlacedEffect(LoadFriction(0), axis)), moved=((3, 2.91),)) for axis in range(6))
-    refused = replace(finding(PlacedEffect(LoadFriction(0), 3), passed=False), refusals=("coefficient is -1 ± 0.1",))
+    asides = tuple(
+        SetAside(finding(PlacedEffect(LoadFriction(0), axis)), moved=((3, 2.91),))
+        for axis in range(6)
+    )
+    refused = replace(
+        finding(PlacedEffect(LoadFriction(0), 3), passed=False),
+        refusals=("coefficient is -1 ± 0.1",),
+    )
     steps = (
         replace(first, after=after),
         *(replace(first, accepted=one, findings=(one,), after=after) for one in found),
@@ -496,7 +600,9 @@ def _with_three_effects(closed: Closed) -> Closed:
         turns=turns,
         total=replace(closed.account.total, gains=gains),
         holdout_change=PairedChange(1.3, 1.0, 20),
-        skew=CurrentDelay(-2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False),
+        skew=CurrentDelay(
+            -2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False
+        ),
     )
     odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
     return Closed(replace(closed.fitted, steps=steps, diagnoses=(odd,)), account)
@@ -522,12 +628,25 @@ def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, colu
     wide = iter(whole.text.split())
     assert all(word in wide for word in shown.split())
     assert ("sentences more:" in screen.text) == (shown.split() != whole.text.split())
-    for words in ("CHECK loaded-2", "J3 has a spring", "J2 has friction", "J5 has a torque", "Currents were sampled"):
+    for words in (
+        "CHECK loaded-2",
+        "J3 has a spring",
+        "J2 has friction",
+        "J5 has a torque",
+        "Currents were sampled",
+    ):
         assert words in whole.text
     for gain in calibration.gains:
         assert f"{gain.std_percent:.2f}" in screen.text
         assert f"{gain.change_percent:+.1f}" in screen.text
-    for statistics in ("Turn 1", "Detection limit", "Not added", "failed a check", "may have", "scales all"):
+    for statistics in (
+        "Turn 1",
+        "Detection limit",
+        "Not added",
+        "failed a check",
+        "may have",
+        "scales all",
+    ):
         assert statistics not in screen.text
 
 
@@ -539,7 +658,9 @@ def test_the_report_has_every_sentence_and_number_of_the_verbose_output(closed: 
     text = " ".join(page.text.split())
     listed = {" ".join(one.split()) for one in page.texts}
     parts = [*residual_view(made.fitted, made.account, calibration, verbose=True)]
-    sentences = [" ".join(part.text.replace("`", "").split()) for part in parts if isinstance(part, Sentence)]
+    sentences = [
+        " ".join(part.text.replace("`", "").split()) for part in parts if isinstance(part, Sentence)
+    ]
     assert len(sentences) > 15
     # A command in a sentence is an element of its own on the page.
     joined = " ".join(text.replace(" .", ".").replace(" ,", ",").split())
@@ -555,7 +676,9 @@ def test_the_report_has_every_sentence_and_number_of_the_verbose_output(closed: 
     assert set(short) <= {part.text for part in parts if isinstance(part, Sentence)}
 
 
-def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(closed: Closed, tmp_path: Path) -> None:
+def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(
+    closed: Closed, tmp_path: Path
+) -> None:
     payloads = tuple(replace(one, mass_tolerance_kg=0.0459) for one in closed.fitted.cell.payloads)
     weighed = replace(closed.fitted, cell=replace(closed.fitted.cell, payloads=payloads))
     calibration = calibration_of(weighed, CREATED)
@@ -602,12 +725,19 @@ def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
         (1.0, 0.8, "the largest difference is +1.00 ± 0.80 % of the gain of J5 without them."),
         (0.3, 0.2, ""),
     ],
-    ids=["just missed among six axes", "beyond its own noise", "above the target of the cell", "within noise"],
+    ids=[
+        "just missed among six axes",
+        "beyond its own noise",
+        "above the target of the cell",
+        "within noise",
+    ],
 )
 def test_a_gain_that_differs_is_not_called_the_same(
     closed: Closed, percent: float, std_percent: float, said: str
 ) -> None:
-    shifts = [replace(gain, after=gain.before, significant=False) for gain in closed.account.total.gains]
+    shifts = [
+        replace(gain, after=gain.before, significant=False) for gain in closed.account.total.gains
+    ]
     before = shifts[4].before
     change_std = 0.01 * std_percent * abs(before)
     shifts[4] = replace(shifts[4], after=before * (1.0 + 0.01 * percent), change_std=change_std)
@@ -619,24 +749,42 @@ def test_a_gain_that_differs_is_not_called_the_same(
 
 
 def test_what_the_fit_has_checked_is_taken_up_where_the_effects_explain_it(closed: Closed) -> None:
-    large = Diagnosis("axis-error", (), ("J3",), "an error of 2.1 in 8 Nm (or N), 26.6 %", "3 to 15 %", "look")
+    large = Diagnosis(
+        "axis-error", (), ("J3",), "an error of 2.1 in 8 Nm (or N), 26.6 %", "3 to 15 %", "look"
+    )
     other = replace(large, axes=("J5",))
-    zero = Diagnosis("zero-turned", (), ("J2",), "the zero of J2 off by about +35 deg", "another", "add it")
-    corrected = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off by +35.0 ± 0.1°", "another", "add it")
-    fitted = replace(closed.fitted, diagnoses_before=(large, other, zero), diagnoses=(other, corrected))
-    (said,) = (one for one in headline(fitted, closed.account, ()) if one.startswith("Without the effects"))
+    zero = Diagnosis(
+        "zero-turned", (), ("J2",), "the zero of J2 off by about +35 deg", "another", "add it"
+    )
+    corrected = Diagnosis(
+        "zero-off", (), ("J2",), "the zero of J2 off by +35.0 ± 0.1°", "another", "add it"
+    )
+    fitted = replace(
+        closed.fitted, diagnoses_before=(large, other, zero), diagnoses=(other, corrected)
+    )
+    (said,) = (
+        one for one in headline(fitted, closed.account, ()) if one.startswith("Without the effects")
+    )
     assert said.startswith(
-        "Without the effects, the fit said CHECK J3: an error of 2.1 in 8 Nm (or N), 26.6 % (axis-error). With them it "
-        "does not: the error of the current of J3 on held-out runs falls from"
+        "Without the effects, the fit said CHECK J3: an error of 2.1 in 8 Nm (or N), 26.6 % "
+        "(axis-error). With them it does not: the error of the current of J3 on held-out runs "
+        "falls from"
     )
 
 
 def test_an_estimate_of_the_noise_is_said_where_it_has_no_lower_limit(closed: Closed) -> None:
     unknown = RelativeError((math.nan,) * 6, math.nan)
     estimate = RelativeError((math.nan, math.nan, 1.7, math.nan, math.nan, math.nan), math.nan)
-    for floor, said in ((estimate, "(noise leaves 1.7 %, an estimate)."), (unknown, "(noise floor not known).")):
-        judged = replace(closed.account, least_holdout_floor=unknown, least_floor=unknown, holdout_floor=floor)
-        (sentence,) = (one for one in headline(closed.fitted, judged, ()) if one.startswith("J3 has"))
+    for floor, said in (
+        (estimate, "(noise leaves 1.7 %, an estimate)."),
+        (unknown, "(noise floor not known)."),
+    ):
+        judged = replace(
+            closed.account, least_holdout_floor=unknown, least_floor=unknown, holdout_floor=floor
+        )
+        (sentence,) = (
+            one for one in headline(closed.fitted, judged, ()) if one.startswith("J3 has")
+        )
         assert sentence.endswith(said)
 
 
@@ -653,8 +801,8 @@ def test_a_correction_that_the_error_hardly_shows_has_its_own_sigma_and_the_axis
         closed.fitted, closed.account, small, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
     )
     assert sentence == (
-        "J2 has a zero that is off: it hardly shows in the error of all axes on held-out runs, 3.12 % without it and "
-        "3.09 % with it; most in that of J1, 3.20 and 3.00 %."
+        "J2 has a zero that is off: it hardly shows in the error of all axes on held-out runs, "
+        "3.12 % without it and 3.09 % with it; most in that of J1, 3.20 and 3.00 %."
     )
     spring = closed.fitted.steps[0].after
     (size,) = coefficients(spring, SPRING)
@@ -668,11 +816,15 @@ def test_the_moves_that_would_help_are_named_after_a_search_too(closed: Closed) 
     sentences = headline(replace(closed.fitted, uncertain=(weak,)), closed.account, ())
     (said,) = (one for one in sentences if one.startswith("Excitation: J5"))
     assert "add 60 s of moves with the payload (σ 0.8 %)" in said
-    assert not any(one.startswith("Excitation") for one in headline(closed.fitted, closed.account, ()))
+    assert not any(
+        one.startswith("Excitation") for one in headline(closed.fitted, closed.account, ())
+    )
 
 
 def test_the_kind_of_the_errors_is_said_where_several_motors_act_on_a_joint(closed: Closed) -> None:
-    (said,) = (one for one in summary(closed.fitted, closed.account, ()) if "motors' currents" in one)
+    (said,) = (
+        one for one in summary(closed.fitted, closed.account, ()) if "motors' currents" in one
+    )
     assert said.endswith("differ where several motors act on a joint (J5).")
 
 
@@ -685,7 +837,9 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     assert outcome.startswith("No structure found")
     assert "1.2 Nm on J2" in limits
     assert "no common clock: a warm-up over the session cannot be seen" in limits
-    timed = tuple(replace(data, started_s=100.0 * index) for index, data in enumerate(start.datasets))
+    timed = tuple(
+        replace(data, started_s=100.0 * index) for index, data in enumerate(start.datasets)
+    )
     clocked = replace(silent, steps=(replace(last, after=replace(start, datasets=timed)),))
     assert "clock" not in " ".join(summary(clocked, account(start, silent.steps), ()))
     nothing_tried = replace(silent, steps=(replace(silent.steps[0], findings=(), structures=()),))
@@ -697,30 +851,37 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
 def test_a_strong_candidate_that_failed_a_check_is_named_with_it(closed: Closed) -> None:
     first, last = closed.fitted.steps
     strong = replace(
-        finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.4, refusals=("coefficient is -1 ± 0.1",)
+        finding(PlacedEffect(LoadFriction(0), 1), passed=False),
+        explained=0.4,
+        refusals=("coefficient is -1 ± 0.1",),
     )
     weak = replace(strong, axis=2, explained=0.1)
     asked = replace(closed.fitted, steps=(first, replace(last, findings=(weak, strong))))
     sentences = [one for one in summary(asked, closed.account, ()) if "failed a check" in one]
     assert sentences == [
-        "J2: friction that grows with the load would explain 40 % of the squared residual, but failed a check: "
-        "coefficient is -1 ± 0.1. The cause may be another one."
+        "J2: friction that grows with the load would explain 40 % of the squared residual, but "
+        "failed a check: coefficient is -1 ± 0.1. The cause may be another one."
     ]
 
 
-def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it_explains(closed: Closed) -> None:
+def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it_explains(
+    closed: Closed,
+) -> None:
     first, last = closed.fitted.steps
     why = "coefficient is -1 ± 0.1 ; physics allows no less than 0"
     refused = replace(
-        finding(PlacedEffect(LoadFriction(0), 1), passed=False), explained=0.1, refusals=(why,), impossible=why
+        finding(PlacedEffect(LoadFriction(0), 1), passed=False),
+        explained=0.1,
+        refusals=(why,),
+        impossible=why,
     )
     second = replace(refused, effect=Spring())
     noise = replace(refused, axis=2, refusals=("noise makes one as strong with p = 0.400", why))
     asked = replace(closed.fitted, steps=(first, replace(last, findings=(refused, second, noise))))
     sentences = [one for one in summary(asked, closed.account, ()) if "impossible" in one]
     assert sentences == [
-        "J2: friction that grows with the load ranks first on this axis, but its sign or size is impossible: "
-        f"{why}. The cause may be another one."
+        "J2: friction that grows with the load ranks first on this axis, but its sign or size is "
+        f"impossible: {why}. The cause may be another one."
     ]
     much = replace(asked, steps=(first, replace(last, findings=(replace(refused, explained=0.4),))))
     assert len([one for one in summary(much, closed.account, ()) if why in one]) == 1
@@ -728,9 +889,15 @@ def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it
 
 def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    why = "it rests on two moves, too few to test it: record more moves with a large current of this axis"
+    why = (
+        "it rests on two moves, too few to test it: record more moves with a large current of "
+        "this axis"
+    )
     untested = replace(
-        finding(PlacedEffect(LoadFriction(0), 1), passed=False), probability=None, explained=0.4, refusals=(why,)
+        finding(PlacedEffect(LoadFriction(0), 1), passed=False),
+        probability=None,
+        explained=0.4,
+        refusals=(why,),
     )
     step = replace(last, findings=(untested,))
     asked = replace(closed.fitted, steps=(first, step))
@@ -748,32 +915,43 @@ def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Clo
     small = finding(PlacedEffect(Saturation(), 1), passed=False)
     untested = replace(small, explained=0.01, refusals=(why,), too_few_moves=why)
     weaker = replace(untested, effect=Spring())
-    impossible = replace(untested, axis=2, impossible="coefficient is -1 ± 0.1; physics allows no less than 0")
+    impossible = replace(
+        untested, axis=2, impossible="coefficient is -1 ± 0.1; physics allows no less than 0"
+    )
     no_help = replace(untested, axis=3, held_out_fall=-1.0)
     few_folds = replace(untested, axis=4, folds_better=0.5)
     tiny = replace(untested, axis=5, explained=0.001)
     first, last = closed.fitted.steps
     asked = replace(
-        closed.fitted, steps=(first, replace(last, findings=(untested, weaker, impossible, no_help, few_folds, tiny)))
+        closed.fitted,
+        steps=(
+            first,
+            replace(last, findings=(untested, weaker, impossible, no_help, few_folds, tiny)),
+        ),
     )
     sentences = [one for one in summary(asked, closed.account, ()) if "rests on" in one]
     assert sentences == [
-        f"These moves do not tell whether J2 has {effect_text(Saturation(), ())}: it rests on two moves, "
-        f"too few to test it: record more {RECORD[Abscissa.CURRENT]}."
+        f"These moves do not tell whether J2 has {effect_text(Saturation(), ())}: it rests on two "
+        f"moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}."
     ]
 
 
 def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    term, name = PlacedEffect(Smooth(Abscissa.POSITION), 1), finding(PlacedEffect(LoadFriction(0), 1))
+    term = PlacedEffect(Smooth(Abscissa.POSITION), 1)
+    name = finding(PlacedEffect(LoadFriction(0), 1))
     refuted = SetAside(name, "{rival} explains clearly more", term, ((3, 2.91),))
     assert refuted.reason([f"J{axis}" for axis in range(1, 7)]) == (
         "it would move the gain of J4 by 2.9 σ, and smooth-position on J2 explains clearly more"
     )
-    sentences = summary(replace(closed.fitted, steps=(first, replace(last, set_aside=(refuted,)))), closed.account, ())
+    sentences = summary(
+        replace(closed.fitted, steps=(first, replace(last, set_aside=(refuted,)))),
+        closed.account,
+        (),
+    )
     assert (
-        "J2: what looks like friction that grows with the load depends clearly more on the joint position, and was not "
-        "added: it would move the gain of J4 by 2.9 σ."
+        "J2: what looks like friction that grows with the load depends clearly more on the joint "
+        "position, and was not added: it would move the gain of J4 by 2.9 σ."
     ) in sentences
 
 
@@ -785,29 +963,53 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     steps = (replace(first, set_aside=(replaced, aside)), replace(last, set_aside=(aside,)))
     made = Closed(replace(closed.fitted, steps=steps), closed.account)
     sentences = summary(made.fitted, made.account, ())
-    assert sum("and was not added: it has no name, and would move the gain of J4 by 2.9 σ" in s for s in sentences) == 1
-    assert any("J2 may have friction that grows with the load: it would" in one for one in sentences)
+    assert (
+        sum(
+            "and was not added: it has no name, and would move the gain of J4 by 2.9 σ" in s
+            for s in sentences
+        )
+        == 1
+    )
+    assert any(
+        "J2 may have friction that grows with the load: it would" in one for one in sentences
+    )
     assert any("added: spring on J3 explains more." in one for one in sentences)
     assert made.document()["turns"][1]["set_aside"][0]["reason"].endswith("the gain of J4 by 2.9 σ")
     assert (
-        "Not added to J2: a torque that depends on the load torque and that no named effect explains: it has no name"
-        in Reader(made.page()).text
+        "Not added to J2: a torque that depends on the load torque and that no named effect "
+        "explains: it has no name" in Reader(made.page()).text
     )
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_effects_that_held_out_runs_refute_are_not_written(
-    closed: Closed, shelved: Shelf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    closed: Closed,
+    shelved: Shelf,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     del shelved
-    out, folder = tmp_path / "calibration.yaml", tmp_path / "report"
+    out = tmp_path / "calibration.yaml"
+    folder = tmp_path / "report"
     rise = PairedChange(5.0, 1.0, 20)
     monkeypatch.setattr(before_after_module, "holdout_change", lambda *_: rise)
     motors = (PairedChange(0.0, 0.0, 0),) * 3
-    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3)))
+    monkeypatch.setattr(
+        fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3))
+    )
     for name in ("fit", "close_loop"):
         monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
-    command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), "--report", str(folder)]
+    command = [
+        "residual",
+        *NAMES[:3],
+        "--holdout",
+        NAMES[3],
+        "--out",
+        str(out),
+        "--report",
+        str(folder),
+    ]
     assert main(command) == ExitCode.DATA_UNFIT
     message = capsys.readouterr().err
     assert "spring on J3" in message
@@ -827,7 +1029,9 @@ def test_effects_that_the_cell_declares_are_in_both_models_of_the_comparison(
 ) -> None:
     rise = PairedChange(5.0, 1.0, 20)
     motors = (PairedChange(0.0, 0.0, 0),) * 3
-    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3)))
+    monkeypatch.setattr(
+        fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3))
+    )
     last = closed.fitted.steps[-1]
     assert last.after.effects
     fit_module.check_holdout(replace(closed.fitted, steps=(replace(last, declared=True),)))
@@ -853,7 +1057,10 @@ def test_what_was_found_is_printed_although_the_disk_is_full(
         monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
     monkeypatch.setattr(os, "fsync", full)
     out = tmp_path / "calibration.yaml"
-    assert main(["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), *options]) == ExitCode.UNEXPECTED
+    assert (
+        main(["residual", *NAMES[:3], "--holdout", NAMES[3], "--out", str(out), *options])
+        == ExitCode.UNEXPECTED
+    )
     text, message = capsys.readouterr()
     assert "J3 has a spring" in text
     assert "Written" not in text
@@ -868,15 +1075,22 @@ def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed)
     (whole,) = (one for one in sentences if one.startswith("All axes together"))
     assert whole.endswith(", within its noise (1.3 σ): the effects are kept, but not confirmed.")
     (refused,) = (one for one in sentences if one.startswith("`apply` refuses"))
-    assert "with spring on J3: on data that the fit did not use, the torque error is 3.11 % with it, 2.98 %" in refused
+    assert (
+        "with spring on J3: on data that the fit did not use, the torque error is 3.11 % with "
+        "it, 2.98 %"
+    ) in refused
     better = replace(worse, error_after_percent=2.97)
-    said = summary(closed.fitted, replace(closed.account, holdout_change=replace(change, rise=-1.0)), (better,))
+    said = summary(
+        closed.fitted, replace(closed.account, holdout_change=replace(change, rise=-1.0)), (better,)
+    )
     assert not any("within its noise" in one or "`apply` refuses" in one for one in said)
 
 
 def test_the_candidate_that_was_added_is_listed_wherever_it_ranks(closed: Closed) -> None:
     first = closed.fitted.steps[0]
-    rivals = tuple(finding(PlacedEffect(LoadFriction(0), axis), passed=False) for axis in range(6)) * 3
+    rivals = (
+        tuple(finding(PlacedEffect(LoadFriction(0), axis), passed=False) for axis in range(6)) * 3
+    )
     late = replace(first, findings=(*rivals, first.findings[0]), structures=())
     (table, *_) = turns_view(replace(closed.fitted, steps=(late,)))
     assert isinstance(table, Table)
@@ -896,9 +1110,13 @@ def test_what_rises_is_not_said_to_fall() -> None:
 
 def test_a_zero_is_read_in_degrees_and_a_slide_in_metres() -> None:
     turned = Parameter("zero-offset offset 3", -math.radians(2.0), math.radians(0.04), "rad")
-    assert named_size(ZeroOffset(), (turned,)) == "offset -2.000 ± 0.040°, to be added to its position"
+    assert named_size(ZeroOffset(), (turned,)) == (
+        "offset -2.000 ± 0.040°, to be added to its position"
+    )
     moved = Parameter("zero-offset offset 1", 0.003, 0.0001, "m")
-    assert named_size(ZeroOffset(), (moved,)) == "offset 0.00300 ± 0.00010 m, to be added to its position"
+    assert named_size(ZeroOffset(), (moved,)) == (
+        "offset 0.00300 ± 0.00010 m, to be added to its position"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -927,7 +1145,9 @@ def test_effects_are_called_by_words_and_axes_by_names() -> None:
     assert PlacedEffect(Coupling(3, 1), 0).name_among(axes) == "coupling on base with wrist"
     assert effect_text(Coupling(3, 1), axes) == "friction shared with wrist"
     term = Smooth(Abscissa.OTHER_VELOCITY, other_axis=2)
-    assert effect_text(term, axes) == "a torque that depends on the velocity of arm and that no named effect explains"
+    assert effect_text(term, axes) == (
+        "a torque that depends on the velocity of arm and that no named effect explains"
+    )
     assert other_axis(Spring()) is None
     assert set(WORDS) <= {family[0].name for family in (*EFFECTS, *GEOMETRY)}
 
@@ -969,16 +1189,23 @@ def test_a_folder_that_takes_no_file_is_refused_before_any_work(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"])
+@pytest.mark.parametrize(
+    "unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"]
+)
 def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
-    text = html_page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])])
+    text = html_page(
+        f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])]
+    )
     assert unseen not in text
     assert f"<title>a\\u{ord(unseen):04x}b</title>" in text
     text.encode()
 
 
 def test_what_is_seen_stays_as_it_is() -> None:
-    assert paragraph("‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext") == "<p>‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext</p>"
+    assert (
+        paragraph("‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext")
+        == "<p>‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext</p>"
+    )
 
 
 def test_a_disk_that_fails_leaves_the_old_report(
@@ -1021,7 +1248,11 @@ def test_a_disk_that_fails_leaves_the_old_pictures(
     assert old.read_bytes() == b"the old one"
     assert list(tmp_path.iterdir()) == [old]
     draw_fit(closed.fitted, calibration, None, tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"torques.svg", "gains.png", "residual-J3-spring.svg"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "torques.svg",
+        "gains.png",
+        "residual-J3-spring.svg",
+    }
 
 
 @pytest.mark.slow
@@ -1040,7 +1271,11 @@ def test_the_verb_writes_the_report_and_says_the_same(
     assert "J3 has a spring" in text
     for sentence in document["summary"]:
         assert sentence in text
-    rows = {line.rsplit(maxsplit=7)[0].strip(): line.split()[-7:] for line in text.splitlines() if ", " in line[:30]}
+    rows = {
+        line.rsplit(maxsplit=7)[0].strip(): line.split()[-7:]
+        for line in text.splitlines()
+        if ", " in line[:30]
+    }
     for name, key in (("fit", "relative_error_percent"), ("held out", "holdout_error_percent")):
         for when in ("before", "after"):
             error = document[when][key]
@@ -1059,7 +1294,9 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     one_sided = GearLoss(motoring_rows=0.9, motoring_torque=0.97, loss=0.01, loss_std=0.04)
     both = GearLoss(motoring_rows=0.5, motoring_torque=0.52, loss=0.01, loss_std=0.04)
     text = next(_gear_sentence("J3", one_sided, in_model=False))
-    assert text.startswith("The gain of J3 includes the efficiency of its gear: the motor drives in 97 %")
+    assert text.startswith(
+        "The gain of J3 includes the efficiency of its gear: the motor drives in 97 %"
+    )
     assert "loss of up to 8.0 % would not show, and would change the gain by 7.5 %" in text
     assert not list(_gear_sentence("J3", both, in_model=False))
     found = GearLoss(motoring_rows=0.5, motoring_torque=0.5, loss=0.2, loss_std=0.01)
@@ -1073,7 +1310,9 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
 def sentences_of(subject: str) -> st.SearchStrategy[tuple[str, ...]]:
     """Sentences of any length, each another."""
     lengths = st.lists(st.integers(0, 60), max_size=8)
-    return lengths.map(lambda found: tuple(f"{subject} {n}{' word' * length}." for n, length in enumerate(found)))
+    return lengths.map(
+        lambda found: tuple(f"{subject} {n}{' word' * length}." for n, length in enumerate(found))
+    )
 
 
 @given(
@@ -1095,7 +1334,9 @@ def test_whatever_was_found_a_search_prints_one_screen(
     width: int | None,
 ) -> None:
     together = "All axes together: the error falls."
-    found = Headline(checks, effects, together, judged, refused, ("The gains are the same.",), (), (), ending)
+    found = Headline(
+        checks, effects, together, judged, refused, ("The gains are the same.",), (), (), ending
+    )
     shown = [part.text for part in SentenceScreen(found, room).chosen(width)]
     assert together in shown
     lines = sum(1 if width is None else len(break_lines(text, width).split("\n")) for text in shown)

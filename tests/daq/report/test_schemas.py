@@ -39,7 +39,9 @@ def test_a_schema_allows_no_other_key(report: Any) -> None:
     objects = list(_objects(TypeAdapter(report).json_schema()))
     assert objects
     of_ident = {Source.__name__, "Recording", Diagnosis.__name__}
-    assert {one["title"] for one in objects if one.get("additionalProperties") is not False} <= of_ident
+    assert {
+        one["title"] for one in objects if one.get("additionalProperties") is not False
+    } <= of_ident
 
 
 def test_every_verb_with_json_has_a_schema() -> None:
@@ -76,19 +78,25 @@ def test_every_type_of_a_document_is_published() -> None:
     for module in pkgutil.iter_modules(daq.report.__path__, "daq.report."):
         importlib.import_module(module.name)
     made = {kind for kind in _subclasses(Report) if kind.__module__.startswith("daq.")}
-    published = {found for kind in (*REPORTS.values(), ErrorReport, *FILES) for found in _reports_in(kind)}
+    published = {
+        found for kind in (*REPORTS.values(), ErrorReport, *FILES) for found in _reports_in(kind)
+    }
     assert {kind.__name__ for kind in made - published} == set()
 
 
 def _kinds(annotation: Any) -> set[Any]:
     """Members of a union."""
-    return set(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else {annotation}
+    if get_origin(annotation) in (Union, UnionType):
+        return set(get_args(annotation))
+    return {annotation}
 
 
 def _named(module: ModuleType, tree: ast.Module, name: str) -> Any:
     """What a name of a module is, also where a verb imports it when it runs."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and name in {one.asname or one.name for one in node.names}:
+        if isinstance(node, ast.ImportFrom) and name in {
+            one.asname or one.name for one in node.names
+        }:
             return getattr(importlib.import_module(str(node.module)), name)
     return getattr(module, name)
 
@@ -97,7 +105,11 @@ def _made_by(module: ModuleType, tree: ast.Module, value: ast.expr) -> set[Any]:
     """Types of a value: of a call, or of what is assigned to a name."""
     if isinstance(value, ast.Name):
         places = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
-        given = [one.value for one in places if value.id in {getattr(target, "id", "") for target in one.targets}]
+        given = [
+            one.value
+            for one in places
+            if value.id in {getattr(target, "id", "") for target in one.targets}
+        ]
         return set[Any]().union(*(_made_by(module, tree, one) for one in given))
     assert isinstance(value, ast.Call), ast.unparse(value)
     assert isinstance(value.func, ast.Name), ast.unparse(value)
@@ -128,4 +140,6 @@ def test_a_verb_prints_the_types_that_are_published_for_it(place: str) -> None:
         calls = [node for node in nodes if ast.unparse(node.func) == "print_json"]
         printed = printed.union(*(_made_by(module, tree, call.args[0]) for call in calls))
     names = [verb.name for verb in verbs]
-    assert printed == set[Any]().union(*(_kinds(REPORTS[name]) for name in names if name in REPORTS))
+    assert printed == set[Any]().union(
+        *(_kinds(REPORTS[name]) for name in names if name in REPORTS)
+    )

@@ -82,7 +82,9 @@ def test_no_name_where_nothing_was_added(evidence: Evidence) -> None:
     assert names_by_split(_turn(evidence, None, _found(LOSS, np.ones(FOLDS)))) == ()
 
 
-@given(st.lists(st.tuples(st.floats(0.0, 9.0), st.floats(0.0, 9.0)), min_size=FOLDS, max_size=FOLDS))
+@given(
+    st.lists(st.tuples(st.floats(0.0, 9.0), st.floats(0.0, 9.0)), min_size=FOLDS, max_size=FOLDS)
+)
 def test_each_split_chooses_one_name(pairs: list[tuple[float, float]]) -> None:
     squares = np.array(pairs).T
     added = _found(FRICTION, squares[0], LOSS)

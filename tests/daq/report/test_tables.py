@@ -1,4 +1,6 @@
-"""Every table of the command line on a terminal of 80 columns and in a pipe: each number is whole."""
+"""Every table of the command line on a terminal of 80 columns and in a pipe:
+each number is whole.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ from tests.daq.calibrations import demo_calibration
 from tests.daq.histories import fill, ledger_in
 
 AXES = tuple(f"gantry-axis-number-{number}" for number in range(1, 15))
-GAINS = tuple(Gain(axis, -1234.5 - n, 0.0123 + 0.001 * n, "Nm/A", -1200.25 - n) for n, axis in enumerate(AXES))
+GAINS = tuple(
+    Gain(axis, -1234.5 - n, 0.0123 + 0.001 * n, "Nm/A", -1200.25 - n) for n, axis in enumerate(AXES)
+)
 ERROR = RelativeError(tuple(10.25 + n for n in range(14)), 12.34)
 CALIBRATION = replace(demo_calibration(), gains=GAINS, relative_error_percent=ERROR)
 
@@ -67,16 +71,24 @@ CALIBRATION = replace(demo_calibration(), gains=GAINS, relative_error_percent=ER
 def cell(checkout: Path) -> Cell:
     """The demo cell, with long names."""
     demo = load_cell(checkout / "configs/cells/demo.yaml")
-    return replace(demo, axes=tuple(replace(axis, name=name) for axis, name in zip(demo.axes, AXES, strict=False)))
+    return replace(
+        demo,
+        axes=tuple(replace(axis, name=name) for axis, name in zip(demo.axes, AXES, strict=False)),
+    )
 
 
 @pytest.fixture(scope="module")
-def series(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, tuple[Series, ...], dict[str, str]]:
+def series(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Any, tuple[Series, ...], dict[str, str]]:
     """Entries of a history, its series, and what was done with each calibration."""
     ledger = ledger_in(tmp_path_factory.mktemp("tables"))
     fill(ledger, 6, lambda week: (1.0, 1.0, 1.0, 1.0 + 0.01 * week, 1.0, 1.0))
     entries = read_history(ledger).entries
-    actions = {entry.digest: "applied by a person with quite a long name, rolled back by another" for entry in entries}
+    actions = {
+        entry.digest: "applied by a person with quite a long name, rolled back by another"
+        for entry in entries
+    }
     return entries, watch(entries, ()), actions
 
 
@@ -126,7 +138,9 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
     values = np.array([gain.value for gain in GAINS])
-    trials = tuple(EstimatorTrial(name, 40.0, 20.0, values, np.full(14, 12.34), 123.45) for name in ESTIMATORS)
+    trials = tuple(
+        EstimatorTrial(name, 40.0, 20.0, values, np.full(14, 12.34), 123.45) for name in ESTIMATORS
+    )
     return fit.comparison_tables(EstimatorComparison(trials), AXES)
 
 
@@ -185,7 +199,9 @@ def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 
 def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    contact = SimpleNamespace(axis=2, start_s=12345.67, end_s=12346.78, peak_nm=-1234.0, peak_over_threshold=12.34)
+    contact = SimpleNamespace(
+        axis=2, start_s=12345.67, end_s=12346.78, peak_nm=-1234.0, peak_over_threshold=12.34
+    )
     n = len(cell.axes)
     ones = np.ones((n, 9))
     band = SimpleNamespace(quiet_s=np.full(n, 12345.0), threshold=np.ones(n), alarms_per_hour=0.1)
@@ -212,7 +228,9 @@ def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     parameters = SimpleNamespace(
         torque_change_percent=ERROR,
         exact=True,
-        model=SimpleNamespace(robot=SimpleNamespace(joints=(), closures=()), drive_train=SimpleNamespace(coupled=())),
+        model=SimpleNamespace(
+            robot=SimpleNamespace(joints=(), closures=()), drive_train=SimpleNamespace(coupled=())
+        ),
     )
     robot: Any = SimpleNamespace(parameters=parameters, prior=SimpleNamespace(assumed=()))
     updated: Any = SimpleNamespace(links={axis: f"link-of-{axis}" for axis in AXES}, merged=())
@@ -231,7 +249,10 @@ def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     report: Any = SimpleNamespace(
         joints=[SimpleNamespace(name=axis, **vars(joint)) for axis in AXES],
         actuators=[
-            SimpleNamespace(axis=one.axis, acts_on=f"tendon {one.axis}", gear=one.value, unit="Nm/A") for one in GAINS
+            SimpleNamespace(
+                axis=one.axis, acts_on=f"tendon {one.axis}", gear=one.value, unit="Nm/A"
+            )
+            for one in GAINS
         ],
         torque_change_percent=ERROR,
         exact=False,
@@ -260,16 +281,32 @@ def _full(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
     summary = Summary(GAINS, (("load-friction", AXES[3]),), 3.21, held_out=False, partial=True)
-    results: tuple[Summary | Failure, ...] = (summary, Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4))
+    results: tuple[Summary | Failure, ...] = (
+        summary,
+        Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4),
+    )
     names = ("press-4-in-hall-12-line-7", "gantry-23")
     return fleet_view(
-        [FleetRow(name, "c" * 64, (), (), one, 1234.56) for name, one in zip(names, results, strict=True)]
+        [
+            FleetRow(name, "c" * 64, (), (), one, 1234.56)
+            for name, one in zip(names, results, strict=True)
+        ]
     )
 
 
 def _changes(cell: Cell, _: Any) -> Iterator[RenderableType]:
     changes = tuple(
-        GainChange(one.axis, "drives.gain", n, one.nameplate, one.value, one.std, one.unit, one.nameplate, "1")
+        GainChange(
+            one.axis,
+            "drives.gain",
+            n,
+            one.nameplate,
+            one.value,
+            one.std,
+            one.unit,
+            one.nameplate,
+            "1",
+        )
         for n, one in enumerate(GAINS)
     )
     yield proposal.change_table(changes, NOTHING)
@@ -286,12 +323,18 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
     "bus_views.prediction_view": _monitor,
     "bus_views.scan_table": _scan,
     "fit.comparison_tables": _comparison,
-    "fit.error_table": lambda _cell, _: [fit.error_table("Error", AXES, {"held out, before": ERROR})],
+    "fit.error_table": lambda _cell, _: [
+        fit.error_table("Error", AXES, {"held out, before": ERROR})
+    ],
     "fleet.fleet_view": _fleet,
     "full_parameters.full_parameter_table": _full,
     "full_parameters.gains_with_prior_table": _full,
-    "gains.gain_table": lambda _cell, _: [gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")],
-    "gains.torque_table": lambda _cell, _: [gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)],
+    "gains.gain_table": lambda _cell, _: [
+        gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")
+    ],
+    "gains.torque_table": lambda _cell, _: [
+        gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)
+    ],
     "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],
     "history.calibration_table": lambda _cell, known: [history.calibration_table(*known)],
     "history.history_gain_table": lambda _cell, known: [history.history_gain_table(known[1])],
@@ -308,18 +351,27 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
 
 
 def _calls(tree: ast.AST) -> set[str]:
-    return {node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+    return {
+        node.func.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
 
 
 def test_every_function_that_makes_a_table_has_an_example(checkout: Path) -> None:
-    makers, others = set(), set()
+    makers = set()
+    others = set()
     for path in (checkout / "daq").rglob("*.py"):
         if path == checkout / "daq/report/text.py":
             continue
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)
         functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-        makers |= {f"{path.stem}.{one.name}" for one in functions if {"plain_table", "WholeTable"} & _calls(one)}
+        makers |= {
+            f"{path.stem}.{one.name}"
+            for one in functions
+            if {"plain_table", "WholeTable"} & _calls(one)
+        }
         if "rich.table" in source and "Table" in _calls(tree):
             others.add(path.name)
     assert makers == EXAMPLES.keys()
@@ -335,18 +387,28 @@ def _tables(parts: Iterable[RenderableType]) -> Iterator[Table]:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(name: str, cell: Cell, series: Any) -> None:
+def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(
+    name: str, cell: Cell, series: Any
+) -> None:
     tables = list(_tables(EXAMPLES[name](cell, series)))
     assert tables
     for table in tables:
         assert isinstance(table, WholeTable)
         words = [
-            word for column in table.columns for value in (column.header, *column.cells) for word in str(value).split()
+            word
+            for column in table.columns
+            for value in (column.header, *column.cells)
+            for word in str(value).split()
         ]
         for width, terminal in ((80, True), (PIPE_COLUMNS, False)):
             out = io.StringIO()
             console = Console(
-                file=out, width=width, force_terminal=terminal, color_system=None, soft_wrap=True, highlight=False
+                file=out,
+                width=width,
+                force_terminal=terminal,
+                color_system=None,
+                soft_wrap=True,
+                highlight=False,
             )
             console.print(table)
             shown = out.getvalue()
@@ -362,7 +424,9 @@ def test_a_row_keeps_its_style_in_every_form() -> None:
         for heading in ("axis", "state", "another"):
             table.add_column(heading, no_wrap=True)
         table.add_row("J1", "x" * 15, "y" * 15, style="bold red")
-        Console(file=out, width=width, force_terminal=True, color_system="standard", soft_wrap=True).print(table)
+        Console(
+            file=out, width=width, force_terminal=True, color_system="standard", soft_wrap=True
+        ).print(table)
         assert out.getvalue().count("\x1b[1;31m") >= 2
 
 
@@ -376,14 +440,27 @@ def test_an_error_of_a_fleet_is_below_its_table() -> None:
 
 
 def test_numbers_of_a_log_have_no_exponent_and_none_that_a_person_has_no_use_for() -> None:
-    described = {"stamped_duration_s": 1234567.8, "rate_hz": 1000.0, "wall_minus_monotonic_s": 1.79565e9, "left": 1e-7}
+    described = {
+        "stamped_duration_s": 1234567.8,
+        "rate_hz": 1000.0,
+        "wall_minus_monotonic_s": 1.79565e9,
+        "left": 1e-7,
+    }
     lines = [str(line) for line in log_lines(described, 80)]
-    assert lines == ["stamped duration s  1234568", "rate hz             1000", "left                1e-07"]
+    assert lines == [
+        "stamped duration s  1234568",
+        "rate hz             1000",
+        "left                1e-07",
+    ]
 
 
 def test_a_log_is_described_in_whole_words() -> None:
     digest = "0123456789abcdef" * 4
-    described = {"sha256": digest, "stamped_duration_s": 12345.678, "missing": {f"J{n}": 100 + n for n in range(40)}}
+    described = {
+        "sha256": digest,
+        "stamped_duration_s": 12345.678,
+        "missing": {f"J{n}": 100 + n for n in range(40)},
+    }
     lines = [str(line) for line in log_lines(described, 80)]
     assert max(map(cell_len, lines)) <= 80
     assert f"  {digest}" in lines

@@ -32,7 +32,13 @@ def _shown(parts: list[RenderableType], width: int) -> str:
 def _on_terminal(parts: list[RenderableType], width: int) -> str:
     out = io.StringIO()
     console = Console(
-        file=out, width=width, force_terminal=True, color_system=None, soft_wrap=True, highlight=False, markup=False
+        file=out,
+        width=width,
+        force_terminal=True,
+        color_system=None,
+        soft_wrap=True,
+        highlight=False,
+        markup=False,
     )
     for part in parts:
         console.print(part)
@@ -44,7 +50,10 @@ def _digits(text: str) -> list[str]:
 
 
 @given(
-    st.lists(st.lists(st.floats(0, 1e15).map("{:.9g} ± 0.123456".format), min_size=7, max_size=7), max_size=4),
+    st.lists(
+        st.lists(st.floats(0, 1e15).map("{:.9g} ± 0.123456".format), min_size=7, max_size=7),
+        max_size=4,
+    ),
     st.integers(20, 120),
 )
 def test_every_number_is_whole_at_any_width(rows: list[list[str]], width: int) -> None:
@@ -56,12 +65,17 @@ def test_every_number_is_whole_at_any_width(rows: list[list[str]], width: int) -
     assert all(_digits(value)[0] in text for row in rows for value in row)
 
 
-WORDS = st.text(st.characters(whitelist_categories=("Ll", "Lu", "Nd"), max_codepoint=0x24F), min_size=1, max_size=14)
+WORDS = st.text(
+    st.characters(whitelist_categories=("Ll", "Lu", "Nd"), max_codepoint=0x24F),
+    min_size=1,
+    max_size=14,
+)
 SENTENCES = st.lists(WORDS, max_size=30).map(" ".join)
 
 
 @given(
-    rows=st.lists(st.lists(SENTENCES, min_size=5, max_size=5), min_size=1, max_size=3), wrap=st.sets(st.integers(0, 4))
+    rows=st.lists(st.lists(SENTENCES, min_size=5, max_size=5), min_size=1, max_size=3),
+    wrap=st.sets(st.integers(0, 4)),
 )
 @pytest.mark.parametrize("width", [40, 80, 120])
 def test_no_word_of_a_table_is_broken_or_cut_whatever_columns_wrap(
@@ -72,7 +86,9 @@ def test_no_word_of_a_table_is_broken_or_cut_whatever_columns_wrap(
         table.add_row(*row)
     shown = _on_terminal([table], width)
     words = shown.split()
-    assert [word for row in rows for value in row for word in value.split() if word not in words] == []
+    assert [
+        word for row in rows for value in row for word in value.split() if word not in words
+    ] == []
 
 
 @given(
@@ -90,7 +106,9 @@ def test_columns_share_what_is_free_and_none_gets_more_than_it_wants(
 
 
 @given(st.lists(SENTENCES, max_size=4), st.integers(20, 120), st.integers(0, 6))
-def test_a_long_line_is_broken_between_words_alone(sentences: list[str], width: int, indent: int) -> None:
+def test_a_long_line_is_broken_between_words_alone(
+    sentences: list[str], width: int, indent: int
+) -> None:
     text = "\n".join(" " * indent + sentence for sentence in sentences)
     broken = break_lines(text, width)
     assert broken.split() == text.split()
@@ -101,10 +119,14 @@ def test_a_long_line_is_broken_between_words_alone(sentences: list[str], width: 
 
 
 def test_a_command_is_not_broken() -> None:
-    command = "drivegain record press-4/cells/press-4.yaml plan.yaml --out loaded.mcap --enable-motion"
+    command = (
+        "drivegain record press-4/cells/press-4.yaml plan.yaml --out loaded.mcap --enable-motion"
+    )
     for line in (f"Next: {command}", command, f"  {command}", "  --yes --base " + "0" * 60):
         assert break_lines(line, 40) == line
-    lines = break_lines(f"word after word comes before `drivegain scan CELL` and {'x ' * 30}", 60).split("\n")
+    lines = break_lines(
+        f"word after word comes before `drivegain scan CELL` and {'x ' * 30}", 60
+    ).split("\n")
     assert any("`drivegain scan CELL`" in line for line in lines)
 
 
@@ -132,7 +154,9 @@ def test_every_line_of_a_verb_is_broken_between_words_on_a_terminal(
 def test_a_digest_is_on_one_line_of_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
     assert not sys.stdout.isatty()
     console = output_console()
-    for line in log_lines({"sha256": SHA256, "a key of many letters and more": "x" * 200}, console.width):
+    for line in log_lines(
+        {"sha256": SHA256, "a key of many letters and more": "x" * 200}, console.width
+    ):
         console.print(line)
     lines = capsys.readouterr().out.splitlines()
     assert any(SHA256 in line for line in lines)

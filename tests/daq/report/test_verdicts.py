@@ -25,12 +25,16 @@ NO_CHANGE = ErrorChange(PairedChange(-1.0, 1.0, 9), (PairedChange(-1.0, 1.0, 9),
 def _judged(judgement: Judgement, *, written: bool) -> EffectVerdict:
     before = RelativeError((3.0, 4.0), 3.5)
     after = RelativeError((3.0, 3.9), 3.4)
-    return EffectVerdict(PlacedEffect(Spring(), 1), judgement, "because", NO_CHANGE, before, after, written=written)
+    return EffectVerdict(
+        PlacedEffect(Spring(), 1), judgement, "because", NO_CHANGE, before, after, written=written
+    )
 
 
 def _said(verdict: EffectVerdict) -> list[str]:
     """The sentences of a fit, of which only the verdicts and the names of the axes count."""
-    fitted = SimpleNamespace(steps=(SimpleNamespace(verdicts=(verdict,)),), cell=SimpleNamespace(place_names=AXES))
+    fitted = SimpleNamespace(
+        steps=(SimpleNamespace(verdicts=(verdict,)),), cell=SimpleNamespace(place_names=AXES)
+    )
     return list(verdict_sentences(cast(Fit, fitted)))
 
 
@@ -38,12 +42,18 @@ def _said(verdict: EffectVerdict) -> list[str]:
     ("judgement", "written", "words"),
     [
         (Judgement.UNDECIDED, False, "Undecided, and not written: spring on J2: because; 3.50 %"),
-        (Judgement.UNDECIDED, True, "Undecided, and written because of --write-undecided: spring on J2"),
+        (
+            Judgement.UNDECIDED,
+            True,
+            "Undecided, and written because of --write-undecided: spring on J2",
+        ),
         (Judgement.REFUTED, False, "Held-out runs refute spring on J2: because; 3.50 %"),
         (Judgement.CONFIRMED, False, "Held-out runs confirm spring on J2, but"),
     ],
 )
-def test_what_is_not_confirmed_is_named_with_both_errors(judgement: Judgement, written: bool, words: str) -> None:
+def test_what_is_not_confirmed_is_named_with_both_errors(
+    judgement: Judgement, written: bool, words: str
+) -> None:
     (sentence,) = _said(_judged(judgement, written=written))
     assert sentence.startswith(words)
 
@@ -63,8 +73,12 @@ def test_the_document_has_the_verdict() -> None:
     )
 
 
-@pytest.mark.parametrize(("after", "confirmed"), [(5.76, True), (5.81, True), (5.83, False), (4.0, True)])
-def test_the_write_back_refuses_no_effect_for_less_than_a_hundredth(after: float, confirmed: bool) -> None:
+@pytest.mark.parametrize(
+    ("after", "confirmed"), [(5.76, True), (5.81, True), (5.83, False), (4.0, True)]
+)
+def test_the_write_back_refuses_no_effect_for_less_than_a_hundredth(
+    after: float, confirmed: bool
+) -> None:
     assert AcceptedEffect("spring", "J2", {}, (), 5.76, after).is_confirmed == confirmed
 
 

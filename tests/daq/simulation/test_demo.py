@@ -23,7 +23,9 @@ from tests.daq.jobs.rig import BEGAN
 NOTHING_LOST = StreamStatistics(*(0 for _ in StreamStatistics.__slots__))
 
 
-def test_recordings_of_an_earlier_demonstration_are_named_before_they_are_replaced(tmp_path: Path) -> None:
+def test_recordings_of_an_earlier_demonstration_are_named_before_they_are_replaced(
+    tmp_path: Path,
+) -> None:
     logs = (tmp_path / "bare-1.mcap", tmp_path / "loaded-1.mcap")
     assert demo.make_room(tmp_path, logs) == ()
     logs[0].touch()
@@ -49,11 +51,15 @@ def test_an_invalid_run_is_made_again_and_said_so(
     monkeypatch.setattr(demo, "TO_DECISION", (Record(),))
     cell_file = checkout / "configs/cells/demo.yaml"
     cell = load_cell(cell_file)
-    moves = plan(cell, seed=1, duration_s=6.0, exchanges=0, largest_condition=1e9, largest_std_percent=1e9)
+    moves = plan(
+        cell, seed=1, duration_s=6.0, exchanges=0, largest_condition=1e9, largest_std_percent=1e9
+    )
     for name in demo.PLANS:
         save_plan(replace(moves, moves=moves.moves[:1]), tmp_path / f"plan-{name}.yaml")
     settings = Settings(tmp_path, shipped_simulation(), 1, 10.0)
-    stages = DemoStages(settings, cell, lambda: BEGAN, ProgressReporter(steps.append, lambda *_: None))
+    stages = DemoStages(
+        settings, cell, lambda: BEGAN, ProgressReporter(steps.append, lambda *_: None)
+    )
     if spoilt > RETRIES:
         with pytest.raises(RunInvalid, match="3 late answers"):
             stages.run(cell_file)

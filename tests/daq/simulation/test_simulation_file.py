@@ -35,26 +35,71 @@ def test_an_unknown_payload_is_refused(checkout: Path) -> None:
     ("old", "new", "kind", "message"),
     [
         ("axis: J3", "axis: J9", ConfigurationInconsistent, "J1 to J6"),
-        ("substeps:", "tuned_with: anvil\nsubsteps:", ConfigurationInconsistent, "tuned_with: found 'anvil'"),
+        (
+            "substeps:",
+            "tuned_with: anvil\nsubsteps:",
+            ConfigurationInconsistent,
+            "tuned_with: found 'anvil'",
+        ),
         ("axis: J3", "axis: elbow", SchemaMismatch, r"effects\[0\].axis"),
         ("start_deg: [0.0, ", "start_deg: [", ConfigurationInconsistent, "5 angles"),
         ("serial: 1001", "serail: 1001", SchemaMismatch, "serial"),
-        ("serial: 1001", "serial: 1001, torque_disturbance_percent: 11", SchemaMismatch, "torque_disturbance_percent"),
+        (
+            "serial: 1001",
+            "serial: 1001, torque_disturbance_percent: 11",
+            SchemaMismatch,
+            "torque_disturbance_percent",
+        ),
         ("gain_nm_per_a: 33.9", "gain_nm_per_a: 0.0", ConfigurationInconsistent, "not zero"),
-        ("gain_nm_per_a: 33.9", "gain_nm_per_a: -1.0e308", ConfigurationInconsistent, r"axes\[0\].gain_nm_per_a"),
-        ("rated_current_a: 2.0", "rated_current_a: 1.0e-300", ConfigurationInconsistent, "rated_current_a"),
-        ("motor_inertia_kg_m2: 0.35", "motor_inertia_kg_m2: 1.0e300", ConfigurationInconsistent, "at most ±1e.09"),
+        (
+            "gain_nm_per_a: 33.9",
+            "gain_nm_per_a: -1.0e308",
+            ConfigurationInconsistent,
+            r"axes\[0\].gain_nm_per_a",
+        ),
+        (
+            "rated_current_a: 2.0",
+            "rated_current_a: 1.0e-300",
+            ConfigurationInconsistent,
+            "rated_current_a",
+        ),
+        (
+            "motor_inertia_kg_m2: 0.35",
+            "motor_inertia_kg_m2: 1.0e300",
+            ConfigurationInconsistent,
+            "at most ±1e.09",
+        ),
         (
             "coefficient: 0.12",
             "coefficient: 1.0e300",
             ConfigurationInconsistent,
             "parameters.coefficient",
         ),
-        ("[32, 0, 0, 0, 0, 0]", "[1.0e200, 0, 0, 0, 0, 0]", ConfigurationInconsistent, r"ratio\[0\]"),
+        (
+            "[32, 0, 0, 0, 0, 0]",
+            "[1.0e200, 0, 0, 0, 0, 0]",
+            ConfigurationInconsistent,
+            r"ratio\[0\]",
+        ),
         ("mass_kg: 4.59", "mass_kg: 1.0e308", ConfigurationInconsistent, "payloads.disc.mass_kg"),
-        ("centre_m: [-0.06", "centre_m: [1.0e200", ConfigurationInconsistent, "payloads.disc.centre_m: .* mm"),
-        ("[0.016, 0.0, 0.0, 0.016, 0.0,", "[-1, 0.0, 0.0, -1, 0.0,", ConfigurationInconsistent, "none below 0"),
-        ("[0.016, 0.0, 0.0, 0.016, 0.0,", "[1.0e200, 0.0, 0.0, 1, 0.0,", ConfigurationInconsistent, "of gyration"),
+        (
+            "centre_m: [-0.06",
+            "centre_m: [1.0e200",
+            ConfigurationInconsistent,
+            "payloads.disc.centre_m: .* mm",
+        ),
+        (
+            "[0.016, 0.0, 0.0, 0.016, 0.0,",
+            "[-1, 0.0, 0.0, -1, 0.0,",
+            ConfigurationInconsistent,
+            "none below 0",
+        ),
+        (
+            "[0.016, 0.0, 0.0, 0.016, 0.0,",
+            "[1.0e200, 0.0, 0.0, 1, 0.0,",
+            ConfigurationInconsistent,
+            "of gyration",
+        ),
     ],
 )
 def test_a_wrong_file_is_refused(
@@ -80,19 +125,49 @@ def test_a_closed_chain_is_read(checkout: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "kind", "message"),
     [
-        ("second: rod-2-tip", "second: rod-3-tip", ConfigurationInconsistent, r"closures\[0\].second.*rod-3-tip"),
+        (
+            "second: rod-2-tip",
+            "second: rod-3-tip",
+            ConfigurationInconsistent,
+            r"closures\[0\].second.*rod-3-tip",
+        ),
         ("second: rod-2-tip", "second: rod-1-tip", ConfigurationInconsistent, "two links"),
-        ("directions: [x, y]", "directions: [x, x]", ConfigurationInconsistent, "each direction once"),
+        (
+            "directions: [x, y]",
+            "directions: [x, x]",
+            ConfigurationInconsistent,
+            "each direction once",
+        ),
         ("directions: [x, y]", "directions: []", SchemaMismatch, r"closures\[0\].directions"),
         ("directions: [x, y]", "directions: [x, w]", SchemaMismatch, r"closures\[0\].directions"),
-        ("motors: [crank-1, crank-2]", "motors: [crank-1]", ConfigurationInconsistent, "2 different joints"),
-        ("motors: [crank-1, crank-2]", "motors: [crank-1, hip]", ConfigurationInconsistent, "crank-1, hip"),
+        (
+            "motors: [crank-1, crank-2]",
+            "motors: [crank-1]",
+            ConfigurationInconsistent,
+            "2 different joints",
+        ),
+        (
+            "motors: [crank-1, crank-2]",
+            "motors: [crank-1, hip]",
+            ConfigurationInconsistent,
+            "crank-1, hip",
+        ),
         ("platform: plate", "platform: tray", ConfigurationInconsistent, "a link of the URDF"),
         ("elbow-1: 0,", "", ConfigurationInconsistent, "no elbow-1"),
-        ("  elbow-2: {viscous", "  crank-2: {viscous", ConfigurationInconsistent, "a joint with a motor"),
+        (
+            "  elbow-2: {viscous",
+            "  crank-2: {viscous",
+            ConfigurationInconsistent,
+            "a joint with a motor",
+        ),
         ("  elbow-2: {viscous", "  knee: {viscous", ConfigurationInconsistent, "knee"),
         ("effects: []", "effects: [{name: stribeck}]", SchemaMismatch, "one of them"),
-        ("effects: []", "assembly_mm: {crank-1: 0}\neffects: []", ConfigurationInconsistent, "prismatic"),
+        (
+            "effects: []",
+            "assembly_mm: {crank-1: 0}\neffects: []",
+            ConfigurationInconsistent,
+            "prismatic",
+        ),
     ],
 )
 def test_a_wrong_closed_chain_is_refused(
@@ -113,7 +188,8 @@ def test_a_serial_robot_has_no_key_of_a_closed_chain(checkout: Path, tmp_path: P
     path = tmp_path / "gantry.yaml"
     (tmp_path / "gantry-plant.urdf").write_bytes((folder / "gantry-plant.urdf").read_bytes())
     path.write_text(
-        (folder / "gantry.yaml").read_text(encoding="utf-8") + "motors: [X, Y, Z, A, B]\n", encoding="utf-8"
+        (folder / "gantry.yaml").read_text(encoding="utf-8") + "motors: [X, Y, Z, A, B]\n",
+        encoding="utf-8",
     )
     with pytest.raises(ConfigurationInconsistent, match="without closures"):
         load_simulation(path)
@@ -124,7 +200,10 @@ def test_only_simulate_and_demo_import_the_truth(checkout: Path) -> None:
     for room in ("daq", "ident", "drivers"):
         for path in (checkout / room).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.Import):
+                    names = [a.name for a in node.names]
+                else:
+                    names = []
                 if isinstance(node, ast.ImportFrom) and node.module:
                     names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
                 if "daq.simulation.simulation_file" in names:

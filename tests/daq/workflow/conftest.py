@@ -13,10 +13,17 @@ from daq.workflow.fit import calibration_of, fit
 
 
 @pytest.fixture(scope="session")
-def real(checkout: Path, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def real(
+    checkout: Path, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
     """A calibration file of the real TX-40 with its gains fixed, and the log that it rests on."""
     folder = tmp_path_factory.mktemp("tx40")
-    log, file = folder / "tx40.mcap", folder / "calibration.yaml"
-    import_recording(checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test")
-    save_calibration(calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file)
+    log = folder / "tx40.mcap"
+    file = folder / "calibration.yaml"
+    import_recording(
+        checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test"
+    )
+    save_calibration(
+        calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file
+    )
     return file, log

@@ -12,7 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figaroh.identification.parameter import add_standard_additional_parameters, get_standard_parameters  # type: ignore[import-not-found]
+from figaroh.identification.parameter import (  # type: ignore[import-not-found]
+    add_standard_additional_parameters,
+    get_standard_parameters,
+)
 from figaroh.tools.regressor import build_regressor_basic  # type: ignore[import-not-found]
 from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
 

@@ -1,4 +1,6 @@
-"""Cells of any robot: prismatic axes in mm, leads, gains in N/A, and a bus that is long enough for its axes."""
+"""Cells of any robot: prismatic axes in mm, leads, gains in N/A,
+and a bus that is long enough for its axes.
+"""
 
 from __future__ import annotations
 
@@ -64,10 +66,14 @@ def test_the_gantry_is_read_in_si_units() -> None:
 
 
 def test_a_turn_of_the_screw_is_its_lead() -> None:
-    scale = scaling(GANTRY, Readback(tuple(AxisReadback(name, 0.003) for name in GANTRY.axis_names)))
+    scale = scaling(
+        GANTRY, Readback(tuple(AxisReadback(name, 0.003) for name in GANTRY.axis_names))
+    )
     assert scale.joint_position(np.array([0, 0, 65536, 0, 0])) == pytest.approx([0, 0, 0.020, 0, 0])
     # Both belt motors a turn forwards: X alone moves, by a fifth of the pulley's circumference.
-    assert scale.joint_position(np.array([65536, 65536, 0, 0, 0])) == pytest.approx([0.030, 0, 0, 0, 0])
+    assert scale.joint_position(np.array([65536, 65536, 0, 0, 0])) == pytest.approx(
+        [0.030, 0, 0, 0, 0]
+    )
 
 
 @pytest.mark.parametrize("name", ["gantry", "seven-axis", "rx90", "kr270"])
@@ -95,25 +101,37 @@ def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
     [
         ("position_mm: [0, 1400], velocity_mm_s: 1500, acceleration_mm_s2: 6000",
          "position_deg: [0, 140], velocity_deg_s: 150, acceleration_deg_s2: 600",
-         "limits in deg, and joint X of the URDF is prismatic; expected position_mm, velocity_mm_s"),
+         "limits in deg, and joint X of the URDF is prismatic; expected position_mm, "
+         "velocity_mm_s"),
         ("position_deg: [-175, 175], velocity_deg_s: 240, acceleration_deg_s2: 1200",
          "position_mm: [-175, 175], velocity_mm_s: 240, acceleration_mm_s2: 1200",
          "limits in mm, and joint A of the URDF is revolute; expected position_deg"),
         ("[0, 1400]", "[0, 1.4]", "range of at least 5 mm; are these m"),
         ("[0, 1400]", "[0, 1400000]", "at most ±100000 mm; are these counts or µm"),
         ("[0, 500]", "[500, 0]", "the lower limit first"),
-        ("lead_mm: 20.0 ", "zero_offset_deg: 3.0\n    lead_mm: 20.0 ", "deg, and joint Z .* expected zero_offset_mm"),
-        ("nameplate_gain_nm_per_a: 12.0", "lead_mm: 5\n    nameplate_gain_nm_per_a: 12.0", "only a prismatic joint"),
-        ("nameplate_gain_n_per_a: 157.1", "nameplate_gain_nm_per_a: 157.1", "a gain in Nm, .* joint Z, which is pris"),
-        ("nameplate_gain_n_per_a: 157.1", "nameplate_gain: 157.1\n    gain_unit: Nm/mV", "gain_unit: .* N per"),
-        ("nameplate_gain_nm_per_a: 12.0", "nameplate_gain_n_per_a: 12.0", "a gain in N, .* joint A, which is revolute"),
+        ("lead_mm: 20.0 ", "zero_offset_deg: 3.0\n    "
+                           "lead_mm: 20.0 ", "deg, and joint Z .* expected zero_offset_mm"),
+        ("nameplate_gain_nm_per_a: 12.0", "lead_mm: 5\n    "
+                                          "nameplate_gain_nm_per_a: 12.0", "only a prismatic joint"),  # noqa: E501
+        ("nameplate_gain_n_per_a: 157.1", "nameplate_gain_nm_per_a: 157.1", "a gain in Nm, .* "
+                                                                            "joint Z, "
+                                                                            "which is pris"),
+        ("nameplate_gain_n_per_a: 157.1", "nameplate_gain: 157.1\n    "
+                                          "gain_unit: Nm/mV", "gain_unit: .* N per"),
+        ("nameplate_gain_nm_per_a: 12.0", "nameplate_gain_n_per_a: 12.0", "a gain in N, .* joint "
+                                                                          "A, which is revolute"),
         ("standstill_mm_s: [8, 8, 5, null, null]", "#", "0 speeds; expected 5"),
-        ("standstill_mm_s: [8, 8, 5, null, null]", "standstill_mm_s: [8, 8, 5, null]", "4 speeds; expected 5"),
-        ("[8, 8, 5, null, null]", "[8, 8, null, null, null]", "None for Z, which is prismatic; expected a speed"),
-        ("[null, null, null, 0.03, 0.03]", "[0.1, null, null, 0.03, 0.03]", "0.1 for X, .* expected null"),
+        ("standstill_mm_s: [8, 8, 5, null, "
+         "null]", "standstill_mm_s: [8, 8, 5, null]", "4 speeds; expected 5"),
+        ("[8, 8, 5, null, null]", "[8, 8, null, null, "
+                        "null]", "None for Z, which is prismatic; expected a speed"),
+        ("[null, null, null, 0.03, "
+         "0.03]", "[0.1, null, null, 0.03, 0.03]", "0.1 for X, .* expected null"),
     ],
 )  # fmt: skip
-def test_mm_and_degrees_are_not_confused(configurations: Path, old: str, new: str, message: str) -> None:
+def test_mm_and_degrees_are_not_confused(
+    configurations: Path, old: str, new: str, message: str
+) -> None:
     path = _spoil(configurations / "cells/gantry.yaml", (old, new))
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(path)
@@ -123,20 +141,29 @@ def test_limits_in_metres_are_recognised_by_the_urdf(configurations: Path) -> No
     path = _spoil(configurations / "cells/gantry.yaml", ("[0, 1400]", "[0, 14]"))
     urdf = configurations / "robots/gantry.urdf"
     _spoil(urdf, ('lower="0.0" upper="1.4"', 'lower="0.0" upper="14.2"'))
-    with pytest.raises(ConfigurationInconsistent, match="the numbers of the URDF in m; expected mm; multiply by 1e"):
+    with pytest.raises(
+        ConfigurationInconsistent, match="the numbers of the URDF in m; expected mm; multiply by 1e"
+    ):
         load_cell(path)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("velocity_mm_s: 600", "velocity_deg_s: 600", r"axes\[2\].limits: .*for a prismatic joint position_mm"),
+        (
+            "velocity_mm_s: 600",
+            "velocity_deg_s: 600",
+            r"axes\[2\].limits: .*for a prismatic joint "
+            r"position_mm",
+        ),
         ("lead_mm: 20.0", "lead_mm: 0.0", r"axes\[2\]: .*not zero"),
         ("nameplate_gain_n_per_a: 157.1", "gain_unit: N/A", "nameplate_gain_n_per_a"),
         ("lead_mm: 20.0", "lead_m: 0.02", "unknown key 'lead_m'.*lead_mm"),
     ],
 )
-def test_a_misspelt_prismatic_axis_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
+def test_a_misspelt_prismatic_axis_is_refused(
+    configurations: Path, old: str, new: str, message: str
+) -> None:
     path = _spoil(configurations / "cells/gantry.yaml", (old, new))
     with pytest.raises(SchemaMismatch, match=message):
         load_cell(path)
@@ -156,7 +183,10 @@ def test_positions_outside_the_limits_are_reported_in_mm() -> None:
 
 @pytest.mark.parametrize(
     ("ends_m", "said"),
-    [((0.7, 1.1), "most likely the zero is wrong: moved by -745 to -155 mm"), ((0.0, 1.1), "mm were taken for m")],
+    [
+        ((0.7, 1.1), "most likely the zero is wrong: moved by -745 to -155 mm"),
+        ((0.0, 1.1), "mm were taken for m"),
+    ],
     ids=["as many as the axis can make", "more"],
 )
 def test_positions_that_another_zero_brings_within_the_limits_are_not_blamed_on_units(
@@ -172,7 +202,9 @@ def test_positions_that_another_zero_brings_within_the_limits_are_not_blamed_on_
 def test_one_start_a_joint(tmp_path: Path) -> None:
     for name in ("gantry.yaml", "gantry-plant.urdf"):
         shutil.copyfile(CHECKOUT / "configs/simulation" / name, tmp_path / name)
-    path = _spoil(tmp_path / "gantry.yaml", ("[700, 450, 200, null, null]", "[700, 450, null, null, null]"))
+    path = _spoil(
+        tmp_path / "gantry.yaml", ("[700, 450, 200, null, null]", "[700, 450, null, null, null]")
+    )
     with pytest.raises(ConfigurationInconsistent, match="joint 3"):
         load_simulation(path)
     _spoil(path, ("[700, 450, null, null, null]", "[700, 450, 200, null]"))
@@ -183,7 +215,11 @@ def test_one_start_a_joint(tmp_path: Path) -> None:
 ENTRY = st.sampled_from((0.0, 0.0, 1.0, -5.0, 50.0, 314.159))
 
 
-@given(st.integers(1, 6).flatmap(lambda n: st.lists(st.lists(ENTRY, min_size=n, max_size=n), min_size=n, max_size=n)))
+@given(
+    st.integers(1, 6).flatmap(
+        lambda n: st.lists(st.lists(ENTRY, min_size=n, max_size=n), min_size=n, max_size=n)
+    )
+)
 def test_the_joint_of_a_gain_is_that_of_its_reduction(rows: list[list[float]]) -> None:
     ratio = np.array(rows)
     assume(np.linalg.matrix_rank(ratio) == len(ratio) and np.linalg.cond(ratio) < 1e6)
@@ -203,9 +239,15 @@ def test_seven_axes_do_not_fit_into_a_millisecond(configurations: Path) -> None:
     timed = [("interface: virtual", "interface: socketcan"), ("pacing: lockstep", "pacing: timed")]
     assert load_cell(_spoil(configurations / "cells/seven-axis.yaml", *timed)).sync is not None
     path = _spoil(configurations / "cells/seven-axis.yaml", ("period_us: 2000", "period_us: 1000"))
-    with pytest.raises(ConfigurationInconsistent, match=r"answers of 7 axes.* by 89 % on average, 100 % .*: 1112 or"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"answers of 7 axes.* by 89 % on average, "
+        r"100 % .*: 1112 or",
+    ):
         load_cell(path)
-    _spoil(path, ("pacing: timed", "pacing: lockstep"), ("interface: socketcan", "interface: virtual"))
+    _spoil(
+        path, ("pacing: timed", "pacing: lockstep"), ("interface: socketcan", "interface: virtual")
+    )
     assert load_cell(path).sync is not None
 
 
@@ -213,7 +255,8 @@ def test_a_picture_says_newton_where_the_joint_slides() -> None:
     time_s = np.linspace(0.0, 1.0, 50)
     force = np.stack([np.sin(9 * time_s), np.cos(9 * time_s)], axis=1)
     torque, sliding = (
-        plot_torques(time_s, force, 0.9 * force, ("Z", "A"), forces=forces) for forces in (("Nm", "Nm"), ("N", "Nm"))
+        plot_torques(time_s, force, 0.9 * force, ("Z", "A"), forces=forces)
+        for forces in (("Nm", "Nm"), ("N", "Nm"))
     )
     assert torque != sliding
 

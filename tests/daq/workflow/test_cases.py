@@ -1,4 +1,6 @@
-"""The paper's cases, and the tables of their validation: on recordings whose truth the tests know."""
+"""The paper's cases, and the tables of their validation:
+on recordings whose truth the tests know.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +23,23 @@ from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.environment import shipped_configurations
 from daq.errors import LogsDiffer
 from daq.log.reader import LossyLogs
-from daq.report.paper_tables import condition_table, mass_tables, paper_error_table, paper_gain_table, parameter_table
+from daq.report.paper_tables import (
+    condition_table,
+    mass_tables,
+    paper_error_table,
+    paper_gain_table,
+    parameter_table,
+)
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.cases import CASES, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
+from daq.workflow.cases import (
+    CASES,
+    ReducedLogs,
+    calibration_of_case,
+    essential_fit,
+    fit_case,
+    reduce_logs,
+)
 from daq.workflow.choices import Known
 from daq.workflow.fit import fit
 from daq.workflow.validate import CrossValidation, Mass, cross_validate
@@ -39,7 +54,9 @@ pytestmark = pytest.mark.slow
 
 CREATED = datetime(2025, 1, 2, tzinfo=UTC)
 PLATE = Payload("plate", "b")
-"""The same body as the disc, of which the log says nothing: a fit that finds its mass finds 4.59 kg."""
+"""The same body as the disc, of which the log says nothing:
+a fit that finds its mass finds 4.59 kg.
+"""
 
 
 @dataclass(frozen=True)
@@ -49,20 +66,35 @@ class Shelf:
     cell: Cell
     runs: dict[str, Run]
 
-    def load(self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load(
+        self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         return self.runs[path.name], cell or self.cell
 
 
 @pytest.fixture(scope="module")
 def shelf() -> Shelf:
-    """Two runs without load, two with the disc, one of each unseen, and two with an unweighed plate."""
-    truth, rng = tx40_truth(), np.random.default_rng(5)
+    """Two runs without load, two with the disc, one of each unseen,
+    and two with an unweighed plate.
+    """
+    truth = tx40_truth()
+    rng = np.random.default_rng(5)
     drawn = {name: value for name, value in PAYLOAD_TRUTH.items() if name != "m"}
     cell = replace(
         load_cell(shipped_configurations() / "cells" / "demo.yaml"),
-        payloads=(WeighedPayload("disc", "a", 4.59, 0.005, drawn), WeighedPayload("plate", "z", 4.5, 0.005, {})),
+        payloads=(
+            WeighedPayload("disc", "a", 4.59, 0.005, drawn),
+            WeighedPayload("plate", "z", 4.5, 0.005, {}),
+        ),
     )
-    mounted = {"bare1": None, "disc1": MOUNTED, "bare2": None, "disc2": MOUNTED, "bare3": None, "disc3": MOUNTED}
+    mounted = {
+        "bare1": None,
+        "disc1": MOUNTED,
+        "bare2": None,
+        "disc2": MOUNTED,
+        "bare3": None,
+        "disc3": MOUNTED,
+    }
     runs = {}
     for index, (name, payload) in enumerate({**mounted, "plate1": PLATE, "plate2": PLATE}.items()):
         runs[name] = replace(record(truth, name, rng, payload, noise_a=0.1), digest=f"{index:064x}")
@@ -112,8 +144,17 @@ def _error(calibration: Calibration) -> float:
 def test_every_case_is_what_it_says(calibrations: dict[str, Calibration]) -> None:
     nameplate = [gain.nameplate for gain in calibrations["ml"].gains]
     assert [gain.value for gain in calibrations["manufacturer"].gains] == nameplate
-    for name, own in {"manufacturer": 10, "case-1": 0, "case-2": 9, "case-3": 0, "case-4": 9, "ml": 9}.items():
-        of_payload = [parameter for parameter in calibrations[name].parameters if ":" in parameter.name]
+    for name, own in {
+        "manufacturer": 10,
+        "case-1": 0,
+        "case-2": 9,
+        "case-3": 0,
+        "case-4": 9,
+        "ml": 9,
+    }.items():
+        of_payload = [
+            parameter for parameter in calibrations[name].parameters if ":" in parameter.name
+        ]
         assert sum(parameter.std > 0.0 for parameter in of_payload) == own
         assert {parameter.name for parameter in of_payload} == {f"{p}:a" for p in LINK_PARAMETERS}
     assert [calibrations[f"case-{n}"].method for n in (1, 2, 3, 4)] == ["wls", "wls", "tls", "tls"]
@@ -146,13 +187,16 @@ def test_one_reading_gives_what_fit_gives(reduced: ReducedLogs) -> None:
     found = fit_case(reduced, Method.ML, Known.MASS).fitted
     assert found.estimate.gains == pytest.approx(other.estimate.gains, rel=1e-9)
     assert found.sources == other.sources
-    one, two = found.identification.holdout_error, other.identification.holdout_error
+    one = found.identification.holdout_error
+    two = other.identification.holdout_error
     assert one is not None
     assert two is not None
     assert one.axes == pytest.approx(two.axes)
 
 
-def test_essential_parameters_leave_no_trace_in_the_file(reduced: ReducedLogs, tmp_path: Path) -> None:
+def test_essential_parameters_leave_no_trace_in_the_file(
+    reduced: ReducedLogs, tmp_path: Path
+) -> None:
     found = essential_fit(fit_case(reduced, Method.WLS, Known.MASS).fitted, 20.0)
     calibration = calibration_of_case(found, CREATED)
     assert found.essential is not None
@@ -181,7 +225,9 @@ def found(shelf: Shelf, calibrations: dict[str, Calibration]) -> CrossValidation
 
 
 def test_cross_validation_distinguishes_good_gains_from_bad(found: CrossValidation) -> None:
-    """Tables 7 and 8: mass errors follow the gains' errors; the mean of Table 6 is least for the best."""
+    """Tables 7 and 8: mass errors follow the gains' errors;
+    the mean of Table 6 is least for the best.
+    """
     errors: dict[str, list[float]] = {label: [] for label in found.calibrations}
     for run in found.weighed:
         for label, mass in run.masses.items():
@@ -191,13 +237,17 @@ def test_cross_validation_distinguishes_good_gains_from_bad(found: CrossValidati
                 assert mass.error_percent == pytest.approx(100.0 * abs(mass.mass_kg / 4.59 - 1.0))
                 errors[label].append(mass.error_percent)
             else:
-                assert mass.error_percent == pytest.approx(100.0 * abs(mass.mass_kg / 4.5 - 1.0))  # the cell's word
+                # The cell's word
+                assert mass.error_percent == pytest.approx(100.0 * abs(mass.mass_kg / 4.5 - 1.0))
             assert 0.0 < mass.std_percent <= mass.std_with_gains_percent < 10.0
     means = {label: float(np.mean(values)) for label, values in errors.items()}
     assert means["ml"] < 1.0
     assert means["ml"] < means["case-2"]
     assert means["ml"] < means["manufacturer"]
-    of = {label: np.mean([run.errors[label].total for run in found.runs if run.errors]) for label in means}
+    of = {
+        label: np.mean([run.errors[label].total for run in found.runs if run.errors])
+        for label in means
+    }
     assert of["ml"] < of["manufacturer"]
 
 
@@ -211,11 +261,16 @@ def test_what_was_seen_and_what_cannot_be_predicted_is_said(found: CrossValidati
     assert [validation.run for validation in found.validations] == ["disc2", "bare3", "disc3"]
 
 
-def test_without_bare_runs_the_calibrations_robot_serves(calibrations: dict[str, Calibration]) -> None:
-    found = cross_validate({"ml": calibrations["ml"], "case-2": calibrations["case-2"]}, _paths("disc3", "plate1"))
+def test_without_bare_runs_the_calibrations_robot_serves(
+    calibrations: dict[str, Calibration],
+) -> None:
+    found = cross_validate(
+        {"ml": calibrations["ml"], "case-2": calibrations["case-2"]}, _paths("disc3", "plate1")
+    )
     assert not found.with_bare_runs
     for run in found.weighed:
-        assert list(run.masses) == ["ml", "case-2"]  # no robot was identified with the nameplate gains
+        # No robot was identified with the nameplate gains
+        assert list(run.masses) == ["ml", "case-2"]
         mass = run.masses["ml"]
         assert isinstance(mass, Mass)
         assert mass.mass_kg == pytest.approx(4.59, rel=0.01)
@@ -224,7 +279,9 @@ def test_without_bare_runs_the_calibrations_robot_serves(calibrations: dict[str,
     assert (other.number, other.title) == (8, "mass of payload plate (b), 4.5 kg")
 
 
-def test_an_unknown_mounting_is_weighed_and_not_predicted(shelf: Shelf, calibrations: dict[str, Calibration]) -> None:
+def test_an_unknown_mounting_is_weighed_and_not_predicted(
+    shelf: Shelf, calibrations: dict[str, Calibration]
+) -> None:
     elsewhere = replace(shelf.runs["disc3"], payload=replace(MOUNTED, mounting="c"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", lambda *_: (elsewhere, shelf.cell))
@@ -233,7 +290,9 @@ def test_an_unknown_mounting_is_weighed_and_not_predicted(shelf: Shelf, calibrat
     assert isinstance(found.weighed[0].masses["ml"], Mass)
 
 
-def test_another_weight_in_the_same_mounting_is_refused(shelf: Shelf, calibrations: dict[str, Calibration]) -> None:
+def test_another_weight_in_the_same_mounting_is_refused(
+    shelf: Shelf, calibrations: dict[str, Calibration]
+) -> None:
     other = replace(shelf.runs["disc3"], payload=replace(MOUNTED, known={"m": 2.0}))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", lambda *_: (other, shelf.cell))
@@ -241,8 +300,12 @@ def test_another_weight_in_the_same_mounting_is_refused(shelf: Shelf, calibratio
             cross_validate({"case-4": calibrations["case-4"]}, _paths("x"))
 
 
-def test_a_run_too_short_to_weigh_says_why(shelf: Shelf, calibrations: dict[str, Calibration]) -> None:
-    short = record(tx40_truth(), "short", np.random.default_rng(1), MOUNTED, seconds=4.0, noise_a=0.1)
+def test_a_run_too_short_to_weigh_says_why(
+    shelf: Shelf, calibrations: dict[str, Calibration]
+) -> None:
+    short = record(
+        tx40_truth(), "short", np.random.default_rng(1), MOUNTED, seconds=4.0, noise_a=0.1
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", lambda *_: (short, shelf.cell))
         found = cross_validate({"ml": calibrations["ml"]}, _paths("short"))
@@ -259,7 +322,9 @@ def test_filters_must_be_the_same(calibrations: dict[str, Calibration]) -> None:
         cross_validate({"ml": ml, "other": other}, _paths("bare3"))
 
 
-def test_the_tables_have_the_papers_form(calibrations: dict[str, Calibration], found: CrossValidation) -> None:
+def test_the_tables_have_the_papers_form(
+    calibrations: dict[str, Calibration], found: CrossValidation
+) -> None:
     one = parameter_table(3, calibrations["case-3"], calibrations["case-4"], "IDIM-TLS")
     rows = {row[0]: row for row in one.rows}
     assert rows["m:a"] == ("m:a", "4.59", "—", "4.59", "—", "0.00")
@@ -274,7 +339,9 @@ def test_the_tables_have_the_papers_form(calibrations: dict[str, Calibration], f
     errors = paper_error_table(found)
     assert len(errors.rows) == 3 * 6 + 1
     of_ml = [run.errors["ml"].axes for run in found.runs if run.errors]
-    assert float(errors.rows[-1][errors.headings.index("ml")]) == pytest.approx(np.mean(of_ml), abs=0.006)
+    assert float(errors.rows[-1][errors.headings.index("ml")]) == pytest.approx(
+        np.mean(of_ml), abs=0.006
+    )
     assert [table.number for table in mass_tables(found)] == [7, 8]
     for table in (one, gains, condition_table(found), errors, *mass_tables(found)):
         assert all(len(row) == len(table.headings) for row in table.rows)
@@ -292,8 +359,11 @@ def test_the_command_line_writes_cases_and_tables(
         [*(f"{case.name}.yaml" for case in CASES), "tables.md"]
     )
     page = (folder / "tables.md").read_text(encoding="utf-8")
-    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [f"Table {n}" for n in (1, 2, 3, 4)]
-    out, ml = tmp_path / "validation", str(folder / "ml.yaml")
+    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [
+        f"Table {n}" for n in (1, 2, 3, 4)
+    ]
+    out = tmp_path / "validation"
+    ml = str(folder / "ml.yaml")
     runs = ["bare3", "disc3", "plate1"]
     assert main(["validate", ml, *runs, "--beside", str(folder), "--out", str(out), "--json"]) == 0
     checked = json.loads(capsys.readouterr().out)
@@ -302,7 +372,9 @@ def test_the_command_line_writes_cases_and_tables(
     assert checked["runs"][2]["relative_error_percent"] == {}
     assert checked["payloads"][0]["masses"]["ml"]["error_percent"] < 1.0
     page = (out / "tables.md").read_text(encoding="utf-8")
-    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [f"Table {n}" for n in (5, 6, 7, 8)]
+    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [
+        f"Table {n}" for n in (5, 6, 7, 8)
+    ]
     assert main(["validate", ml, *runs[1:]]) == 0
     text = capsys.readouterr().out
     assert "\nMass of payload disc (a), 4.59 kg\n" in text
@@ -311,16 +383,22 @@ def test_the_command_line_writes_cases_and_tables(
     case_3 = ("--known", "cad", "--method", "tls", "--essential", "20")
     assert main(["fit", *logs, *case_3, "--json"]) == 0
     gains = [gain["value"] for gain in json.loads(capsys.readouterr().out)["gains"]]
-    assert gains == pytest.approx([gain.value for gain in load_calibration(folder / "case-3.yaml").gains], rel=1e-6)
+    assert gains == pytest.approx(
+        [gain.value for gain in load_calibration(folder / "case-3.yaml").gains], rel=1e-6
+    )
 
 
-def test_what_does_not_go_together_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_does_not_go_together_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["fit", "bare1", "disc1", "--cases", str(tmp_path), "--method", "wls"]) == 2
     assert "--cases" in capsys.readouterr().err
     (tmp_path / "tables.md").write_text("my own notes", encoding="utf-8")
     assert main(["fit", "bare1", "disc1", "--cases", str(tmp_path)]) == 2
     assert "tables.md" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
-    found = main(["validate", str(tmp_path / "none.yaml"), "bare1", "--beside", str(tmp_path / "empty")])
+    found = main(
+        ["validate", str(tmp_path / "none.yaml"), "bare1", "--beside", str(tmp_path / "empty")]
+    )
     assert found == 4
     assert "empty" in capsys.readouterr().err

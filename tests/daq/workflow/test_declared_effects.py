@@ -1,4 +1,6 @@
-"""Effects that a cell file declares: read, checked, and part of a fit by any estimator but instruments."""
+"""Effects that a cell file declares: read, checked,
+and part of a fit by any estimator but instruments.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def _declaring(*effects: DeclaredEffect) -> Cell:
 
 
 def test_the_shipped_cell_declares_its_balancer() -> None:
-    assert CELL.effects == (DeclaredEffect("counterbalance", AXIS, {"ratio": 0.25, "phase_rad": -1.57}),)
+    assert CELL.effects == (
+        DeclaredEffect("counterbalance", AXIS, {"ratio": 0.25, "phase_rad": -1.57}),
+    )
     assert declared_effects(CELL) == (PlacedEffect(Counterbalance(0.25, -1.57), AXIS),)
 
 
@@ -40,8 +44,14 @@ def test_settings_that_are_not_given_are_those_of_the_dictionary() -> None:
     ("effect", "message"),
     [
         (DeclaredEffect("counterweight", 1, {}), "no such effect; expected one of stribeck"),
-        (DeclaredEffect("counterbalance", 1, {"length": 0.2}), "settings length; expected ratio, phase_rad"),
-        (DeclaredEffect("counterbalance", 1, {"ratio": 1.4}), "ratio = 1.4; it lies between 0.05 and 0.95"),
+        (
+            DeclaredEffect("counterbalance", 1, {"length": 0.2}),
+            "settings length; expected ratio, phase_rad",
+        ),
+        (
+            DeclaredEffect("counterbalance", 1, {"ratio": 1.4}),
+            "ratio = 1.4; it lies between 0.05 and 0.95",
+        ),
         (DeclaredEffect("cogging", 1, {"order": 2.5}), "2.5; expected a whole number"),
         (DeclaredEffect("coupling", 1, {"other_axis": 9}), "number of another of the 6 axes"),
     ],
@@ -53,9 +63,14 @@ def test_an_effect_that_cannot_be_is_refused(effect: DeclaredEffect, message: st
 
 @pytest.mark.parametrize(
     ("new", "message"),
-    [("axis: J9", "'J9'; expected one of J1"), ("axis: J2\n  - name: counterbalance\n    axis: J2", "J2 twice")],
+    [
+        ("axis: J9", "'J9'; expected one of J1"),
+        ("axis: J2\n  - name: counterbalance\n    axis: J2", "J2 twice"),
+    ],
 )
-def test_the_place_of_an_effect_is_checked_with_the_file(tmp_path: Path, new: str, message: str) -> None:
+def test_the_place_of_an_effect_is_checked_with_the_file(
+    tmp_path: Path, new: str, message: str
+) -> None:
     text = (CHECKOUT / "configs/cells/kr270.yaml").read_text(encoding="utf-8")
     text = text.replace("../", f"{CHECKOUT}/configs/").replace("axis: J2", new, 1)
     (tmp_path / "cell.yaml").write_text(text, encoding="utf-8")

@@ -27,7 +27,8 @@ def test_full_collections_are_deferred_and_young_ones_are_not() -> None:
     limits = gc.get_threshold()
     gc.set_threshold(700, 10, 10)  # Python's own
     gc.collect()
-    # A full collection looks at a quarter more than the last one has left; what the test runner has frozen is no part.
+    # A full collection looks at a quarter more than the last one has left; what the test runner has
+    # frozen is no part.
     enough = 200_000 + 4 * len(gc.get_objects())
     gc.callbacks.append(note)
     try:
@@ -37,7 +38,8 @@ def test_full_collections_are_deferred_and_young_ones_are_not() -> None:
         assert fresh() is None
         assert 2 not in collected
         assert {0, 1} <= set(collected)
-        kept += [[number] for number in range(len(kept))]  # outside the block the same causes a full collection
+        # Outside the block the same causes a full collection
+        kept += [[number] for number in range(len(kept))]
         assert 2 in collected
     finally:
         gc.callbacks.remove(note)

@@ -40,11 +40,16 @@ def shelf(recorded: Shelf, monkeypatch: pytest.MonkeyPatch) -> Shelf:
 
 @pytest.fixture(scope="module")
 def recorded() -> Shelf:
-    """One run without load, three with; of these one has its currents exchanged, one carries nothing."""
-    truth, rng = tx40_truth(), np.random.default_rng(5)
+    """One run without load, three with; of these one has its currents exchanged,
+    one carries nothing.
+    """
+    truth = tx40_truth()
+    rng = np.random.default_rng(5)
 
     def made(name: str, *, mounted: bool = False) -> Run:
-        run = record(truth, name, rng, MOUNTED if mounted else None, noise_a=0.1, seconds=12.0, rate_hz=200.0)
+        run = record(
+            truth, name, rng, MOUNTED if mounted else None, noise_a=0.1, seconds=12.0, rate_hz=200.0
+        )
         return replace(run, digest=name.encode().hex().ljust(64, "0"))
 
     loaded = made("crossed", mounted=True)
@@ -89,7 +94,9 @@ def test_validate_names_the_log(
     assert validate_report(calibration, found, {}).diagnoses[0].name == name
 
 
-def test_a_diagnosis_that_is_made_again_is_shown_once(shelf: Shelf, calibration: Calibration) -> None:
+def test_a_diagnosis_that_is_made_again_is_shown_once(
+    shelf: Shelf, calibration: Calibration
+) -> None:
     fresh = cross_validate({"one": calibration}, [Path("thousandfold")]).diagnoses
     other = replace(fresh[0], runs=("another",))
     stored = replace(calibration, diagnoses=(*fresh, other))
@@ -102,14 +109,18 @@ def test_a_diagnosis_that_is_made_again_is_shown_once(shelf: Shelf, calibration:
 
 
 def test_exchanged_currents_in_the_fit_are_an_error(shelf: Shelf) -> None:
-    crossed = {name: replace(run, current_a=run.current_a[:, CROSSED]) for name, run in shelf.runs.items()}
+    crossed = {
+        name: replace(run, current_a=run.current_a[:, CROSSED]) for name, run in shelf.runs.items()
+    }
     shelf.runs.update(crossed)
     try:
         for fixed in (False, True):
             with pytest.raises(ChannelsExchanged, match="the currents of J2 and J3: "):
                 fit(FIT, gains_fixed=fixed)
     finally:
-        shelf.runs.update({n: replace(run, current_a=run.current_a[:, CROSSED]) for n, run in crossed.items()})
+        shelf.runs.update(
+            {n: replace(run, current_a=run.current_a[:, CROSSED]) for n, run in crossed.items()}
+        )
 
 
 def test_the_operator_may_say_that_no_currents_are_exchanged(shelf: Shelf) -> None:
@@ -127,10 +138,16 @@ def test_exchanged_currents_in_one_log_of_the_fit_name_it(shelf: Shelf, fixed: b
 
 def test_exchanged_currents_in_a_held_out_run_are_named(shelf: Shelf) -> None:
     first = fit(FIT, holdout=[Path("crossed")]).diagnoses[0]
-    assert (first.name, first.runs, first.axes) == ("channels-exchanged", ("crossed",), ("J2", "J3"))
+    assert (first.name, first.runs, first.axes) == (
+        "channels-exchanged",
+        ("crossed",),
+        ("J2", "J3"),
+    )
 
 
 def test_a_calibration_keeps_what_was_said_of_its_fit(shelf: Shelf) -> None:
     made = calibration_of(fit(FIT, method=Method.WLS), WHEN)
     assert {one.name for one in made.diagnoses} == {"estimators-disagree"}
-    assert decode_calibration(encode_calibration(made), "calibration.yaml").diagnoses == made.diagnoses
+    assert (
+        decode_calibration(encode_calibration(made), "calibration.yaml").diagnoses == made.diagnoses
+    )

@@ -1,4 +1,6 @@
-"""Room for a log: refused before anything moves, and a controlled end while there is still room for it."""
+"""Room for a log: refused before anything moves,
+and a controlled end while there is still room for it.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ def test_no_log_is_larger_than_the_estimate(
     """Noise over the whole range, which no packing makes smaller."""
     noise = np.random.default_rng(seed).integers(-(2**31), 2**31, size=(count, 2, axes)).tolist()
     rows = [
-        Sample(k, START_NS + k * 1_000_000, tuple(p), tuple(c), (k & 0xFFFF,) * axes) for k, (p, c) in enumerate(noise)
+        Sample(k, START_NS + k * 1_000_000, tuple(p), tuple(c), (k & 0xFFFF,) * axes)
+        for k, (p, c) in enumerate(noise)
     ]
     start = content(axes)
     path = write(tmp_path_factory.mktemp("log") / "a.mcap", start, rows)
@@ -56,7 +59,9 @@ def test_a_real_disk_is_asked(tmp_path: Path) -> None:
         DiskRoom(tmp_path / "none" / "a.mcap").require(1)
 
 
-def _rig(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, free: Callable[[Path], int]) -> Rig:
+def _rig(
+    checkout: Path, folder: Path, patch: pytest.MonkeyPatch, free: Callable[[Path], int]
+) -> Rig:
     rig = Rig(checkout, folder, patch, "lockstep")
     genuine = DiskRoom
     patch.setattr("daq.workflow.record.DiskRoom", lambda log, _free: genuine(log, free))

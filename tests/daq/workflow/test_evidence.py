@@ -1,4 +1,6 @@
-"""Evidence of how a log was recorded: written at the recording, carried by the calibration, there for the gates."""
+"""Evidence of how a log was recorded: written at the recording, carried by the calibration,
+there for the gates.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ LIMIT = 0x1237 | 0x0800
     entered=st.none() | st.floats(1e-6, 1e6),
     digest=st.none() | st.text("0123456789abcdef", min_size=64, max_size=64),
 )
-def test_metadata_carries_second_weighing_and_controller(entered: float | None, digest: str | None) -> None:
+def test_metadata_carries_second_weighing_and_controller(
+    entered: float | None, digest: str | None
+) -> None:
     run = replace(content(6, DISC).run, entered_kg=entered, controller_sha256=digest)
     assert run_from_record(run_record(run)) == run
 
@@ -111,11 +115,17 @@ def test_a_source_carries_payload_and_recording(tmp_path: Path, checkout: Path) 
 @pytest.fixture(scope="module")
 def truth_runs() -> dict[str, Run]:
     """Two runs without load, two with, one of them to be held out."""
-    truth, rng = tx40_truth(), np.random.default_rng(3)
+    truth = tx40_truth()
+    rng = np.random.default_rng(3)
     names = ("bare-1", "loaded-1", "bare-2", "loaded-2", "held-out")
     made = [
         invented(
-            truth, name, rng, MOUNTED if name.startswith(("loaded", "held-out")) else None, noise_a=0.3, seconds=22.0
+            truth,
+            name,
+            rng,
+            MOUNTED if name.startswith(("loaded", "held-out")) else None,
+            noise_a=0.3,
+            seconds=22.0,
         )
         for name in names
     ]
@@ -123,21 +133,26 @@ def truth_runs() -> dict[str, Run]:
 
 
 @pytest.mark.parametrize("nameplate_is_true", [False, True])
-def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(
+def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(  # noqa: E501
     truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch, nameplate_is_true: bool
 ) -> None:
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     if nameplate_is_true:
-        axes = (replace(axis, nameplate_gain=float(g)) for axis, g in zip(cell.axes, GAINS, strict=True))
+        axes = (
+            replace(axis, nameplate_gain=float(g)) for axis, g in zip(cell.axes, GAINS, strict=True)
+        )
         cell = replace(cell, axes=tuple(axes))
 
-    def load(path: Path, _cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load(
+        path: Path, _cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         return truth_runs[path.name], cell
 
     monkeypatch.setattr(fit_module, "load_run", load)
     logs = [Path(name) for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
     found = calibration_of(fit(logs, holdout=[Path("held-out")]), datetime(2025, 1, 2, tzinfo=UTC))
-    held, nameplate = found.holdout_error_percent, found.nameplate_holdout_error_percent
+    held = found.holdout_error_percent
+    nameplate = found.nameplate_holdout_error_percent
     assert held is not None
     assert nameplate is not None
     ratio = held.total / nameplate.total
@@ -164,7 +179,9 @@ def with_effect(truth_runs: dict[str, Run]) -> Fit:
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-        patch.setattr(fit_module, "find_effects", partial(find_effects, families=((Stribeck(0.3),),)))
+        patch.setattr(
+            fit_module, "find_effects", partial(find_effects, families=((Stribeck(0.3),),))
+        )
         start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("held-out")])
         found = close_loop(start, 0)
     assert [(placed.effect.name, placed.axis) for placed in _effects(found)] == [("stribeck", 1)]
@@ -176,9 +193,13 @@ def _effects(fitted: Fit) -> tuple[PlacedEffect, ...]:
 
 
 def _with_gains(fitted: Fit, factors: tuple[float, ...]) -> Calibration:
-    """Return the calibration of other gains, all the rest refitted to them, as if they had been identified."""
+    """Return the calibration of other gains, all the rest refitted to them,
+    as if they had been identified.
+    """
     after = fitted.steps[-1].after
-    other = estimate_with(Method.ML, after.training.system(), after.estimate.gains * np.array(factors))
+    other = estimate_with(
+        Method.ML, after.training.system(), after.estimate.gains * np.array(factors)
+    )
     other = replace(other, gains_fixed=False, covariance=after.estimate.covariance)
     step = replace(fitted.steps[-1], after=replace(after, estimate=other))
     return calibration_of(replace(fitted, steps=(*fitted.steps[:-1], step)), NOW)
@@ -192,11 +213,14 @@ def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
 
 @pytest.mark.slow
 def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -> None:
-    """The nameplate is compared in the same model: with its own gains a calibration is no better than it is."""
+    """The nameplate is compared in the same model:
+    with its own gains a calibration is no better than it is.
+    """
     nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
     gains = with_effect.estimate.gains
     same = _with_gains(with_effect, tuple(nameplate / gains))
-    held, compared = same.holdout_error_percent, same.nameplate_holdout_error_percent
+    held = same.holdout_error_percent
+    compared = same.nameplate_holdout_error_percent
     assert held is not None
     assert compared is not None
     assert held.axes == pytest.approx(compared.axes, rel=1e-6)
@@ -220,7 +244,8 @@ def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(
 ) -> None:
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (truth_runs[path.name], cell))
-    logs, now = [Path("bare-1"), Path("loaded-1")], datetime(2025, 1, 2, tzinfo=UTC)
+    logs = [Path("bare-1"), Path("loaded-1")]
+    now = datetime(2025, 1, 2, tzinfo=UTC)
     assert calibration_of(fit(logs), now).nameplate_holdout_error_percent is None
     fixed = fit(logs, holdout=[Path("held-out")], gains_fixed=True)
     assert calibration_of(fixed, now).nameplate_holdout_error_percent is None
@@ -238,10 +263,13 @@ def test_a_delay_of_all_axes_is_predicted_from_the_file(with_effect: Fit) -> Non
     first = with_effect.steps[0]
     assert first.accepted is not None
     delayed = with_effects(first.after, (PlacedEffect(TimeSkew(), 0),))
-    step = replace(first, accepted=replace(first.accepted, effect=TimeSkew(), axis=0), after=delayed)
+    step = replace(
+        first, accepted=replace(first.accepted, effect=TimeSkew(), axis=0), after=delayed
+    )
     made = calibration_of(replace(with_effect, steps=(step,)), NOW)
     assert [effect.axis for effect in made.effects] == [ALL_AXES]
-    read, data = decode_calibration(encode_calibration(made), "c.yaml"), delayed.datasets[0]
+    read = decode_calibration(encode_calibration(made), "c.yaml")
+    data = delayed.datasets[0]
     torque = decimate_rows(data, delayed.conditioning, predict_torque(read, delayed.model, data).T)
     fitted = delayed.estimate.predicted_torque(delayed.training)[:, : torque.shape[1]]
     assert np.max(np.abs(torque - fitted)) < 1e-3 * np.max(np.abs(fitted))
@@ -267,7 +295,14 @@ def test_a_mass_off_the_cell_s_is_refused_before_anything_is_asked_of_the_bus(
     with pytest.raises(UsageError, match=r"4\.59 kg within 0\.005 kg"):
         record(request)
     assert not rig.bus.sent
-    command = ["record", str(rig.cell_file), str(rig.plan), "--out", str(rig.out), "--enable-motion"]
+    command = [
+        "record",
+        str(rig.cell_file),
+        str(rig.plan),
+        "--out",
+        str(rig.out),
+        "--enable-motion",
+    ]
     assert main([*command, "--payload", "disc", "--mass", str(entered)]) == ExitCode.USAGE
     assert not rig.bus.sent
     assert not rig.out.exists()
@@ -277,7 +312,9 @@ def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
-    rig.cell_file.write_text(rig.cell_file.read_text().replace("../controllers/demo.yaml", "controller.yaml"))
+    rig.cell_file.write_text(
+        rig.cell_file.read_text().replace("../controllers/demo.yaml", "controller.yaml")
+    )
     (tmp_path / "controller.yaml").write_bytes(b"drives: {}\n")
     declared = load_cell(rig.cell_file)
     request = RecordingRequest(

@@ -1,4 +1,6 @@
-"""`drivegain export mjcf`: MuJoCo's inverse dynamics of the model are the torques that the calibration predicts."""
+"""`drivegain export mjcf`: MuJoCo's inverse dynamics of the model are the torques that the
+calibration predicts.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,10 @@ from numpy.typing import NDArray
 
 import daq.environment
 from daq.cli.app import main
-from daq.workflow.mjcf_effects import split_installed
+from daq.workflow.mjcf_effects import numbers_of, split_installed
 from ident.calibration import AcceptedEffect, Calibration, Parameter
+from ident.effects.position import Spring
+from ident.effects.signals import Signals
 from ident.model.closures import origin
 from ident.model.robot import poses
 from ident.physical.full_set import FullParameter, FullSet
@@ -33,7 +37,9 @@ FloatArray = NDArray[np.float64]
 SERIAL = ("kr270", "seven-axis", "gantry", "tx40")
 CLOSED = ("five-bar", "orthoglide", "dualv")
 SLOWEST = (
-    0.05  #: Speed of joints and motors above which MuJoCo's friction constraint has its whole force [rad/s or m/s]
+    #: Speed of joints and motors above which MuJoCo's friction constraint has its whole force
+    #: [rad/s or m/s]
+    0.05
 )
 SAME = 1e-6  #: ‖Δτ‖/‖τ‖
 
@@ -51,7 +57,9 @@ class Exported:
         """Torque that the document says the model lacks, shape (m, k)."""
         value_of = {entry["name"]: entry["value"] for entry in self.report["not_in_mjcf"]}
         values = np.array([value_of.get(column.name, 0.0) for column in self.robot.model.columns])
-        return np.asarray(np.einsum("jck,c->jk", self.robot.model.regressor(self.robot.states), values))
+        return np.asarray(
+            np.einsum("jck,c->jk", self.robot.model.regressor(self.robot.states), values)
+        )
 
 
 def export(
@@ -63,7 +71,9 @@ def export(
     """Run the command."""
     file = robot.saved(folder, calibration)
     out = folder / "robot.xml"
-    assert main(["export", "mjcf", str(robot.cell_file), str(file), "--out", str(out), "--json"]) == 0
+    assert (
+        main(["export", "mjcf", str(robot.cell_file), str(file), "--out", str(out), "--json"]) == 0
+    )
     return Exported(robot, out.read_text(), json.loads(capsys.readouterr().out))
 
 
@@ -80,7 +90,9 @@ def loaded(text: str) -> Any:
 
 
 def inverse_nm(text: str, robot: CalibratedRobot, *, friction: bool = True) -> FloatArray:
-    """Torque of each axis by MuJoCo's inverse dynamics, of a closed chain projected to its motors, shape (m, k)."""
+    """Torque of each axis by MuJoCo's inverse dynamics, of a closed chain projected to its motors,
+    shape (m, k).
+    """
     simulated = loaded(text)
     if not friction:
         simulated.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
@@ -129,16 +141,24 @@ def test_inverse_dynamics_are_the_predicted_torque_without_what_is_listed(
     assert exported.report["same_configuration"]
     assert exported.report["closures_left_out"] == []
     axes = [joint + 1 for joint in robot.model.robot.axis_joints]
-    assert [entry["name"] for entry in exported.report["not_in_mjcf"]] == [f"off{number}" for number in axes]
+    assert [entry["name"] for entry in exported.report["not_in_mjcf"]] == [
+        f"off{number}" for number in axes
+    ]
     expected = robot.predicted_nm()
-    smooth = apart(inverse_nm(exported.text, robot, friction=False) + dry_nm(robot) + exported.missing_nm, expected)
+    smooth = apart(
+        inverse_nm(exported.text, robot, friction=False) + dry_nm(robot) + exported.missing_nm,
+        expected,
+    )
     moving = is_moving(robot)
     assert moving.sum() >= 100
     whole = inverse_nm(exported.text, robot) + exported.missing_nm
     with_friction = apart(whole[:, moving], expected[:, moving])
     without_list = apart(inverse_nm(exported.text, robot)[:, moving], expected[:, moving])
     with capsys.disabled():
-        figures = f"{smooth:.1e}, with dry friction {with_friction:.1e}, without the listed offsets {without_list:.1e}"
+        figures = (
+            f"{smooth:.1e}, with dry friction {with_friction:.1e}, without the listed "
+            f"offsets {without_list:.1e}"
+        )
         sys.stdout.write(f"\n  {name}: torque of MuJoCo apart from predict_torque by {figures}\n")
     assert smooth <= SAME
     assert with_friction <= SAME
@@ -167,7 +187,9 @@ def _turn_gravity(root: Element) -> None:
 
 def _turn_frame(root: Element) -> None:
     """Conjugate a quaternion: the frame of the child in the parent's is taken for its inverse."""
-    body = next(one for one in root.iter("body") if one.get("quat", "").split()[1:] != ["0.0", "0.0", "0.0"])
+    body = next(
+        one for one in root.iter("body") if one.get("quat", "").split()[1:] != ["0.0", "0.0", "0.0"]
+    )
     first, *others = body.get("quat", "").split()
     body.set("quat", " ".join((first, *(repr(-float(word)) for word in others))))
 
@@ -255,11 +277,15 @@ def test_predicted_currents_accelerate_the_simulated_robot_as_predicted(
         data.ctrl[:] = current_a[sample]
         mujoco.mj_forward(simulated, data)
         # The friction constraint is solved by iteration.
-        assert data.qacc == pytest.approx(robot.states.acceleration_rad_s2[sample], abs=1e-4 * largest)
+        assert data.qacc == pytest.approx(
+            robot.states.acceleration_rad_s2[sample], abs=1e-4 * largest
+        )
 
 
 def _simulated_gap_m(simulated: Any, robot: CalibratedRobot) -> tuple[float, float]:
-    """Push a closed chain by its first motor; return how far it moved, and how far its loops are open [m]."""
+    """Push a closed chain by its first motor;
+    return how far it moved, and how far its loops are open [m].
+    """
     data = mujoco.MjData(simulated)
     mujoco.mj_resetDataKeyframe(simulated, data, 0)
     start = data.qpos.copy()
@@ -270,12 +296,17 @@ def _simulated_gap_m(simulated: Any, robot: CalibratedRobot) -> tuple[float, flo
     assert not any(warning.number for warning in data.warning)
     joints = [simulated.joint(joint.name).qposadr[0] for joint in robot.model.robot.joints]
     placed = poses(robot.model.robot, data.qpos[joints][None])
-    gaps = [origin(placed, closure.first) - origin(placed, closure.second) for closure in robot.model.robot.closures]
+    gaps = [
+        origin(placed, closure.first) - origin(placed, closure.second)
+        for closure in robot.model.robot.closures
+    ]
     return float(np.abs(data.qpos - start).max()), float(np.abs(gaps).max())
 
 
 @pytest.mark.parametrize("name", CLOSED)
-def test_a_simulated_closed_chain_stays_closed(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_simulated_closed_chain_stays_closed(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     robot = robot_of(name)
     simulated = loaded(export(robot, tmp_path, capsys).text)
     moved, gap_m = _simulated_gap_m(simulated, robot)
@@ -286,7 +317,43 @@ def test_a_simulated_closed_chain_stays_closed(name: str, tmp_path: Path, capsys
     assert apart_m > 10.0 * gap_m
 
 
-def test_a_planar_loop_closes_beside_its_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_joint_that_follows_an_axis_follows_it_in_mujoco(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = CHECKOUT / "configs"
+    (tmp_path / "cells").mkdir()
+    (tmp_path / "robots").mkdir()
+    rod = """<link name="behind"><inertial><origin xyz="0.05 0.02 0.1"/><mass value="1.5"/>
+      <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>
+      <joint name="rod" type="revolute"><origin xyz="0 0 0.1"/>
+      <parent link="link5"/><child link="behind"/>
+      <axis xyz="0 1 0"/><limit lower="-9" upper="9" velocity="1" effort="1"/>
+      <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
+    urdf = (source / "robots/tx40.urdf").read_text()
+    (tmp_path / "robots/tx40.urdf").write_text(urdf.replace("</robot>", rod))
+    cell = tmp_path / "cells/tx40.yaml"
+    cell.write_text((source / "cells/tx40.yaml").read_text())
+    robot = calibrated_robot(cell)
+    exported = export(robot, tmp_path, capsys)
+    moving = is_moving(robot)
+    expected = robot.predicted_nm() - exported.missing_nm
+    assert apart(inverse_nm(exported.text, robot)[:, moving], expected[:, moving]) < SAME
+    simulated = loaded(exported.text)
+    data = mujoco.MjData(simulated)
+    mujoco.mj_resetDataKeyframe(simulated, data, 0)
+    leader = simulated.joint("J5").qposadr[0]
+    follower = simulated.joint("rod").qposadr[0]
+    start = data.qpos[leader]
+    data.ctrl[4] = 3.0 * np.sign(robot.calibration.gains[4].value)  # that of J5, in A
+    for _ in range(200):
+        mujoco.mj_step(simulated, data)
+    assert abs(data.qpos[leader] - start) > 0.02
+    assert data.qpos[follower] == pytest.approx(0.1 - 0.5 * data.qpos[leader], abs=2e-3)
+
+
+def test_a_planar_loop_closes_beside_its_plane(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The rods of a five-bar pass each other: their tips are apart along the axis of the pivot."""
     source = CHECKOUT / "configs"
     (tmp_path / "cells").mkdir()
@@ -308,13 +375,16 @@ def test_a_planar_loop_closes_beside_its_plane(tmp_path: Path, capsys: pytest.Ca
     assert data.ne == 3
 
 
-def test_effects_are_listed_and_exactly_they_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_effects_are_listed_and_exactly_they_are_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     robot = robot_of("seven-axis")
     coefficient = Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1")
     effect = AcceptedEffect("load-friction", "J3", {"speed_exponent": 0}, (coefficient,), 6.1, 3.4)
     calibration = robot.with_effect(effect)
     calibration = replace(
-        calibration, parameters=(*calibration.parameters, Parameter("mx:flange-a", 0.3, 0.01, "kg m"))
+        calibration,
+        parameters=(*calibration.parameters, Parameter("mx:flange-a", 0.3, 0.01, "kg m")),
     )
     exported = export(robot, tmp_path, capsys, calibration)
     assert exported.report["effects_left_out"] == ["load-friction on J3"]
@@ -335,16 +405,22 @@ def test_an_effect_that_is_not_installed_is_listed_with_its_package(
 ) -> None:
     robot = robot_of("seven-axis")
     coefficient = Parameter("ring-friction coefficient 1", 0.1, 0.01, "Nm")
-    effect = AcceptedEffect("ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0")
+    effect = AcceptedEffect(
+        "ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0"
+    )
     exported = export(robot, tmp_path, capsys, robot.with_effect(effect))
-    assert exported.report["effects_left_out"] == ["ring-friction on J3 (of ring-effect 1.2.0, not installed)"]
+    assert exported.report["effects_left_out"] == [
+        "ring-friction on J3 (of ring-effect 1.2.0, not installed)"
+    ]
     assert "Effects NOT in this model: ring-friction on J3 (of ring-effect 1.2.0" in exported.text
 
 
 def test_the_covariance_without_a_missing_effect_is_that_of_the_others() -> None:
     robot = robot_of("seven-axis")
     coefficient = Parameter("ring-friction coefficient 1", 0.1, 0.01, "Nm")
-    effect = AcceptedEffect("ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0")
+    effect = AcceptedEffect(
+        "ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0"
+    )
     known = robot.with_effect(effect)
     known = replace(known, parameters=(known.parameters[-1], *known.parameters[:-1]))
     size = len(known.gains) + len(known.parameters)
@@ -354,7 +430,9 @@ def test_the_covariance_without_a_missing_effect_is_that_of_the_others() -> None
     left = np.delete(np.arange(size), len(known.gains))
     assert without.parameters == known.parameters[1:]
     assert without.covariance is not None
-    np.testing.assert_allclose(without.covariance, (factor @ factor.T)[np.ix_(left, left)], atol=1e-12)
+    np.testing.assert_allclose(
+        without.covariance, (factor @ factor.T)[np.ix_(left, left)], atol=1e-12
+    )
 
 
 def test_a_calibration_of_a_library_has_neither_date_nor_configuration(
@@ -373,7 +451,9 @@ def test_springs_and_friction_of_passive_joints_are_at_their_joints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arm = robot_of("seven-axis")
-    spring = AcceptedEffect("spring", "J2", {}, (Parameter("spring stiffness 2", 30.0, 0.1, "Nm/rad"),), 6.0, 3.0)
+    spring = AcceptedEffect(
+        "spring", "J2", {}, (Parameter("spring stiffness 2", 30.0, 0.1, "Nm/rad"),), 6.0, 3.0
+    )
     pushing = replace(spring, coefficients=(replace(spring.coefficients[0], value=-30.0),))
     chain = robot_of("five-bar")
     places = [joint.name for joint in chain.model.robot.places]
@@ -405,7 +485,8 @@ def test_springs_and_friction_of_passive_joints_are_at_their_joints(
     pivot = replace(
         pivot,
         coefficients=tuple(
-            replace(one, name=one.name.rpartition(" ")[0] + f" {number}") for one in friction.coefficients
+            replace(one, name=one.name.rpartition(" ")[0] + f" {number}")
+            for one in friction.coefficients
         ),
     )
     for robot, effect, is_held in (
@@ -430,11 +511,15 @@ def test_springs_and_friction_of_passive_joints_are_at_their_joints(
         assert apart(found[:, moving], expected[:, moving]) <= SAME
 
 
-def test_a_corrected_zero_is_in_the_frames_of_the_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_corrected_zero_is_in_the_frames_of_the_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Where the calibration corrects the description, recorded positions still mean the same."""
     robot = robot_of("kr270")
     offset = Parameter("zero-offset offset 3", 0.02, 1e-5, "rad")
-    corrected = robot.with_effect(AcceptedEffect("zero-offset", "J3", {}, (offset,), 6.0, 3.0, described=(0.0,)))
+    corrected = robot.with_effect(
+        AcceptedEffect("zero-offset", "J3", {}, (offset,), 6.0, 3.0, described=(0.0,))
+    )
     late = Parameter("late-position time 2", 0.001, 1e-5, "s")
     delayed = robot.with_effect(AcceptedEffect("late-position", "J2", {}, (late,), 6.0, 3.0))
     exported = export(robot, tmp_path, capsys, corrected)
@@ -454,13 +539,21 @@ def test_a_corrected_zero_is_in_the_frames_of_the_model(tmp_path: Path, capsys: 
 def test_a_coupling_that_no_rotor_has_is_listed_and_exactly_it_is_missing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Identified Ia may be less than the diagonal of its motors' r rᵀ; MuJoCo knows no negative armature."""
+    """Identified Ia may be less than the diagonal of its motors' r rᵀ;
+    MuJoCo knows no negative armature.
+    """
     robot = calibrated_robot(CHECKOUT / "configs/cells/kr270.yaml", coupling=1.5)
     exported = export(robot, tmp_path, capsys)
-    listed = [entry["name"] for entry in exported.report["not_in_mjcf"] if not entry["name"].startswith("off")]
+    listed = [
+        entry["name"]
+        for entry in exported.report["not_in_mjcf"]
+        if not entry["name"].startswith("off")
+    ]
     assert listed == ["Iam5", "fvm5", "Iam6", "fvm6"]
     root = fromstring(exported.text)
-    amounts = [float(element.get("armature", "0")) for element in root.iter() if element.get("armature")]
+    amounts = [
+        float(element.get("armature", "0")) for element in root.iter() if element.get("armature")
+    ]
     assert min(amounts) >= 0.0
     found = inverse_nm(exported.text, robot, friction=False) + exported.missing_nm + dry_nm(robot)
     assert apart(found, robot.predicted_nm()) <= SAME
@@ -473,9 +566,20 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     robot = robot_of("kr270")
     parameters = []
     for column, value in zip(robot.model.columns, robot.standard, strict=True):
-        basis, share = ("prior", 0.9) if column.name == "m1" else ("data", 0.1)
-        parameters.append(FullParameter(column.name, 1.01 * float(value), 0.1, column.unit, basis, share, None, None))
-    full = FullSet("arm.urdf", "a" * 64, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ())
+        if column.name == "m1":
+            basis = "prior"
+            share = 0.9
+        else:
+            basis = "data"
+            share = 0.1
+        parameters.append(
+            FullParameter(
+                column.name, 1.01 * float(value), 0.1, column.unit, basis, share, None, None
+            )
+        )
+    full = FullSet(
+        "arm.urdf", "a" * 64, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ()
+    )
     exported = export(robot, tmp_path, capsys, replace(robot.calibration, full_parameters=full))
     report = exported.report
     assert report["chosen_by"] == "full_parameters of the calibration"
@@ -483,7 +587,9 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     assert report["torque_change_percent"]["total"] == pytest.approx(1.0, abs=1e-6)
     assert [one["value"] for one in report["parameters"]] == [one.value for one in parameters]
     assert [one["name"] for one in report["parameters"] if one["basis"] == "prior"] == ["m1"]
-    assert [one["prior_share"] for one in report["parameters"]] == [one.prior_share for one in parameters]
+    assert [one["prior_share"] for one in report["parameters"]] == [
+        one.prior_share for one in parameters
+    ]
     assert "By the prior, not measured: m1\n" in exported.text
     moving = is_moving(robot)
     found = inverse_nm(exported.text, robot) + exported.missing_nm
@@ -491,16 +597,31 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     # Of another robot they are refused.
     shorter = replace(full, parameters=full.parameters[1:])
     file = robot.saved(tmp_path, replace(robot.calibration, full_parameters=shorter))
-    assert main(["export", "mjcf", str(robot.cell_file), str(file), "--out", str(tmp_path / "other.xml")]) == 4
+    assert (
+        main(
+            [
+                "export",
+                "mjcf",
+                str(robot.cell_file),
+                str(file),
+                "--out",
+                str(tmp_path / "other.xml"),
+            ]
+        )
+        == 4
+    )
     assert "Ixx1" in capsys.readouterr().err
 
 
-def test_numbers_that_rest_on_the_prior_are_marked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_numbers_that_rest_on_the_prior_are_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     robot = robot_of("tx40")
     exported = export(robot, tmp_path, capsys)
     basis = {one["name"]: one["basis"] for one in exported.report["parameters"]}
     value = {one["name"]: one["value"] for one in exported.report["parameters"]}
-    # The base does not move: of its mass and most of its inertia the torque says nothing, and the prior all.
+    # The base does not move: of its mass and most of its inertia the torque says nothing, and the
+    # prior all.
     prior = dict(zip(("Ixx1", "m1"), inertia_prior(robot.cell.urdf).links[0][[0, 9]], strict=True))
     for name, expected in prior.items():
         assert basis[name] == "prior"
@@ -547,7 +668,9 @@ def _tx40_of(folder: Path, urdf: str) -> CalibratedRobot:
     return calibrated_robot(cell)
 
 
-def test_a_moving_link_called_world_has_another_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_moving_link_called_world_has_another_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The world is MuJoCo's own body; it refuses a second one."""
     urdf = (CHECKOUT / "configs/robots/tx40.urdf").read_text().replace('"link3"', '"world"')
     simulated = loaded(export(_tx40_of(tmp_path, urdf), tmp_path, capsys).text)
@@ -556,13 +679,17 @@ def test_a_moving_link_called_world_has_another_name(tmp_path: Path, capsys: pyt
     assert data.site("world").xpos == pytest.approx(data.body("world link").xpos)
 
 
-def test_frames_of_fixed_links_are_sites(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_of_fixed_links_are_sites(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Names are those of the URDF: a program that knows the tool frame finds it."""
     urdf = (CHECKOUT / "configs/robots/tx40.urdf").read_text()
     tool = (
-        '<link name="tool"/><joint name="mount" type="fixed"><origin xyz="0.1 0.02 0.3" rpy="0.4 -0.2 1.1"/>'
+        '<link name="tool"/><joint name="mount" type="fixed"><origin xyz="0.1 0.02 0.3" rpy="0.4 '
+        '-0.2 1.1"/>'
         '<parent link="link6"/><child link="tool"/></joint>'
-        '<link name="flange"/><joint name="at flange" type="fixed"><parent link="link6"/><child link="flange"/></joint>'
+        '<link name="flange"/><joint name="at flange" type="fixed"><parent link="link6"/><child '
+        'link="flange"/></joint>'
         "</robot>"
     )
     robot = _tx40_of(tmp_path, urdf.replace("</robot>", tool))
@@ -574,10 +701,14 @@ def test_frames_of_fixed_links_are_sites(tmp_path: Path, capsys: pytest.CaptureF
     at_link = placed.rotation[6, 0]
     assert data.body("link6").xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
     assert data.site("flange").xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
-    assert data.site("tool").xpos == pytest.approx(placed.origin_m[6, 0] + at_link @ (0.1, 0.02, 0.3), abs=1e-12)
+    assert data.site("tool").xpos == pytest.approx(
+        placed.origin_m[6, 0] + at_link @ (0.1, 0.02, 0.3), abs=1e-12
+    )
 
 
-def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     robot = robot_of("kr270")
     file = robot.saved(tmp_path)
     out = tmp_path / "robot.xml"
@@ -589,13 +720,16 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
     assert out.read_text() == "<mujoco/>"
     out.unlink()
     poor = replace(
-        robot.calibration, relative_error_percent=replace(robot.calibration.relative_error_percent, total=90.0)
+        robot.calibration,
+        relative_error_percent=replace(robot.calibration.relative_error_percent, total=90.0),
     )
     robot.saved(tmp_path, poor)
     assert main(command) == 4
     assert "a relative error of 90 %" in capsys.readouterr().err
     robot.saved(tmp_path)
-    monkeypatch.setattr(daq.environment, "find_spec", lambda name: None if name == "cvxpy" else object())
+    monkeypatch.setattr(
+        daq.environment, "find_spec", lambda name: None if name == "cvxpy" else object()
+    )
     assert main(command) == 6
     assert "pip install 'drivegain[physical]'" in capsys.readouterr().err
     assert not out.exists()
@@ -630,5 +764,25 @@ def test_the_example_of_the_page_runs(
     monkeypatch.chdir(tmp_path)
     exec(example[1], {})  # noqa: S102 - of this repository
     torques, accelerations = capsys.readouterr().out.split("]")[:2]
-    assert float(torques.split("[")[1].split()[0]) == pytest.approx(1.5 * robot.calibration.gains[0].value, rel=1e-3)
+    assert float(torques.split("[")[1].split()[0]) == pytest.approx(
+        1.5 * robot.calibration.gains[0].value, rel=1e-3
+    )
     assert len(accelerations.split("[")[1].split()) == 6
+
+
+@dataclass(frozen=True, slots=True)
+class StiffeningSpring(Spring):
+    """τ = c q³, of a package of one's own."""
+
+    name = "stiffening-spring"
+
+    def columns(self, signals: Signals, axis: int) -> NDArray[np.float64]:
+        return np.asarray(signals.position_rad[axis] ** 3)[None]
+
+
+def test_an_own_class_that_derives_from_a_spring_is_no_spring_of_the_model() -> None:
+    stiffness = np.array([12.0])
+    numbers = numbers_of(Spring(), stiffness)
+    assert numbers is not None
+    assert numbers.tolist() == [12.0, 0.0, 0.0, 0.0]
+    assert numbers_of(StiffeningSpring(), stiffness) is None

@@ -34,14 +34,22 @@ from tests.daq.robot_calibrations import robot_of
 from tests.ident.arms import GANTRY
 
 FloatArray = NDArray[np.float64]
-BODY = Body(2.5, np.array([0.01, -0.02, 0.1]), np.array([[0.03, 1e-3, -2e-3], [1e-3, 0.04, 3e-3], [-2e-3, 3e-3, 0.02]]))
+BODY = Body(
+    2.5,
+    np.array([0.01, -0.02, 0.1]),
+    np.array([[0.03, 1e-3, -2e-3], [1e-3, 0.04, 3e-3], [-2e-3, 3e-3, 0.02]]),
+)
 
 
 def _calibration(
     cell: str, model: Model, limits: FloatArray, standard: FloatArray, digest: str = "c" * 64
 ) -> Calibration:
-    columns = model.regressor(random_motion(limits, 200, 9)).transpose(0, 2, 1).reshape(-1, len(standard))
-    base = base_parameters(np.asarray(np.linalg.qr(columns, mode="r")), tuple(column.name for column in model.columns))
+    columns = (
+        model.regressor(random_motion(limits, 200, 9)).transpose(0, 2, 1).reshape(-1, len(standard))
+    )
+    base = base_parameters(
+        np.asarray(np.linalg.qr(columns, mode="r")), tuple(column.name for column in model.columns)
+    )
     count = model.robot.joint_count
     return Calibration(
         cell=cell,
@@ -126,7 +134,9 @@ def test_a_corrected_description_is_said_beside_the_bodies(
     calibration = load_calibration(file)
     offset = Parameter("zero-offset offset 2", 1e-4, 1e-5, "rad")
     zero = AcceptedEffect("zero-offset", calibration.gains[1].axis, {}, (offset,), 6.0, 3.0)
-    save_calibration(replace(calibration, effects=(*calibration.effects, zero)), tmp_path / "zero.yaml")
+    save_calibration(
+        replace(calibration, effects=(*calibration.effects, zero)), tmp_path / "zero.yaml"
+    )
     for known, corrected in ((file, False), (tmp_path / "zero.yaml", True)):
         assert _export(cell, known, "--out", tmp_path / "out.urdf") == 0
         printed = " ".join(capsys.readouterr().out.split())
@@ -136,7 +146,9 @@ def test_a_corrected_description_is_said_beside_the_bodies(
 
 
 def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source, file, out = tmp_path / "gantry.urdf", tmp_path / "c.yaml", tmp_path / "out.urdf"
+    source = tmp_path / "gantry.urdf"
+    file = tmp_path / "c.yaml"
+    out = tmp_path / "out.urdf"
     source.write_text(GANTRY.urdf)
     model = Model(robot_from_urdf(GANTRY.urdf), DriveTrain(np.eye(5)))
     standard = np.zeros(len(model.columns))
@@ -146,7 +158,9 @@ def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[s
     calibration = _calibration("any", model, limits, standard)
     # An effect of a package that is not installed is left out, as every effect is.
     cosine = Parameter("ring-friction cosine 2", 0.1, 0.01, "Nm")
-    missing = AcceptedEffect("ring-friction", calibration.gains[1].axis, {}, (cosine,), 6.1, 3.4, package="rings 1.2.0")
+    missing = AcceptedEffect(
+        "ring-friction", calibration.gains[1].axis, {}, (cosine,), 6.1, 3.4, package="rings 1.2.0"
+    )
     save_calibration(replace(calibration, effects=(*calibration.effects, missing)), file)
     assert _export(file, "--urdf", source, "--out", out, "--json") == 0
     report = json.loads(capsys.readouterr().out)
@@ -154,7 +168,12 @@ def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[s
     rest = {entry["name"]: entry["value"] for entry in report["not_in_urdf"]}
     for number, joint in enumerate(report["joints"], start=1):
         rest |= {f"fv{number}": joint["damping"], f"fs{number}": joint["friction"]}
-    _compare(model, out.read_text(), np.array([rest.get(column.name, 0.0) for column in model.columns]), standard)
+    _compare(
+        model,
+        out.read_text(),
+        np.array([rest.get(column.name, 0.0) for column in model.columns]),
+        standard,
+    )
 
 
 def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -> None:
@@ -168,7 +187,9 @@ def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -
     rigid = np.array(
         [
             pin.rnea(robot, data, *state)
-            for state in zip(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2, strict=True)
+            for state in zip(
+                motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2, strict=True
+            )
         ]
     ).T
     assert np.linalg.norm(rigid + friction - expected) <= 2e-6 * np.linalg.norm(expected)
@@ -197,7 +218,10 @@ def test_an_impossible_calibration_is_projected_and_reported(
 
 
 def test_what_is_refused_and_with_which_code(
-    tx40: tuple[Path, Path, FloatArray], tmp_path: Path, capsys: pytest.CaptureFixture[str], checkout: Path
+    tx40: tuple[Path, Path, FloatArray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    checkout: Path,
 ) -> None:
     cell, calibration, _ = tx40
     out = tmp_path / "robot.urdf"
@@ -241,7 +265,9 @@ def test_no_input_and_no_foreign_file_is_overwritten(
     source = copy / "robots/tx40.urdf"
     # An earlier export may be replaced, but not while it is the URDF of the cell.
     text = (
-        (checkout / "configs/robots/tx40.urdf").read_text().replace("<robot", "<!-- format: drivegain-urdf -->\n<robot")
+        (checkout / "configs/robots/tx40.urdf")
+        .read_text()
+        .replace("<robot", "<!-- format: drivegain-urdf -->\n<robot")
     )
     source.write_text(text)
     own = copy / "cells/tx40.yaml"
@@ -267,7 +293,9 @@ def test_without_the_solver_the_extra_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     cell, calibration, _ = tx40
-    monkeypatch.setattr(daq.environment, "find_spec", lambda name: None if name == "cvxpy" else object())
+    monkeypatch.setattr(
+        daq.environment, "find_spec", lambda name: None if name == "cvxpy" else object()
+    )
     assert _export(calibration, "--cell", cell, "--out", tmp_path / "robot.urdf") == 6
     assert "pip install 'drivegain[physical]'" in capsys.readouterr().err
     assert not (tmp_path / "robot.urdf").exists()
@@ -275,7 +303,8 @@ def test_without_the_solver_the_extra_is_named(
 
 def test_nothing_brings_the_solver_along_at_start_up() -> None:
     code = (
-        "import sys, daq.cli.app, daq.cli.logs, ident.physical.physical;print({'cvxpy', 'clarabel'} & set(sys.modules))"
+        "import sys, daq.cli.app, daq.cli.logs, ident.physical.physical;print({'cvxpy', "
+        "'clarabel'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
@@ -299,7 +328,7 @@ ODD = """<?xml version="1.0" encoding='utf-8'?>\r
 \t\t<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>\r
 \t<transmission name="t"><joint name="a"><dynamics damping="3"/></joint></transmission>\r
 </robot>\r
-"""
+"""  # noqa: E501
 UPDATES = {"a": JointUpdate(BODY, 1.5, 0.25), "b": JointUpdate(BODY, 2.5, 0.5)}
 
 
@@ -307,7 +336,9 @@ def test_everything_else_of_the_file_stays_byte_for_byte() -> None:
     updated = update_urdf(ODD.encode(), "odd.urdf", UPDATES, "by -- me -")
     assert updated.links == {"a": "arm", "b": "slide"}
     assert updated.merged == ("tool",)
-    assert urdf_links(updated.content.decode()) == pytest.approx(np.array([BODY.parameters] * 2), abs=1e-12)
+    assert urdf_links(updated.content.decode()) == pytest.approx(
+        np.array([BODY.parameters] * 2), abs=1e-12
+    )
     text = updated.content.decode()
     assert '<dynamics damping="1.5" friction="0.25" spring="2"/>' in text
     assert '<dynamics damping="2.5" friction="0.5"/>' in text
@@ -317,8 +348,15 @@ def test_everything_else_of_the_file_stays_byte_for_byte() -> None:
     def without(document: str) -> str:
         """Remove the parts that the export may change, and the space around them."""
         kept = re.sub(r"(?s)<!-- (format: drivegain-urdf|drivegain:).*?-->", "", document)
-        kept = re.sub(r"(?s)<inertial>(?=\s*<(origin|mass)).*?</inertial>|<dynamics (?!damping=\"3\").*?/>", "", kept)
-        return re.sub(r"\s+", "", kept.replace("<link name='arm'>\r\n\t</link>", "<link name='arm'/>"))
+        kept = re.sub(
+            r"(?s)<inertial>(?=\s*<(origin|mass)).*?</inertial>|<dynamics "
+            r"(?!damping=\"3\").*?/>",
+            "",
+            kept,
+        )
+        return re.sub(
+            r"\s+", "", kept.replace("<link name='arm'>\r\n\t</link>", "<link name='arm'/>")
+        )
 
     base = '<mass value="9"/>'
     assert base in text
@@ -328,7 +366,10 @@ def test_everything_else_of_the_file_stays_byte_for_byte() -> None:
 
 
 @settings(deadline=None, max_examples=60)
-@given(cut=st.integers(0, len(ODD)), rubbish=st.sampled_from(["", "<", "\x00", "<a>", "&x;", "]]>", '"']))
+@given(
+    cut=st.integers(0, len(ODD)),
+    rubbish=st.sampled_from(["", "<", "\x00", "<a>", "&x;", "]]>", '"']),
+)
 def test_a_damaged_file_is_refused_or_gives_the_bodies(cut: int, rubbish: str) -> None:
     damaged = (ODD[:cut] + rubbish + ODD[cut:]).encode()
     try:
@@ -351,8 +392,16 @@ def test_a_damaged_file_is_refused_or_gives_the_bodies(cut: int, rubbish: str) -
         (ODD.replace('name="slide"', 'name="slid"').encode(), "no link 'slide'"),
         (ODD.replace('name="slide"', 'name="base"').encode(), "two of <link name='base'>"),
         (ODD.replace('<child link="slide"/>', "").encode(), "without one <child"),
-        (ODD.replace("</inertial></link>\r\n\t<trans", "</inertial><inertial/></link><trans").encode(), "2 <inertial>"),
-        (ODD.replace("<robot", '<!DOCTYPE robot SYSTEM "/etc/hostname"><robot').encode(), "document type"),
+        (
+            ODD.replace(
+                "</inertial></link>\r\n\t<trans", "</inertial><inertial/></link><trans"
+            ).encode(),
+            "2 <inertial>",
+        ),
+        (
+            ODD.replace("<robot", '<!DOCTYPE robot SYSTEM "/etc/hostname"><robot').encode(),
+            "document type",
+        ),
     ],
 )
 def test_hostile_and_foreign_files_are_refused(content: bytes, says: str) -> None:
@@ -360,13 +409,22 @@ def test_hostile_and_foreign_files_are_refused(content: bytes, says: str) -> Non
         update_urdf(content, "x.urdf", UPDATES, "me")
 
 
-def test_held_joints_are_fixed_in_the_exported_urdf(tx40: tuple[Path, Path, FloatArray], tmp_path: Path) -> None:
+def test_held_joints_are_fixed_in_the_exported_urdf(
+    tx40: tuple[Path, Path, FloatArray], tmp_path: Path
+) -> None:
     cell, calibration, _ = tx40
-    finger = '<link name="f"/><joint name="finger" type="revolute"><parent link="link6"/><child link="f"/><limit '
-    urdf = load_cell(cell).urdf.replace("</robot>", finger + 'effort="1" velocity="1"/></joint></robot>')
+    finger = (
+        '<link name="f"/><joint name="finger" type="revolute"><parent link="link6"/><child '
+        'link="f"/><limit '
+    )
+    urdf = load_cell(cell).urdf.replace(
+        "</robot>", finger + 'effort="1" velocity="1"/></joint></robot>'
+    )
     (tmp_path / "robot.urdf").write_text(urdf)
     text = (
-        cell.read_text().replace("../robots/tx40.urdf", "robot.urdf").replace("axes:", "hold: {finger: 20}\naxes:", 1)
+        cell.read_text()
+        .replace("../robots/tx40.urdf", "robot.urdf")
+        .replace("axes:", "hold: {finger: 20}\naxes:", 1)
     )
     (tmp_path / "cell.yaml").write_text(text)
     out = tmp_path / "out.urdf"

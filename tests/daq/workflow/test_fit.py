@@ -1,4 +1,6 @@
-"""From logs to a fit: one log after the other, each once, of one cell, and the one that contradicts is named."""
+"""From logs to a fit: one log after the other, each once, of one cell,
+and the one that contradicts is named.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,17 @@ class Shelf:
     cell: Cell
     runs: dict[str, Run]
 
-    def load(self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load(
+        self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         return self.runs[path.name], cell or self.cell
 
 
 @pytest.fixture(scope="module")
 def shelf() -> Shelf:
     """Two runs without load, two with."""
-    truth, rng = tx40_truth(), np.random.default_rng(3)
+    truth = tx40_truth()
+    rng = np.random.default_rng(3)
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     runs = {}
     for index in range(4):
@@ -69,7 +74,9 @@ def pair(shelf: Shelf) -> Fit:
         return fit(_paths("run0", "run1"))
 
 
-def test_logs_become_sources_with_their_roles(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logs_become_sources_with_their_roles(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     found = fit(_paths("run0", "run1", "run2"), holdout=_paths("run3"))
     assert [(source.name, source.role) for source in found.sources] == [
@@ -78,7 +85,9 @@ def test_logs_become_sources_with_their_roles(shelf: Shelf, monkeypatch: pytest.
     assert found.identification.holdout_error is not None
 
 
-def test_the_log_that_contradicts_the_others_is_named(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_log_that_contradicts_the_others_is_named(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     with pytest.raises(PayloadUnseen, match="without undeclared they do"):
         fit(_paths("undeclared", "run1", "run2", "run3"))
@@ -90,8 +99,12 @@ def test_a_recording_counts_once(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) 
         fit(_paths("run0", "run1"), holdout=_paths("run1"))
 
 
-def test_logs_of_two_configurations_are_refused(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
-    def load(path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+def test_logs_of_two_configurations_are_refused(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(
+        path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         run, described = shelf.load(path, cell)
         return run, replace(described, digest="0" * 64) if path.name == "run1" else described
 
@@ -129,7 +142,9 @@ def moves_in(found: Fit) -> int:
     return len(found.identification.system.clusters)
 
 
-def test_a_sigma_of_few_moves_is_said_to_be_rough(shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sigma_of_few_moves_is_said_to_be_rough(
+    shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     found = pair
     moves = moves_in(found)
@@ -155,8 +170,12 @@ def test_an_axis_that_did_not_move_has_a_dash_and_no_number(
     rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
     out = io.StringIO()
     rested_on = replace(calibration, holdout_error_percent=rested)
-    Console(file=out, width=100).print(*fit_view(CaseFit(pair, (), None), rested_on, None), sep="\n")
-    (held_out,) = (line.split() for line in out.getvalue().splitlines() if line.strip().startswith("held out"))
+    Console(file=out, width=100).print(
+        *fit_view(CaseFit(pair, (), None), rested_on, None), sep="\n"
+    )
+    (held_out,) = (
+        line.split() for line in out.getvalue().splitlines() if line.strip().startswith("held out")
+    )
     assert held_out == ["held", "out", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
 
 
@@ -166,7 +185,9 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
     """A torque constant entered 4 % too large, and an axis whose drive reports no torque."""
     rng = np.random.default_rng(1)
 
-    def load(path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load(
+        path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         run, described = shelf.load(path, cell)
         channels = []
         for axis, gain in enumerate(GAINS):
@@ -193,7 +214,9 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
         assert abs(slope.value - 1.04 * gain) < 4.0 * slope.std
         assert abs(row["ratio"] - 1.04) < 4.0 * row["ratio_std"] < 0.1
         assert slope.readings == len(range(12, 5500 - 12, 12)) * 2
-    assert "torque_channel" not in json_tree(fit_report(CaseFit(without, (), None), calibration, None))
+    assert "torque_channel" not in json_tree(
+        fit_report(CaseFit(without, (), None), calibration, None)
+    )
     out = io.StringIO()
     Console(file=out, width=80).print(*fit_view(case, calibration, None), sep="\n")
     assert "own torque against the current, not used in the fit" in out.getvalue()

@@ -1,4 +1,6 @@
-"""`friction_by_payload` of a cell file: friction with a payload is its own in fit, calibration and predictions."""
+"""`friction_by_payload` of a cell file: friction with a payload is its own in fit,
+calibration and predictions.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ WARMER = 0.75  #: Friction in the loaded runs over that in the bare ones, which 
 
 @pytest.fixture(scope="module")
 def cell() -> Cell:
-    return replace(load_cell(shipped_configurations() / "cells" / "demo.yaml"), friction_by_payload=True)
+    return replace(
+        load_cell(shipped_configurations() / "cells" / "demo.yaml"), friction_by_payload=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +41,9 @@ def shelf(cell: Cell) -> Shelf:
     warm = replace(truth, parameters=parameters)
     rng = np.random.default_rng(4)
     runs = {}
-    for number, (arm, payload) in enumerate([(truth, None), (truth, None), (warm, MOUNTED), (warm, MOUNTED)]):
+    for number, (arm, payload) in enumerate(
+        [(truth, None), (truth, None), (warm, MOUNTED), (warm, MOUNTED)]
+    ):
         run = record(arm, f"run{number}", rng, payload, noise_a=0.05, seconds=22.0)
         runs[run.name] = replace(run, digest=f"{number:064x}")
     return Shelf(cell, runs)
@@ -60,14 +66,17 @@ def test_gains_are_true_and_the_calibration_predicts_with_the_friction_of_the_pa
     forgetful = replace(
         calibration,
         parameters=tuple(
-            replace(one, value=0.0) if one.name.endswith("_loaded") else one for one in calibration.parameters
+            replace(one, value=0.0) if one.name.endswith("_loaded") else one
+            for one in calibration.parameters
         ),
     )
     (without,) = validate(forgetful, [Path("run3")], shelf.cell)
     assert without.error.total > 2.0 * validation.error.total
 
 
-def test_without_the_key_friction_that_falls_becomes_gain(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_key_friction_that_falls_becomes_gain(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     without_key = replace(shelf, cell=replace(shelf.cell, friction_by_payload=False))
     monkeypatch.setattr(fit_module, "load_run", without_key.load)
     fitted = fit([Path("run0"), Path("run1"), Path("run2")])
@@ -75,14 +84,18 @@ def test_without_the_key_friction_that_falls_becomes_gain(shelf: Shelf, monkeypa
 
 
 def test_a_description_that_differs_in_it_is_another_one_for_a_fit(cell: Cell) -> None:
-    assert differing_sections(cell, replace(cell, friction_by_payload=False)) == ("friction_by_payload",)
+    assert differing_sections(cell, replace(cell, friction_by_payload=False)) == (
+        "friction_by_payload",
+    )
 
 
 def test_the_key_is_read_and_is_off_where_a_cell_file_does_not_have_it(tmp_path: Path) -> None:
     shipped = shipped_configurations() / "cells" / "demo.yaml"
     assert not load_cell(shipped).friction_by_payload
     text = shipped.read_text(encoding="utf-8")
-    text = text.replace("urdf: ../robots/tx40.urdf", f"urdf: {shipped.parent.parent / 'robots' / 'tx40.urdf'}")
+    text = text.replace(
+        "urdf: ../robots/tx40.urdf", f"urdf: {shipped.parent.parent / 'robots' / 'tx40.urdf'}"
+    )
     changed = tmp_path / "demo.yaml"
     changed.write_text(f"{text}friction_by_payload: true\n", encoding="utf-8")
     assert load_cell(changed).friction_by_payload

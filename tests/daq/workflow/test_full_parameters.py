@@ -46,7 +46,9 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
     _, log = real
     out = tmp_path / "calibration.yaml"
     capsys.readouterr()
-    assert _fit(log, "--method", "ml", "--prior-tolerance", 0.2, "--out", out, "--json") == ExitCode.OK
+    assert (
+        _fit(log, "--method", "ml", "--prior-tolerance", 0.2, "--out", out, "--json") == ExitCode.OK
+    )
     document = json.loads(capsys.readouterr().out)["full_parameters"]
     assert document["urdf"] == OF_CELL
     assert document["contradictions"] == []
@@ -59,7 +61,8 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
     assert parameters["m1"]["std"] == pytest.approx(0.2 * parameters["m1"]["prior"])
     assert all(one["std"] > 0.0 for one in parameters.values())
     assert all(parameters[f"m{number}"]["value"] > 0.0 for number in range(1, 7))
-    # The torque of the full set is that of the fit: its combinations are the base parameters, within their σ.
+    # The torque of the full set is that of the fit: its combinations are the base parameters,
+    # within their σ.
     read = load_calibration(out)
     assert read.full_parameters is not None
     differences = []
@@ -88,7 +91,9 @@ def _scaled(urdf: str, factor: float) -> str:
     return re.sub(r'(<mass value|i[xyz][xyz])="([^"]+)"', scaled, urdf)
 
 
-def test_a_urdf_that_is_no_prior_of_this_robot_is_refused(fitted: Fit, urdf: str, checkout: Path) -> None:
+def test_a_urdf_that_is_no_prior_of_this_robot_is_refused(
+    fitted: Fit, urdf: str, checkout: Path
+) -> None:
     other = (checkout / "configs" / "robots" / "gantry.urdf").read_text(encoding="utf-8")
     longer = urdf.replace("0.225 0 0.035", "0.250 0 0.035")
     assert longer != urdf
@@ -144,4 +149,7 @@ def test_the_full_set_comes_back_from_the_file_and_older_files_have_none() -> No
     older = yaml.safe_load(encode_calibration(demo_calibration()))
     del older["full_parameters"]
     del older["digests"]["full_parameters"]
-    assert decode_calibration(yaml.safe_dump(older).encode(), "calibration.yaml").full_parameters is None
+    assert (
+        decode_calibration(yaml.safe_dump(older).encode(), "calibration.yaml").full_parameters
+        is None
+    )

@@ -24,14 +24,17 @@ from tests.ident.recordings import MOUNTED, record, tx40_truth
 @pytest.fixture(scope="module")
 def fitted() -> Iterator[Fit]:
     """Short and noisy: some gains are weak."""
-    truth, rng = tx40_truth(), np.random.default_rng(6)
+    truth = tx40_truth()
+    rng = np.random.default_rng(6)
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     runs = {
         name: replace(record(truth, name, rng, payload, noise_a=0.6, seconds=14.0), digest=name)
         for name, payload in (("bare", None), ("loaded", MOUNTED))
     }
 
-    def load(path: Path, other: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load(
+        path: Path, other: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         return runs[path.name], other or cell
 
     with pytest.MonkeyPatch.context() as patch:

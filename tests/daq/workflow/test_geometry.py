@@ -1,4 +1,6 @@
-"""A wrong zero or length of a redundant drive: named by a fit, corrected for `residual`, kept by the calibration."""
+"""A wrong zero or length of a redundant drive:
+named by a fit, corrected for `residual`, kept by the calibration.
+"""
 
 from __future__ import annotations
 
@@ -48,11 +50,14 @@ GAINS = np.array([7.3, 6.8, -7.1, -7.5])
 LOGS = (Path("bare.mcap"), Path("loaded.mcap"))
 ZERO = GeometryParameter(GeometryKind.ZERO, "crank-2")
 ROD = GeometryParameter(GeometryKind.LENGTH, "elbow-3", "arm-3")
-RATE_HZ, COUNT_RAD = 250.0, 2.0 * np.pi / (65536 * 5)
+RATE_HZ = 250.0
+COUNT_RAD = 2.0 * np.pi / (65536 * 5)
 
 
 def _positions(seed: int) -> FloatArray:
-    """Positions of the motors, 9 s, that the closures allow: the poses that fit a smooth motion best."""
+    """Positions of the motors, 9 s, that the closures allow:
+    the poses that fit a smooth motion best.
+    """
     model = model_of(CELL)
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, 9.0, 1.0 / RATE_HZ)[:, None, None]
@@ -80,7 +85,13 @@ def _runs() -> tuple[Run, Run]:
     made: list[Run] = []
     for seed, payload in ((3, None), (4, body)):
         exact = _positions(seed)
-        blank = Run(LOGS[len(made)].stem, np.arange(len(exact)) / RATE_HZ, exact, np.zeros_like(exact), payload)
+        blank = Run(
+            LOGS[len(made)].stem,
+            np.arange(len(exact)) / RATE_HZ,
+            exact,
+            np.zeros_like(exact),
+            payload,
+        )
         data = differentiate(blank, model.drive_train, CELL.conditioning)
         mounted = standard.copy()
         if payload is not None:
@@ -102,7 +113,9 @@ def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     offset = np.array([axis.zero_offset_rad for axis in cell.axes])
     runs = dict(zip(LOGS, _runs(), strict=True))
 
-    def load_run(path: Path, given: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load_run(
+        path: Path, given: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         del given, lossy
         run = runs[Path(path)]
         return replace(run, position_rad=run.position_rad + offset), cell
@@ -111,7 +124,10 @@ def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _with_zero(degrees: float) -> Cell:
-    axes = [replace(one, zero_offset_rad=radians(degrees)) if one.name == "crank-2" else one for one in CELL.axes]
+    axes = [
+        replace(one, zero_offset_rad=radians(degrees)) if one.name == "crank-2" else one
+        for one in CELL.axes
+    ]
     return replace(CELL, axes=tuple(axes))
 
 
@@ -140,7 +156,12 @@ def test_a_right_description_is_fitted_as_it_is(clean: Fit) -> None:
     assert with_corrected_geometry(clean) is clean
     kept = calibration_of(clean, RECORDED).encoder_misfit
     assert kept is not None
-    assert (kept.applied, kept.significant, kept.corrections, kept.unit) == (False, False, (), "rad")
+    assert (kept.applied, kept.significant, kept.corrections, kept.unit) == (
+        False,
+        False,
+        (),
+        "rad",
+    )
     assert np.all(np.abs(_errors(clean)) < 3.0)
 
 
@@ -152,7 +173,8 @@ def test_a_right_description_is_fitted_as_it_is(clean: Fit) -> None:
             ZERO,
             -np.radians(0.5),
             "zero-off",
-            r"add -0\.500\d* to `zero_offset_deg` of crank-2 in the cell file, which makes it -?0\.000\d*",
+            r"add -0\.500\d* to `zero_offset_deg` of crank-2 in the cell file, which makes it "
+            r"-?0\.000\d*",
         ),
         (_with_rod(0.3), ROD, -0.00084, "length-off", "279.99.|280.00. mm in place of 280.840 mm"),
     ],
@@ -201,9 +223,9 @@ def test_a_wrong_number_is_named_and_corrected(
         turned = robot.joints[robot.axis_joints[1]].rotation
         expected = model_of(CELL).robot.joints[robot.axis_joints[1]].rotation
         offset = described.axes[1].zero_offset_rad
-        assert np.arccos(np.clip(0.5 * (np.trace(expected.T @ turned) - 1.0), -1.0, 1.0)) == pytest.approx(
-            offset, abs=2e-5
-        )
+        assert np.arccos(
+            np.clip(0.5 * (np.trace(expected.T @ turned) - 1.0), -1.0, 1.0)
+        ) == pytest.approx(offset, abs=2e-5)
         assert described_length(robot, ROD) == pytest.approx(0.28, abs=2e-6)
     if parameter is ZERO:
         assert calibration.encoder_misfit is not None
@@ -226,7 +248,8 @@ def test_the_uncertainty_of_the_geometry_reaches_the_gains_beside_effects(clean:
     assert joined.identification.estimate is joined.estimate
     count = len(evidence.estimate.covariance)
     gains = len(GAINS)
-    # In another order, and with a parameter that the estimate with effects lacks, as after another turn of gravity.
+    # In another order, and with a parameter that the estimate with effects lacks, as after another
+    # turn of gravity.
     unknowns = (Column("of another gravity", "kg m"), *reversed(evidence.estimate.unknowns))
     extra = np.diag(np.arange(1.0, count + 2.0))
     changed = evidence_with_geometry(joined, extra, unknowns)
@@ -250,13 +273,17 @@ def test_the_uncertainty_of_the_geometry_is_in_sigma_once(monkeypatch: pytest.Mo
     bare = closed.evidence().training.system()
     expected = estimate_with(Method.ML, bare).covariance + closed.geometry_covariance
     assert closed.identification.estimate.covariance == pytest.approx(expected, rel=1e-6, abs=1e-15)
-    assert closed.estimate.gains_std == pytest.approx(np.sqrt(np.diag(expected))[: len(GAINS)], rel=1e-6)
+    assert closed.estimate.gains_std == pytest.approx(
+        np.sqrt(np.diag(expected))[: len(GAINS)], rel=1e-6
+    )
     again = close_loop(closed, 0)
     assert again.estimate.gains_std == pytest.approx(closed.estimate.gains_std, rel=1e-6)
 
 
 def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: Fit) -> None:
-    """A gain of small σ that moves by three of them counts for more than one of large σ that moves by one."""
+    """A gain of small σ that moves by three of them counts for more than one of large σ that moves
+    by one.
+    """
     std = clean.estimate.gains_std
     few = np.zeros(len(clean.estimate.covariance))
     few[int(np.argmax(std))] = 1.0 * std.max()
@@ -266,35 +293,47 @@ def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: F
     assert shift_in_sigmas(many, clean.estimate) == pytest.approx(3.0)
 
 
-def _finding(*causes: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...] = ()) -> GeometryFinding:
+def _finding(
+    *causes: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...] = ()
+) -> GeometryFinding:
     covariance = np.diag([one.std**2 for one in causes])
     return GeometryFinding(4e-4, 6e-6, 5e-6, True, causes, covariance, alternatives, (), ())
 
 
 def test_what_encoders_cannot_tell_apart_is_said() -> None:
-    zero, rod = GeometryEstimate(ZERO, 1e-3, 1e-5), GeometryEstimate(ROD, -3e-4, 1e-6)
+    zero = GeometryEstimate(ZERO, 1e-3, 1e-5)
+    rod = GeometryEstimate(ROD, -3e-4, 1e-6)
     (one,) = geometry_diagnoses(_finding(zero, alternatives=((rod,),)), CELL, applied=False)
     assert one.name == "zero-off"
-    assert "not distinguishable from a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter" in one.found
+    assert (
+        "not distinguishable from a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter"
+    ) in one.found
     (both,) = geometry_diagnoses(_finding(zero, rod), CELL, applied=False)
     assert (both.name, both.axes) == ("geometry-off", ("crank-2",))
     assert "explain together" in both.found
     kept = encoder_misfit_of(_finding(zero, alternatives=((rod,),)), CELL, applied=True)
     assert kept is not None
-    assert kept.alternatives == ("a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter than described",)
+    assert kept.alternatives == (
+        "a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter than described",
+    )
     assert list(geometry_diagnoses(None, CELL, applied=False)) == []
 
 
 def test_a_misfit_that_nothing_explains_is_called_so() -> None:
     (none,) = geometry_diagnoses(_finding(), CELL, applied=False)
     assert none.name == "geometry-off"
-    assert "miss the loops by 0.4 mrad, which no zero, length, place on the base or late encoder explains" in none.found
+    assert (
+        "miss the loops by 0.4 mrad, which no zero, length, place on the base or late "
+        "encoder explains"
+    ) in none.found
     assert none.expected == "0.005 mrad, the noise of the encoders"
     assert "arms that bend, play in joints" in none.remedy
     kept = encoder_misfit_of(_finding(), CELL, applied=False)
     assert kept is not None
     text = encoder_text(kept)
-    assert "miss the loops by 0.4 mrad, where their noise is 0.005 mrad, which no zero, length" in text
+    assert (
+        "miss the loops by 0.4 mrad, where their noise is 0.005 mrad, which no zero, length"
+    ) in text
     assert "all zeros and lengths together leave 0.006 mrad" in text
 
 
@@ -313,7 +352,9 @@ def test_a_late_encoder_is_named_and_not_corrected(tmp_path: Path, clean: Fit) -
     assert kept == calibration.encoder_misfit
     assert kept is not None
     assert (kept.corrections, kept.noise) == ((), 5e-6)
-    assert "explained by an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms" in encoder_text(kept)
+    assert (
+        "explained by an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms"
+    ) in encoder_text(kept)
 
 
 def test_a_late_encoder_that_may_be_a_wrong_zero_corrects_none() -> None:
@@ -337,7 +378,9 @@ def test_a_place_on_the_base_is_named_and_corrected(clean: Fit, tmp_path: Path) 
     joints = {joint.name: joint for joint in model_of(CELL).robot.joints}
     described_mm = 1e3 * float(joints["crank-3"].translation_m[1])
     assert f"{described_mm - 0.3:.3f} mm in place of {described_mm:.3f} mm" in one.remedy
-    calibration = calibration_of(replace(clean, geometry=finding, geometry_covariance=np.zeros((1, 1))), RECORDED)
+    calibration = calibration_of(
+        replace(clean, geometry=finding, geometry_covariance=np.zeros((1, 1))), RECORDED
+    )
     save_calibration(calibration, tmp_path / "calibration.yaml")
     read = load_calibration(tmp_path / "calibration.yaml")
     moved = {joint.name: joint for joint in calibrated_model(read, CELL).robot.joints}

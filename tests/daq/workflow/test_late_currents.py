@@ -34,13 +34,17 @@ def _checked(*found: Finding) -> GeometryCheck:
 def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(cell: Cell) -> None:
     (one,) = check_diagnoses(_checked(_finding(TimeSkew(), 0, 0.003)), cell, model_of(cell))
     assert (one.name, one.axes) == ("time-skew", ())
-    assert one.found == "all currents late by 3.00 ± 0.07 ms beside the positions, the same on every axis"
+    assert one.found == (
+        "all currents late by 3.00 ± 0.07 ms beside the positions, the same on every axis"
+    )
     assert "how positions and currents are stamped" in one.remedy
     assert "no single encoder or drive is late" in one.remedy
 
 
 def test_an_early_skew_is_said_to_be_early(cell: Cell) -> None:
-    (one,) = check_diagnoses(_checked(_finding(TimeSkew(backwards=1), 0, -0.003)), cell, model_of(cell))
+    (one,) = check_diagnoses(
+        _checked(_finding(TimeSkew(backwards=1), 0, -0.003)), cell, model_of(cell)
+    )
     assert "all currents early by 3.00 ± 0.07 ms" in one.found
 
 

@@ -1,4 +1,6 @@
-"""`export mjcf` keeps what a URDF shows: names, frames, shapes and meshes; with `--urdf` it needs no cell file."""
+"""`export mjcf` keeps what a URDF shows: names, frames, shapes and meshes;
+with `--urdf` it needs no cell file.
+"""
 
 from __future__ import annotations
 
@@ -93,13 +95,14 @@ def export(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, 
 
 
 SHAPES = {
-    "link1": '<visual><geometry><box size="0.2 0.4 0.6"/></geometry><material name="grey"/></visual>',
-    "link2": '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/>'
-    '<geometry><mesh filename="package://arm_description/meshes/link 2.stl" scale="2 2 -2"/></geometry></visual>',
+    "link1": '<visual><geometry><box size="0.2 0.4 0.6"/></geometry><material '
+    'name="grey"/></visual>',
+    "link2": '<visual><origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/><geometry><mesh '
+    'filename="package://arm_description/meshes/link 2.stl" scale="2 2 -2"/></geometry></visual>',
     "link3": '<visual><geometry><mesh filename="../meshes/flat.STL"/></geometry></visual>'
     '<collision><geometry><cylinder radius="0.05" length="0.4"/></geometry></collision>',
-    "link5": '<visual><geometry><sphere radius="0.07"/></geometry>'
-    '<material name="own"><color rgba="1 0 0 0.5"/></material></visual>',
+    "link5": '<visual><geometry><sphere radius="0.07"/></geometry><material name="own"><color '
+    'rgba="1 0 0 0.5"/></material></visual>',
 }
 
 
@@ -144,7 +147,9 @@ def test_a_urdf_alone_gives_the_predicted_torque_with_its_shapes(
     assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
     joints = [joint.name for joint in robot.model.robot.joints]
     assert [simulated.joint(number).name for number in range(simulated.njnt)] == joints
-    assert {simulated.body(number).name for number in range(1, simulated.nbody)} == {f"link{i}" for i in range(1, 7)}
+    assert {simulated.body(number).name for number in range(1, simulated.nbody)} == {
+        f"link{i}" for i in range(1, 7)
+    }
 
 
 def uncoupled_arm(folder: Path) -> CalibratedRobot:
@@ -171,7 +176,9 @@ def test_shapes_are_where_the_urdf_has_them(
     data.qpos[:] = robot.states.position_rad[3]
     mujoco.mj_kinematics(simulated, data)
     placed = poses(robot.model.robot, robot.states.position_rad[3:4])
-    geoms = {(simulated.body(geom.bodyid[0]).name, geom.group[0]): geom for geom in geoms_of(simulated)}
+    geoms = {
+        (simulated.body(geom.bodyid[0]).name, geom.group[0]): geom for geom in geoms_of(simulated)
+    }
     assert set(geoms) == {
         ("link1", VISUAL_GROUP),
         ("link2", VISUAL_GROUP),
@@ -192,7 +199,9 @@ def test_shapes_are_where_the_urdf_has_them(
     vertices = simulated.mesh_vert[first : first + simulated.mesh_vertnum[geom.dataid[0]]]
     shown = data.geom_xpos[geom.id] + vertices @ data.geom_xmat[geom.id].reshape(3, 3).T
     corners = np.array(CORNERS) * (2.0, 2.0, -2.0)
-    in_link = Rotation.from_euler("xyz", (0.4, -0.5, 0.6)).apply(corners) + np.array((0.1, 0.2, 0.3))
+    in_link = Rotation.from_euler("xyz", (0.4, -0.5, 0.6)).apply(corners) + np.array(
+        (0.1, 0.2, 0.3)
+    )
     expected = placed.origin_m[2, 0] + in_link @ placed.rotation[2, 0].T
     for corner in expected:
         assert np.linalg.norm(shown - corner, axis=1).min() < 1e-6
@@ -209,7 +218,9 @@ def geoms_of(simulated: Any) -> list[Any]:
     return [simulated.geom(number) for number in range(simulated.ngeom)]
 
 
-def test_limits_are_those_of_the_urdf(tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_are_those_of_the_urdf(
+    tmp_path: Path, urdf_of_arm: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A joint without limits has none in the model."""
     robot = uncoupled_arm(tmp_path)
     urdf = urdf_of_arm.read_text()
@@ -227,7 +238,9 @@ def test_limits_are_those_of_the_urdf(tmp_path: Path, urdf_of_arm: Path, capsys:
     assert simulated.jnt_limited.tolist() == [1, 1, 1, 1, 1, 0]
 
 
-def test_the_shapes_of_a_cell_are_those_of_its_urdf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shapes_of_a_cell_are_those_of_its_urdf(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A coupled wrist needs its cell file, and meshes are found from the folder of the URDF."""
     (tmp_path / "cells").mkdir()
     (tmp_path / "robots").mkdir()
@@ -268,22 +281,30 @@ def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
         "<cone/>": "<cone>",
     }
     visuals = "".join(f"<visual><geometry>{text}</geometry></visual>" for text in wrong)
-    urdf = urdf_of_arm.read_text().replace('<link name="link4">', f'<link name="link4">{visuals}<visual/>')
+    urdf = urdf_of_arm.read_text().replace(
+        '<link name="link4">', f'<link name="link4">{visuals}<visual/>'
+    )
     urdf_of_arm.write_text(urdf)
     out = tmp_path / "robot.xml"
     file = robot.saved(tmp_path)
     report = export(capsys, file, "--urdf", urdf_of_arm, "--out", out)
     assert len(report["shapes_left_out"]) == len(wrong) + 1
-    for reason, expected in zip(report["shapes_left_out"], [*wrong.values(), "0 geometries"], strict=True):
+    for reason, expected in zip(
+        report["shapes_left_out"], [*wrong.values(), "0 geometries"], strict=True
+    ):
         assert reason.startswith("visual of link4: ")
         assert expected in reason
     assert loaded(out).ngeom == 6
     assert "Shapes NOT in this model: visual of link4: " in out.read_text()
     assert main(["export", "mjcf", str(file), "--urdf", str(urdf_of_arm), "--out", str(out)]) == 0
-    assert "Shapes that are not in the model: visual of link4: " in " ".join(capsys.readouterr().out.split())
+    assert ("Shapes that are not in the model: visual of link4: ") in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
-def test_a_urdf_of_another_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_urdf_of_another_robot_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     robot = robot_of("kr270")
     file = robot.saved(tmp_path)
     out = tmp_path / "robot.xml"
@@ -295,7 +316,10 @@ def test_a_urdf_of_another_robot_is_refused(tmp_path: Path, capsys: pytest.Captu
     bomb = tmp_path / "bomb.urdf"
     bomb.write_text('<!DOCTYPE robot [<!ENTITY a "b">]><robot name="r"/>')
     assert main([*command, str(bomb)]) == 6
-    assert main(["export", "mjcf", str(robot.cell_file), *command[2:], str(robots / "kr270.urdf")]) == 2
+    assert (
+        main(["export", "mjcf", str(robot.cell_file), *command[2:], str(robots / "kr270.urdf")])
+        == 2
+    )
     assert main(["export", "mjcf", str(file), "--out", str(out)]) == 2
     assert not out.exists()
 

@@ -1,4 +1,6 @@
-"""figaroh reads the exported URDF: its regressor times the parameters that it finds is the predicted torque."""
+"""figaroh reads the exported URDF: its regressor times the parameters that it finds is the
+predicted torque.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +21,35 @@ from tests.daq.robot_calibrations import apart, robot_of
 def test_the_torque_of_the_urdf_and_of_the_list_is_the_predicted_one(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """figaroh takes rotors, friction and offsets as numbers beside the URDF; gravity is downwards for it."""
+    """figaroh takes rotors, friction and offsets as numbers beside the URDF;
+    gravity is downwards for it.
+    """
     python = CHECKOUT / FIGAROH_VENV / "bin/python"
     if not python.exists():
         pytest.skip(f"no figaroh at {FIGAROH_VENV}: `make bench` makes its environment")
     robot = robot_of(name)
     out = tmp_path / "robot.urdf"
-    assert main(["export", "urdf", str(robot.cell_file), str(robot.saved(tmp_path)), "--out", str(out), "--json"]) == 0
+    assert (
+        main(
+            [
+                "export",
+                "urdf",
+                str(robot.cell_file),
+                str(robot.saved(tmp_path)),
+                "--out",
+                str(out),
+                "--json",
+            ]
+        )
+        == 0
+    )
     report = json.loads(capsys.readouterr().out)
     value_of = {entry["name"]: entry["value"] for entry in report["not_in_urdf"]}
     count = robot.model.robot.joint_count
-    own = {key: np.array([value_of[f"{key}{number}"] for number in range(1, count + 1)]) for key in ("Ia", "off")}
+    own = {
+        key: np.array([value_of[f"{key}{number}"] for number in range(1, count + 1)])
+        for key in ("Ia", "off")
+    }
     states = robot.states
     np.savez(
         tmp_path / "states.npz",
@@ -43,12 +63,16 @@ def test_the_torque_of_the_urdf_and_of_the_list_is_the_predicted_one(
     )
     script = Path(__file__).with_name("figaroh_torque.py")
     command = [python, script, out, tmp_path / "states.npz", tmp_path / "torque.npy"]
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [str(word) for word in command], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     # What motors that turn with several joints have along their direction, figaroh does not know.
     along = np.zeros(len(robot.model.columns))
     for place, column in enumerate(robot.model.columns):
         if column.name.startswith(("Iam", "fvm", "fsm")):
             along[place] = value_of.get(column.name, 0.0)
-    found = np.load(tmp_path / "torque.npy") + np.einsum("jck,c->jk", robot.model.regressor(states), along)
+    found = np.load(tmp_path / "torque.npy") + np.einsum(
+        "jck,c->jk", robot.model.regressor(states), along
+    )
     assert apart(found, robot.predicted_nm()) <= 1e-6

@@ -1,4 +1,6 @@
-"""Pinocchio reads the exported URDF and MJCF: torques with its own dynamics are those that the calibration predicts."""
+"""Pinocchio reads the exported URDF and MJCF:
+torques with its own dynamics are those that the calibration predicts.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def _export(
 
 
 def _rigid_nm(model: Any, robot: CalibratedRobot, tree: Motion) -> FloatArray:
-    """Torque of the links at each joint of the tree, by Pinocchio's recursive Newton-Euler algorithm, shape (n, k)."""
+    """Torque of the links at each joint of the tree, by Pinocchio's recursive Newton-Euler
+    algorithm, shape (n, k).
+    """
     model.gravity.linear = robot.model.robot.gravity_m_s2
     model.armature = np.zeros(model.nv)
     data = model.createData()
@@ -46,7 +50,10 @@ def _rigid_nm(model: Any, robot: CalibratedRobot, tree: Motion) -> FloatArray:
         for number, angle in zip(ids, position, strict=True):
             joint = model.joints[number]
             # A joint without limits has cosine and sine of its angle.
-            own = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+            if joint.nq == 1:
+                own = [angle]
+            else:
+                own = [np.cos(angle), np.sin(angle)]
             q[joint.idx_q : joint.idx_q + joint.nq] = own
         v[places] = velocity
         a[places] = acceleration
@@ -54,11 +61,15 @@ def _rigid_nm(model: Any, robot: CalibratedRobot, tree: Motion) -> FloatArray:
     return np.array(torques).T
 
 
-@pytest.mark.parametrize("name", ["kr270", "seven-axis", "gantry", "ur10", "five-bar", "orthoglide", "dualv"])
+@pytest.mark.parametrize(
+    "name", ["kr270", "seven-axis", "gantry", "ur10", "five-bar", "orthoglide", "dualv"]
+)
 def test_the_urdf_has_the_predicted_torque_without_what_is_listed(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Damping and friction are those of the file; rotors, offsets and couplings those of the list."""
+    """Damping and friction are those of the file;
+    rotors, offsets and couplings those of the list.
+    """
     robot = robot_of(name)
     out, report = _export("urdf", robot, tmp_path, capsys)
     assert report["exact"]
@@ -74,7 +85,9 @@ def test_the_urdf_has_the_predicted_torque_without_what_is_listed(
     found = robot.model.at_axes(followed, rigid) + of_drives
     difference = apart(found, robot.predicted_nm())
     with capsys.disabled():
-        sys.stdout.write(f"\n  {name}: torque of Pinocchio apart from predict_torque by {difference:.1e}\n")
+        sys.stdout.write(
+            f"\n  {name}: torque of Pinocchio apart from predict_torque by {difference:.1e}\n"
+        )
     assert difference <= SAME
 
 
@@ -86,7 +99,9 @@ def test_the_mjcf_of_a_serial_robot_has_the_same_bodies_and_joints(
     robot = robot_of(name)
     out, report = _export("mjcf", robot, tmp_path, capsys)
     model = pin.buildModelFromMJCF(str(out))
-    places = [model.joints[model.getJointId(joint.name)].idx_v for joint in robot.model.robot.joints]
+    places = [
+        model.joints[model.getJointId(joint.name)].idx_v for joint in robot.model.robot.joints
+    ]
     armature = np.array(model.armature)[places, None]
     damping = np.array(model.damping)[places, None]
     friction = np.array(model.upperDryFrictionLimit)[places, None]

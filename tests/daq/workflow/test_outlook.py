@@ -1,4 +1,6 @@
-"""The next block: for the gain that is worst, inside the room and the speed of what was accepted."""
+"""The next block: for the gain that is worst,
+inside the room and the speed of what was accepted.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ def room(experiment: Experiment, accepted: tuple[Plan, ...]) -> AcceptedRoom:
 
 @pytest.fixture(scope="module")
 def outlook(experiment: Experiment, accepted: tuple[Plan, ...]) -> Outlook:
-    """After these moves, made without load and loaded; the estimate has other σ than the design predicts."""
+    """After these moves, made without load and loaded;
+    the estimate has other σ than the design predicts.
+    """
     information = np.sum([_information(experiment, one, (None, 0)) for one in accepted], axis=0)
     scale = np.ones(len(experiment.cell.axes))
     scale[POOR] = 3.0
@@ -83,7 +87,9 @@ def _information(experiment: Experiment, made: Plan, mounted: tuple[int | None, 
     return experiment.design.information(excitation, mounted)
 
 
-def _next(experiment: Experiment, outlook: Outlook, room: AcceptedRoom, seed: int, *, is_aimed: bool) -> Plan:
+def _next(
+    experiment: Experiment, outlook: Outlook, room: AcceptedRoom, seed: int, *, is_aimed: bool
+) -> Plan:
     """The next block, loaded, in the same room."""
     return plan(
         experiment.cell,
@@ -114,8 +120,12 @@ def test_the_worst_gain_of_the_estimate_falls_faster_than_with_moves_for_all_gai
     ratios = []
     for seed, one in zip(SEEDS, aimed, strict=True):
         other = _next(experiment, outlook, room, seed, is_aimed=False)
-        with_aim = experiment.design.std_percent(outlook.information + _information(experiment, one, (0,)))
-        without = experiment.design.std_percent(outlook.information + _information(experiment, other, (0,)))
+        with_aim = experiment.design.std_percent(
+            outlook.information + _information(experiment, one, (0,))
+        )
+        without = experiment.design.std_percent(
+            outlook.information + _information(experiment, other, (0,))
+        )
         assert one.predicted_std_percent == pytest.approx(with_aim.tolist())
         ratios.append(with_aim[POOR] / without[POOR])
     assert np.mean(ratios) < 0.95
@@ -132,15 +142,21 @@ def test_the_next_moves_stay_inside_what_was_accepted(
     checker = experiment.scene.checker
     for one in aimed:
         paths = paths_of(experiment.cell, one.moves)
-        position = np.concatenate([path.at(np.linspace(0.0, path.duration_s, 80))[0] for path in paths])
+        position = np.concatenate(
+            [path.at(np.linspace(0.0, path.duration_s, 80))[0] for path in paths]
+        )
         assert (position >= lower - ROUNDING).all()
         assert (position <= upper + ROUNDING).all()
         reached = extent(checker, placed(checker, position))
         assert (reached.lower_m >= room.reach.lower_m - SLACK_M).all()
         assert (reached.upper_m <= room.reach.upper_m + SLACK_M).all()
         for move in one.moves:
-            assert move.velocity <= max(other.velocity for first in accepted for other in first.moves)
-            assert move.acceleration <= max(other.acceleration for first in accepted for other in first.moves)
+            assert move.velocity <= max(
+                other.velocity for first in accepted for other in first.moves
+            )
+            assert move.acceleration <= max(
+                other.acceleration for first in accepted for other in first.moves
+            )
 
 
 def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> None:
@@ -193,12 +209,16 @@ def test_the_plan_and_its_page_say_what_they_were_planned_for(
     save_plan(replace(aimed[0], purpose=purpose), path)
     loaded = load_plan(path, experiment.cell)
     assert loaded.purpose == purpose
-    page = preview_page(experiment.cell, loaded.moves, experiment.scene.checker, path.read_bytes(), loaded.purpose)
+    page = preview_page(
+        experiment.cell, loaded.moves, experiment.scene.checker, path.read_bytes(), loaded.purpose
+    )
     assert "Planned for J4: ± 1.2 % (target 0.5 %)" in page
     assert "<b>" not in page
     save_plan(aimed[0], path)
     assert "purpose" not in path.read_text()
-    assert "Planned for" not in preview_page(experiment.cell, loaded.moves, experiment.scene.checker, b"")
+    assert "Planned for" not in preview_page(
+        experiment.cell, loaded.moves, experiment.scene.checker, b""
+    )
 
 
 @pytest.mark.parametrize("cause", SlowCause)

@@ -19,7 +19,10 @@ from daq.workflow.cases import payload_as
 from daq.workflow.choices import Known
 from ident.model.bodies import LINK_PARAMETERS, Payload
 
-DRAWN = "mass_kg: 4.59\n    centre_m: [-0.06, -0.063, 0.095]\n    inertia_kg_m2: [0.016, 0.001, 0.0, 0.017, 0.0, 0.012]"
+DRAWN = (
+    "mass_kg: 4.59\n    centre_m: [-0.06, -0.063, 0.095]\n    inertia_kg_m2: [0.016, 0.001, "
+    "0.0, 0.017, 0.0, 0.012]"
+)
 
 
 @pytest.fixture
@@ -42,7 +45,9 @@ def test_a_drawing_gives_all_ten_in_the_last_joints_frame(configurations: Path) 
     (disc,) = _cell(configurations, DRAWN).payloads
     assert set(disc.drawn.known) == set(LINK_PARAMETERS)
     assert disc.payload.known == {"m": 4.59}  # as in the log; a fit takes it unless given another
-    x, y, z = -0.06, -0.063, 0.095
+    x = -0.06
+    y = -0.063
+    z = 0.095
     known = disc.drawn.known
     assert (known["mx"], known["my"], known["mz"]) == pytest.approx((4.59 * x, 4.59 * y, 4.59 * z))
     assert known["Ixx"] == pytest.approx(0.016 + 4.59 * (y * y + z * z))
@@ -68,20 +73,34 @@ def test_single_parameters_are_about_the_frame(configurations: Path) -> None:
         ("mass_kg: 4.59\n    centre: [0, 0, 0]", "centre_m"),
     ],
 )
-def test_two_spellings_of_one_thing_are_refused(configurations: Path, payload: str, message: str) -> None:
+def test_two_spellings_of_one_thing_are_refused(
+    configurations: Path, payload: str, message: str
+) -> None:
     with pytest.raises(SchemaMismatch, match=message):
         _cell(configurations, payload)
 
 
-@pytest.mark.parametrize("inertia", ["[0.016, 0, 0, 0.016, 0, 0.05]", "[0.01, 0.02, 0, 0.01, 0, 0.01]"])
+@pytest.mark.parametrize(
+    "inertia", ["[0.016, 0, 0, 0.016, 0, 0.05]", "[0.01, 0.02, 0, 0.01, 0, 0.01]"]
+)
 def test_an_inertia_that_no_body_has_is_refused(configurations: Path, inertia: str) -> None:
-    with pytest.raises(ConfigurationInconsistent, match=r"inertia_kg_m2: found principal moments .*sum of the other"):
-        _cell(configurations, f"mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: {inertia}")
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"inertia_kg_m2: found principal moments "
+        r".*sum of the other",
+    ):
+        _cell(
+            configurations, f"mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: {inertia}"
+        )
 
 
 def test_a_mounting_is_one_body(configurations: Path) -> None:
     second = "mass_kg: 4.59\n  - name: plate\n    mounting: flange-a\n    mass_kg: 1.686"
-    with pytest.raises(ConfigurationInconsistent, match=r"flange-a, used 2 times.*a name of its own"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"flange-a, used 2 times.*a name "
+        r"of its own",
+    ):
         _cell(configurations, second)
     other = second.replace("mounting: flange-a", "mounting: flange-b")
     path = configurations / "cells" / "demo.yaml"
@@ -89,14 +108,22 @@ def test_a_mounting_is_one_body(configurations: Path) -> None:
     assert [payload.mounting for payload in load_cell(path).payloads] == ["flange-a", "flange-b"]
 
 
-@given(st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3), st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3))
+@given(
+    st.lists(st.floats(0.01, 1.0), min_size=3, max_size=3),
+    st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
+)
 @settings(deadline=None, max_examples=25)
 def test_moving_an_inertia_keeps_it_a_bodys(half: list[float], centre: list[float]) -> None:
-    """A box of half-sides: its inertia about any frame is positive definite with its first moments."""
+    """A box of half-sides: its inertia about any frame is positive definite with its first
+    moments.
+    """
     a, b, c = (2.0 * side**2 for side in half)
     known = drawn_parameters(2.0, tuple(centre), (b + c, 0.0, 0.0, a + c, 0.0, a + b))
     inertia = np.array(
-        [[known[name] for name in row] for row in (("Ixx", "Ixy", "Ixz"), ("Ixy", "Iyy", "Iyz"), ("Ixz", "Iyz", "Izz"))]
+        [
+            [known[name] for name in row]
+            for row in (("Ixx", "Ixy", "Ixz"), ("Ixy", "Iyy", "Iyz"), ("Ixz", "Iyz", "Izz"))
+        ]
     )
     second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     first = np.array([known["mx"], known["my"], known["mz"]])
@@ -108,7 +135,9 @@ def test_a_fit_reports_as_much_as_it_asks_for(configurations: Path) -> None:
     cell = _cell(configurations, DRAWN)
     logged = cell.payloads[0].payload
     assert payload_as(logged, cell, Known.NOTHING).known == {}
-    assert payload_as(replace(logged, known={"m": 4.59, "mx": 1.0}), cell, Known.MASS).known == {"m": 4.59}
+    assert payload_as(replace(logged, known={"m": 4.59, "mx": 1.0}), cell, Known.MASS).known == {
+        "m": 4.59
+    }
     assert payload_as(logged, cell, Known.CAD) == cell.payloads[0].drawn
     # What the log says was weighed; a later cell file does not change it.
     heavier = WeighedPayload("disc", "flange-a", 5.0, 0.0, cell.payloads[0].known)

@@ -56,28 +56,42 @@ def _worst(made: Plan) -> float:
     return max(made.predicted_std_percent)
 
 
-def test_the_worst_gain_is_a_quarter_better_than_by_random_moves(demo: Cell, experiment: Experiment) -> None:
+def test_the_worst_gain_is_a_quarter_better_than_by_random_moves(
+    demo: Cell, experiment: Experiment
+) -> None:
     random = [plan(demo, seed=seed, exchanges=0, experiment=experiment) for seed in range(5)]
     reported: list[float] = []
     made = plan(
-        demo, seed=1, exchanges=600, experiment=experiment, progress=lambda _done, worst: reported.append(worst)
+        demo,
+        seed=1,
+        exchanges=600,
+        experiment=experiment,
+        progress=lambda _done, worst: reported.append(worst),
     )
     assert made.duration_s <= 40.0
     assert all(one.duration_s <= 40.0 for one in random)
     assert _worst(made) <= 0.75 * float(np.median([_worst(one) for one in random]))
-    # The second half of the search still finds something: the figure is no accident of the first moves.
+    # The second half of the search still finds something: the figure is no accident of the first
+    # moves.
     assert reported[-1] < reported[len(reported) // 2] < reported[0]
 
 
 def test_the_same_seed_gives_the_same_plan(demo: Cell, experiment: Experiment) -> None:
-    first, again = (plan(demo, seed=4, duration_s=12.0, exchanges=60, experiment=experiment) for _ in range(2))
+    first, again = (
+        plan(demo, seed=4, duration_s=12.0, exchanges=60, experiment=experiment) for _ in range(2)
+    )
     assert first == again == plan(demo, seed=4, duration_s=12.0, exchanges=60)
-    assert plan(demo, seed=5, duration_s=12.0, exchanges=60, experiment=experiment).moves != first.moves
+    assert (
+        plan(demo, seed=5, duration_s=12.0, exchanges=60, experiment=experiment).moves
+        != first.moves
+    )
 
 
 @settings(deadline=None, max_examples=6, derandomize=True)
 @given(seed=st.integers(0, 1000), speed=st.floats(0.5, 1.0), duration_s=st.floats(14.0, 20.0))
-def test_limits_and_room_are_kept_along_the_whole_way(seed: int, speed: float, duration_s: float) -> None:
+def test_limits_and_room_are_kept_along_the_whole_way(
+    seed: int, speed: float, duration_s: float
+) -> None:
     cell = replace(load_cell(CELLS / "demo.yaml"), clearance=TIGHT)
     room = experiment_of(cell)
     made = plan(
@@ -101,9 +115,15 @@ def _assert_kept(room: Experiment, paths: tuple[Trapezoid, ...], speed: float) -
         position, velocity, acceleration = path.at(np.linspace(0.0, path.duration_s, 600))
         assert (position >= low - 1e-9).all()
         assert (position <= high + 1e-9).all()
-        assert (np.abs(velocity) <= speed * np.array([a.limits.velocity for a in axes]) * (1 + 2e-3)).all()
-        assert (np.abs(acceleration) <= speed * np.array([a.limits.acceleration for a in axes]) * (1 + 2e-3)).all()
-        # The search halves stretches down to some millimetres of motion; six hundred samples a way are far finer.
+        assert (
+            np.abs(velocity) <= speed * np.array([a.limits.velocity for a in axes]) * (1 + 2e-3)
+        ).all()
+        assert (
+            np.abs(acceleration)
+            <= speed * np.array([a.limits.acceleration for a in axes]) * (1 + 2e-3)
+        ).all()
+        # The search halves stretches down to some millimetres of motion; six hundred samples a way
+        # are far finer.
         assert float(room.scene.checker.margins(position).min()) >= 0.0
 
 
@@ -124,15 +144,23 @@ def test_other_robots_can_be_planned_for(name: str) -> None:
     _assert_kept(room, paths_of(cell, made.moves), 1.0)
 
 
-def test_what_cannot_be_planned_is_refused_with_evidence(demo: Cell, experiment: Experiment) -> None:
+def test_what_cannot_be_planned_is_refused_with_evidence(
+    demo: Cell, experiment: Experiment
+) -> None:
     with pytest.raises(UsageError, match="predicted for the gain of J"):
         plan(demo, seed=1, exchanges=0, experiment=experiment, largest_std_percent=0.01)
     with pytest.raises(UsageError, match="condition"):
         plan(demo, seed=1, exchanges=0, experiment=experiment, largest_condition=2.0)
     with pytest.raises(UsageError, match="room for"):
         plan(demo, seed=1, duration_s=1.0, experiment=experiment)
-    walled = replace(demo, clearance=replace(TIGHT, workspace=Box("workspace", (5.0, 5.0, 5.0), (6.0, 6.0, 6.0))))
-    with pytest.raises(UsageError, match=r"no clear posture.*payload and the end of the workspace") as shut_in:
+    walled = replace(
+        demo, clearance=replace(TIGHT, workspace=Box("workspace", (5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))
+    )
+    with pytest.raises(
+        UsageError,
+        match=r"no clear posture.*payload and the end of the "
+        r"workspace",
+    ) as shut_in:
         plan(walled, seed=1)
     assert shut_in.value.remedy == "correct `workspace` in the cell file, or the joint limits"
     with pytest.raises(ConfigurationInconsistent, match="weigh a body"):
@@ -145,16 +173,34 @@ def test_what_cannot_be_planned_is_refused_with_evidence(demo: Cell, experiment:
     assert caught.value.expected == "disc"
 
 
-def test_a_plan_that_a_longer_run_mends_is_called_too_short(demo: Cell, experiment: Experiment) -> None:
+def test_a_plan_that_a_longer_run_mends_is_called_too_short(
+    demo: Cell, experiment: Experiment
+) -> None:
     with pytest.raises(PlanTooShort, match="room for"):
         plan(demo, seed=1, duration_s=2.0, experiment=experiment)
     with pytest.raises(PlanTooShort, match=r"condition .* allow a longer run"):
-        plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_condition=100.0)
+        plan(
+            demo,
+            seed=1,
+            duration_s=12.0,
+            exchanges=0,
+            experiment=experiment,
+            largest_condition=100.0,
+        )
     with pytest.raises(UsageError, match="condition") as refused:
-        plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_condition=1.0)
+        plan(
+            demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_condition=1.0
+        )
     assert not isinstance(refused.value, PlanTooShort)
     with pytest.raises(PlanTooShort, match=r"predicted for the gain .* allow a longer run"):
-        plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment, largest_std_percent=1.0)
+        plan(
+            demo,
+            seed=1,
+            duration_s=12.0,
+            exchanges=0,
+            experiment=experiment,
+            largest_std_percent=1.0,
+        )
 
 
 def test_a_slower_plan_keeps_its_ways(demo: Cell, experiment: Experiment) -> None:
@@ -183,18 +229,37 @@ def test_a_longer_run_that_is_advised_is_longer_and_long_enough(
     demo: Cell, experiment: Experiment, duration_s: float
 ) -> None:
     with pytest.raises(UsageError, match="condition") as refused:
-        plan(demo, seed=1, duration_s=duration_s, exchanges=0, experiment=experiment, largest_condition=500.0)
+        plan(
+            demo,
+            seed=1,
+            duration_s=duration_s,
+            exchanges=0,
+            experiment=experiment,
+            largest_condition=500.0,
+        )
     assert advised_s(refused.value.remedy) > duration_s
     with pytest.raises(UsageError, match="predicted") as refused:
-        plan(demo, seed=1, duration_s=duration_s, exchanges=0, experiment=experiment, largest_std_percent=0.7)
+        plan(
+            demo,
+            seed=1,
+            duration_s=duration_s,
+            exchanges=0,
+            experiment=experiment,
+            largest_std_percent=0.7,
+        )
     longer_s = advised_s(refused.value.remedy)
     assert longer_s > duration_s
     # σ falls with the square root of the time, and random moves scatter.
-    assert _worst(plan(demo, seed=1, duration_s=longer_s, exchanges=0, experiment=experiment)) < 2.0 * 0.7
+    assert (
+        _worst(plan(demo, seed=1, duration_s=longer_s, exchanges=0, experiment=experiment))
+        < 2.0 * 0.7
+    )
 
 
 @given(used_s=st.floats(1.0, 3000.0), spare_s=st.floats(0.0, 5.0), ratio=st.floats(1.001, 20.0))
-def test_the_longer_run_exceeds_the_requested_one(used_s: float, spare_s: float, ratio: float) -> None:
+def test_the_longer_run_exceeds_the_requested_one(
+    used_s: float, spare_s: float, ratio: float
+) -> None:
     longer_s = longer_run_s(used_s, used_s + spare_s, ratio)
     if longer_s is None:
         assert used_s * ratio**2 > LONGEST_S - 20.0
@@ -222,7 +287,9 @@ def test_a_rounded_angle_of_the_urdf_is_named_and_no_longer_run_is_advised(
 
 def _joints_of(urdf: str) -> list[tuple[str, str]]:
     """Name and text of each joint of a URDF."""
-    found: list[tuple[str, str]] = re.findall(r'<joint name="([^"]+)"(.*?)</joint>', urdf, re.DOTALL)
+    found: list[tuple[str, str]] = re.findall(
+        r'<joint name="([^"]+)"(.*?)</joint>', urdf, re.DOTALL
+    )
     return found
 
 

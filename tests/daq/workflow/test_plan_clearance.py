@@ -1,4 +1,6 @@
-"""The `workspace` and `clearance` sections of a cell file, and the arm that is guessed without them."""
+"""The `workspace` and `clearance` sections of a cell file,
+and the arm that is guessed without them.
+"""
 
 from __future__ import annotations
 
@@ -56,8 +58,18 @@ def test_what_is_declared_is_what_is_checked(cell_file: Path) -> None:
     ("old", "new", "error", "message"),
     [
         ("link: J3", "link: J9", ConfigurationInconsistent, "J9"),
-        ("lower_m: [-0.8, -0.8, 0.0]", "lower_m: [0.8, -0.8, 0.0]", ConfigurationInconsistent, "workspace"),
-        ("upper_m: [1.0, 1.0, -0.02]", "upper_m: [1.0, 1.0, -0.2]", ConfigurationInconsistent, "obstacles"),
+        (
+            "lower_m: [-0.8, -0.8, 0.0]",
+            "lower_m: [0.8, -0.8, 0.0]",
+            ConfigurationInconsistent,
+            "workspace",
+        ),
+        (
+            "upper_m: [1.0, 1.0, -0.02]",
+            "upper_m: [1.0, 1.0, -0.2]",
+            ConfigurationInconsistent,
+            "obstacles",
+        ),
         ("radius_m: 0.06", "radius_m: 0", SchemaMismatch, "radius_m"),
         ("radius_m: 0.06", "radius_m: 60", SchemaMismatch, "radius_m"),
         ("minimum_m: 0.03", "minimum_m: -0.03", SchemaMismatch, "minimum_m"),

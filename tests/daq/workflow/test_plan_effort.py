@@ -1,4 +1,6 @@
-"""Planned moves ask no more torque than the drives can give, also where gains and inertias are not those expected."""
+"""Planned moves ask no more torque than the drives can give,
+also where gains and inertias are not those expected.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ from ident.planning.effort import EFFORT_MARGIN
 pytestmark = pytest.mark.slow
 
 CELLS = Path(__file__).parents[3] / "configs" / "cells"
-TRIPPED = (500, 902)  #: Seeds of plans on which J2 of the RX-90 had a following error when no torque was looked at
+#: Seeds of plans on which J2 of the RX-90 had a following error when no torque was looked at
+TRIPPED = (500, 902)
 
 
 def _cell(name: str) -> Cell:
@@ -43,17 +46,24 @@ def _made(experiment: Experiment, seed: int, duration_s: float = 20.0) -> Plan:
 
 
 def _true_shares(spec: CellSpec, path: Trapezoid) -> FloatArray:
-    """Largest current of each motor on a way over its peak, shape (n,): by the plant, which no plan knows."""
+    """Largest current of each motor on a way over its peak, shape (n,):
+    by the plant, which no plan knows.
+    """
     model = link_model(spec)
     data = model.createData()
     rows = motor_rows(spec.ratio)
     position, velocity, acceleration = path.at(np.linspace(0.0, path.duration_s, 60))
-    links = [pin.rnea(model, data, *state) for state in zip(position, velocity, acceleration, strict=True)]
+    links = [
+        pin.rnea(model, data, *state)
+        for state in zip(position, velocity, acceleration, strict=True)
+    ]
     viscous = np.array([axis.viscous_nm_s_rad for axis in spec.axes])
     coulomb = np.array([axis.coulomb_nm for axis in spec.axes])
     joints = np.array(links) + viscous * velocity + coulomb * np.sign(velocity)
     motors = np.linalg.solve(rows.T, joints.T)
-    motors += np.array([axis.motor_inertia_kg_m2 for axis in spec.axes])[:, None] * (rows @ acceleration.T)
+    motors += np.array([axis.motor_inertia_kg_m2 for axis in spec.axes])[:, None] * (
+        rows @ acceleration.T
+    )
     peak_nm = np.array([abs(axis.gain_nm_per_a) * axis.peak_current_a for axis in spec.axes])
     return np.asarray(np.max(np.abs(motors), axis=1) / peak_nm)
 
@@ -78,7 +88,10 @@ def test_planned_moves_keep_a_margin_below_the_efforts_of_the_urdf(name: str) ->
     assert np.isfinite(experiment.effort).all()
     for seed in (1, 2):
         made = _made(experiment, seed)
-        assert EFFORT_MARGIN * experiment.effort_shares(paths_of(experiment.cell, made.moves)).max() <= 1.0
+        assert (
+            EFFORT_MARGIN * experiment.effort_shares(paths_of(experiment.cell, made.moves)).max()
+            <= 1.0
+        )
 
 
 def test_moves_of_a_light_arm_are_those_without_a_limit() -> None:
@@ -92,26 +105,38 @@ def test_moves_of_a_light_arm_are_those_without_a_limit() -> None:
 def test_speeds_that_no_drive_can_carry_are_lowered() -> None:
     cell = _cell("rx90")
     fast = tuple(
-        replace(axis, limits=replace(axis.limits, acceleration=5.0 * axis.limits.acceleration)) for axis in cell.axes
+        replace(axis, limits=replace(axis.limits, acceleration=5.0 * axis.limits.acceleration))
+        for axis in cell.axes
     )
     experiment = experiment_of(replace(cell, axes=fast))
     made = _made(experiment, 3)
-    assert EFFORT_MARGIN * experiment.effort_shares(paths_of(experiment.cell, made.moves)).max() <= 1.0
+    assert (
+        EFFORT_MARGIN * experiment.effort_shares(paths_of(experiment.cell, made.moves)).max() <= 1.0
+    )
 
 
 def test_drives_that_hardly_hold_the_arm_are_named() -> None:
     # Gravity with the payload asks 180 N of the vertical axis in all postures.
     cell = _cell("gantry")
     head, tail = cell.urdf.split('<joint name="Z"')
-    weak = replace(cell, urdf=f"""{head}<joint name="Z"{tail.replace('effort="900"', 'effort="200"', 1)}""")
-    with pytest.raises(UsageError, match=r"no clear way .*: also slowly, they ask too much torque of Z; expected"):
+    weak = replace(
+        cell, urdf=f"""{head}<joint name="Z"{tail.replace('effort="900"', 'effort="200"', 1)}"""
+    )
+    with pytest.raises(
+        UsageError,
+        match=r"no clear way .*: also slowly, they ask too much torque "
+        r"of Z; expected",
+    ):
         plan(weak, seed=1, duration_s=10.0, exchanges=0)
 
 
 def test_an_effort_that_cannot_be_true_is_said() -> None:
     cell = _cell("rx90")
     false = replace(
-        cell, urdf=cell.urdf.replace('effort="520"', 'effort="100"', 2).replace('effort="36"', 'effort="0"')
+        cell,
+        urdf=cell.urdf.replace('effort="520"', 'effort="100"', 2).replace(
+            'effort="36"', 'effort="0"'
+        ),
     )
     experiment = experiment_of(false)
     assert experiment.effort.tolist() == [100.0, np.inf, 260.0, 75.0, 85.0, np.inf]

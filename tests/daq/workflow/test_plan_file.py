@@ -15,11 +15,13 @@ from hypothesis import strategies as st
 from daq.cli import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
+from daq.config.same_cell import calibrated_robot
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.report.plan_preview import find_preview
 from daq.workflow.plan import Plan, load_plan, plan, save_plan, way_to_first_target
 from drivers.errors import MotionRefused
+from ident.calibration import CalibratedRobot
 from ident.model.urdf import read_urdf
 from ident.planning.clearance import Box
 
@@ -51,9 +53,19 @@ def made(demo: Cell) -> Plan:
 @pytest.mark.parametrize("name", ["demo", "gantry"])
 @settings(deadline=None, max_examples=4, derandomize=True)
 @given(seed=st.integers(0, 100))
-def test_a_plan_is_read_as_it_was_made(tmp_path_factory: pytest.TempPathFactory, name: str, seed: int) -> None:
-    cell, path = load_cell(CELLS / f"{name}.yaml"), tmp_path_factory.mktemp("plan") / "plan.yaml"
-    made = plan(cell, seed=seed, duration_s=14.0, exchanges=8, largest_condition=1e9, largest_std_percent=1e6)
+def test_a_plan_is_read_as_it_was_made(
+    tmp_path_factory: pytest.TempPathFactory, name: str, seed: int
+) -> None:
+    cell = load_cell(CELLS / f"{name}.yaml")
+    path = tmp_path_factory.mktemp("plan") / "plan.yaml"
+    made = plan(
+        cell,
+        seed=seed,
+        duration_s=14.0,
+        exchanges=8,
+        largest_condition=1e12,  # the moves are what is read, however good they are
+        largest_std_percent=1e6,
+    )
     save_plan(made, path)
     found = load_plan(path, cell)
     assert found.moves == made.moves
@@ -63,7 +75,8 @@ def test_a_plan_is_read_as_it_was_made(tmp_path_factory: pytest.TempPathFactory,
 
 
 def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> None:
-    cell, path = load_cell(CELLS / "dualv.yaml"), tmp_path / "plan.yaml"
+    cell = load_cell(CELLS / "dualv.yaml")
+    path = tmp_path / "plan.yaml"
     text = (
         "format: drivegain-plan\ncell: dualv\nseed: 1\ncondition: 1500.0\nmoves:\n"
         "  - {target_deg: [0, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.1}\n"
@@ -71,10 +84,18 @@ def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> Non
     path.write_text(text)
     read = load_plan(path, cell)
     assert way_to_first_target(cell, read, np.radians([0.3, 0.0, 0.0, 0.0])) == (read.moves, "")
-    with pytest.raises(MotionRefused, match=r"the loops do not close, or are close to a singularity, at .*closures"):
+    with pytest.raises(
+        MotionRefused,
+        match=r"the loops do not close, or are close to a "
+        r"singularity, at .*closures",
+    ):
         way_to_first_target(cell, load_plan(path, cell), np.radians([0.0, 8.0, 0.0, 0.0]))
     path.write_text(text + "  - {target_deg: [0, 12, 0, 0], velocity: 0.5, acceleration: 0.5}\n")
-    with pytest.raises(ConfigurationInconsistent, match=r"moves\[1\], on the way there: found that the loops do not"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"moves\[1\], on the way there: found that "
+        r"the loops do not",
+    ):
         load_plan(path, cell)
 
 
@@ -95,10 +116,22 @@ def _with_other_product(cell: Cell) -> Cell:
     return replace(cell, axes=(*cell.axes[:2], third, *cell.axes[3:]))
 
 
-OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str]] = {
-    "another joint": (_with_joint_renamed, r"what differs: joints \(names, kinds, parents or motors\);"),
-    "another node": (_with_other_node, r"what differs: drives \(node ids, vendors or product codes\);"),
-    "another product": (_with_other_product, r"what differs: drives \(node ids, vendors or product codes\);"),
+OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str, str]] = {
+    "another joint": (
+        _with_joint_renamed,
+        r"joint \S+ \(revolute, behind .*; expected joint another \(revolute",
+        "joints",
+    ),
+    "another node": (
+        _with_other_node,
+        r"drive of J3 with node id 3; expected drive of J3 with node id 33",
+        "drives",
+    ),
+    "another product": (
+        _with_other_product,
+        r"drive of J3 with product code 0x40200; expected .* with product code 0x7",
+        "drives",
+    ),
 }
 
 
@@ -106,16 +139,38 @@ OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str]] = {
 def test_a_plan_of_another_robot_with_the_same_cell_name_is_refused(
     kind: str, demo: Cell, made: Plan, tmp_path: Path
 ) -> None:
-    change, message = OTHER_ROBOTS[kind]
+    change, message, part = OTHER_ROBOTS[kind]
     other = change(demo)
     assert other.name == demo.name
     path = tmp_path / "plan.yaml"
     save_plan(made, path)
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_plan(path, other)
+    # A plan of an earlier version has the digests alone.
+    assert made.robot is not None
+    save_plan(replace(made, robot=_digests_alone(made.robot)), path)
+    with pytest.raises(ConfigurationInconsistent, match=f"other {part}.*; expected the same"):
+        load_plan(path, other)
 
 
-def test_a_plan_is_read_with_a_corrected_description(demo: Cell, made: Plan, tmp_path: Path) -> None:
+def test_a_plan_is_of_the_same_robot_once_its_cell_file_says_more_of_the_drives(
+    demo: Cell, made: Plan, tmp_path: Path
+) -> None:
+    unnamed = replace(demo, axes=tuple(replace(axis, identity=None) for axis in demo.axes))
+    robot = calibrated_robot(unnamed)
+    path = tmp_path / "plan.yaml"
+    for stated in (robot, _digests_alone(robot)):
+        save_plan(replace(made, robot=stated), path)
+        assert load_plan(path, demo).robot == stated
+
+
+def _digests_alone(robot: CalibratedRobot) -> CalibratedRobot:
+    return replace(robot, joints=(), drives=(), motors=())
+
+
+def test_a_plan_is_read_with_a_corrected_description(
+    demo: Cell, made: Plan, tmp_path: Path
+) -> None:
     first = demo.axes[0]
     assert first.identity is not None
     exchanged_drive = replace(first.identity, serial=9999)
@@ -137,9 +192,24 @@ def test_a_plan_of_an_earlier_version_is_read(demo: Cell, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("old", "new", "error", "message"),
     [
-        ("velocity: 0.5, acceleration: 0.5}", "velocity: 0.5, acceleration: 0.00005}", SchemaMismatch, "acceleration"),
-        ("velocity: 0.5, acceleration: 0.5}", "velocity: 1.5, acceleration: 0.5}", SchemaMismatch, "velocity"),
-        ("velocity: 0.5, acceleration: 0.5}", "velocity: .nan, acceleration: 0.5}", SchemaMismatch, "velocity"),
+        (
+            "velocity: 0.5, acceleration: 0.5}",
+            "velocity: 0.5, acceleration: 0.00005}",
+            SchemaMismatch,
+            "acceleration",
+        ),
+        (
+            "velocity: 0.5, acceleration: 0.5}",
+            "velocity: 1.5, acceleration: 0.5}",
+            SchemaMismatch,
+            "velocity",
+        ),
+        (
+            "velocity: 0.5, acceleration: 0.5}",
+            "velocity: .nan, acceleration: 0.5}",
+            SchemaMismatch,
+            "velocity",
+        ),
         ("dwell_s: 0.1", "dwell_s: 61", SchemaMismatch, "dwell_s"),
         ("target_deg: [10, 5", "target_deg: [10, 500", ConfigurationInconsistent, "500 deg"),
         ("target_deg: [10, 5,", "target_deg: [10,", ConfigurationInconsistent, "5 positions"),
@@ -147,7 +217,12 @@ def test_a_plan_of_an_earlier_version_is_read(demo: Cell, tmp_path: Path) -> Non
         ("cell: demo", "cell: other", ConfigurationInconsistent, "other"),
         ("condition: 1500.0", "condition: -1.0", SchemaMismatch, "condition"),
         ("moves:", "predicted_std_percent: [1.0]\nmoves:", ConfigurationInconsistent, "one a gain"),
-        ("moves:", "predicted_std_percent: [0, 1, 1, 1, 1, 1]\nmoves:", SchemaMismatch, "predicted_std_percent"),
+        (
+            "moves:",
+            "predicted_std_percent: [0, 1, 1, 1, 1, 1]\nmoves:",
+            SchemaMismatch,
+            "predicted_std_percent",
+        ),
         ("moves:", "surprise: 1\nmoves:", SchemaMismatch, "surprise"),
     ],
 )
@@ -163,12 +238,17 @@ def test_what_a_hand_may_have_changed_is_refused(
 
 def test_more_than_an_hour_is_refused(demo: Cell, tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
-    path.write_text(OLD + "  - {target_deg: [10, 5, 80, 0, 0, 0], velocity: 1, acceleration: 1, dwell_s: 60}\n" * 61)
+    path.write_text(
+        OLD + "  - {target_deg: [10, 5, 80, 0, 0, 0], velocity: 1, acceleration: 1, "
+        "dwell_s: 60}\n" * 61
+    )
     with pytest.raises(ConfigurationInconsistent, match="at most 3600 s"):
         load_plan(path, demo)
 
 
-def test_a_way_through_a_declared_obstacle_is_refused(demo: Cell, made: Plan, tmp_path: Path) -> None:
+def test_a_way_through_a_declared_obstacle_is_refused(
+    demo: Cell, made: Plan, tmp_path: Path
+) -> None:
     path = tmp_path / "plan.yaml"
     save_plan(made, path)
     everywhere = Box("press", (-0.6, -0.6, 0.3), (0.6, 0.6, 1.2))
@@ -181,7 +261,16 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "plan.yaml"
-    arguments = ["plan", str(CELLS / "demo.yaml"), "--out", str(out), "--duration", "8", "--exchanges", "10"]
+    arguments = [
+        "plan",
+        str(CELLS / "demo.yaml"),
+        "--out",
+        str(out),
+        "--duration",
+        "8",
+        "--exchanges",
+        "10",
+    ]
     assert main([*arguments, "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert [gain["axis"] for gain in found["gains"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
@@ -194,7 +283,9 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     assert main(arguments) == ExitCode.OK
     text = capsys.readouterr().out
     assert "predicted σ" in text
-    assert "The way to its first target is not checked: the cell file declares no `workspace`" in text
+    assert (
+        "The way to its first target is not checked: the cell file declares no `workspace`"
+    ) in text
     page = tmp_path / "look.html"
     for _ in range(2):  # a preview is replaced
         assert main([*arguments, "--preview", str(page)]) == ExitCode.OK

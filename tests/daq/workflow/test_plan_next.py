@@ -1,4 +1,6 @@
-"""Plans on top of what has been recorded: for the gain that is worst then, inside a box, with what is mounted."""
+"""Plans on top of what has been recorded:
+for the gain that is worst then, inside a box, with what is mounted.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def _made(
 
 
 def _information(experiment: Experiment, made: Plan) -> FloatArray:
-    information: FloatArray = np.sum(experiment.informations(paths_of(experiment.cell, made.moves)), axis=0)
+    information: FloatArray = np.sum(
+        experiment.informations(paths_of(experiment.cell, made.moves)), axis=0
+    )
     return information
 
 
@@ -101,7 +105,8 @@ def test_the_next_moves_are_for_the_gain_that_is_worst_so_far(
         without = design.std_percent(poor + _information(experiment, first_plan))
         assert next_plan.predicted_std_percent == pytest.approx(with_goal.tolist())
         ratios.append(with_goal[POOR] / without[POOR])
-    # Both begin with the same random moves, so no seed is worse by more than the search leaves to chance.
+    # Both begin with the same random moves, so no seed is worse by more than the search leaves to
+    # chance.
     assert max(ratios) < 1.03
     assert np.mean(ratios) < 0.93
 
@@ -115,11 +120,15 @@ def test_a_stricter_target_draws_the_moves_to_its_gain(
     ratios = []
     for seed in SEEDS[:3]:
         for_it = _made(experiment, seed, goal=PlanGoal(poor, strict))
-        ratios.append(for_it.predicted_std_percent[axis] / next_plans[seed].predicted_std_percent[axis])
+        ratios.append(
+            for_it.predicted_std_percent[axis] / next_plans[seed].predicted_std_percent[axis]
+        )
     assert np.mean(ratios) < 0.98
 
 
-def test_a_gain_that_does_not_matter_is_not_planned_for(experiment: Experiment, poor: FloatArray) -> None:
+def test_a_gain_that_does_not_matter_is_not_planned_for(
+    experiment: Experiment, poor: FloatArray
+) -> None:
     """Nor is a plan refused for it."""
     box = _box_without(experiment, POOR)
     others = np.ones(6)
@@ -148,9 +157,13 @@ def test_a_gain_that_does_not_matter_is_not_planned_for(experiment: Experiment, 
         )
 
 
-def test_the_same_seed_and_record_give_the_same_plan(experiment: Experiment, poor: FloatArray) -> None:
+def test_the_same_seed_and_record_give_the_same_plan(
+    experiment: Experiment, poor: FloatArray
+) -> None:
     goal = PlanGoal(poor, np.ones(6))
-    assert _made(experiment, 7, exchanges=40, goal=goal) == _made(experiment, 7, exchanges=40, goal=goal)
+    assert _made(experiment, 7, exchanges=40, goal=goal) == _made(
+        experiment, 7, exchanges=40, goal=goal
+    )
     assert _made(experiment, 7, exchanges=40) == _made(
         experiment, 7, exchanges=40, goal=PlanGoal.of_first(experiment.design)
     )
@@ -158,7 +171,9 @@ def test_the_same_seed_and_record_give_the_same_plan(experiment: Experiment, poo
 
 @settings(max_examples=6)
 @given(seed=st.integers(0, 1000), middle=st.floats(0.4, 0.6), width=st.floats(0.2, 0.5))
-def test_targets_and_ways_stay_in_the_box(experiment: Experiment, seed: int, middle: float, width: float) -> None:
+def test_targets_and_ways_stay_in_the_box(
+    experiment: Experiment, seed: int, middle: float, width: float
+) -> None:
     lower, upper = limits_of(experiment.cell).targets()
     span = upper - lower
     box = TargetBox(lower + (middle - 0.5 * width) * span, lower + (middle + 0.5 * width) * span)
@@ -185,7 +200,9 @@ def test_a_block_is_planned_for_what_is_mounted(experiment: Experiment, poor: Fl
     assert made.predicted_std_percent == pytest.approx(expected.tolist())
 
 
-def test_the_reason_of_a_slow_gain_is_that_of_the_moves(experiment: Experiment, resting: Plan) -> None:
+def test_the_reason_of_a_slow_gain_is_that_of_the_moves(
+    experiment: Experiment, resting: Plan
+) -> None:
     excitation, _ = experiment.excitation(paths_of(experiment.cell, resting.moves))
     runs = [(excitation, (None, 0))]
     judged = verdicts(experiment.design, runs).gains
@@ -194,4 +211,6 @@ def test_the_reason_of_a_slow_gain_is_that_of_the_moves(experiment: Experiment, 
     assert causes[0] is SlowCause.INERTIA  # the vertical axis
     assert causes[1] is SlowCause.TIME
     information = recorded_information(experiment.design, runs)
-    assert experiment.design.std_percent(information) == pytest.approx([gain.std_percent for gain in judged])
+    assert experiment.design.std_percent(information) == pytest.approx(
+        [gain.std_percent for gain in judged]
+    )

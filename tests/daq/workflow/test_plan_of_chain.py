@@ -1,4 +1,6 @@
-"""Plans of a redundant drive: the planner's own show every gain, and a small workspace is refused with the reason."""
+"""Plans of a redundant drive: the planner's own show every gain,
+and a small workspace is refused with the reason.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def test_the_payload_is_expected_at_the_platform() -> None:
     centre = payload.parameters[6:9] / payload.parameters[9]
     # The plate is at the end of the rod, 0.45 m from the joint that moves it.
     assert centre == pytest.approx([0.45, 0.0, 0.0], abs=0.15)
-    (body,) = (capsule for capsule in expected.scene.checker.scene.capsules if capsule.name == "payload")
+    (body,) = (
+        capsule for capsule in expected.scene.checker.scene.capsules if capsule.name == "payload"
+    )
     assert body.start_m == pytest.approx((0.45, 0.0, 0.0), abs=0.15)
 
 
@@ -58,32 +62,44 @@ def made(searched: tuple[Plan, list[tuple[int, float]]]) -> Plan:
     return searched[0]
 
 
-def _searched(cell: Cell, experiment: Experiment, exchanges: int) -> tuple[Plan, list[tuple[int, float]]]:
+def _searched(
+    cell: Cell, experiment: Experiment, exchanges: int
+) -> tuple[Plan, list[tuple[int, float]]]:
     reports = list[tuple[int, float]]()
 
     def note(done: int, worst: float) -> None:
         reports.append((done, worst))
 
-    made = plan(cell, seed=4, duration_s=SECONDS, exchanges=exchanges, experiment=experiment, progress=note)
+    made = plan(
+        cell, seed=4, duration_s=SECONDS, exchanges=exchanges, experiment=experiment, progress=note
+    )
     return made, reports
 
 
-def test_the_planners_own_plan_shows_every_gain(cell: Cell, experiment: Experiment, made: Plan) -> None:
-    judged = verdicts(experiment.design, [(experiment.excitation(paths_of(cell, made.moves))[0], RUNS)])
+def test_the_planners_own_plan_shows_every_gain(
+    cell: Cell, experiment: Experiment, made: Plan
+) -> None:
+    judged = verdicts(
+        experiment.design, [(experiment.excitation(paths_of(cell, made.moves))[0], RUNS)]
+    )
     assert judged.rank == judged.known_preload_rank == 4
     assert not judged.sentences(cell.axis_names)
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
     targets = np.array([move.target_rad for move in made.moves])
     assert ((targets >= lower) & (targets <= upper)).all()
     text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS)
-    assert "Internal preload obscures no gain: these moves determine 4 of 4 independent directions" in text
+    assert (
+        "Internal preload obscures no gain: these moves determine 4 of 4 independent directions"
+    ) in text
     assert "\nAssumed:\n  payload: disc, 8.2 kg\n" in text
     assert max(len(line) for line in text.partition("Assumed:")[2].splitlines()[:7]) < 110
     page = preview_page(cell, made.moves, experiment.scene.checker, b"plan")
     assert "The shape of the arm is unknown: links of a closed chain are not guessed" in page
 
 
-def test_a_weak_gain_is_told_how_to_become_good(cell: Cell, experiment: Experiment, made: Plan) -> None:
+def test_a_weak_gain_is_told_how_to_become_good(
+    cell: Cell, experiment: Experiment, made: Plan
+) -> None:
     """σ falls with the square root of the time: the same moves made so many times over are good."""
     excitation = experiment.excitation(paths_of(cell, made.moves))[0]
     judged = verdicts(experiment.design, [(excitation, RUNS)])
@@ -91,15 +107,21 @@ def test_a_weak_gain_is_told_how_to_become_good(cell: Cell, experiment: Experime
     assert worst > 1.0
     (line,) = (
         line
-        for line in plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS).splitlines()
+        for line in plan_text(
+            Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS
+        ).splitlines()
         if line.startswith("For good gains (1 %)")
     )
     seconds = float(line.partition("--duration ")[2].partition(")")[0])
     assert "a heavier payload" in line
-    repeated = verdicts(experiment.design, [(excitation, RUNS)] * int(np.ceil(seconds / made.duration_s)))
+    repeated = verdicts(
+        experiment.design, [(excitation, RUNS)] * int(np.ceil(seconds / made.duration_s))
+    )
     assert max(gain.std_percent for gain in repeated.gains) <= 1.0
     good = replace(judged, gains=repeated.gains)
-    assert "For good gains" not in plan_text(Path("plan.yaml"), None, cell, experiment, made, good, SECONDS)
+    assert "For good gains" not in plan_text(
+        Path("plan.yaml"), None, cell, experiment, made, good, SECONDS
+    )
 
 
 def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
@@ -111,35 +133,48 @@ def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
     five_bar = load_cell(tmp_path / "cell.yaml")
     experiment = experiment_of(five_bar)
     made = plan(five_bar, seed=1, duration_s=SECONDS, exchanges=0, experiment=experiment)
-    judged = verdicts(experiment.design, [(experiment.excitation(paths_of(five_bar, made.moves))[0], RUNS)])
+    judged = verdicts(
+        experiment.design, [(experiment.excitation(paths_of(five_bar, made.moves))[0], RUNS)]
+    )
     text = plan_text(Path("plan.yaml"), None, five_bar, experiment, made, judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("Assembly pose"))
     assert line == (
-        "Assembly pose, to compare with the robot: elbow-1 0 deg, elbow-2 0 deg while the motors' joints are at "
-        "crank-1 0 deg, crank-2 0 deg."
+        "Assembly pose, to compare with the robot: elbow-1 0 deg, elbow-2 0 deg while the motors' "
+        "joints are at crank-1 0 deg, crank-2 0 deg."
     )
 
 
 def test_an_interrupted_search_is_repeated_by_its_number_of_exchanges(
     cell: Cell, experiment: Experiment, searched: tuple[Plan, list[tuple[int, float]]]
 ) -> None:
-    """What `plan` says when it is interrupted: the first exchanges do not depend on how many are to come."""
+    """What `plan` says when it is interrupted:
+    the first exchanges do not depend on how many are to come.
+    """
     longer = searched[1]
     assert [done for done, _ in longer] == [8, 16]
     assert longer[:1] == _searched(cell, experiment, 8)[1]
 
 
-def test_the_same_moves_around_one_pose_hide_gains(cell: Cell, experiment: Experiment, made: Plan) -> None:
+def test_the_same_moves_around_one_pose_hide_gains(
+    cell: Cell, experiment: Experiment, made: Plan
+) -> None:
     checker = experiment.scene.checker
-    near = [checker.fitting(checker.home + 0.3 * (np.array(m.target_rad) - checker.home)) for m in made.moves]
-    moves = tuple(replace(m, target_rad=tuple(t.tolist())) for m, t in zip(made.moves, near, strict=True))
+    near = [
+        checker.fitting(checker.home + 0.3 * (np.array(m.target_rad) - checker.home))
+        for m in made.moves
+    ]
+    moves = tuple(
+        replace(m, target_rad=tuple(t.tolist())) for m, t in zip(made.moves, near, strict=True)
+    )
     judged = verdicts(experiment.design, [(experiment.excitation(paths_of(cell, moves))[0], RUNS)])
     hidden = judged.hidden(Hidden.PRELOAD)
     assert hidden
     assert judged.known_preload_rank is not None
     assert judged.rank < judged.known_preload_rank
     named = [cell.axis_names[axis] for axis in hidden]
-    text = plan_text(Path("plan.yaml"), None, cell, experiment, replace(made, moves=moves), judged, SECONDS)
+    text = plan_text(
+        Path("plan.yaml"), None, cell, experiment, replace(made, moves=moves), judged, SECONDS
+    )
     (line,) = (line for line in text.splitlines() if line.startswith("Internal preload obscures"))
     assert [name for name in cell.axis_names if name in line] == named
     gains = plan_report(Path("plan.yaml"), cell, experiment, made, judged).gains
@@ -149,9 +184,20 @@ def test_the_same_moves_around_one_pose_hide_gains(cell: Cell, experiment: Exper
         assert gain.known_preload_std_percent < gain.predicted_std_percent
 
 
-def test_a_workspace_too_small_for_the_gains_is_refused_with_the_reason(cell: Cell, experiment: Experiment) -> None:
-    low, high = np.radians(-2.0), np.radians(2.0)
-    axes = tuple(replace(axis, limits=replace(axis.limits, position=(low, high))) for axis in cell.axes)
+def test_a_workspace_too_small_for_the_gains_is_refused_with_the_reason(
+    cell: Cell, experiment: Experiment
+) -> None:
+    low = np.radians(-2.0)
+    high = np.radians(2.0)
+    axes = tuple(
+        replace(axis, limits=replace(axis.limits, position=(low, high))) for axis in cell.axes
+    )
     tight = replace(cell, axes=axes)
     with pytest.raises(UsageError, match="Internal preload obscures the gains of"):
-        plan(tight, seed=1, duration_s=SECONDS, exchanges=0, experiment=replace(experiment, cell=tight))
+        plan(
+            tight,
+            seed=1,
+            duration_s=SECONDS,
+            exchanges=0,
+            experiment=replace(experiment, cell=tight),
+        )

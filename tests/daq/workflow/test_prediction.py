@@ -11,7 +11,14 @@ import pytest
 from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.errors import LogsDiffer
-from daq.workflow.live_prediction import LEAST_S, RECENT_S, PredictedRows, Predictor, Recent, predictor_of
+from daq.workflow.live_prediction import (
+    LEAST_S,
+    RECENT_S,
+    PredictedRows,
+    Predictor,
+    Recent,
+    predictor_of,
+)
 from daq.workflow.validate import conditioning_of
 from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import differentiate
@@ -21,7 +28,8 @@ from ident.model.bodies import Payload
 from ident.prediction import predict_current
 from tests.daq.console.feeds import facts, predicting_calibration
 
-RATE_HZ, SAMPLES = 500.0, 3000
+RATE_HZ = 500.0
+SAMPLES = 3000
 CYCLES = np.arange(SAMPLES)
 
 
@@ -35,7 +43,9 @@ def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
     """Joint positions [rad] that come to rest half-way, and currents [A], shape (k, n)."""
     time_s = np.arange(SAMPLES) / RATE_HZ
     frequency = 0.5 + 0.1 * np.arange(len(cell.axes))
-    position = np.where(time_s[:, None] < 4.0, np.sin(2.0 * np.pi * frequency * time_s[:, None]), 0.0)
+    position = np.where(
+        time_s[:, None] < 4.0, np.sin(2.0 * np.pi * frequency * time_s[:, None]), 0.0
+    )
     position[time_s >= 4.0] = position[time_s < 4.0][-1]
     return 0.5 * position, np.random.default_rng(1).normal(0.0, 1.0, position.shape)
 
@@ -48,19 +58,25 @@ def _with_late_position(calibration: Calibration) -> Calibration:
 
 @pytest.mark.parametrize(("block", "is_late"), [(1, False), (10, False), (997, False), (10, True)])
 def test_rows_are_those_of_the_whole_run(cell: Cell, block: int, *, is_late: bool) -> None:
-    calibration, model = predicting_calibration(), model_of(cell)
+    calibration = predicting_calibration()
+    model = model_of(cell)
     if is_late:
         calibration = _with_late_position(calibration)
     position, current = _motion(cell)
     predictor = Predictor(calibration, cell, None, RATE_HZ)
     blocks = [slice(at, at + block) for at in range(0, SAMPLES, block)]
-    found = [part for one in blocks for part in predictor.take(CYCLES[one], position[one], current[one])]
+    found = [
+        part for one in blocks for part in predictor.take(CYCLES[one], position[one], current[one])
+    ]
     cycle, predicted, residual = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ("cycle", "predicted", "residual")
+        np.concatenate([getattr(part, name) for part in found])
+        for name in ("cycle", "predicted", "residual")
     )
     # Each row once, without a gap, until the windows of the last samples are not whole.
     assert set(np.diff(cycle)) == {10}
-    assert cycle[0] < 0.3 * RATE_HZ and cycle[-1] > SAMPLES - (0.6 * RATE_HZ if block < 100 else 1000)
+    assert cycle[0] < 0.3 * RATE_HZ and cycle[-1] > SAMPLES - (
+        0.6 * RATE_HZ if block < 100 else 1000
+    )
     conditioning = conditioning_of(calibration)
     run = Run("whole", np.arange(SAMPLES) / RATE_HZ, position, current, None, None)
     data = differentiate(run, model.drive_train, conditioning)
@@ -73,7 +89,9 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int, *, is_late: boo
     # The grid of the rows is another: the whole run's are interpolated between.
     axis = np.arange(expected.shape[1])
     for motor in range(len(cell.axes)):
-        assert predicted[moving, motor] == pytest.approx(np.interp(at_row, axis, expected[motor])[moving], abs=0.05)
+        assert predicted[moving, motor] == pytest.approx(
+            np.interp(at_row, axis, expected[motor])[moving], abs=0.05
+        )
     on_grid = moving & (at_row == np.floor(at_row))
     for motor in range(len(cell.axes)):
         rows = at_row[on_grid].astype(int)
@@ -120,7 +138,12 @@ def test_an_axis_is_judged_by_the_last_ten_seconds_in_which_it_moved() -> None:
     for _ in range(10):
         recent.add(_rows(np.nan, RECENT_S))  # a rest heals nothing
     found, other = recent.axes()
-    assert (found.measured, found.predicted, found.outside_share, found.conspicuous) == (None, None, 1.0, True)
+    assert (found.measured, found.predicted, found.outside_share, found.conspicuous) == (
+        None,
+        None,
+        1.0,
+        True,
+    )
     assert found.residual_rms == pytest.approx(3.0)
     assert (other.residual_rms, other.outside_share, other.conspicuous) == (None, 0.0, False)
     recent.add(_rows(0.5, 6.0))  # 4 s of 8 s are left in the ten seconds of motion
@@ -136,15 +159,27 @@ def test_another_mass_than_that_of_the_calibration_is_refused(cell: Cell) -> Non
     calibration = replace(calibration, parameters=(*calibration.parameters, *known))
     weighed = replace(cell.payloads[0], name="disc", mounting="disc", mass_kg=4.59)
     run = replace(facts(cell, None), payload="disc")
-    for mass_kg, remark in ((4.59, ""), (5.0, "carries 5 kg on mounting 'disc'; the calibration has 4.59 kg")):
-        _, found = predictor_of(calibration, replace(cell, payloads=(replace(weighed, mass_kg=mass_kg),)), run)
+    for mass_kg, remark in (
+        (4.59, ""),
+        (5.0, "carries 5 kg on mounting 'disc'; the calibration has 4.59 kg"),
+    ):
+        _, found = predictor_of(
+            calibration, replace(cell, payloads=(replace(weighed, mass_kg=mass_kg),)), run
+        )
         assert remark in found and bool(found) == bool(remark)
 
 
 def test_what_the_calibration_does_not_know_is_not_predicted(cell: Cell) -> None:
-    unknown = Predictor(predicting_calibration(), cell, Payload("body", "flange", {"m": 1.0}), RATE_HZ)
+    unknown = Predictor(
+        predicting_calibration(), cell, Payload("body", "flange", {"m": 1.0}), RATE_HZ
+    )
     assert "nothing is known of mounting" in unknown.problem
     position, current = _motion(cell)
     assert unknown.take(CYCLES, position, current) == []
     with pytest.raises(LogsDiffer):
-        Predictor(replace(predicting_calibration(), cell="other"), replace(cell, folder=Path()), None, RATE_HZ)
+        Predictor(
+            replace(predicting_calibration(), cell="other"),
+            replace(cell, folder=Path()),
+            None,
+            RATE_HZ,
+        )

@@ -83,7 +83,9 @@ def _start(number: int, time_s: float) -> CellEvent:
     return CellEvent(round(1e9 * time_s), None, EventKind.MOVE_START, number, "")
 
 
-def test_the_samples_of_the_feed_are_a_run_in_si(cell: Cell, nothing: GainsSoFar, blocks: tuple[Run, ...]) -> None:
+def test_the_samples_of_the_feed_are_a_run_in_si(
+    cell: Cell, nothing: GainsSoFar, blocks: tuple[Run, ...]
+) -> None:
     loaded = blocks[1]
     rows = _rows(cell, loaded)
     rows["missing"][7] = 0b100  # J3 did not answer
@@ -123,7 +125,10 @@ def test_there_are_no_figures_before_both_kinds_of_block_and_half_a_minute(
     first = after_bare.look(PLACE, {})
     assert not first.gains
     assert "no block with DISC" in first.missing
-    assert "a block without DISC" in nothing.with_run(loaded).with_motion(loaded).look(PLACE, {}).missing
+    assert (
+        "a block without DISC"
+        in nothing.with_run(loaded).with_motion(loaded).look(PLACE, {}).missing
+    )
     short = replace(after_bare.with_run(loaded).with_motion(loaded), motion_s=29.0)
     assert not short.look(PLACE, {}).gains
     assert "30 s of motion" in short.look(PLACE, {}).missing
@@ -134,7 +139,13 @@ def test_after_a_move_each_gain_is_beside_its_target_with_the_worst_first(
     nothing: GainsSoFar, blocks: tuple[Run, ...]
 ) -> None:
     bare, loaded, _ = blocks
-    look = nothing.with_run(bare).with_motion(bare).with_run(loaded).with_motion(loaded).look(PLACE, {})
+    look = (
+        nothing.with_run(bare)
+        .with_motion(bare)
+        .with_run(loaded)
+        .with_motion(loaded)
+        .look(PLACE, {})
+    )
     assert look.missing == ""
     assert [gain.target_percent for gain in look.gains] == [TARGET_PERCENT] * len(GAINS)
     ratios = [gain.ratio for gain in look.gains]
@@ -151,8 +162,12 @@ def test_after_a_move_each_gain_is_beside_its_target_with_the_worst_first(
     assert known.look(PLACE, {worst: "its current is noisy"}).why == "its current is noisy"
 
 
-def test_sigma_goes_on_from_that_of_the_estimator(nothing: GainsSoFar, blocks: tuple[Run, ...]) -> None:
-    """An effect that the search has found is noise to the quick estimate: its own σ would be several times as large."""
+def test_sigma_goes_on_from_that_of_the_estimator(
+    nothing: GainsSoFar, blocks: tuple[Run, ...]
+) -> None:
+    """An effect that the search has found is noise to the quick estimate:
+    its own σ would be several times as large.
+    """
     bare, loaded, again = blocks
     known = nothing.with_run(bare).with_motion(bare).with_run(loaded).with_motion(loaded)
     quick = known.fit.gains().std_percent
@@ -162,9 +177,14 @@ def test_sigma_goes_on_from_that_of_the_estimator(nothing: GainsSoFar, blocks: t
     names = nothing.experiment.cell.axis_names
     shown = {gain.axis: gain.std_percent for gain in continued.look(PLACE, {}).gains}
     assert [shown[name] for name in names] == pytest.approx(judged.tolist())
-    raw = {gain.axis: gain.std_percent for gain in known.with_run(again).with_motion(again).look(PLACE, {}).gains}
+    raw = {
+        gain.axis: gain.std_percent
+        for gain in known.with_run(again).with_motion(again).look(PLACE, {}).gains
+    }
     later = continued.with_run(again).with_motion(again).look(PLACE, {})
-    assert {gain.axis: gain.std_percent for gain in later.gains} == pytest.approx({**raw, "J3": 0.2 * raw["J3"]})
+    assert {gain.axis: gain.std_percent for gain in later.gains} == pytest.approx(
+        {**raw, "J3": 0.2 * raw["J3"]}
+    )
     assert nothing.in_proportion(judged).scale is None
 
 

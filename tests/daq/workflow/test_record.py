@@ -1,4 +1,6 @@
-"""Recording against drives that live in a time of their own: what the bus did must be in the log and in its verdict."""
+"""Recording against drives that live in a time of their own:
+what the bus did must be in the log and in its verdict.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 SECOND_NS = 10**9
 DAY_NS = 86_400 * SECOND_NS
 WALL_NS = 1_700_000_000_000_000_000
-ELBOW, ELBOW_COUNTS = 3, round(radians(60) * 45 / (2 * 3.141592653589793) * 65536)
+ELBOW = 3
+ELBOW_COUNTS = round(radians(60) * 45 / (2 * 3.141592653589793) * 65536)
 PLAN = """format: drivegain-plan
 cell: demo
 seed: 1
@@ -45,9 +48,13 @@ moves:
 class Rig:
     """Six scripted drives in the place of the demo cell's, the elbow at 60 deg."""
 
-    def __init__(self, checkout: Path, folder: Path, patch: pytest.MonkeyPatch, pacing: str) -> None:
+    def __init__(
+        self, checkout: Path, folder: Path, patch: pytest.MonkeyPatch, pacing: str
+    ) -> None:
         configs = checkout / "configs"
-        text = (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+        text = (
+            (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+        )
         self.cell_file = folder / "cell.yaml"
         self.cell_file.write_text(text.replace("pacing: lockstep", f"pacing: {pacing}"))
         self.plan = folder / "plan.yaml"
@@ -116,7 +123,8 @@ def silent_at_first(bus: ScriptedBus, cycles: int) -> None:
 
 
 def test_no_full_collection_delays_a_sync(timed: Rig) -> None:
-    usual, during = gc.get_threshold(), set()
+    usual = gc.get_threshold()
+    during = set()
 
     def tamper(message: can.Message) -> Iterable[can.Message]:
         during.add(gc.get_threshold()[2])
@@ -168,7 +176,9 @@ def test_a_glitch_of_an_encoder_makes_the_run_invalid(lockstep: Rig) -> None:
         load_run(lockstep.out)
 
 
-def test_what_is_done_before_the_first_sample_costs_no_period(timed: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_done_before_the_first_sample_costs_no_period(
+    timed: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def slow_bundle(cell_file: Path) -> dict[str, bytes]:
         timed.bus.clock.now_ns += 30_000_000
         return bundle(cell_file)
@@ -195,8 +205,14 @@ def test_moves_are_planned_from_where_the_axes_are_known_to_be(
     assert lockstep.profiles() == sound.profiles() != []
 
 
-def test_axes_that_would_go_on_when_the_recorder_is_killed_do_not_move_unasked(lockstep: Rig) -> None:
-    with pytest.raises(MotionRefused, match=r"UNGUARDED: J1: no 1016h.*pass --unguarded to move J1, J2, .*emergency"):
+def test_axes_that_would_go_on_when_the_recorder_is_killed_do_not_move_unasked(
+    lockstep: Rig,
+) -> None:
+    with pytest.raises(
+        MotionRefused,
+        match=r"UNGUARDED: J1: no 1016h.*pass --unguarded to move "
+        r"J1, J2, .*emergency",
+    ):
         lockstep.run(unguarded=False)
     assert not lockstep.out.exists()
     assert not any(node.powered_cycles for node in lockstep.bus.nodes)
@@ -225,8 +241,12 @@ def test_a_schedule_that_slipped_is_refused(timed: Rig) -> None:
         load_run(timed.out)
 
 
-@pytest.mark.parametrize(("twice", "says"), [(0x182, "1 answers twice"), (0x482, "no axis was configured to send")])
-def test_what_the_stream_cannot_explain_makes_a_run_invalid(lockstep: Rig, twice: int, says: str) -> None:
+@pytest.mark.parametrize(
+    ("twice", "says"), [(0x182, "1 answers twice"), (0x482, "no axis was configured to send")]
+)
+def test_what_the_stream_cannot_explain_makes_a_run_invalid(
+    lockstep: Rig, twice: int, says: str
+) -> None:
     sent: list[int] = []
 
     def tamper(message: can.Message) -> Iterable[can.Message]:
@@ -250,7 +270,9 @@ def test_another_node_on_the_bus_does_no_harm(lockstep: Rig) -> None:
     assert (done.log.valid, done.log.reason) == (True, "")
 
 
-@pytest.mark.parametrize("step_ns", [0, 3 * SECOND_NS, 3 * DAY_NS, -3 * DAY_NS, 730 * DAY_NS, -730 * DAY_NS])
+@pytest.mark.parametrize(
+    "step_ns", [0, 3 * SECOND_NS, 3 * DAY_NS, -3 * DAY_NS, 730 * DAY_NS, -730 * DAY_NS]
+)
 def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
     lockstep: Rig, step_ns: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -271,9 +293,14 @@ def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
     assert json.loads(capsys.readouterr().out)["wall_clock_step_s"] == step_ns * 1e-9
 
 
-def test_what_is_reported_after_the_last_sample_counts_too(lockstep: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The interface's own counters are read five times a second, so they may report losses after the last cycle."""
-    bus, recv = lockstep.bus, lockstep.bus.recv
+def test_what_is_reported_after_the_last_sample_counts_too(
+    lockstep: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The interface's own counters are read five times a second,
+    so they may report losses after the last cycle.
+    """
+    bus = lockstep.bus
+    recv = lockstep.bus.recv
     ended_ns: list[int] = []
 
     def late(timeout: float | None = None) -> can.Message | None:
@@ -289,7 +316,9 @@ def test_what_is_reported_after_the_last_sample_counts_too(lockstep: Rig, monkey
     assert any(event.kind is EventKind.FRAMES_DROPPED for event in read_log(lockstep.out).events)
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, NodeMisplaced(1, "A", "B")], ids=["Ctrl-C", "misplaced"])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt, NodeMisplaced(1, "A", "B")], ids=["Ctrl-C", "misplaced"]
+)
 def test_a_recording_that_ended_early_is_not_salvaged_as_a_valid_one(
     lockstep: Rig, error: BaseException, tmp_path: Path
 ) -> None:
@@ -308,7 +337,11 @@ def test_a_recording_that_ended_early_is_not_salvaged_as_a_valid_one(
 def test_an_answer_that_comes_twice_to_the_last_sync_of_all_is_counted(lockstep: Rig) -> None:
     """Behind it SDO answers are looked for on the same bus: the amplifiers end watching us."""
     for node in lockstep.bus.nodes:
-        node.objects[0x1016, 0], node.objects[0x1016, 1], node.objects[0x6007, 0] = (1, 1), (0, 4), (1, 2)
+        node.objects[0x1016, 0], node.objects[0x1016, 1], node.objects[0x6007, 0] = (
+            (1, 1),
+            (0, 4),
+            (1, 2),
+        )
 
     doubled: list[int] = []
 
@@ -330,7 +363,8 @@ def test_axes_that_are_stopped_by_sdo_leave_no_doubt_about_the_samples(
     timed: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That takes SYNCs too, whose answers belong to no sample."""
-    network, bus = timed.network, timed.bus
+    network = timed.network
+    bus = timed.bus
     unguard = network.unguard
 
     def late_answers() -> None:
@@ -345,11 +379,13 @@ def test_axes_that_are_stopped_by_sdo_leave_no_doubt_about_the_samples(
 
 
 def test_another_master_that_reads_meanwhile_is_named_at_the_end(lockstep: Rig) -> None:
-    reading = can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, *bytes(5))))
+    reading = can.Message(
+        arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, *bytes(5)))
+    )
     lockstep.bus.on_cycle = lambda cycle: lockstep.bus.inject(reading) if cycle == 200 else None
     done = lockstep.run()
     assert done.log.valid
     assert [text for text in done.warnings if "another master" in text] == [
-        "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but end that program "
-        "before the next run"
+        "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but "
+        "end that program before the next run"
     ]

@@ -1,4 +1,6 @@
-"""Axes that an abrupt stop left beyond their limits, and axes that no one would stop: what the cell file permits."""
+"""Axes that an abrupt stop left beyond their limits, and axes that no one would stop:
+what the cell file permits.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from daq.workflow.record import RECOVERY_SPEED, recovery_move
 from drivers.errors import MotionRefused
 from tests.daq.workflow.test_record import ELBOW, Rig
 
-LIMIT_DEG, COUNTS_PER_DEG = 133.0, 45 * 65536 / 360.0
+LIMIT_DEG = 133.0
+COUNTS_PER_DEG = 45 * 65536 / 360.0
 LIMIT = round(LIMIT_DEG * COUNTS_PER_DEG)
 BEYOND = 50  #: counts
 
@@ -54,14 +57,17 @@ def test_an_axis_beyond_its_limit_is_a_persons_business(outside: Rig) -> None:
     assert "`policy: {recovery_motion: allowed}`" in failure.do
 
 
-def test_where_the_cell_allows_it_the_axis_goes_slowly_back_and_the_run_begins(outside: Rig) -> None:
+def test_where_the_cell_allows_it_the_axis_goes_slowly_back_and_the_run_begins(
+    outside: Rig,
+) -> None:
     permit(outside, recovery_motion="allowed")
     done = outside.run()
     assert done.log.valid
     assert [text for text in done.warnings if "brought back slowly" in text]
     first = outside.profiles()[0]
     declared = load_cell(outside.cell_file)
-    limits, scale = declared.axes[ELBOW - 1].limits, 57.29577951308232 * COUNTS_PER_DEG
+    limits = declared.axes[ELBOW - 1].limits
+    scale = 57.29577951308232 * COUNTS_PER_DEG
     velocity, acceleration = struct.unpack_from("<II", first)
     assert 0 < velocity <= RECOVERY_SPEED * 1.01 * limits.velocity * scale
     assert 0 < acceleration <= RECOVERY_SPEED * 1.01 * limits.acceleration * scale
@@ -70,7 +76,8 @@ def test_where_the_cell_allows_it_the_axis_goes_slowly_back_and_the_run_begins(o
 
 
 @pytest.mark.parametrize(
-    ("place_deg", "remedy"), [(LIMIT_DEG + 10.0, "too far for `recovery_motion`"), (-LIMIT_DEG - 10.0, "too far")]
+    ("place_deg", "remedy"),
+    [(LIMIT_DEG + 10.0, "too far for `recovery_motion`"), (-LIMIT_DEG - 10.0, "too far")],
 )
 def test_an_axis_far_beyond_its_limit_is_a_persons_business_all_the_same(
     outside: Rig, place_deg: float, remedy: str
@@ -80,12 +87,15 @@ def test_an_axis_far_beyond_its_limit_is_a_persons_business_all_the_same(
     assert remedy in refused(outside).do
 
 
-def test_no_motor_of_a_closed_chain_moves_alone(outside: Rig, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_motor_of_a_closed_chain_moves_alone(
+    outside: Rig, checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     permit(outside, recovery_motion="allowed")
     chain = load_cell(checkout / "configs" / "cells" / "five-bar.yaml").chain
     assert chain is not None
     monkeypatch.setattr(
-        "daq.workflow.record.recovery_move", lambda cell, *given: recovery_move(replace(cell, chain=chain), *given)
+        "daq.workflow.record.recovery_move",
+        lambda cell, *given: recovery_move(replace(cell, chain=chain), *given),
     )
     assert "closed chain" in refused(outside).do
 

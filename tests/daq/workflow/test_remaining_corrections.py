@@ -37,7 +37,12 @@ def _calibration(*effects: AcceptedEffect) -> Calibration:
 
 def _zero() -> AcceptedEffect:
     return AcceptedEffect(
-        "zero-offset", "J2", {}, (Parameter("zero-offset offset 2", ZERO_RAD, 1e-3, "rad"),), 6.0, 3.0
+        "zero-offset",
+        "J2",
+        {},
+        (Parameter("zero-offset offset 2", ZERO_RAD, 1e-3, "rad"),),
+        6.0,
+        3.0,
     )
 
 
@@ -51,7 +56,9 @@ def _gravity() -> AcceptedEffect:
 
 def _with_zero(cell: Cell, offset_rad: float) -> Cell:
     axes = tuple(
-        replace(axis, zero_offset_rad=axis.zero_offset_rad + offset_rad) if axis.name == "J2" else axis
+        replace(axis, zero_offset_rad=axis.zero_offset_rad + offset_rad)
+        if axis.name == "J2"
+        else axis
         for axis in cell.axes
     )
     return replace(cell, axes=axes)
@@ -61,17 +68,25 @@ def _with_zero(cell: Cell, offset_rad: float) -> Cell:
 def test_of_a_zero_the_difference_to_the_cell_is_left(cell: Cell, corrected_rad: float) -> None:
     known = with_described(_calibration(_zero()), cell)
     left, _ = on_cell(known, _with_zero(cell, corrected_rad))
-    assert left.effects[0].coefficients[0].value == pytest.approx(ZERO_RAD - corrected_rad, abs=1e-12)
+    assert left.effects[0].coefficients[0].value == pytest.approx(
+        ZERO_RAD - corrected_rad, abs=1e-12
+    )
 
 
-ZERO_OFF = Diagnosis("zero-off", (), ("J2",), "the zero of J2 off", "that of the URDF", "correct it")
+ZERO_OFF = Diagnosis(
+    "zero-off", (), ("J2",), "the zero of J2 off", "that of the URDF", "correct it"
+)
 OTHER_ZERO = replace(ZERO_OFF, axes=("J3",))
 TILTED = Diagnosis("gravity-tilted", (), (), "gravity turned", "the cell file's", "correct it")
 
 
 @pytest.mark.parametrize(
     ("corrected_rad", "left"),
-    [(0.0, (ZERO_OFF, OTHER_ZERO)), (0.5 * ZERO_RAD, (ZERO_OFF, OTHER_ZERO)), (ZERO_RAD, (OTHER_ZERO,))],
+    [
+        (0.0, (ZERO_OFF, OTHER_ZERO)),
+        (0.5 * ZERO_RAD, (ZERO_OFF, OTHER_ZERO)),
+        (ZERO_RAD, (OTHER_ZERO,)),
+    ],
 )
 def test_a_zero_that_the_cell_file_has_right_since_is_not_named_again(
     cell: Cell, corrected_rad: float, left: tuple[Diagnosis, ...]
@@ -100,7 +115,9 @@ def test_of_gravity_the_turn_from_the_cell_is_left(cell: Cell) -> None:
 
 
 def test_a_calibration_of_before_corrects_as_a_whole(cell: Cell) -> None:
-    """It does not say how the number was described; `validate`, `weigh` and `contact` warn of it."""
+    """It does not say how the number was described;
+    `validate`, `weigh` and `contact` warn of it.
+    """
     left, _ = on_cell(_calibration(_zero()), _with_zero(cell, ZERO_RAD))
     assert left.effects[0].coefficients[0].value == ZERO_RAD
 
@@ -113,8 +130,11 @@ def test_what_was_described_is_kept_in_the_file(cell: Cell) -> None:
 
 
 @given(angles, angles, angles, angles)
-def test_a_turn_between_two_directions_leads_from_one_to_the_other(a: float, b: float, c: float, d: float) -> None:
+def test_a_turn_between_two_directions_leads_from_one_to_the_other(
+    a: float, b: float, c: float, d: float
+) -> None:
     down = np.array([0.0, 0.0, -9.81])
-    one, other = turned_gravity(down, (a, b)), turned_gravity(down, (c, d))
+    one = turned_gravity(down, (a, b))
+    other = turned_gravity(down, (c, d))
     turn = turn_between(one, other)
     assert turned_gravity(one, turn.tolist()) == pytest.approx(other, abs=1e-9)

@@ -33,7 +33,9 @@ def _table(path: Path) -> dict[str, FloatArray]:
 
 
 @pytest.mark.slow
-def test_a_real_log_as_a_table(real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_real_log_as_a_table(
+    real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     calibration, log = real
     out = tmp_path / "residual.csv"
     assert main(["export", "csv", str(calibration), str(log), "--out", str(out), "--json"]) == 0
@@ -60,7 +62,9 @@ def test_a_real_log_as_a_table(real: tuple[Path, Path], tmp_path: Path, capsys: 
 def test_its_currents_are_those_that_a_drive_would_get(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Motor 6 of the TX-40 turns with joints 5 and 6: its current is not the torque of joint 6 over its gain."""
+    """Motor 6 of the TX-40 turns with joints 5 and 6:
+    its current is not the torque of joint 6 over its gain.
+    """
     calibration, log = real
     out = tmp_path / "residual.csv"
     assert main(["export", "csv", str(calibration), str(log), "--out", str(out)]) == 0
@@ -76,8 +80,12 @@ def test_its_currents_are_those_that_a_drive_would_get(
     measured = filtered(data.current_a.T)
     unit = "Nm_motor_a_priori_"
     for index in range(6):
-        assert table[f"J{index + 1}.current_predicted_{unit}"] == pytest.approx(expected[index], abs=1e-9)
-        assert table[f"J{index + 1}.current_measured_{unit}"] == pytest.approx(measured[index], abs=1e-9)
+        assert table[f"J{index + 1}.current_predicted_{unit}"] == pytest.approx(
+            expected[index], abs=1e-9
+        )
+        assert table[f"J{index + 1}.current_measured_{unit}"] == pytest.approx(
+            measured[index], abs=1e-9
+        )
     assert model_of(read_log(log).head.cell(log)).drive_train.coupled == (5,)
 
 

@@ -1,4 +1,6 @@
-"""A recording gets the same diagnoses from `fit`, `residual`, `validate`, the report, and `daq.fit_logs`."""
+"""A recording gets the same diagnoses from `fit`, `residual`, `validate`, the report,
+and `daq.fit_logs`.
+"""
 
 from __future__ import annotations
 
@@ -69,14 +71,16 @@ payloads:
   - {name: disc, mounting: a, mass_kg: 4.59, mass_tolerance_kg: 0.005}
 conditioning:
   {position_cutoff_hz: 40.0, position_order: 4, decimation_cutoff_hz: 20.0, standstill_rad_s: [0.03, 0.03, 0.03]}
-"""
+"""  # noqa: E501
 
 SECTION = "axes.zero_offset (J2)"  #: That a given description changes
 RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
 SECONDS = 13.0
 FEW = {"stribeck", "load-friction", "spring", "lag", "time-skew"}
 FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in FEW)
-"""What a search tries here beside the corrections of the description: what is diagnosed hangs on none of it."""
+"""What a search tries here beside the corrections of the description:
+what is diagnosed hangs on none of it.
+"""
 Runs = list[Run]
 Mistake = Callable[[Runs], Runs]
 
@@ -111,7 +115,9 @@ def of_size(*axes: int) -> Mistake:
 
 def noisy(run: Run) -> Run:
     """A run of which the last current is mostly noise."""
-    noise = np.random.default_rng(0).standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0])
+    noise = np.random.default_rng(0).standard_normal(run.current_a.shape) * np.array(
+        [0.0, 0.0, 1.0]
+    )
     return replace(run, current_a=run.current_a + noise)
 
 
@@ -130,7 +136,9 @@ def late_currents(*delays_s: float) -> Mistake:
 
     def change(run: Run) -> Run:
         columns = zip(run.current_a.T, delays_s, strict=True)
-        late = [np.interp(run.time_s - delay_s, run.time_s, current) for current, delay_s in columns]
+        late = [
+            np.interp(run.time_s - delay_s, run.time_s, current) for current, delay_s in columns
+        ]
         return replace(run, current_a=np.stack(late, axis=1))
 
     return lambda runs: [change(run) for run in runs]
@@ -192,7 +200,9 @@ def displaced(run: Run) -> Run:
 
 def constant(run: Run) -> Run:
     """A run in which the channel of J2 has one value."""
-    return replace(run, current_a=run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0]))
+    return replace(
+        run, current_a=run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0])
+    )
 
 
 def still(run: Run) -> Run:
@@ -200,7 +210,8 @@ def still(run: Run) -> Run:
     return replace(run, position_rad=run.position_rad * np.array([1.0, 1.0, 0.0]))
 
 
-#: By mistake: how it is made in the runs r0 to r7, of which r6 and r7 are held out, and what is said of it.
+#: By mistake: how it is made in the runs r0 to r7, of which r6 and r7 are held out, and what is
+#: said of it.
 MISTAKES: dict[str, tuple[Mistake, str]] = {
     "none": (lambda runs: runs, ""),
     "J2 half as large": (scaled(1.0, 0.51, 1.0), "gain-off-nameplate J2"),
@@ -211,7 +222,8 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "sizes": (of_size(0, 1, 2), "CurrentUnsigned"),
     "size of J3": (of_size(2), "CurrentUnsigned"),
     "J2 and J3 exchanged": (lambda runs: [exchanged(run) for run in runs], "ChannelsExchanged"),
-    "position of J2 reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
+    "position of J2 "
+    "reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
     "mounted on a wall": (mounted_on_a_wall, "GeometryTurned"),
     "zero of J2 off": (lambda runs: [offset(run) for run in runs], "zero-off J2"),
     "all currents late": (late_currents(0.004, 0.004, 0.004), "time-skew"),
@@ -244,7 +256,9 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
     folder = tmp_path_factory.mktemp("cell")
     (folder / "arm.urdf").write_text(THREE_AXES.urdf)
     gains = three_axes_truth().gains
-    axes = "".join(AXIS.format(name=f"J{number}", gain=gain) for number, gain in enumerate(gains, start=1))
+    axes = "".join(
+        AXIS.format(name=f"J{number}", gain=gain) for number, gain in enumerate(gains, start=1)
+    )
     (folder / "cell.yaml").write_text(CELL + axes + REST)
     return load_cell(folder / "cell.yaml")
 
@@ -275,13 +289,16 @@ def test_the_same_is_said_by_every_verb(
     change, expected = MISTAKES[mistake]
     runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in change(recorded)}
 
-    def load(path: Path, given: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    def load(
+        path: Path, given: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
         return runs[path.name], given or cell
 
     for module in (fit_module, validate_module):
         monkeypatch.setattr(module, "load_run", load)
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    # Every verb asks for these itself; what is asked with the same arguments again is not computed again.
+    # Every verb asks for these itself; what is asked with the same arguments again is not computed
+    # again.
     turned_geometry = remembered(find_turned_geometry)
     for asking in (diagnoses_module, validate_module):
         monkeypatch.setattr(asking, "find_turned_geometry", turned_geometry)
@@ -289,7 +306,8 @@ def test_the_same_is_said_by_every_verb(
     # The masses of a validation say nothing of a diagnosis.
     monkeypatch.setattr(validate_module, "rows_to_weigh", lambda *_, **__: refuse_to_weigh())
     paths = [Path(f"r{number}") for number in range(RUNS)]
-    logs, holdout = paths[:USED], paths[USED:]
+    logs = paths[:USED]
+    holdout = paths[USED:]
     verbs: dict[str, Callable[[], tuple[Diagnosis, ...]]] = {
         # Where a search adds an effect, the gains are others, and so are the numbers in a text.
         "residual": lambda: close_loop(unjudged, 0).diagnoses,
@@ -309,17 +327,25 @@ def test_the_same_is_said_by_every_verb(
     assert said(fitted.diagnoses) == ({expected} if expected else set())
     assert texts(verbs["fit_logs"]()) == texts(fitted.diagnoses)
     assert said(verbs["residual"]()) == said(fitted.diagnoses)
-    calibration = decode_calibration(encode_calibration(calibration_of(fitted, WHEN)), "calibration.yaml")
+    calibration = decode_calibration(
+        encode_calibration(calibration_of(fitted, WHEN)), "calibration.yaml"
+    )
     assert texts(calibration.diagnoses) == texts(fitted.diagnoses)
     for given in (logs, holdout, [*logs, *holdout]):
-        assert texts(cross_validate({"one": calibration}, given).diagnoses) == texts(fitted.diagnoses)
-    page = certificate_page(certify(calibration, without_controller(calibration, "Not read.", WHEN)))
+        assert texts(cross_validate({"one": calibration}, given).diagnoses) == texts(
+            fitted.diagnoses
+        )
+    page = certificate_page(
+        certify(calibration, without_controller(calibration, "Not read.", WHEN))
+    )
     shown = unescape(re.sub(r"<[^>]*>|`", "", page))
     for one in fitted.diagnoses:
         assert f"CHECK {one.text}.".replace("`", "") in shown
 
 
-@pytest.mark.parametrize(("degrees", "next_step"), [(4.0, "correct the description"), (0.0, "drivegain residual")])
+@pytest.mark.parametrize(
+    ("degrees", "next_step"), [(4.0, "correct the description"), (0.0, "drivegain residual")]
+)
 def test_a_wrong_description_is_corrected_before_the_next_step(
     cell: Cell,
     recorded: Runs,
@@ -328,7 +354,10 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     degrees: float,
     next_step: str,
 ) -> None:
-    runs = {run.name: replace(offset(run, degrees), digest=f"{int(run.name[1:]):064x}") for run in recorded}
+    runs = {
+        run.name: replace(offset(run, degrees), digest=f"{int(run.name[1:]):064x}")
+        for run in recorded
+    }
     for module in (fit_module, validate_module):
         monkeypatch.setattr(module, "load_run", lambda path, *_: (runs[path.name], cell))
     paths = [Path(f"r{number}") for number in range(RUNS)]
@@ -350,9 +379,13 @@ def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load
     runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in recorded}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     calibration = calibration_of(fit([Path(f"r{number}") for number in range(USED)]), WHEN)
-    given = Recording(None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,))
+    given = Recording(
+        None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,)
+    )
     noise_a = 0.06 * np.random.default_rng(1).standard_normal(recorded[6].current_a.shape)
-    moved = replace(offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given)
+    moved = replace(
+        offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given
+    )
     other = replace(cell, digest="other", recording_digest="other")
     found: dict[str, set[str]] = {}
     for name, run in {"given": moved, "recorded": replace(moved, recording=None)}.items():
@@ -393,10 +426,15 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
     (diagnosis,) = description_diagnoses(replace(fitted, steps=(step,)))
     assert (diagnosis.name, diagnosis.axes) == ("zero-off", ("J2",))
     assert "off by -4.00 ± 0.10°" in diagnosis.found
-    assert "the gains are without this correction (the squared error on runs left out rises)" in diagnosis.found
-    # Beside a delay that the moves do not tell from it, it is one diagnosis, and no number is to be typed in.
+    assert (
+        "the gains are without this correction (the squared error on runs left out rises)"
+    ) in diagnosis.found
+    # Beside a delay that the moves do not tell from it, it is one diagnosis, and no number is to be
+    # typed in.
     late = passed_finding(LatePosition(), 1, 0.002, 1e-4)
-    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), alike=(AlikeCorrections((finding, late), ()),))
+    check = GeometryCheck(
+        gravity=None, mistakes=(), hidden_zeros=(), alike=(AlikeCorrections((finding, late), ()),)
+    )
     (unclear,) = description_diagnoses(replace(fitted, steps=(step,), description=check))
     assert unclear.name == "correction-unclear"
     assert "the zero of J2 off by -4.00 ± 0.10°" in unclear.found
@@ -419,7 +457,9 @@ def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
     runs = {run.name: replace(offset(run), digest=run.name) for run in (*recorded[:USED], short)}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    fitted = fit([Path(f"r{number}") for number in range(USED)], holdout=[Path("r6")], keep_rows=True)
+    fitted = fit(
+        [Path(f"r{number}") for number in range(USED)], holdout=[Path("r6")], keep_rows=True
+    )
     closed = close_loop(fitted, 0)
     assert closed.steps[-1].after.effects == ()
     (verdict,) = closed.steps[-1].verdicts
@@ -436,7 +476,9 @@ def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
     cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It was "about -35 deg", and gains and held-out errors of the corrected robot followed."""
-    runs = {run.name: replace(offset(run, 35.0), digest=f"{int(run.name[1:]):064x}") for run in recorded}
+    runs = {
+        run.name: replace(offset(run, 35.0), digest=f"{int(run.name[1:]):064x}") for run in recorded
+    }
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
     fitted = fit([Path(f"r{number}") for number in range(USED)], keep_rows=True)
@@ -460,7 +502,10 @@ def test_gains_that_mean_nothing_are_refused(
     json: bool,
 ) -> None:
     """They ended with exit code 0, beside a CHECK that said so."""
-    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in map(reversed_position, recorded)}
+    runs = {
+        run.name: replace(run, digest=f"{int(run.name[1:]):064x}")
+        for run in map(reversed_position, recorded)
+    }
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
     out = tmp_path / "calibration.yaml"
@@ -477,7 +522,9 @@ def test_gains_that_mean_nothing_are_refused(
 
 
 def test_what_is_said_of_another_run_leaves_the_gains_as_they_are() -> None:
-    of_run = Diagnosis("position-reversed", ("held-out",), ("J2",), "a position", "another", "reverse it")
+    of_run = Diagnosis(
+        "position-reversed", ("held-out",), ("J2",), "a position", "another", "reverse it"
+    )
     assert geometry_refusal((of_run,)) is None
     refused = geometry_refusal((of_run, replace(of_run, runs=())))
     assert refused is not None
@@ -489,14 +536,23 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
 ) -> None:
     truth = three_axes_truth()
     lean = np.radians(2.0)
-    leaning = replace(truth, model=with_gravity(truth.model, 9.81 * np.array([np.sin(lean), 0.0, -np.cos(lean)])))
+    leaning = replace(
+        truth, model=with_gravity(truth.model, 9.81 * np.array([np.sin(lean), 0.0, -np.cos(lean)]))
+    )
     rng = np.random.default_rng(8)
     less = np.array([0.06, 1.0, 1.0])  # J1 hardly moves
     runs: dict[str, Run] = {}
     for number in range(4):
         payload = MOUNTED if number % 2 else None
         run = record(
-            leaning, f"r{number}", rng, payload, seconds=15.0, noise_a=0.1, rate_hz=500.0, bend=lambda q: q * less
+            leaning,
+            f"r{number}",
+            rng,
+            payload,
+            seconds=15.0,
+            noise_a=0.1,
+            rate_hz=500.0,
+            bend=lambda q: q * less,
         )
         runs[run.name] = replace(run, digest=f"{number:064x}")
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
@@ -525,7 +581,10 @@ def test_each_hidden_zero_has_its_own_reason(cell: Cell) -> None:
 def test_the_key_that_is_named_reverses_a_position_and_no_current(
     cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in map(reversed_position, recorded)}
+    runs = {
+        run.name: replace(run, digest=f"{int(run.name[1:]):064x}")
+        for run in map(reversed_position, recorded)
+    }
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     (diagnosis,) = fit([Path(f"r{number}") for number in range(USED)], keep_rows=True).diagnoses
     assert (diagnosis.name, diagnosis.axes) == ("position-reversed", ("J2",))

@@ -22,7 +22,9 @@ EXPLAINED = ("cycles", "frames", "foreign")
 
 def cell_with(folder: Path, interface: str, pacing: str, producer: str | None) -> Path:
     text = (CONFIGURATIONS / "cells" / "demo.yaml").read_text(encoding="utf-8")
-    text = text.replace("../", f"{CONFIGURATIONS}/").replace("interface: virtual", f"interface: {interface}")
+    text = text.replace("../", f"{CONFIGURATIONS}/").replace(
+        "interface: virtual", f"interface: {interface}"
+    )
     said = "" if producer is None else f"\n  producer: {producer}"
     path = folder / "cell.yaml"
     path.write_text(text.replace("pacing: lockstep ", f"pacing: {pacing}{said} "), encoding="utf-8")
@@ -51,12 +53,25 @@ def test_a_producer_that_there_is(
     ("interface", "pacing", "producer", "message"),
     [
         ("virtual", "timed", "kernel", "kernel on virtual; expected a bus of interface socketcan"),
-        ("socketcand", "timed", "kernel", "kernel on socketcand; expected a bus of interface socketcan"),
-        ("socketcan", "timed", "J9", r"J9; expected recorder, kernel, or an axis \(J1, J2, J3, J4, J5, J6\)"),
+        (
+            "socketcand",
+            "timed",
+            "kernel",
+            "kernel on socketcand; expected a bus of interface socketcan",
+        ),
+        (
+            "socketcan",
+            "timed",
+            "J9",
+            r"J9; expected recorder, kernel, or an axis \(J1, J2, J3, "
+            r"J4, J5, J6\)",
+        ),
         ("virtual", "lockstep", "J3", "J3 with pacing lockstep"),
     ],
 )
-def test_a_producer_that_there_is_not(tmp_path: Path, interface: str, pacing: str, producer: str, message: str) -> None:
+def test_a_producer_that_there_is_not(
+    tmp_path: Path, interface: str, pacing: str, producer: str, message: str
+) -> None:
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(cell_with(tmp_path, interface, pacing, producer))
 

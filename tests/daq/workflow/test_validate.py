@@ -1,4 +1,6 @@
-"""Validation: a calibration that was saved and read predicts as the fit did, and says what it cannot predict."""
+"""Validation: a calibration that was saved and read predicts as the fit did,
+and says what it cannot predict.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,21 @@ from daq.cli.next_step import cell_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import CalibrationUnreadable
-from daq.workflow.validate import DataUse, conditioning_of, together, validate, warn_without_temperature
+from daq.workflow.validate import (
+    DataUse,
+    conditioning_of,
+    together,
+    validate,
+    warn_without_temperature,
+)
 from ident.calibration import AcceptedEffect, Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
 
 
-def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_file_gives_the_errors_of_the_fit(
+    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     file, log = real
     assert main(["validate", str(file), str(log), "--json"]) == 0
     output = capsys.readouterr()
@@ -32,15 +42,23 @@ def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: p
     error = entry["relative_error_percent"]
     assert error["axes"] == pytest.approx(calibration.relative_error_percent.axes, rel=1e-6)
     assert error["total"] == pytest.approx(calibration.relative_error_percent.total, rel=1e-6)
-    assert (entry["seen_by_fit"], entry["held_out"], entry["same_configuration"]) == (True, False, True)
+    assert (entry["seen_by_fit"], entry["held_out"], entry["same_configuration"]) == (
+        True,
+        False,
+        True,
+    )
     assert entry["rows"] == calibration.rows
     assert entry["picture"] is None
     assert found["filter"]["position_cutoff_hz"] == 100.0
 
 
-def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_and_picture(
+    real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, log = real
-    assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "new" / "folder")]) == 0
+    assert (
+        main(["validate", str(file), str(log), "--pictures", str(tmp_path / "new" / "folder")]) == 0
+    )
     text, said = capsys.readouterr()
     assert "Next:" not in said  # its gains were held fixed
     assert f"{load_calibration(file).relative_error_percent.total:.2f}" in text
@@ -59,11 +77,16 @@ def test_identified_gains_that_apply_refuses_are_not_applied_next(
 ) -> None:
     file, log = real
     held = load_calibration(file)
-    free = replace(held, gains=tuple(replace(gain, std=0.01 * abs(gain.value)) for gain in held.gains))
+    free = replace(
+        held, gains=tuple(replace(gain, std=0.01 * abs(gain.value)) for gain in held.gains)
+    )
     save_calibration(free, tmp_path / "free.yaml")
     assert main(["validate", str(tmp_path / "free.yaml"), str(log)]) == 0
     said = capsys.readouterr().err
-    assert "`drivegain apply` refuses this calibration: calibration: no payload in any log that was fitted" in said
+    assert (
+        "`drivegain apply` refuses this calibration: calibration: no payload in any log that "
+        "was fitted"
+    ) in said
 
 
 def test_the_next_step_names_the_cell_file_that_the_logs_carry(
@@ -71,18 +94,24 @@ def test_the_next_step_names_the_cell_file_that_the_logs_carry(
 ) -> None:
     shipped = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8")
     shipped = shipped.replace("../", f"{checkout}/configs/")
-    other, own = tmp_path / "a/cells/demo.yaml", tmp_path / "mine/own.yaml"
+    other = tmp_path / "a/cells/demo.yaml"
+    own = tmp_path / "mine/own.yaml"
     for file, kg in ((other, "4.59"), (own, "4.58")):
         file.parent.mkdir(parents=True)
         file.write_text(shipped.replace("mass_kg: 4.59", f"mass_kg: {kg}"), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    fitted = replace(demo_calibration(), cell="demo", recording_configuration_sha256=load_cell(own).recording_digest)
+    fitted = replace(
+        demo_calibration(),
+        cell="demo",
+        recording_configuration_sha256=load_cell(own).recording_digest,
+    )
     logs = [Path("mine/log.mcap")]
     assert cell_of(fitted, logs) == Path("mine/own.yaml")
     unknown = replace(fitted, recording_configuration_sha256=None)
     assert cell_of(unknown, logs) == Path("CELL")
     assert cell_of(unknown, [Path("log.mcap")]) == Path("a/cells/demo.yaml")
-    own.write_text("name: demo\nrobot:\n", encoding="utf-8")  # one that cannot be read is no reason to fail
+    # One that cannot be read is no reason to fail
+    own.write_text("name: demo\nrobot:\n", encoding="utf-8")
     assert cell_of(fitted, logs) == Path("CELL")
 
 
@@ -90,7 +119,9 @@ def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, 
     file, log = real
     calibration = load_calibration(file)
     (source,) = calibration.sources
-    changed = replace(calibration, sources=(replace(source, role="holdout"),), configuration_sha256="0" * 64)
+    changed = replace(
+        calibration, sources=(replace(source, role="holdout"),), configuration_sha256="0" * 64
+    )
     (held_out,) = validate(changed, [log])
     assert (held_out.data_use, held_out.same_configuration) == (DataUse.HOLDOUT, False)
     (new,) = validate(replace(calibration, sources=(replace(source, sha256="0" * 64),)), [log])
@@ -104,7 +135,9 @@ def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
     calibration = load_calibration(file)
     first, *others = calibration.gains
     (right,) = validate(calibration, [log])
-    (wrong,) = validate(replace(calibration, gains=(replace(first, value=1.2 * first.value), *others)), [log])
+    (wrong,) = validate(
+        replace(calibration, gains=(replace(first, value=1.2 * first.value), *others)), [log]
+    )
     # ‖1.2 Y − W χ‖/‖1.2 Y‖ with a residual that is nearly orthogonal to W χ.
     expected = np.hypot(100.0 * 0.2 / 1.2, right.error.axes[0] / 1.2)
     assert wrong.error.axes[0] == pytest.approx(expected, rel=0.05)
@@ -115,15 +148,20 @@ def test_the_filter_is_that_of_the_calibration(real: tuple[Path, Path]) -> None:
     file, log = real
     calibration = load_calibration(file)
     (as_fitted,) = validate(calibration, [log])
-    (slower,) = validate(replace(calibration, filter={**calibration.filter, "decimation_cutoff_hz": 5.0}), [log])
+    (slower,) = validate(
+        replace(calibration, filter={**calibration.filter, "decimation_cutoff_hz": 5.0}), [log]
+    )
     assert len(slower.time_s) < 0.3 * len(as_fitted.time_s)
     assert slower.error.total < as_fitted.error.total
 
 
 @pytest.mark.parametrize(
-    "spoilt", [{}, {"position_cutoff_hz": 40.0}, {**demo_calibration().filter, "standstill_rad_s": 0.1}]
+    "spoilt",
+    [{}, {"position_cutoff_hz": 40.0}, {**demo_calibration().filter, "standstill_rad_s": 0.1}],
 )
-def test_a_calibration_without_its_filter_is_unreadable(spoilt: dict[str, float | list[float]]) -> None:
+def test_a_calibration_without_its_filter_is_unreadable(
+    spoilt: dict[str, float | list[float]],
+) -> None:
     with pytest.raises(CalibrationUnreadable, match="position_cutoff_hz"):
         conditioning_of(replace(demo_calibration(), filter=spoilt))
 
@@ -173,7 +211,9 @@ def test_a_robot_that_was_at_rest_reports_nothing(
     assert "did the robot move" in capsys.readouterr().err
 
 
-def test_a_run_without_the_temperature_that_an_effect_needs_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_run_without_the_temperature_that_an_effect_needs_is_warned_of(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     effect = AcceptedEffect("temperature-friction", "J2", {}, (), 5.0, 4.0)
     calibration = replace(demo_calibration(), effects=(effect,))
     bare = np.zeros((3, 6))

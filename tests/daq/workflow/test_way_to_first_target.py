@@ -1,4 +1,6 @@
-"""From where the robot stands to the first target of a plan: straight, around what is in the way, or not at all."""
+"""From where the robot stands to the first target of a plan:
+straight, around what is in the way, or not at all.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from ident.planning.clearance import Box, Checker
 pytestmark = pytest.mark.slow
 
 LEFT = (1.2, 1.5, 0.0, 0.0, 0.0, 0.0)  #: The arm, stretched forward, beside a wall in front of it
-RIGHT = (-1.2, 1.5, 0.0, 0.0, 0.0, 0.0)  #: On its other side: the straight way there swings through it
+#: On its other side: the straight way there swings through it
+RIGHT = (-1.2, 1.5, 0.0, 0.0, 0.0, 0.0)
 ABOVE = (0.0, -0.5, 0.0, 0.0, 0.0, 0.0)
 MOVE = PlannedMove(RIGHT, 0.9, 0.8, 0.5)
 
@@ -30,7 +33,10 @@ MOVE = PlannedMove(RIGHT, 0.9, 0.8, 0.5)
 def walled(checkout: Path) -> Cell:
     """The demo cell with a wall in front of the arm."""
     wall = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
-    return replace(load_cell(checkout / "configs/cells/demo.yaml"), clearance=Clearance(None, 0.02, (), (wall,)))
+    return replace(
+        load_cell(checkout / "configs/cells/demo.yaml"),
+        clearance=Clearance(None, 0.02, (), (wall,)),
+    )
 
 
 def _plan_to(*targets: tuple[float, ...]) -> Plan:
@@ -52,7 +58,11 @@ def test_nothing_is_asked_where_the_cell_file_says_nothing_of_the_room(walled: C
 
 def test_a_wall_that_no_position_of_the_plan_leads_around_is_refused(walled: Cell) -> None:
     """All targets of the plan are as high as the wall."""
-    with pytest.raises(MotionRefused, match=r"found -?\d+ mm between .* and wall at .*, and no other clear way"):
+    with pytest.raises(
+        MotionRefused,
+        match=r"found -?\d+ mm between .* and wall at .*, and no "
+        r"other clear way",
+    ):
         way_to_first_target(walled, _plan_to(RIGHT), np.array(LEFT))
 
 
@@ -63,7 +73,8 @@ def test_slow_moves_lead_around_a_wall_between_the_positions_of_the_plan(walled:
     assert moves[-1].target_rad == RIGHT
     robot = robot_from_urdf(walled.urdf)
     scene = scene_of(walled, robot, 1.0).checker.scene
-    checker = Checker(robot, replace(scene, pairs=()))  # that a guessed arm touches itself refuses nothing
+    # That a guessed arm touches itself refuses nothing
+    checker = Checker(robot, replace(scene, pairs=()))
     way = np.array([LEFT, *(move.target_rad for move in moves)])
     for start, end in pairwise(way):
         assert checker.obstruction(start, end) is None
@@ -75,13 +86,24 @@ def test_slow_moves_lead_around_a_wall_between_the_positions_of_the_plan(walled:
 
 
 def test_the_next_plan_of_a_closed_chain_begins_where_the_last_one_ended(checkout: Path) -> None:
-    """Between random positions the loops of the DualV do not stay closed on a straight way of its motors."""
+    """Between random positions the loops of the DualV do not stay closed on a straight way of its
+    motors.
+    """
     cell = load_cell(checkout / "configs/cells/dualv.yaml")
     plans = [
-        plan(cell, seed=seed, duration_s=5.0, exchanges=0, largest_condition=np.inf, largest_std_percent=np.inf)
+        plan(
+            cell,
+            seed=seed,
+            duration_s=5.0,
+            exchanges=0,
+            largest_condition=np.inf,
+            largest_std_percent=np.inf,
+        )
         for seed in (1, 2, 3)
     ]
-    remarks = [way_to_first_target(cell, after, _end_of(before))[1] for before, after in pairwise(plans)]
+    remarks = [
+        way_to_first_target(cell, after, _end_of(before))[1] for before, after in pairwise(plans)
+    ]
     assert any("slow moves led around it" in remark for remark in remarks)
 
 

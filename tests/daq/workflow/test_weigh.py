@@ -45,15 +45,24 @@ def test_a_real_robot_that_touched_nothing(
     assert Path(found["picture"]).read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_log_is_not_its_own_quiet_motion(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_is_not_its_own_quiet_motion(
+    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     file, log = real
-    assert main(["contact", str(log), "--calibration", str(file), "--quiet", str(log)]) == ExitCode.DATA_UNFIT
+    assert (
+        main(["contact", str(log), "--calibration", str(file), "--quiet", str(log)])
+        == ExitCode.DATA_UNFIT
+    )
     assert "the same log twice" in capsys.readouterr().err
 
 
 def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
-    calibration, rest = demo_calibration(), np.zeros((4, 6))
-    runs = [Run(name, np.arange(4.0), rest, rest, digest=key * 64) for name, key in (("seen", "a"), ("held", "d"))]
+    calibration = demo_calibration()
+    rest = np.zeros((4, 6))
+    runs = [
+        Run(name, np.arange(4.0), rest, rest, digest=key * 64)
+        for name, key in (("seen", "a"), ("held", "d"))
+    ]
     assert warn_of_fitted(calibration, runs[1:], "no matter") == ()
     assert caplog.messages == []
     assert warn_of_fitted(calibration, runs, "no proof") == ("seen",)
@@ -90,12 +99,18 @@ def test_a_cell_that_was_corrected_since_is_not_corrected_twice_unsaid(
         save_calibration(changed, known)
         caplog.clear()
         assert main([verb, str(log), "--calibration", str(known)]) == ExitCode.OK
-        texts = [text for text in caplog.messages if "another description of the cell than the fit" in text]
+        texts = [
+            text
+            for text in caplog.messages
+            if "another description of the cell than the fit" in text
+        ]
         assert len(texts) == warned
         assert all(f"zero-offset on {axis}" in text for text in texts)
 
 
-def test_a_calibration_comes_first_or_as_an_option(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_calibration_comes_first_or_as_an_option(
+    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     file, log = map(str, real)
     for verb in ("weigh", "validate"):
         printed = []
@@ -110,7 +125,9 @@ def test_a_log_that_declares_a_payload_is_not_bare(
 ) -> None:
     file, _ = real
     calibration = load_calibration(file)
-    axes = tuple(replace(gain, axis=f"J{index + 1}") for index, gain in enumerate(calibration.gains))
+    axes = tuple(
+        replace(gain, axis=f"J{index + 1}") for index, gain in enumerate(calibration.gains)
+    )
     save_calibration(replace(calibration, cell="demo", gains=axes), tmp_path / "calibration.yaml")
     angle = np.rint(20000.0 * np.sin(np.arange(2500)[:, None] / 200.0 + np.arange(6))).astype(int)
     log = str(write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples(angle.tolist())))
@@ -167,20 +184,26 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     assert report.mass_std_of_reference_kg == 0.0
     reference = np.full((10, 10), 1e-6)
     tolerant = replace(found, body=replace(body, reference_covariance=reference))
-    assert "with the tolerance of the calibration's payload mass" in " ".join(_text(weighed_view(tolerant)).split())
+    assert ("with the tolerance of the calibration's payload mass") in " ".join(
+        _text(weighed_view(tolerant)).split()
+    )
     assert weigh_report(tolerant).mass_std_of_reference_kg == pytest.approx(0.001)
     nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
     assert "No body shows" in _text(weighed_view(nothing))
 
 
 def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
-    """The plate of the five-bar is 450 mm from its joint; a planar robot shows Izz, two first moments and the mass."""
+    """The plate of the five-bar is 450 mm from its joint;
+    a planar robot shows Izz, two first moments and the mass.
+    """
     cell = load_cell(checkout / "configs/cells/five-bar.yaml")
     ten = np.array([np.nan] * 5 + [1.0, 2.16, 0.15, np.nan, 5.0])
     std = np.where(np.isnan(ten), np.nan, 0.02)
     std[5] = 0.2
     covariance = np.diag(std**2)
-    body = WeighedBody(ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale))
+    body = WeighedBody(
+        ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale)
+    )
     found = Weighed(cell, (Path("a.mcap"),), (), body, (), 5.0)
     text = _text(weighed_view(found))
     assert re.search(r"centre x +432\.0 ± 4\.4 +mm", text)
@@ -198,7 +221,9 @@ def test_a_platform_that_only_translates_shows_a_mass_alone(checkout: Path) -> N
     cell = load_cell(checkout / "configs/cells/five-bar.yaml")
     ten = np.array([np.nan] * 9 + [5.0])
     covariance = np.diag(np.where(np.isnan(ten), np.nan, 0.02) ** 2)
-    body = WeighedBody(ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale))
+    body = WeighedBody(
+        ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale)
+    )
     lines = _text(weighed_view(Weighed(cell, (Path("a.mcap"),), (), body, (), 5.0))).splitlines()
     assert lines[0].strip() == "Body on the platform"
     assert "The platform does not turn in these moves: centre and inertia cannot be seen." in lines
@@ -207,8 +232,11 @@ def test_a_platform_that_only_translates_shows_a_mass_alone(checkout: Path) -> N
 
 def test_contacts_are_listed(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
-    one, even = np.ones(6), np.ones((6, 500))
-    band = Band(np.ones((6, 4)), 2.0 * one, np.array([5.0] * 5 + [np.nan]), 0.05 * one, 40.0 * one, 1.0)
+    one = np.ones(6)
+    even = np.ones((6, 500))
+    band = Band(
+        np.ones((6, 4)), 2.0 * one, np.array([5.0] * 5 + [np.nan]), 0.05 * one, 40.0 * one, 1.0
+    )
     torque = 0.5 * even
     torque[2, 100:140] = -9.0
     found = ExternalTorque(np.linspace(0.0, 9.98, 500), torque, even, even > 0.0, band, True, 1)
@@ -226,9 +254,11 @@ def test_contacts_are_listed(checkout: Path) -> None:
 
 def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
-    one, even = np.ones(6), np.ones((6, 500))
+    one = np.ones(6)
+    even = np.ones((6, 500))
     threshold = np.array([5.0, np.nan, np.nan, 5.0, 5.0, 5.0])
-    correlation_s, quiet_s = np.where(np.arange(6) == 1, 1.5, 0.02), np.array([40.0, 11.0, 8.0, 40.0, 40.0, 40.0])
+    correlation_s = np.where(np.arange(6) == 1, 1.5, 0.02)
+    quiet_s = np.array([40.0, 11.0, 8.0, 40.0, 40.0, 40.0])
     band = Band(np.ones((6, 4)), 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
     use = even > 0.0
     use[3] = False

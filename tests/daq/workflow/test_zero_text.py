@@ -1,4 +1,6 @@
-"""The words for a zero that is off: one number and one sign, by torque, by encoders, and on the certificate."""
+"""The words for a zero that is off: one number and one sign, by torque, by encoders,
+and on the certificate.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +37,25 @@ def _by_encoders(value_rad: float) -> GeometryFinding:
     """A finding by redundant encoders, of the second axis of a closed chain."""
     parameter = GeometryParameter(GeometryKind.ZERO, "crank-2")
     correction = GeometryEstimate(parameter, value_rad, radians(STD_DEG))
-    return GeometryFinding(4e-4, 6e-6, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ())
+    return GeometryFinding(
+        4e-4, 6e-6, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ()
+    )
 
 
 @pytest.mark.parametrize("too_large_deg", DECLARED_TOO_LARGE_DEG)
-def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(checkout: Path, too_large_deg: float) -> None:
-    """A zero that is declared 2° too large is off by -2°, and the cell file is right with that added."""
+def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(
+    checkout: Path, too_large_deg: float
+) -> None:
+    """A zero that is declared 2° too large is off by -2°,
+    and the cell file is right with that added.
+    """
     value_rad = -radians(too_large_deg)
     right_deg = 10.0
     said = f"{-too_large_deg:+.2f} ± 0.04° (to be added to its position)"
-    typed = f"add {-too_large_deg:+.2f} to `zero_offset_deg` of {{}} in the cell file, which makes it {right_deg:.2f},"
+    typed = (
+        f"add {-too_large_deg:+.2f} to `zero_offset_deg` of {{}} in the cell file, which makes it "
+        f"{right_deg:.2f},"
+    )
 
     serial = load_cell(checkout / "configs/cells/demo.yaml")
     declared = replace(serial.axes[1], zero_offset_rad=radians(right_deg + too_large_deg))
@@ -73,6 +84,8 @@ def test_a_zero_of_a_slide_is_in_millimetres() -> None:
     assert text == "the zero of J1 off by +3.00 ± 0.05 mm (to be added to its position)"
 
 
-@pytest.mark.parametrize(("std", "decimals"), [(0.4, 2), (0.04, 2), (0.004, 3), (0.0004, 4), (1e-7, 4), (0.0, 4)])
+@pytest.mark.parametrize(
+    ("std", "decimals"), [(0.4, 2), (0.04, 2), (0.004, 3), (0.0004, 4), (1e-7, 4), (0.0, 4)]
+)
 def test_a_zero_has_the_decimals_that_its_deviation_leaves(std: float, decimals: int) -> None:
     assert zero_decimals(std) == decimals

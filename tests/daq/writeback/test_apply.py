@@ -1,4 +1,7 @@
-"""Writing back: every failure of the disk, two writers, and rollback. The gates are in test_gates.py."""
+"""Writing back: every failure of the disk, two writers, and rollback.
+
+The gates are in test_gates.py.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,12 @@ def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -
     written = apply(_propose(demo_calibration(), controller), NOW)
     assert written is not None
     expected = before
-    for old, new in ((b"25.65", b"24.2000"), (b"-11.52", b"-9.2100"), (b"18.48", b"16.3000"), (b" 7.68", b" 6.7900")):
+    for old, new in (
+        (b"25.65", b"24.2000"),
+        (b"-11.52", b"-9.2100"),
+        (b"18.48", b"16.3000"),
+        (b" 7.68", b" 6.7900"),
+    ):
         assert expected.count(old) == 1
         expected = expected.replace(old, new)
     expected = expected.replace(b"32.96", b"33.900", 1).replace(b"32.96", b"32.400", 1)
@@ -88,7 +96,10 @@ def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
     with pytest.raises(CalibrationRefused, match="J1, J2, J3, J4, J5; expected"):
         _propose(fewer, controller)
     with pytest.raises(ControllerUnfit, match=r"drives\.J1\.gain for more than one axis"):
-        propose(FileTarget(controller, {**KEYS, "J2": "drives.J1.gain"}), Request(demo_calibration(), NOW))
+        propose(
+            FileTarget(controller, {**KEYS, "J2": "drives.J1.gain"}),
+            Request(demo_calibration(), NOW),
+        )
 
 
 @pytest.mark.parametrize(
@@ -100,7 +111,9 @@ def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
         ("gain: 7.68", "gain: unknown", "'unknown'"),
     ],
 )
-def test_a_controller_file_that_does_not_fit_is_refused(controller: Path, old: str, new: str, says: str | None) -> None:
+def test_a_controller_file_that_does_not_fit_is_refused(
+    controller: Path, old: str, new: str, says: str | None
+) -> None:
     controller.write_text(controller.read_text().replace(old, new))
     with pytest.raises(ControllerUnfit, match=says):
         _propose(demo_calibration(), controller)
@@ -140,7 +153,8 @@ def test_a_second_writer_is_refused(controller: Path) -> None:
 
 def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: Path) -> None:
     file = tmp_path / "x.yaml"
-    lock, made = tmp_path / ".x.yaml.lock", 0
+    lock = tmp_path / ".x.yaml.lock"
+    made = 0
     umask = os.umask(0o077)
     try:
         with exclusive_writer(file):
@@ -181,10 +195,16 @@ def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: 
             "[2003]\nObjectType=0x9\nSubNumber=2\n[2003sub1]\nDataType=0x0008\nParameterValue=32.96\n",
             ("2003:01", "2003sub1"),
         ),
-        ("x.xml", "<c><Axis name='J1'><gain>32.96</gain></Axis></c>", ("c/Axis[1]/gain", "c/Axis[@name='J1']/gain")),
+        (
+            "x.xml",
+            "<c><Axis name='J1'><gain>32.96</gain></Axis></c>",
+            ("c/Axis[1]/gain", "c/Axis[@name='J1']/gain"),
+        ),
     ],
 )
-def test_two_names_of_one_number_are_refused(tmp_path: Path, name: str, content: str, keys: tuple[str, str]) -> None:
+def test_two_names_of_one_number_are_refused(
+    tmp_path: Path, name: str, content: str, keys: tuple[str, str]
+) -> None:
     file = tmp_path / name
     file.write_text(content)
     two = replace(demo_calibration(), gains=demo_calibration().gains[:2])
@@ -210,7 +230,9 @@ class _Failing:
     """Replaces a system call and fails on its n-th use, when the disk is full."""
 
     def __init__(self, call: Callable[..., object], at: int) -> None:
-        self.call, self.at, self.uses = call, at, 0
+        self.call = call
+        self.at = at
+        self.uses = 0
 
     def __call__(self, *arguments: object, **options: object) -> object:
         self.uses += 1
@@ -245,14 +267,18 @@ def test_whatever_step_fails_the_old_file_stays_and_nothing_is_left(
     assert failures >= {"open": 5, "fchmod": 2, "fsync": 4, "replace": 2}[name]
 
 
-def test_a_disk_that_gives_back_something_else_is_noticed(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_gives_back_something_else_is_noticed(
+    controller: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = controller.read_bytes()
     proposal = _propose(demo_calibration(), controller)
     read = Path.read_bytes
 
     def flipped(path: Path) -> bytes:
         content = read(path)
-        return content.replace(b"kp: 120.0", b"kp: 120.1") if path.suffix == ".tmp" else content
+        if path.suffix == ".tmp":
+            return content.replace(b"kp: 120.0", b"kp: 120.1")
+        return content
 
     monkeypatch.setattr(Path, "read_bytes", flipped)
     with pytest.raises(ControllerUnfit, match=r"another value at drives\.J1\.loop\.kp"):
@@ -268,7 +294,8 @@ def test_what_a_person_saves_during_the_write_is_not_lost(
 ) -> None:
     """An editor takes no lock: the last check is right before the rename."""
     proposal = _propose(demo_calibration(), controller)
-    fsync, edited = os.fsync, controller.read_bytes() + b"# by hand\n"
+    fsync = os.fsync
+    edited = controller.read_bytes() + b"# by hand\n"
 
     def meanwhile(descriptor: int) -> None:
         fsync(descriptor)
@@ -288,7 +315,9 @@ def test_what_a_person_saves_during_the_write_is_not_lost(
     assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]
 
 
-def test_a_file_that_someone_makes_during_a_rollback_stays(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_someone_makes_during_a_rollback_stays(
+    controller: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     apply(_propose(demo_calibration(), controller), NOW)
     controller.unlink()
     fsync = os.fsync
@@ -324,12 +353,16 @@ def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path
     apply(_propose(demo_calibration(), controller), NOW)
     for step in (0, -3600, 0, -7200):
         rollback(FileTarget(controller), NOW + timedelta(seconds=step))
-    assert [(one.stamp, one.count) for one in backups(controller)] == [("20250102T030405Z", k) for k in range(5)]
+    assert [(one.stamp, one.count) for one in backups(controller)] == [
+        ("20250102T030405Z", k) for k in range(5)
+    ]
     contents = [one.path.read_bytes() for one in backups(controller)]
     assert all(a != b for a, b in itertools.pairwise(contents))
 
 
-def _make_backup(controller: Path, was: bytes, after_digest: bytes, stamp: str = "20250102T030405Z") -> Path:
+def _make_backup(
+    controller: Path, was: bytes, after_digest: bytes, stamp: str = "20250102T030405Z"
+) -> Path:
     digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (was, after_digest))
     path = controller.parent / f"demo.yaml.{stamp}.{digests}.bak"
     path.write_bytes(was)
@@ -339,7 +372,8 @@ def _make_backup(controller: Path, was: bytes, after_digest: bytes, stamp: str =
 def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
     with pytest.raises(CalibrationRefused, match="no backup beside it"):
         rollback(FileTarget(controller), NOW)
-    # A backup of a writer that was killed before it replaced the file does not allow a rollback either.
+    # A backup of a writer that was killed before it replaced the file does not allow a rollback
+    # either.
     _make_backup(controller, controller.read_bytes(), b"never written")
     with pytest.raises(CalibrationRefused, match="same content"):
         rollback(FileTarget(controller), NOW)
@@ -397,7 +431,9 @@ def test_a_deleted_file_comes_back(controller: Path, capsys: pytest.CaptureFixtu
     assert "the file was gone" in capsys.readouterr().out
 
 
-def test_an_edit_since_the_write_is_not_lost(controller: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_edit_since_the_write_is_not_lost(
+    controller: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = controller.parent.rename(controller.parent.parent / "my controllers")
     controller = folder / controller.name
     written = apply(_propose(demo_calibration(), controller), NOW)

@@ -1,4 +1,6 @@
-"""The controller's YAML file on the disk: only the numbers meant change, whatever a human has made of the rest."""
+"""The controller's YAML file on the disk:
+only the numbers meant change, whatever a human has made of the rest.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from tests.daq.formats.yaml_cases import Case, cases
 
 @settings(max_examples=150, deadline=None)
 @given(cases(), st.data())
-def test_of_a_file_on_the_disk_nothing_but_the_gains_changes(case: Case, data: st.DataObject) -> None:
+def test_of_a_file_on_the_disk_nothing_but_the_gains_changes(
+    case: Case, data: st.DataObject
+) -> None:
     """The whole way, with lock, audit, backup and rename; and the bytes in the file afterwards."""
     axes = [f"J{number + 1}" for number in range(len(case.keys))]
     olds = [float(number) for number in case.numbers]
@@ -36,13 +40,16 @@ def test_of_a_file_on_the_disk_nothing_but_the_gains_changes(case: Case, data: s
         for gain, text in zip(gains, case.numbers, strict=True)
     )
     with tempfile.TemporaryDirectory() as folder:
-        file, audit = Path(folder) / "robot.yaml", Path(folder) / "audit.jsonl"
+        file = Path(folder) / "robot.yaml"
+        audit = Path(folder) / "audit.jsonl"
         file.write_bytes(case.text(case.numbers).encode())
         calibration = of_first_axes(replace(demo_calibration(), gains=gains), len(gains))
         keys = dict(zip(axes, case.keys, strict=True))
         # Its own file is not under test, and to spell it would take as long as all the rest.
         now = datetime(2025, 1, 2, tzinfo=UTC)
-        proposal = propose(FileTarget(file, keys), Request(calibration, now, content=b"a calibration"))
+        proposal = propose(
+            FileTarget(file, keys), Request(calibration, now, content=b"a calibration")
+        )
         assert proposal.refusals == ()
         written = apply(proposal, now, audit=audit, who="Ada")
         assert file.read_bytes() == case.text(spelt).encode()
@@ -50,4 +57,7 @@ def test_of_a_file_on_the_disk_nothing_but_the_gains_changes(case: Case, data: s
             assert written is not None
             assert written.backup is not None
             assert written.backup.read_bytes() == case.text(case.numbers).encode()
-            assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+            assert [entry.action for entry in read(audit)] == [
+                AuditAction.APPLY_BEGUN,
+                AuditAction.APPLIED,
+            ]

@@ -33,7 +33,9 @@ def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, anot
     reviewed, _ = parse_base(f" {change_digest(before, after).upper()}\n", before)
     assert reviewed == hashlib.sha256(before).hexdigest()
     assert _findings(change_digest(before, after), before, after) == []
-    assert bool(_findings(change_digest(before, after), before, another)) == (another not in (before, after))
+    assert bool(_findings(change_digest(before, after), before, another)) == (
+        another not in (before, after)
+    )
     assert (parse_base(change_digest(another, after), before)[0] == reviewed) == (another == before)
 
 
@@ -44,7 +46,9 @@ def test_the_whole_digest_alone_names_no_change() -> None:
     assert _findings(None, b"old", b"any") == []
 
 
-@pytest.mark.parametrize("text", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])
+@pytest.mark.parametrize(
+    "text", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"]
+)
 def test_what_is_no_digest_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="12 digits, a hyphen, 12 digits"):
         parse_base(text, b"old")

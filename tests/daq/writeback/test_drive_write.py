@@ -1,4 +1,6 @@
-"""Gains written into the objects of simulated drives: without power, read back, saved, all or none, and back again."""
+"""Gains written into the objects of simulated drives:
+without power, read back, saved, all or none, and back again.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +17,22 @@ import pytest
 
 from daq.config.cell import Cell
 from daq.config.controller import Controller, GainObject
-from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.errors import (
+    CalibrationRefused,
+    ConfigurationInconsistent,
+    ControllerChanged,
+    ControllerUnfit,
+)
 from daq.ledger.audit import AuditAction, read, verify
-from daq.ledger.ledger import Ledger, plan_rename, read_history, rename_cell
+from daq.ledger.ledger import Ledger, acknowledge, plan_rename, read_history, rename_cell
 from daq.ledger.names import drives_of
-from daq.writeback.drive_target import DriveEdit, DriveTarget, read_record, read_records, record_folder
+from daq.writeback.drive_target import (
+    DriveEdit,
+    DriveTarget,
+    read_record,
+    read_records,
+    record_folder,
+)
 from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose, rollback
@@ -43,7 +56,16 @@ from drivers.simulation.hub import Hub
 from drivers.simulation.node import NmtCommand, NmtState
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, IDENTIFIED, NAMEPLATE, demo_calibration, of_first_axes
-from tests.daq.drives import REAL, WHOLE, Listener, demo_cell, entered_gain, network_of, saved_gain, simulated
+from tests.daq.drives import (
+    REAL,
+    WHOLE,
+    Listener,
+    demo_cell,
+    entered_gain,
+    network_of,
+    saved_gain,
+    simulated,
+)
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 IN_DRIVES = pytest.approx(NAMEPLATE)
@@ -65,13 +87,20 @@ def listener(address: BusAddress) -> Iterator[Listener]:
 
 
 def _propose(
-    cell: Cell, network: CanopenNetwork, calibration: Calibration | None = None, base: str | None = None
+    cell: Cell,
+    network: CanopenNetwork,
+    calibration: Calibration | None = None,
+    base: str | None = None,
 ) -> Proposal[DriveEdit]:
-    request = Request(calibration or demo_calibration(), NOW, accepts_changed_configuration=True, base=base)
+    request = Request(
+        calibration or demo_calibration(), NOW, accepts_changed_configuration=True, base=base
+    )
     return propose(DriveTarget(cell, network), request)
 
 
-def _apply(proposal: Proposal[DriveEdit], target: DriveTarget, audit: Path | None = None) -> Written:
+def _apply(
+    proposal: Proposal[DriveEdit], target: DriveTarget, audit: Path | None = None
+) -> Written:
     """Write a proposal, in a network that may be another than the one it was planned in."""
     written = apply(replace(proposal, target=target), NOW, audit=audit, who="T")
     assert written is not None
@@ -79,7 +108,10 @@ def _apply(proposal: Proposal[DriveEdit], target: DriveTarget, audit: Path | Non
 
 
 def _write(
-    cell: Cell, address: BusAddress, saving: Saving = Saving.KNOWN, mapping: Mapping = Mapping.STORED
+    cell: Cell,
+    address: BusAddress,
+    saving: Saving = Saving.KNOWN,
+    mapping: Mapping = Mapping.STORED,
 ) -> Written:
     """Look, and then write, each in a network of its own, as two commands do."""
     with network_of(cell, address, mapping) as network:
@@ -103,7 +135,9 @@ def _saved(simulation: SimulatedCell) -> list[float]:
     return [saved_gain(node) for node in simulation.nodes]
 
 
-def test_gains_are_written_read_back_and_saved(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+def test_gains_are_written_read_back_and_saved(
+    address: BusAddress, listener: Listener, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation:
         before = [node.saved for node in simulation.nodes]
@@ -111,7 +145,8 @@ def test_gains_are_written_read_back_and_saved(address: BusAddress, listener: Li
         assert [change.parameter.value(change.new) / 1000.0 for change in written.parameters] == NEW
         assert all(change.saved for change in written.parameters)
         assert _gains(simulation) == NEW
-        # A drive that loses its power comes back with what it saved: the gain, and the mapping of before.
+        # A drive that loses its power comes back with what it saved: the gain, and the mapping of
+        # before.
         for node in simulation.nodes:
             node.command_nmt(NmtCommand.RESET_NODE, 0.0)
         assert _gains(simulation) == NEW
@@ -127,9 +162,15 @@ def test_nothing_but_the_gain_and_the_save_is_ever_sent(
         listener.frames()
         _write(demo_cell(tmp_path), address)
     heard = listener.frames()
-    ours = [frame for frame in heard if not 0x580 < frame.arbitration_id < 0x600 and frame.arbitration_id < 0x700]
+    ours = [
+        frame
+        for frame in heard
+        if not 0x580 < frame.arbitration_id < 0x600 and frame.arbitration_id < 0x700
+    ]
     assert {frame.arbitration_id for frame in ours} == set(range(0x601, 0x607))
-    written = {int.from_bytes(frame.data[1:3], "little") for frame in ours if frame.data[0] >> 5 == 1}
+    written = {
+        int.from_bytes(frame.data[1:3], "little") for frame in ours if frame.data[0] >> 5 == 1
+    }
     assert written == {0x2003, 0x1010}
     assert CONTROLWORD.index not in written
 
@@ -180,7 +221,11 @@ def test_an_axis_with_power_is_refused_and_nothing_is_written(
         listener.frames()
         with (
             network_of(cell, address) as network,
-            pytest.raises(ParameterRefused, match=rf"J{axis + 1} \(node {axis + 1}\): OPERATION ENABLED"),
+            pytest.raises(
+                ParameterRefused,
+                match=rf"J{axis + 1} \(node {axis + 1}\): "
+                r"OPERATION ENABLED",
+            ),
         ):
             _apply(proposal, DriveTarget(cell, network))
         assert listener.downloads() == []
@@ -200,7 +245,11 @@ def test_power_that_comes_midway_ends_it_and_the_rest_is_put_back(
 
     write = _after_gain(monkeypatch, enable_2)
     with simulated(address) as simulation:
-        with pytest.raises(ParametersMixed, match=r"restored in J1, and NOT confirmed where J2 \(node 2\)"):
+        with pytest.raises(
+            ParametersMixed,
+            match=r"restored in J1, and NOT confirmed where J2 "
+            r"\(node 2\)",
+        ):
             _write(cell, address)
         assert _gains(simulation)[0] == pytest.approx(NAMEPLATE[0])
         assert _gains(simulation)[1] == pytest.approx(IDENTIFIED[1])
@@ -224,16 +273,24 @@ def _after_gain(monkeypatch: pytest.MonkeyPatch, then: Callable[[ObjectAccess], 
     return write
 
 
-@pytest.mark.parametrize("kind", [FaultKind.REFUSES_WRITE, FaultKind.REFUSES_SAVE], ids=lambda kind: kind.value)
+@pytest.mark.parametrize(
+    "kind", [FaultKind.REFUSES_WRITE, FaultKind.REFUSES_SAVE], ids=lambda kind: kind.value
+)
 def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
     address: BusAddress, tmp_path: Path, kind: FaultKind
 ) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address, FaultSpec(kind, 2)) as simulation:
-        with pytest.raises(ObjectAccessError, match=r"J3 \(node 3\): object (2003h:01|1010h:01): aborted") as caught:
+        with pytest.raises(
+            ObjectAccessError,
+            match=r"J3 \(node 3\): object "
+            r"(2003h:01|1010h:01): aborted",
+        ) as caught:
             _write(cell, address)
         restored = AXES if kind is FaultKind.REFUSES_SAVE else AXES[:3]
-        assert caught.value.__notes__ == [f"kept: the previous values are restored in {', '.join(restored)}"]
+        assert caught.value.__notes__ == [
+            f"kept: the previous values are restored in {', '.join(restored)}"
+        ]
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -249,9 +306,14 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
                 simulation.nodes[2].nmt = NmtState.STOPPED
 
         _after_gain(monkeypatch, stop)
-        # Where the host is late, the search for silent nodes can end before this node counts as one.
+        # Where the host is late, the search for silent nodes can end before this node counts as
+        # one.
         silent = r"the node does not answer|no answer within 0\.3 s, asked 3 times"
-        with pytest.raises(ParametersMixed, match=rf"J3 \(node 3\): object 2003h:01: ({silent})") as caught:
+        with pytest.raises(
+            ParametersMixed,
+            match=r"J3 \(node 3\): object 2003h:01: "
+            rf"({silent})",
+        ) as caught:
             _write(cell, address)
         assert caught.value.restored == ("J1", "J2")
         assert isinstance(caught.value.__cause__, ObjectAccessError)
@@ -269,11 +331,15 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
 def test_whichever_transfer_fails_the_old_values_stay_everywhere(
     address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: bool
 ) -> None:
-    """Every SDO transfer of the path fails once, before it was made or after; only the whole way changes all.
+    """Every SDO transfer of the path fails once, before it was made or after;
+    only the whole way changes all.
 
-    Of three drives: the first, one in between and the last; the others are on the bus and left alone.
+    Of three drives: the first, one in between and the last; the others are on the bus and left
+    alone.
     """
-    whole, count, left = demo_cell(tmp_path), 3, 0
+    whole = demo_cell(tmp_path)
+    count = 3
+    left = 0
     cell = replace(whole, axes=whole.axes[:count], controller=Controller(objects=(WHOLE,) * count))
     changed = pytest.approx([*IDENTIFIED[:count], *NAMEPLATE[count:]])
 
@@ -315,7 +381,9 @@ def test_whichever_transfer_fails_the_old_values_stay_everywhere(
     assert failed > 25 * count
 
 
-@pytest.mark.parametrize("kind", [FaultKind.SECOND_MASTER, FaultKind.SDO_MASTER], ids=lambda kind: kind.value)
+@pytest.mark.parametrize(
+    "kind", [FaultKind.SECOND_MASTER, FaultKind.SDO_MASTER], ids=lambda kind: kind.value
+)
 def test_a_foreign_master_is_refused(address: BusAddress, tmp_path: Path, kind: FaultKind) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address, FaultSpec(kind, 1)) as simulation:
@@ -361,13 +429,21 @@ def test_a_drive_that_keeps_something_else_is_found(
 
     monkeypatch.setattr(ObjectAccess, "write", rounding)
     with simulated(address) as simulation:
-        with pytest.raises(ParameterRefused, match=r"reads back as -9209 .*written was -9210") as caught:
+        with pytest.raises(
+            ParameterRefused,
+            match=r"reads back as -9209 .*written "
+            r"was -9210",
+        ) as caught:
             _write(cell, address)
-        assert caught.value.__notes__ == ["kept: the previous values are restored in J1, J2, J3, J4"]
+        assert caught.value.__notes__ == [
+            "kept: the previous values are restored in J1, J2, J3, J4"
+        ]
         assert _gains(simulation) == IN_DRIVES
 
 
-def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+def test_what_a_killed_recording_left_is_not_saved(
+    address: BusAddress, listener: Listener, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation:
         with network_of(cell, address) as network:
@@ -379,7 +455,10 @@ def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener
         for node in simulation.nodes:
             node.inject(FaultKind.NO_GUARD)  # the mapping alone must be enough
         listener.frames()
-        with network_of(cell, address) as network, pytest.raises(ParameterRefused, match="TPDO1: COB-ID 00000181h"):
+        with (
+            network_of(cell, address) as network,
+            pytest.raises(ParameterRefused, match="TPDO1: COB-ID 00000181h"),
+        ):
             _apply(proposal, DriveTarget(cell, network))
         assert listener.downloads() == []
         assert _saved(simulation) == IN_DRIVES
@@ -393,50 +472,74 @@ def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener
 def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
     address: BusAddress, tmp_path: Path, recorder_id: int
 ) -> None:
-    """Killed before the mapping was touched: 1016h would stop the axis for want of a recorder, for ever."""
+    """Killed before the mapping was touched:
+    1016h would stop the axis for want of a recorder, for ever.
+    """
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
         consumer = ObjectEntry(0x1016, 1, 32, signed=False)
         network.link.objects(2).write(consumer, recorder_id << 16 | 500)
         with pytest.raises(
-            ParameterRefused, match=rf"J2 \(node 2\): .*1016h:01 = 00{recorder_id:02X}01F4h watches the recorder"
+            ParameterRefused,
+            match=rf"J2 \(node 2\): .*1016h:01 = 00{recorder_id:02X}01F4h "
+            r"watches the recorder",
         ):
             _apply(proposal, DriveTarget(cell, network))
         assert _gains(simulation) == IN_DRIVES
 
 
-def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(address: BusAddress, tmp_path: Path) -> None:
+def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(
+    address: BusAddress, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation:
-        with pytest.raises(ParameterRefused, match=r"J1 \(node 1\): .*`Saving\.RAM`.*`Saving\.ANY`"):
+        with pytest.raises(
+            ParameterRefused,
+            match=r"J1 \(node 1\): "
+            r".*`Saving\.RAM`.*`Saving\.ANY`",
+        ):
             _write(cell, address, mapping=Mapping.UNKNOWN)
         assert _gains(simulation) == IN_DRIVES
-        assert all(change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters)
+        assert all(
+            change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters
+        )
         assert _saved(simulation) == NEW
 
 
 def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
-        network.axes = tuple(replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes)
+        network.axes = tuple(
+            replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes
+        )
         with pytest.raises(ParameterRefused, match="is not described in its profile"):
             _apply(_propose(cell, network), DriveTarget(cell, network, Saving.ANY))
         assert _gains(simulation) == IN_DRIVES
 
 
-def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+def test_the_gates_are_those_of_a_file(
+    address: BusAddress, listener: Listener, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     calibration = demo_calibration()
-    far = replace(calibration, gains=(replace(calibration.gains[0], value=60.0), *calibration.gains[1:]))
+    far = replace(
+        calibration, gains=(replace(calibration.gains[0], value=60.0), *calibration.gains[1:])
+    )
     with simulated(address), network_of(cell, address) as network:
         proposal = _propose(cell, network, far, base="0" * 64)
-        assert [refusal.gate for refusal in proposal.refusals] == [Gate.BASE, Gate.CHANGE, Gate.NAMEPLATE]
+        assert [refusal.gate for refusal in proposal.refusals] == [
+            Gate.BASE,
+            Gate.CHANGE,
+            Gate.NAMEPLATE,
+        ]
         reviewed = _propose(cell, network, base=_propose(cell, network).edit.base_sha256)
         assert reviewed.refusals == ()
         with pytest.raises(CalibrationRefused, match="3 failed checks"):
             _apply(proposal, DriveTarget(cell, network), tmp_path / "audit")
-        strange = replace(calibration, gains=(*calibration.gains[:5], replace(calibration.gains[5], axis="J9")))
+        strange = replace(
+            calibration, gains=(*calibration.gains[:5], replace(calibration.gains[5], axis="J9"))
+        )
         with pytest.raises(CalibrationRefused, match="one for each axis of the cell"):
             _propose(cell, network, strange)
         nowhere = replace(cell, controller=None)
@@ -453,9 +556,18 @@ def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, 
             GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1.0),
             "± 0.14, which the number 34 does not represent",
         ),
-        (GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1e9), "does not fit i32"),
-        (GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1e-3), "the number 0 does not represent"),
-        (GainObject(index=0x2003, subindex=1, type=ParameterKind.U32, factor=-1.0), "does not fit u32"),
+        (
+            GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1e9),
+            "does not fit i32",
+        ),
+        (
+            GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1e-3),
+            "the number 0 does not represent",
+        ),
+        (
+            GainObject(index=0x2003, subindex=1, type=ParameterKind.U32, factor=-1.0),
+            "does not fit u32",
+        ),
     ],
 )
 def test_an_object_that_cannot_hold_the_gain_is_refused(
@@ -464,12 +576,18 @@ def test_an_object_that_cannot_hold_the_gain_is_refused(
     calibration = demo_calibration()
     gains = (replace(calibration.gains[0], value=33.7, std=0.135), *calibration.gains[1:])
     cell = demo_cell(tmp_path, *(gain_object,) * 6)
-    with simulated(address), network_of(cell, address) as network, pytest.raises(ControllerUnfit) as caught:
+    with (
+        simulated(address),
+        network_of(cell, address) as network,
+        pytest.raises(ControllerUnfit) as caught,
+    ):
         _propose(cell, network, replace(calibration, gains=gains))
     assert says in str(caught.value)
 
 
-def test_a_drive_that_someone_changed_since_the_dry_run_is_refused(address: BusAddress, tmp_path: Path) -> None:
+def test_a_drive_that_someone_changed_since_the_dry_run_is_refused(
+    address: BusAddress, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
@@ -490,7 +608,11 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
             ("J1", 1001, 32960, 33900),
             ("J2", 1002, 32960, 32400),
         ]
-        for minutes, expected, saved in ((1, IN_DRIVES, IN_DRIVES), (2, NEW, NEW), (2, IN_DRIVES, IN_DRIVES)):
+        for minutes, expected, saved in (
+            (1, IN_DRIVES, IN_DRIVES),
+            (2, NEW, NEW),
+            (2, IN_DRIVES, IN_DRIVES),
+        ):
             with network_of(cell, address) as network:
                 rollback(
                     DriveTarget(cell, network),
@@ -514,7 +636,9 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
     assert verify(cell.history.audit).open_writes == ()
 
 
-def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(address: BusAddress, tmp_path: Path) -> None:
+def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(
+    address: BusAddress, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     press = replace(cell, name="press")
     ledger = Ledger.of(press)
@@ -523,7 +647,11 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(address: Bu
         _write(cell, address)
         with (
             network_of(press, address) as network,
-            pytest.raises(ControllerUnfit, match=r"a write to cell 'demo'; expected one to the drives of cell 'press'"),
+            pytest.raises(
+                ControllerUnfit,
+                match=r"a write to cell 'demo' at 2025-01-02.*; expected one to the "
+                r"drives of the cell that is called 'press' now",
+            ),
         ):
             rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
         rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=NOW)
@@ -533,14 +661,48 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(address: Bu
     assert [event.target for event in read_history(ledger).events] == [drives_of("press")] * 2
 
 
-def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddress, tmp_path: Path) -> None:
+@pytest.mark.parametrize("renamed_after_s", [-60, 60])
+def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
+    address: BusAddress, tmp_path: Path, renamed_after_s: int
+) -> None:
+    demo = demo_cell(tmp_path)
+    press = replace(demo, name="press")
+    ledger = Ledger.of(press)
+    assert ledger is not None
+    renamed_at = NOW + timedelta(seconds=renamed_after_s)
+    # Something under the old name, without which there is nothing to rename.
+    acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
+    with simulated(address) as simulation:
+        if renamed_after_s < 0:
+            rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=renamed_at)
+        _write(demo, address)
+        if renamed_after_s > 0:
+            rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=renamed_at)
+        written = _gains(simulation)
+        owner, other = (demo, press) if renamed_after_s < 0 else (press, demo)
+        with (
+            network_of(other, address) as network,
+            pytest.raises(ControllerUnfit, match=f"expected .* called '{other.name}' now"),
+        ):
+            rollback(DriveTarget(other, network), NOW, audit=ledger.audit, who="T")
+        assert _gains(simulation) == written
+        with network_of(owner, address) as network:
+            rollback(DriveTarget(owner, network), NOW, audit=ledger.audit, who="T")
+        assert _gains(simulation) == IN_DRIVES
+
+
+def test_a_rollback_that_would_lose_what_someone_did_is_refused(
+    address: BusAddress, tmp_path: Path
+) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         with pytest.raises(CalibrationRefused, match="no record"):
             rollback(DriveTarget(cell, network), NOW)
         written = _write(cell, address)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
-        with pytest.raises(ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"):
+        with pytest.raises(
+            ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"
+        ):
             rollback(DriveTarget(cell, network), NOW)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 16300)
         body = json.loads(_backup(written).read_text())
@@ -554,8 +716,12 @@ def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddr
             rollback(DriveTarget(cell, network), NOW)
 
 
-def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(address: BusAddress, tmp_path: Path) -> None:
-    """The newest record holds the value that drivegain left there: that, or the one before it, is no surprise."""
+def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(
+    address: BusAddress, tmp_path: Path
+) -> None:
+    """The newest record holds the value that drivegain left there:
+    that, or the one before it, is no surprise.
+    """
     cell = demo_cell(tmp_path)
     entry = ObjectEntry(0x2003, 1, 32, signed=True)
     with simulated(address), network_of(cell, address) as network:
@@ -572,11 +738,15 @@ def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(address: BusAd
         ]
         assert "16300" in changed.refusals[0].expected
         assert _propose(cell, network, base=changed.edit.base_sha256).refusals == ()
-        assert [one.gate for one in _propose(cell, network, base=first.edit.base_sha256).refusals] == [Gate.BASE]
+        assert [
+            one.gate for one in _propose(cell, network, base=first.edit.base_sha256).refusals
+        ] == [Gate.BASE]
         network.link.objects(5).write(entry, 16300)
         _backup(written).write_text("{}")
         unread = _propose(cell, network)
-        assert [(one.gate, one.subject) for one in unread.refusals] == [(Gate.BASE, str(_backup(written)))]
+        assert [(one.gate, one.subject) for one in unread.refusals] == [
+            (Gate.BASE, str(_backup(written)))
+        ]
         assert _propose(cell, network, base=unread.edit.base_sha256).refusals == ()
 
 
@@ -586,25 +756,34 @@ def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path
         _write(cell, address)
     new = replace(cell, axes=(replace(cell.axes[0], identity=None), *cell.axes[1:]))
     with simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 0), entered=IDENTIFIED) as simulation:
-        with network_of(new, address) as network, pytest.raises(ControllerChanged, match="serial number 1002"):
+        with (
+            network_of(new, address) as network,
+            pytest.raises(ControllerChanged, match="serial number 1002"),
+        ):
             rollback(DriveTarget(new, network), NOW)
         assert _gains(simulation) == NEW
 
 
 @pytest.mark.parametrize("writes", [0, 1, 3, 6, 8])
-def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Path, writes: int) -> None:
+def test_after_a_kill_the_record_says_what_was_there_and_leads_back(
+    tmp_path: Path, writes: int
+) -> None:
     """SIGKILL after so many writes, saves among them."""
     cell = demo_cell(tmp_path)
     assert cell.history is not None
     with Hub(("can0",)) as hub, simulated(hub.address()) as simulation:
-        process = WRITERS.Process(target=_write_until_killed, args=(tmp_path, hub.address(), writes))
+        process = WRITERS.Process(
+            target=_write_until_killed, args=(tmp_path, hub.address(), writes)
+        )
         process.start()
         process.join()
         assert process.exitcode == -signal.SIGKILL
         changed = min(writes, 6)
         assert _gains(simulation) == pytest.approx([*IDENTIFIED[:changed], *NAMEPLATE[changed:]])
         (path,) = read_records(record_folder(cell))
-        assert [note.parameter.value(note.old) / 1000.0 for note in read_record(path).drives] == IN_DRIVES
+        assert [
+            note.parameter.value(note.old) / 1000.0 for note in read_record(path).drives
+        ] == IN_DRIVES
         (left,) = verify(cell.history.audit).open_writes
         assert left.begun.action is AuditAction.APPLY_BEGUN
         with network_of(cell, hub.address()) as network:

@@ -1,4 +1,6 @@
-"""Every gate closes for its own reason, and alone: one thing is broken of a calibration that passes all of them."""
+"""Every gate closes for its own reason, and alone:
+one thing is broken of a calibration that passes all of them.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,15 @@ from daq.writeback.target import Proposal, apply, propose
 from ident.calibration import Calibration, EncoderMisfit, Gain, GeometryCorrection, Source
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
-from tests.daq.calibrations import AXES, KEYS, RECORDED, demo_calibration, demo_recording, recorded, with_recordings
+from tests.daq.calibrations import (
+    AXES,
+    KEYS,
+    RECORDED,
+    demo_calibration,
+    demo_recording,
+    recorded,
+    with_recordings,
+)
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -79,10 +89,14 @@ def scene(tmp_path: Path) -> Scene:
     shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controller)
     cell = load_cell(CONFIGS / "cells" / "demo.yaml")
     keys = {name: generate(tmp_path, name)[1].line for name in ("Ada", "Bob")}
-    calibration = with_recordings(demo_calibration(), controller_sha256=sha256(controller.read_bytes()))
+    calibration = with_recordings(
+        demo_calibration(), controller_sha256=sha256(controller.read_bytes())
+    )
     return Scene(
         calibration=replace(
-            calibration, configuration_sha256=cell.digest, recording_configuration_sha256=cell.recording_digest
+            calibration,
+            configuration_sha256=cell.digest,
+            recording_configuration_sha256=cell.recording_digest,
         ),
         cell=cell,
         controller=controller,
@@ -98,7 +112,10 @@ def scene(tmp_path: Path) -> Scene:
 
 def _gain(axis: str, **changes: float) -> Callable[[Scene], Scene]:
     def broken(scene: Scene) -> Scene:
-        gains = tuple(_changed(gain, changes) if gain.axis == axis else gain for gain in scene.calibration.gains)
+        gains = tuple(
+            _changed(gain, changes) if gain.axis == axis else gain
+            for gain in scene.calibration.gains
+        )
         return replace(scene, calibration=replace(scene.calibration, gains=gains))
 
     return broken
@@ -106,7 +123,10 @@ def _gain(axis: str, **changes: float) -> Callable[[Scene], Scene]:
 
 def _unit(axis: str, unit: str) -> Callable[[Scene], Scene]:
     def broken(scene: Scene) -> Scene:
-        gains = (replace(gain, unit=unit) if gain.axis == axis else gain for gain in scene.calibration.gains)
+        gains = (
+            replace(gain, unit=unit) if gain.axis == axis else gain
+            for gain in scene.calibration.gains
+        )
         return _calibration(gains=tuple(gains))(scene)
 
     return broken
@@ -120,8 +140,13 @@ def _nameplate(axis: str, nameplate: float) -> Callable[[Scene], Scene]:
     """The cell's, and the calibration's with it."""
 
     def broken(scene: Scene) -> Scene:
-        axes = (replace(one, nameplate_gain=nameplate) if one.name == axis else one for one in scene.cell.axes)
-        return _gain(axis, nameplate=nameplate)(replace(scene, cell=replace(scene.cell, axes=tuple(axes))))
+        axes = (
+            replace(one, nameplate_gain=nameplate) if one.name == axis else one
+            for one in scene.cell.axes
+        )
+        return _gain(axis, nameplate=nameplate)(
+            replace(scene, cell=replace(scene.cell, axes=tuple(axes)))
+        )
 
     return broken
 
@@ -164,12 +189,19 @@ _RECORDING = set(type(demo_recording()).__slots__)
 def diagnosis_named(name: str, *axes: str, runs: tuple[str, ...] = ()) -> Diagnosis:
     """What a fit says of a description that is wrong."""
     return Diagnosis(
-        name, runs, axes, "the zero of J2 off by +2.00 ± 0.05 °", "the URDF's", "correct it, and fit again"
+        name,
+        runs,
+        axes,
+        "the zero of J2 off by +2.00 ± 0.05 °",
+        "the URDF's",
+        "correct it, and fit again",
     )
 
 
 def _corrected(effect: str, diagnosis: Diagnosis) -> Callable[[Scene], Scene]:
-    """An effect on J3, in the place of the load friction there, and what the fit has said without it."""
+    """An effect on J3, in the place of the load friction there,
+    and what the fit has said without it.
+    """
 
     def broken(scene: Scene) -> Scene:
         correction = replace(scene.calibration.effects[0], name=effect)
@@ -192,9 +224,15 @@ def _unexplained(misfit: float, noise: float | None = 5e-6) -> Callable[[Scene],
 
 
 def _late_encoder(scene: Scene) -> Scene:
-    """An encoder of a closed chain that is late: its diagnosis refuses, whatever the size of the misfit."""
-    found = EncoderMisfit(2e-3, 5e-6, "rad", True, (), False, noise=5e-6, late_encoders="an encoder of J2")
-    return _calibration(encoder_misfit=found, diagnoses=(diagnosis_named("position-late", "J2"),))(scene)
+    """An encoder of a closed chain that is late:
+    its diagnosis refuses, whatever the size of the misfit.
+    """
+    found = EncoderMisfit(
+        2e-3, 5e-6, "rad", True, (), False, noise=5e-6, late_encoders="an encoder of J2"
+    )
+    return _calibration(encoder_misfit=found, diagnoses=(diagnosis_named("position-late", "J2"),))(
+        scene
+    )
 
 
 def _diagnosed(*diagnoses: Diagnosis) -> Callable[[Scene], Scene]:
@@ -206,7 +244,10 @@ def _only(*indices: int) -> Callable[[Scene], Scene]:
 
     def broken(scene: Scene) -> Scene:
         sources = tuple(scene.calibration.sources[index] for index in indices)
-        gone = {} if 2 in indices else {"holdout_error_percent": None, "nameplate_holdout_error_percent": None}
+        if 2 in indices:
+            gone = {}
+        else:
+            gone = {"holdout_error_percent": None, "nameplate_holdout_error_percent": None}
         return _calibration(sources=sources, **gone)(scene)
 
     return broken
@@ -282,7 +323,9 @@ def _doubled(scene: Scene) -> Scene:
 
 def _bare(scene: Scene) -> Scene:
     """Nothing was mounted, ever."""
-    return _both(*(_source(index, payload=None, mass_kg=None, entered_kg=None) for index in (1, 2)))(scene)
+    return _both(
+        *(_source(index, payload=None, mass_kg=None, entered_kg=None) for index in (1, 2))
+    )(scene)
 
 
 HELD = (3.2, 2.9, 3.5, 4.1, 5.6, 5.0)
@@ -302,9 +345,21 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.NOT_FINITE, "J3", _gain("J3", value=0.0)),
     (Gate.NOT_FINITE, "J3", _gain("J3", std=math.nan)),
     (Gate.NOT_FINITE, "J3", _gain("J3", nameplate=math.nan)),
-    (Gate.NOT_FINITE, "calibration", _calibration(holdout_error_percent=RelativeError((1.0,), math.nan))),
-    (Gate.NOT_FINITE, "calibration", _calibration(relative_error_percent=RelativeError((math.nan,), 3.0))),
-    (Gate.NOT_FINITE, "calibration", _calibration(relative_error_percent=RelativeError((*HELD[:5], -1.0), 3.0))),
+    (
+        Gate.NOT_FINITE,
+        "calibration",
+        _calibration(holdout_error_percent=RelativeError((1.0,), math.nan)),
+    ),
+    (
+        Gate.NOT_FINITE,
+        "calibration",
+        _calibration(relative_error_percent=RelativeError((math.nan,), 3.0)),
+    ),
+    (
+        Gate.NOT_FINITE,
+        "calibration",
+        _calibration(relative_error_percent=RelativeError((*HELD[:5], -1.0), 3.0)),
+    ),
     (Gate.NOT_FINITE, "calibration", _calibration(holdout_error_percent=RelativeError(HELD, -3.0))),
     (Gate.NAMEPLATE, "J5", _gain("J5", nameplate=17.0)),
     (Gate.UNIT, "J5", _unit("J5", "mNm/A")),
@@ -339,29 +394,48 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (
         Gate.ERROR,
         "J6",
-        _both(_only(0, 1), _calibration(relative_error_percent=RelativeError((*HELD[:5], 51.0), 3.3))),
+        _both(
+            _only(0, 1), _calibration(relative_error_percent=RelativeError((*HELD[:5], 51.0), 3.3))
+        ),
     ),
     (Gate.ERROR, "calibration", _calibration(holdout_error_percent=RelativeError(HELD[:5], 3.3))),
     (Gate.ERROR, "calibration", _calibration(holdout_error_percent=RelativeError((), 3.3))),
     (Gate.ERROR, "calibration", _calibration(relative_error_percent=RelativeError((), 3.3))),
-    (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.25))),
     (
         Gate.HOLDOUT,
-        "J4",
-        _calibration(nameplate_holdout_error_percent=RelativeError((*HELD[:3], 4.1 / 1.021, *HELD[4:]), 4.3)),
+        "calibration",
+        _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.25)),
     ),
     (
         Gate.HOLDOUT,
         "J4",
-        _calibration(nameplate_holdout_error_percent=RelativeError((*HELD[:3], math.nan, *HELD[4:]), 4.3)),
+        _calibration(
+            nameplate_holdout_error_percent=RelativeError((*HELD[:3], 4.1 / 1.021, *HELD[4:]), 4.3)
+        ),
     ),
-    (Gate.HOLDOUT, "J6", _calibration(nameplate_holdout_error_percent=RelativeError(HELD[:5], 4.3))),
+    (
+        Gate.HOLDOUT,
+        "J4",
+        _calibration(
+            nameplate_holdout_error_percent=RelativeError((*HELD[:3], math.nan, *HELD[4:]), 4.3)
+        ),
+    ),
+    (
+        Gate.HOLDOUT,
+        "J6",
+        _calibration(nameplate_holdout_error_percent=RelativeError(HELD[:5], 4.3)),
+    ),
     (Gate.HOLDOUT, "calibration", _both(_wanted, _only(0, 1))),
     (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=None)),
     (Gate.HOLDOUT, "calibration", _calibration(holdout_error_percent=None)),
-    (Gate.HOLDOUT, "calibration", lambda scene: _calibration(sources=scene.calibration.sources[:2])(scene)),
+    (
+        Gate.HOLDOUT,
+        "calibration",
+        lambda scene: _calibration(sources=scene.calibration.sources[:2])(scene),
+    ),
     (Gate.DESCRIPTION, "J2", _diagnosed(diagnosis_named("zero-off", "J2"))),
-    (Gate.DESCRIPTION, "J2", _corrected("zero-offset", diagnosis_named("zero-off", "J2"))),  # corrects that of J3
+    # Corrects that of J3
+    (Gate.DESCRIPTION, "J2", _corrected("zero-offset", diagnosis_named("zero-off", "J2"))),
     (Gate.DESCRIPTION, "J2", _by_encoders(applied=False)),
     (Gate.DESCRIPTION, "calibration", _unexplained(1.001e-4)),
     (Gate.DESCRIPTION, "calibration", _unexplained(1e-3, noise=None)),
@@ -390,7 +464,11 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0))),
     (Gate.SOURCES, "log held-out", _source(2, sha256="b" * 64)),
     (Gate.SOURCES, "log loaded", _source(1, sha256="a" * 64)),
-    (Gate.SOURCES, "log other", _both(_doubled, _source(3, name="other", sha256="e" * 64, role="train"))),
+    (
+        Gate.SOURCES,
+        "log other",
+        _both(_doubled, _source(3, name="other", sha256="e" * 64, role="train")),
+    ),
     (Gate.SOURCES, "calibration", _both(_bare, _only(0, 1))),
     (Gate.SOURCES, "calibration", _only(1)),
     (Gate.SOURCES, "calibration", _only(2)),
@@ -407,8 +485,16 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.STALE, "log unloaded", _source(0, recorded_s=math.nan)),
     (Gate.SERIAL, "axis J4", _another_serial_now),
     (Gate.SERIAL, "log loaded, axis J4", _source(1, serials=(1001, 1002, 1003, None, 1005, 1006))),
-    (Gate.SERIAL, "axis J4", _both(NO_SERIALS, _source(1, serials=(1001, 1002, 1003, 9, 1005, 1006)))),
-    (Gate.SATURATED, "log loaded, axis J3", _source(1, saturated_percent=(0.0, 0.0, 2.1, 0.0, 0.0, 0.0))),
+    (
+        Gate.SERIAL,
+        "axis J4",
+        _both(NO_SERIALS, _source(1, serials=(1001, 1002, 1003, 9, 1005, 1006))),
+    ),
+    (
+        Gate.SATURATED,
+        "log loaded, axis J3",
+        _source(1, saturated_percent=(0.0, 0.0, 2.1, 0.0, 0.0, 0.0)),
+    ),
     (Gate.MASS, "log loaded, payload disc", _source(1, entered_kg=None)),
     (Gate.MASS, "log loaded, payload disc", _source(1, entered_kg=4.596)),
     (Gate.MASS, "log loaded, payload disc", _source(1, mass_kg=None)),
@@ -439,7 +525,9 @@ def test_a_refusal_names_a_wrong_description_that_the_calibration_corrects(scene
     off = diagnosis_named("zero-off", "J3")
     wrong = _both(_corrected("zero-offset", off), _calibration(cell="another"))(scene).propose()
     assert not any(refusal.gate is Gate.DESCRIPTION for refusal in wrong.refusals)
-    assert f"hint: the fit of this calibration found {off.found}; {off.remedy}" in wrong.error.__notes__
+    assert (
+        f"hint: the fit of this calibration found {off.found}; {off.remedy}"
+    ) in wrong.error.__notes__
     plain = _calibration(cell="another")(scene).propose()
     assert not getattr(plain.error, "__notes__", [])
 
@@ -469,7 +557,11 @@ def test_each_gate_closes_alone(
     assert scene.controller.read_bytes() == before
     assert not list(tmp_path.glob("*.bak"))
     (entry,) = read(audit)
-    assert (entry.action, entry.who, entry.subject) == (AuditAction.REFUSED, "Ada", str(scene.controller))
+    assert (entry.action, entry.who, entry.subject) == (
+        AuditAction.REFUSED,
+        "Ada",
+        str(scene.controller),
+    )
     reported = entry.details["refusals"]
     assert isinstance(reported, list)
     assert [one["gate"] for one in reported] == [gate.value] * len(proposal.refusals)
@@ -494,7 +586,9 @@ def test_the_table_lists_every_gate_once_with_its_description() -> None:
         _only(0, 1),
         _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.3 / fit_gates.NOISE)),
         _calibration(
-            nameplate_holdout_error_percent=RelativeError(tuple(axis / fit_gates.AXIS_NOISE for axis in HELD), 3.3)
+            nameplate_holdout_error_percent=RelativeError(
+                tuple(axis / fit_gates.AXIS_NOISE for axis in HELD), 3.3
+            )
         ),
         _calibration(
             holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
@@ -514,7 +608,11 @@ def test_the_table_lists_every_gate_once_with_its_description() -> None:
         _logs(saturated_percent=(2.0,) * 6),
         _logs(controller_sha256=None),
         _source(1, entered_kg=4.595),
-        _both(_source(1, entered_kg=None), _source(2, entered_kg=None), _scene(entered_kg={"disc": 4.585})),
+        _both(
+            _source(1, entered_kg=None),
+            _source(2, entered_kg=None),
+            _scene(entered_kg={"disc": 4.585}),
+        ),
         _both(NO_SERIALS, _logs(serials=(None,) * 6)),
         _wanted,
         lambda scene: _bounded(scene, J4=2.32, J1=0.95),
@@ -535,7 +633,9 @@ def test_just_inside_its_bound_a_gate_is_open(scene: Scene, kept: Callable[[Scen
 
 
 @pytest.mark.parametrize("effects", [True, False])
-def test_a_number_just_beyond_its_bound_is_not_written_as_the_bound(scene: Scene, effects: bool) -> None:
+def test_a_number_just_beyond_its_bound_is_not_written_as_the_bound(
+    scene: Scene, effects: bool
+) -> None:
     """And a large σ is looked for in what the model lacks first, where that was not done."""
     bound = scene.policy.max_std_percent
     std = 1.0001e-2 * bound * abs(scene.calibration.gains[0].value)
@@ -565,7 +665,10 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
         max_saturated_percent=1.0,
         max_age_days=0.01,
     )
-    gates = [(refusal.gate, refusal.subject) for refusal in replace(scene, policy=tight).propose().refusals]
+    gates = [
+        (refusal.gate, refusal.subject)
+        for refusal in replace(scene, policy=tight).propose().refusals
+    ]
     assert [axis for gate, axis in gates if gate is Gate.CHANGE] == ["J3", "J4", "J5", "J6"]
     assert [axis for gate, axis in gates if gate is Gate.NAMEPLATE] == ["J4"]
     assert [axis for gate, axis in gates if gate is Gate.UNCERTAINTY] == list(AXES)
@@ -582,7 +685,9 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
         ({"by": "job", "holdout": "required"}, True),
     ],
 )
-def test_a_job_that_applies_by_itself_wants_a_hold_out(section: dict[str, str], wanted: bool) -> None:
+def test_a_job_that_applies_by_itself_wants_a_hold_out(
+    section: dict[str, str], wanted: bool
+) -> None:
     policy = PolicyModel.model_validate_json(json.dumps({"apply": section})).apply
     assert (policy.requires_holdout, policy.by) == (wanted, AppliedBy(section.get("by", "person")))
     with pytest.raises(ValueError, match="holdout: required"):
@@ -597,7 +702,11 @@ def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path:
     assert load_cell(cell).apply.max_change == {"J4": 2.0}
     cell.write_text(text + "policy:\n  apply:\n    max_change:\n      j4: 2.0\n")
     line = len(cell.read_text().splitlines())
-    with pytest.raises(ConfigurationInconsistent, match=rf":{line}: policy\.apply\.max_change\.j4: found axis 'j4'"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=rf":{line}: policy\.apply\.max_change\.j4: "
+        r"found axis 'j4'",
+    ):
         load_cell(cell)
 
 
@@ -606,7 +715,9 @@ def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
     hour = replace(scene, policy=ApplyPolicy(max_age_days=1 / 24))
     reported = {(one.found, one.expected) for one in hour.propose().refusals}
     assert reported == {("recorded 1.1 hours ago", "recorded within the last 1 hours")}
-    days = _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())(replace(scene, policy=ApplyPolicy()))
+    days = _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())(
+        replace(scene, policy=ApplyPolicy())
+    )
     assert [(one.found, one.expected) for one in days.propose().refusals] == [
         ("recorded 30.1 days ago", "recorded within the last 30 days")
     ]
@@ -614,7 +725,9 @@ def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
 
 @pytest.mark.parametrize("days", [3, 730])
 def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(scene: Scene, days: int) -> None:
-    future = _source(0, recorded_s=(NOW + days * DAY).timestamp())(replace(scene, policy=ApplyPolicy()))
+    future = _source(0, recorded_s=(NOW + days * DAY).timestamp())(
+        replace(scene, policy=ApplyPolicy())
+    )
     (refusal,) = future.propose().refusals
     assert refusal.gate is Gate.STALE
     assert refusal.found.endswith("from now")
@@ -623,9 +736,13 @@ def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(scene: Scene, d
 
 def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(scene: Scene) -> None:
     cell = _payload(mass_kg=5.0)(scene).cell
-    request = Request(scene.calibration, NOW, policy=ApplyPolicy(), accepts_changed_configuration=True)
+    request = Request(
+        scene.calibration, NOW, policy=ApplyPolicy(), accepts_changed_configuration=True
+    )
     proposal = propose(FileTarget.of(cell, scene.controller), request)
-    assert {(one.gate, one.found) for one in proposal.refusals} == {(Gate.MASS, "fitted with 4.59 kg")}
+    assert {(one.gate, one.found) for one in proposal.refusals} == {
+        (Gate.MASS, "fitted with 4.59 kg")
+    }
 
 
 def test_two_names_of_one_signer_are_one_person(scene: Scene, tmp_path: Path) -> None:
@@ -635,17 +752,28 @@ def test_two_names_of_one_signer_are_one_person(scene: Scene, tmp_path: Path) ->
     assert [one.gate for one in twice.propose().refusals] == [Gate.SIGNATURE]
 
 
-def test_a_signer_s_key_that_is_none_is_refused_with_file_line_and_key(tmp_path: Path, scene: Scene) -> None:
+def test_a_signer_s_key_that_is_none_is_refused_with_file_line_and_key(
+    tmp_path: Path, scene: Scene
+) -> None:
     cell = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells" / "demo.yaml"
     text = cell.read_text()
     line = len(text.splitlines()) + 4
     head = text + "policy:\n  apply:\n    signers:\n"
     cell.write_text(f"{head}      Ada: RWQnonsense\n")
-    with pytest.raises(ConfigurationInconsistent, match=rf"demo\.yaml:{line}: policy\.apply\.signers\.Ada: found"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=rf"demo\.yaml:{line}: "
+        r"policy\.apply\.signers\.Ada: found",
+    ):
         load_cell(cell)
     key = scene.policy.signers["Ada"]
     cell.write_text(f"{head}      Ada: {key}\n      Bob: {key}\n")
-    with pytest.raises(ConfigurationInconsistent, match=rf":{line + 1}: policy\.apply\.signers\.Bob: .*key of Ada"):
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=rf":{line + 1}: "
+        r"policy\.apply\.signers\.Bob: "
+        r".*key of Ada",
+    ):
         load_cell(cell)
     cell.write_text(f"{head}      Ada: {key}\n")
     assert load_cell(cell).apply.signers == {"Ada": key}
@@ -653,14 +781,18 @@ def test_a_signer_s_key_that_is_none_is_refused_with_file_line_and_key(tmp_path:
 
 def test_two_signatures_of_others_are_two(scene: Scene) -> None:
     two = replace(scene, policy=replace(scene.policy, signatures=2))
-    assert [refusal.gate for refusal in replace(two, signed=("Ada", "Bob")).propose().refusals] == [Gate.SIGNATURE]
+    assert [refusal.gate for refusal in replace(two, signed=("Ada", "Bob")).propose().refusals] == [
+        Gate.SIGNATURE
+    ]
     assert replace(two, signed=("Ada", "Bob"), appliers=("the job",)).propose().refusals == ()
 
 
 def test_all_failed_checks_are_reported_at_once(scene: Scene) -> None:
     other = replace(scene, policy=ApplyPolicy(max_change_percent=5.0))
     error = _calibration(cell="other")(other).propose().error
-    assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [True] * 5 + [False]
+    assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [
+        True
+    ] * 5 + [False]
 
 
 def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
@@ -672,7 +804,9 @@ def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
 
 
 def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
-    skew = replace(scene.calibration.effects[0], name="time-skew", axis="all axes", error_after_percent=9.0)
+    skew = replace(
+        scene.calibration.effects[0], name="time-skew", axis="all axes", error_after_percent=9.0
+    )
     (refusal,) = _calibration(effects=(skew,))(scene).propose().refusals
     assert refusal.subject == "effect time-skew on all axes"
 
@@ -680,7 +814,10 @@ def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
 def test_a_library_that_reports_no_gate_context_is_not_asked_for_them(scene: Scene) -> None:
     old = replace(scene.calibration, sources=(Source("old", "a" * 64, "fit"),))
     assert propose(FileTarget(scene.controller, KEYS), Request(old, NOW)).refusals == ()
-    assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {Gate.SOURCES, Gate.HOLDOUT}
+    assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {
+        Gate.SOURCES,
+        Gate.HOLDOUT,
+    }
 
 
 def test_the_demo_calibration_is_of_the_day_it_says() -> None:

@@ -1,7 +1,9 @@
-"""Kill -9 at any system call of the write path: the old file or the new one, whole, and the audit says which.
+"""Kill -9 at any system call of the write path:
+the old file or the new one, whole, and the audit says which.
 
-A kill changes no file, so one at a call leaves what the files are as that call begins. One writer is therefore followed
-through all its calls, and another one is killed in each different state that the files have been in.
+A kill changes no file, so one at a call leaves what the files are as that call begins. One writer
+is therefore followed through all its calls, and another one is killed in each different state that
+the files have been in.
 """
 
 from __future__ import annotations
@@ -40,9 +42,12 @@ OLD = b"# K. has weighed it.\ndrives:\n  J1: {gain: 32.96, kp: 120.0}   # Nm/A\n
 KEYS = {"J1": "drives.J1.gain"}
 MIN_CALLS = 50
 MIN_STATES = 8
-LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl(\.head)?|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp")
-"""Files that may remain: the files themselves, the note of the audit's last entry, whole backups, the lock file without
-a holder, unfinished copies."""
+LEFT = re.compile(
+    r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl(\.head)?|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp"
+)
+"""Files that may remain: the files themselves, the note of the audit's last entry, whole backups,
+the lock file without a holder, unfinished copies.
+"""
 
 
 @cache
@@ -90,7 +95,9 @@ class Place:
 
     def to_roll_back(self) -> Callable[[], object]:
         """Return the rollback of an earlier write."""
-        return lambda: rollback(FileTarget(self.file), NOW + timedelta(minutes=1), audit=self.audit, who="Bob")
+        return lambda: rollback(
+            FileTarget(self.file), NOW + timedelta(minutes=1), audit=self.audit, who="Bob"
+        )
 
     def content(self) -> bytes | None:
         """Content of the file; None where it is gone."""
@@ -115,7 +122,9 @@ Work = Callable[[Place], Callable[[], object]]
 
 
 def _unflushed(_descriptor: int) -> None:
-    """For what comes before the kill and after it: a kill is no power cut, and flushing takes most of the time."""
+    """For what comes before the kill and after it:
+    a kill is no power cut, and flushing takes most of the time.
+    """
 
 
 def _fresh(folder: Path) -> Place:
@@ -147,17 +156,21 @@ def _reported_content(verdict: AuditVerdict) -> Content:
         return verdict.open_writes[0].content
     last = verdict.entries[-1].action if verdict.entries else None
     begun = [
-        entry for entry in verdict.entries if entry.action in {AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN}
+        entry
+        for entry in verdict.entries
+        if entry.action in {AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN}
     ]
     ended = {AuditAction.APPLIED, AuditAction.ROLLED_BACK}
-    return (
-        Content.AFTER if last in ended and begun[-1].at == (NOW + timedelta(minutes=1)).isoformat() else Content.BEFORE
-    )
+    if last in ended and begun[-1].at == (NOW + timedelta(minutes=1)).isoformat():
+        return Content.AFTER
+    return Content.BEFORE
 
 
 @pytest.fixture(scope="module")
 def small() -> Iterator[Executor]:
-    """A process that has imported this module alone: to fork one that has run other tests takes far longer."""
+    """A process that has imported this module alone:
+    to fork one that has run other tests takes far longer.
+    """
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         yield pool
 
@@ -172,11 +185,17 @@ def small() -> Iterator[Executor]:
     ],
 )
 def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_reports_which(
-    tmp_path: Path, prepare: Prepare, work: Work, capsys: pytest.CaptureFixture[str], small: Executor
+    tmp_path: Path,
+    prepare: Prepare,
+    work: Work,
+    capsys: pytest.CaptureFixture[str],
+    small: Executor,
 ) -> None:
     calls, outcomes, left, states = small.submit(_kill_everywhere, tmp_path, prepare, work).result()
     with capsys.disabled():
-        reported = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
+        reported = ", ".join(
+            f"{count} × {content.name.lower()}" for content, count in outcomes.items()
+        )
         remains = f"killed in each of them: {reported}; left behind: {', '.join(sorted(left))}"
         sys.stdout.write(f"\n  {states} states of the files at {calls} system calls, {remains}\n")
     assert calls >= MIN_CALLS
@@ -186,8 +205,11 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
     assert {"lock", "tmp"} <= left
 
 
-def _kill_everywhere(folder: Path, prepare: Prepare, work: Work) -> tuple[int, Counter[Content], set[str], int]:
-    """Kill a writer in each state of the files that its system calls make, and check what each leaves.
+def _kill_everywhere(
+    folder: Path, prepare: Prepare, work: Work
+) -> tuple[int, Counter[Content], set[str], int]:
+    """Kill a writer in each state of the files that its system calls make,
+    and check what each leaves.
 
     Returns:
         number of calls, outcomes, endings of what was left, and the number of different states.
@@ -199,7 +221,8 @@ def _kill_everywhere(folder: Path, prepare: Prepare, work: Work) -> tuple[int, C
     assert before != after
     outcomes: Counter[Content] = Counter()
     left: set[str] = set()
-    place, kept = prepare(folder / "place"), folder / "kept"
+    place = prepare(folder / "place")
+    kept = folder / "kept"
     shutil.copytree(place.folder, kept)
     seen: list[State] = []  # at each call of the writer that is followed
     gc.disable()  # of the child: when it collects is not part of the path
@@ -207,7 +230,8 @@ def _kill_everywhere(folder: Path, prepare: Prepare, work: Work) -> tuple[int, C
         killed_where(lambda _: seen.append(place.state()), work(place))
         states = dict.fromkeys((*seen, place.state()))
         for state in states:
-            # Copied back, because preparing it takes longer; into the same folder, because the audit names the file.
+            # Copied back, because preparing it takes longer; into the same folder, because the
+            # audit names the file.
             shutil.rmtree(place.folder)
             shutil.copytree(kept, place.folder)
             killed_where(partial(_is_reached, place, state), work(place))
@@ -226,7 +250,9 @@ def _is_reached(place: Place, state: State, _call: int) -> bool:
     return place.state() == state
 
 
-@pytest.mark.parametrize(("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
+@pytest.mark.parametrize(
+    ("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)]
+)
 def test_where_ptrace_is_not_permitted_it_is_skipped_by_people_and_fails_in_ci(
     monkeypatch: pytest.MonkeyPatch, ci: str, ends: type[BaseException]
 ) -> None:
@@ -257,7 +283,12 @@ def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -
     was = place.content()
     reported = [one.content for one in verify(place.audit).open_writes]
     if was is None:
-        assert rollback(FileTarget(place.file), NOW + timedelta(minutes=2), audit=place.audit).edit.after == after
+        assert (
+            rollback(
+                FileTarget(place.file), NOW + timedelta(minutes=2), audit=place.audit
+            ).edit.after
+            == after
+        )
         assert [one.content for one in verify(place.audit).open_writes] == reported
         return
     place.apply(31.5, minutes=2)
@@ -265,5 +296,8 @@ def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -
     verdict = verify(place.audit)
     assert verdict.holds
     assert [one.content for one in verdict.open_writes] == reported
-    assert rollback(FileTarget(place.file), NOW + timedelta(minutes=3), audit=place.audit).edit.after == was
+    assert (
+        rollback(FileTarget(place.file), NOW + timedelta(minutes=3), audit=place.audit).edit.after
+        == was
+    )
     assert place.file.read_bytes() in {before, after}

@@ -1,4 +1,6 @@
-"""Signatures: what minisign wrote is read, what we write has its layout, and whatever is changed is noticed."""
+"""Signatures: what minisign wrote is read, what we write has its layout,
+and whatever is changed is noticed.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ from tests.daq.calibrations import demo_calibration
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 CONTENT = b"drivegain\n"
 
-# Made by minisign 0.11 of Debian: -G -W, then -S of a file with CONTENT; the last one with -l (legacy, not prehashed).
+# Made by minisign 0.11 of Debian: -G -W, then -S of a file with CONTENT; the last one with -l
+# (legacy, not prehashed).
 PUBLIC = "RWSIVoGC/VTYqNYUY9W0O5S777B4IqweO57qpzAPcdetGnbAICUCC7wp"
 SECRET = (
     "untrusted comment: minisign encrypted secret key\n"
@@ -103,7 +106,11 @@ def test_minisigns_own_files_are_read_and_written_alike() -> None:
 @pytest.mark.parametrize(
     ("opslimit", "memlimit", "work", "parallel"),
     # libsodium's limits "sensitive" (of `minisign -G`), "interactive", and ours.
-    [(33_554_432, 1_073_741_824, 2**20, 1), (524_288, 16_777_216, 2**14, 1), (2**22, 2**27, 2**17, 1)],
+    [
+        (33_554_432, 1_073_741_824, 2**20, 1),
+        (524_288, 16_777_216, 2**14, 1),
+        (2**22, 2**27, 2**17, 1),
+    ],
 )
 def test_scrypts_parameters_are_picked_as_libsodium_does(
     opslimit: int, memlimit: int, work: int, parallel: int
@@ -148,9 +155,16 @@ def test_every_changed_bit_of_the_content_is_noticed(place: int, bit: int) -> No
 
 
 @settings(max_examples=200, deadline=None)
-@given(place=st.integers(0, len(SIGNATURE) - 1), letter=st.characters(min_codepoint=1, max_codepoint=0x17F))
-def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(place: int, letter: str) -> None:
-    """Behind "untrusted comment: " any text is allowed; the last letters of a base64 text have meaningless bits."""
+@given(
+    place=st.integers(0, len(SIGNATURE) - 1),
+    letter=st.characters(min_codepoint=1, max_codepoint=0x17F),
+)
+def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(
+    place: int, letter: str
+) -> None:
+    """Behind "untrusted comment: " any text is allowed;
+    the last letters of a base64 text have meaningless bits.
+    """
     changed = SIGNATURE[:place] + letter + SIGNATURE[place + 1 :]
     public = parse_public_key(PUBLIC)
     try:
@@ -162,15 +176,21 @@ def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(place: int,
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.text(max_size=300) | st.binary(max_size=200).map(lambda raw: base64.b64encode(raw).decode()))
+@given(
+    st.text(max_size=300) | st.binary(max_size=200).map(lambda raw: base64.b64encode(raw).decode())
+)
 def test_what_is_no_key_and_no_signature_is_reported_and_never_trusted(text: str) -> None:
     for parse in (parse_public_key, minisign.parse_secret_key, minisign.parse_signature):
         with pytest.raises(ValueError, match=r".+"):
             parse(text)
 
 
-@pytest.mark.parametrize("broken", ["content", "comment", "signature", "copied", "legacy", "folder", "empty"])
-def test_a_trusted_persons_signature_that_does_not_fit_is_an_error(calibration: Path, broken: str) -> None:
+@pytest.mark.parametrize(
+    "broken", ["content", "comment", "signature", "copied", "legacy", "folder", "empty"]
+)
+def test_a_trusted_persons_signature_that_does_not_fit_is_an_error(
+    calibration: Path, broken: str
+) -> None:
     secret, public = generate(calibration.parent, "anna")
     other, _ = generate(calibration.parent, "bert")
     path = sign(calibration, secret, "anna", at=NOW)
@@ -213,8 +233,12 @@ def test_two_names_with_one_key_are_no_two_persons(calibration: Path) -> None:
         signers_of(calibration, {"anna": public.line, "bert": public.line})
 
 
-@pytest.mark.parametrize("trusted", [{"anna": "no key"}, {"../anna": PUBLIC}, {"": PUBLIC}, {"anna": PUBLIC[:-4]}])
-def test_a_public_key_that_is_none_is_the_configurations_fault(calibration: Path, trusted: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    "trusted", [{"anna": "no key"}, {"../anna": PUBLIC}, {"": PUBLIC}, {"anna": PUBLIC[:-4]}]
+)
+def test_a_public_key_that_is_none_is_the_configurations_fault(
+    calibration: Path, trusted: dict[str, str]
+) -> None:
     with pytest.raises(ConfigurationInconsistent, match="trusted signer"):
         signers_of(calibration, trusted)
 
@@ -253,7 +277,9 @@ def test_a_key_without_a_password_that_others_may_read_signs_nothing(calibration
 def test_a_password_protects_the_key(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna", "grüne Bohne")
     assert needs_password(secret)
-    assert parse_public_key(public.text).key not in base64.b64decode(secret.read_text().splitlines()[1])
+    assert parse_public_key(public.text).key not in base64.b64decode(
+        secret.read_text().splitlines()[1]
+    )
     for wrong in ("", "grüne bohne"):
         with pytest.raises(UsageError, match="a secret key of"):
             sign(calibration, secret, "anna", password=wrong)
@@ -298,9 +324,19 @@ def test_the_verbs_make_a_key_sign_and_check(
     calibration: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = str(calibration.parent / "keys")
-    assert main(["sign", "key", "--name", "anna", "--folder", folder, "--no-password", "--json"]) == 0
+    assert (
+        main(["sign", "key", "--name", "anna", "--folder", folder, "--no-password", "--json"]) == 0
+    )
     made = json.loads(capsys.readouterr().out)
-    signed = ["sign", "calibration", str(calibration), "--key", made["secret_key"], "--name", "anna"]
+    signed = [
+        "sign",
+        "calibration",
+        str(calibration),
+        "--key",
+        made["secret_key"],
+        "--name",
+        "anna",
+    ]
     assert main(signed) == 0
     out = capsys.readouterr().out
     assert "J4" in out
@@ -314,13 +350,17 @@ def test_the_verbs_make_a_key_sign_and_check(
     assert main(signed) == 3  # a calibration that was edited is not signed
 
 
-def test_check_names_the_signers_of_the_cell(calibration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_names_the_signers_of_the_cell(
+    calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     secret, public = generate(calibration.parent, "anna")
     cell = calibration.parent / "cells" / "demo.yaml"
     shutil.copytree(Path(__file__).parents[3] / "configs", calibration.parent, dirs_exist_ok=True)
     text = cell.read_text()
     assert "\npolicy:" not in text
-    cell.write_text(f"{text}\npolicy: {{apply: {{signatures: 1, signers: {{anna: {public.line}}}}}}}\n")
+    cell.write_text(
+        f"{text}\npolicy: {{apply: {{signatures: 1, signers: {{anna: {public.line}}}}}}}\n"
+    )
     check = ["sign", "check", str(calibration), "--cell", str(cell)]
     assert main([*check, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"signers": [], "signatures_needed": 1}

@@ -1,4 +1,6 @@
-"""A file system that fails at any call of a write: every message says what is true, and the next command repairs."""
+"""A file system that fails at any call of a write:
+every message says what is true, and the next command repairs.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def cell(tmp_path: Path) -> Path:
 class Disk:
     """Counts the calls of the operating system, and fails at one of them or from one of them on."""
 
-    def __init__(self, patch: pytest.MonkeyPatch, at: int | None = None, *, lasting: bool = False) -> None:
+    def __init__(
+        self, patch: pytest.MonkeyPatch, at: int | None = None, *, lasting: bool = False
+    ) -> None:
         self.calls: list[str] = []
         self.renamed: int | None = None  #: number of the call that put the new content in its place
         self._at, self._lasting = at, lasting
@@ -44,7 +48,11 @@ class Disk:
         def call(*given: Any, **named: Any) -> Any:
             number = len(self.calls)
             self.calls.append(name)
-            if name == "replace" and str(given[1]).endswith("controllers/demo.yaml") and self.renamed is None:
+            if (
+                name == "replace"
+                and str(given[1]).endswith("controllers/demo.yaml")
+                and self.renamed is None
+            ):
                 self.renamed = number
             later = self._lasting and self._at is not None and number > self._at and name in WRITING
             if number == self._at or later:
@@ -70,12 +78,18 @@ def controller_of(cell: Path) -> Path:
 @pytest.mark.parametrize("lasting", [False, True], ids=["once", "from then on"])
 @pytest.mark.parametrize("verb", ["apply", "rollback"])
 def test_no_message_denies_a_write_and_the_next_command_enters_it(
-    cell: Path, verb: str, lasting: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell: Path,
+    verb: str,
+    lasting: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     controller, calibration = controller_of(cell), calibration_for(cell)
     if verb == "rollback":
         assert apply(cell, calibration) == ExitCode.OK
-    work: Callable[[], int] = (lambda: apply(cell, calibration)) if verb == "apply" else lambda: main([verb, str(cell)])
+    work: Callable[[], int] = (
+        (lambda: apply(cell, calibration)) if verb == "apply" else lambda: main([verb, str(cell)])
+    )
     kept = cell.parents[1].with_name("kept")
     shutil.copytree(cell.parents[1], kept)
     before = controller.read_bytes()
@@ -107,7 +121,10 @@ def test_no_message_denies_a_write_and_the_next_command_enters_it(
             assert controller.read_bytes() == after
         else:
             assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK, at
-        assert main(["history", str(cell), "--verify"]) == ExitCode.OK, (at, capsys.readouterr().err)
+        assert main(["history", str(cell), "--verify"]) == ExitCode.OK, (
+            at,
+            capsys.readouterr().err,
+        )
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
@@ -156,7 +173,10 @@ def test_what_is_in_place_is_called_applied_by_the_audit(
     assert "has the new content, complete; the history lacks this write" in said
     history = load_cell(cell).history
     assert history is not None
-    assert [entry.action for entry in read(history.audit)] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+    assert [entry.action for entry in read(history.audit)] == [
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+    ]
     assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
     assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK

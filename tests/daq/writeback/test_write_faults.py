@@ -1,4 +1,6 @@
-"""Failures at system calls of a write, a sample of `tests.studies.write_faults`; and what its checks would notice."""
+"""Failures at system calls of a write, a sample of `tests.studies.write_faults`;
+and what its checks would notice.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,23 @@ from tests.studies.write_faults import ERRORS, CallUnit, FaultRow, Scene, counts
 from tests.studies.write_truth import Content, Facts, false_sentences, wrong_code
 
 CONTROLLER = Path("/cell/x.yaml")
-SAMPLE = ("chmod of lock", "fsync of audit log", "close of audit log", "rename of controller's file", "fsync of folder")
-"""Where a lock file stays behind, where an entry is there that was not flushed, and beside the replacement."""
+SAMPLE = (
+    "chmod of lock",
+    "fsync of audit log",
+    "close of audit log",
+    "rename of controller's file",
+    "fsync of folder",
+)
+"""Where a lock file stays behind, where an entry is there that was not flushed,
+and beside the replacement.
+"""
 
 
 @pytest.fixture(scope="module")
 def small() -> Iterator[Executor]:
-    """A process that has imported this module alone: its forks are quick, and no thread of another test is in it."""
+    """A process that has imported this module alone:
+    its forks are quick, and no thread of another test is in it.
+    """
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         yield pool
 
@@ -42,7 +54,9 @@ def _label(unit: CallUnit) -> str:
 
 
 def _sampled(folder: Path) -> list[FaultRow]:
-    """The last call of each kind of the sample: killed there, and failing with one error from there on."""
+    """The last call of each kind of the sample:
+    killed there, and failing with one error from there on.
+    """
     scene = Scene(folder, "apply")
     last = {_label(unit): unit for unit in scene.units()}
     rows = []
@@ -83,7 +97,9 @@ def test_an_entry_that_was_flushed_counts_although_the_audit_log_cannot_be_close
 
 
 def _append_twice(path: Path) -> int:
-    """Return 0 where both lines were written, 1 where the first one failed, 2 where the second one did."""
+    """Return 0 where both lines were written, 1 where the first one failed,
+    2 where the second one did.
+    """
     for number in (1, 2):
         try:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -100,7 +116,9 @@ def _traced_twice(path: Path, fault: Fault | None) -> Traced:
     return traced(lambda: _append_twice(path), path.__eq__, fault)
 
 
-def test_a_fault_is_at_the_chosen_call_and_the_call_is_not_made(tmp_path: Path, small: Executor) -> None:
+def test_a_fault_is_at_the_chosen_call_and_the_call_is_not_made(
+    tmp_path: Path, small: Executor
+) -> None:
     _require_tracing(small)
     path = tmp_path.resolve() / "file"
     whole = small.submit(_traced_twice, path, None).result()
@@ -126,7 +144,10 @@ def _facts(content: Content, **changed: object) -> Facts:
 @pytest.mark.parametrize(
     ("said", "true_of"),
     [
-        ("error: /cell/x.yaml found: no space expected: room do: it is as it was; free space", Content.OLD),
+        (
+            "error: /cell/x.yaml found: no space expected: room do: it is as it was; free space",
+            Content.OLD,
+        ),
         ("do: nothing was written to the controller; free space or rights", Content.OLD),
         ("do: check the disk; /cell/x.yaml has the new content, complete", Content.NEW),
         ("the audit log may lack the entry that it is applied: a.jsonl: no space", Content.NEW),

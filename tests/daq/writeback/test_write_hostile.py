@@ -1,4 +1,7 @@
-"""Files that are no files: links, loops, pipes, devices. A clear message for each, and no waiting."""
+"""Files that are no files: links, loops, pipes, devices.
+
+A clear message for each, and no waiting.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,15 @@ from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.documents import calibration_file
 from daq.errors import CalibrationMissing, ControllerUnfit, ExitCode, OutputFailed
-from daq.ledger.audit import BACKUPS_WITHOUT_LOG, AuditAction, Content, append, head_file, read, verify
+from daq.ledger.audit import (
+    BACKUPS_WITHOUT_LOG,
+    AuditAction,
+    Content,
+    append,
+    head_file,
+    read,
+    verify,
+)
 from daq.writeback.file_target import FileTarget
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose, rollback
@@ -70,12 +81,17 @@ def test_what_is_no_regular_file_is_no_controller_and_no_calibration(
 def test_a_link_that_leads_nowhere_says_where(tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(tmp_path / "gone" / "demo.yaml")
-    with pytest.raises(ControllerUnfit, match=r"a symbolic link to .*gone/demo\.yaml, which is not there"):
+    with pytest.raises(
+        ControllerUnfit,
+        match=r"a symbolic link to .*gone/demo\.yaml, which is "
+        r"not there",
+    ):
         propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
 
 
 def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
-    one, other = tmp_path / "one.yaml", tmp_path / "other.yaml"
+    one = tmp_path / "one.yaml"
+    other = tmp_path / "other.yaml"
     one.symlink_to(other)
     other.symlink_to(one)
     with pytest.raises(ControllerUnfit, match="round in a circle"):
@@ -86,7 +102,9 @@ def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
         calibration_file.load_calibration(one)
 
 
-def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controller: Path, tmp_path: Path) -> None:
+def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(
+    controller: Path, tmp_path: Path
+) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
     controller.parent.chmod(0o777)
@@ -112,7 +130,9 @@ def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Pa
     assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
 
 
-def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, tmp_path: Path) -> None:
+def test_a_file_of_two_names_is_not_written_under_one_of_them(
+    controller: Path, tmp_path: Path
+) -> None:
     """The other name would keep the current gains, and its readers would not know."""
     other = tmp_path / "plc's.yaml"
     other.hardlink_to(controller)
@@ -124,10 +144,15 @@ def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, 
     assert controller.stat().st_nlink == 1
     assert other.read_bytes() == controller.read_bytes()
     assert propose(FileTarget(other, KEYS), Request(demo_calibration(), NOW)).refusals == ()
-    assert apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW) is not None
+    assert (
+        apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW)
+        is not None
+    )
 
 
-def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path, tmp_path: Path) -> None:
+def test_a_link_between_the_look_and_the_write_changes_nothing(
+    controller: Path, tmp_path: Path
+) -> None:
     """The lock's name is no way to another file either."""
     proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
     victim = tmp_path / "victim"
@@ -137,16 +162,27 @@ def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path,
     assert not victim.exists()
 
 
-def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(controller: Path, tmp_path: Path) -> None:
-    audit, link = tmp_path / "audit.jsonl", tmp_path / "link.yaml"
+def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(
+    controller: Path, tmp_path: Path
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    link = tmp_path / "link.yaml"
     link.symlink_to(controller)
     before = controller.read_bytes()
-    apply(propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit, who="Ada")
+    apply(
+        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)),
+        NOW,
+        audit=audit,
+        who="Ada",
+    )
     controller.unlink()
     assert rollback(FileTarget(link), NOW, audit=audit, who="Bob").edit.subject == str(controller)
     assert controller.read_bytes() == before
     entries = read(audit)
-    assert [entry.action for entry in entries][2:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert [entry.action for entry in entries][2:] == [
+        AuditAction.ROLLBACK_BEGUN,
+        AuditAction.ROLLED_BACK,
+    ]
     assert entries[2].details["sha256_before"] is None
     assert {entry.subject for entry in entries} == {str(controller)}
 
@@ -154,7 +190,8 @@ def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(controller: 
 def test_what_fails_within_a_write_is_recorded_as_failed(
     controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    audit, before = tmp_path / "audit.jsonl", controller.read_bytes()
+    audit = tmp_path / "audit.jsonl"
+    before = controller.read_bytes()
     proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
 
     def full(*_: object, **__: object) -> None:
@@ -172,7 +209,10 @@ def test_what_fails_within_a_write_is_recorded_as_failed(
 
 
 def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
-    controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    controller: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     audit = tmp_path / "audit.jsonl"
 
@@ -191,7 +231,14 @@ def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
 
 def _write_and_delete_log(controller: Path, audit: Path) -> None:
     """Apply a calibration, and remove the audit log of it with the note of its last entry."""
-    assert apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit) is not None
+    assert (
+        apply(
+            propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)),
+            NOW,
+            audit=audit,
+        )
+        is not None
+    )
     audit.unlink()
     head_file(audit).unlink()
 
@@ -215,7 +262,9 @@ def test_a_rollback_beside_a_deleted_log_works_and_the_new_log_says_what_is_miss
     assert BACKUPS_WITHOUT_LOG not in read(audit)[-2].details
 
 
-def test_a_first_write_misses_no_log(controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_first_write_misses_no_log(
+    controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     audit = tmp_path / "audit.jsonl"
     apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit)
     assert caplog.text == ""

@@ -1,4 +1,6 @@
-"""An SDO abort at every step of the set-up: each object that a drive may refuse, read or written."""
+"""An SDO abort at every step of the set-up:
+each object that a drive may refuse, read or written.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,20 @@ STEPS = steps_of_setup()
 def test_the_steps_are_those_of_a_whole_setup() -> None:
     assert len(STEPS) > 80
     indices = {index for _, index, _ in STEPS}
-    assert indices >= {0x1016, 0x1017, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6007, 0x6041, 0x6060, 0x6061, 0x6075}
+    assert indices >= {
+        0x1016,
+        0x1017,
+        0x1018,
+        0x1400,
+        0x1600,
+        0x1800,
+        0x1A00,
+        0x6007,
+        0x6041,
+        0x6060,
+        0x6061,
+        0x6075,
+    }
 
 
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: f"{step[0]}-{step[1]:04X}h-{step[2]:02X}")
@@ -65,9 +80,21 @@ def test_an_abort_names_axis_object_and_remedy_and_the_other_axis_is_restored(st
     action, index, sub = step
     network, bus = rich_cell()
     refusing = bus.nodes[NODE]
-    aborts = refusing.read_aborts if action == "read" else refusing.aborts
+    if action == "read":
+        aborts = refusing.read_aborts
+    else:
+        aborts = refusing.aborts
     aborts[index, sub] = ABORT
-    settings = [(0x1017, 0), (0x6060, 0), (0x6007, 0), (0x1016, 1), (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1400, 1)]
+    settings = [
+        (0x1017, 0),
+        (0x6060, 0),
+        (0x6007, 0),
+        (0x1016, 1),
+        (0x1800, 1),
+        (0x1800, 2),
+        (0x1A00, 0),
+        (0x1400, 1),
+    ]
     before = [bus.nodes[0].value(*key) for key in settings]
     try:
         with network:
@@ -83,7 +110,8 @@ def test_an_abort_names_axis_object_and_remedy_and_the_other_axis_is_restored(st
         assert is_of_identity or "present device state" in said
         assert "expect" in said
         assert said.count(";") >= 1  # and what to do
-    unused = {("write", 0x1A00, 3), ("write", 0x1601, 2)}  # PDOs of fewer objects are mapped instead
+    # PDOs of fewer objects are mapped instead
+    unused = {("write", 0x1A00, 3), ("write", 0x1601, 2)}
     assert is_ready is (step in NOT_NEEDED | unused)
     assert [bus.nodes[0].value(*key) for key in settings] == before
     assert all(node.statusword & 0x6F == 0x40 for node in bus.nodes)

@@ -65,7 +65,8 @@ def _foreign(monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
 
 @pytest.mark.parametrize("opened", [_own, _of_a_hub, _foreign])
 def test_a_wait_does_not_become_longer_when_the_wall_clock_is_set_back(
-    monkeypatch: pytest.MonkeyPatch, opened: Callable[[pytest.MonkeyPatch], AbstractContextManager[can.BusABC]]
+    monkeypatch: pytest.MonkeyPatch,
+    opened: Callable[[pytest.MonkeyPatch], AbstractContextManager[can.BusABC]],
 ) -> None:
     """python-can waits by the wall clock: SYNC was not sent until the next frame came."""
     with opened(monkeypatch) as end:
@@ -94,12 +95,18 @@ def test_a_flood_does_not_keep_a_reader() -> None:
         end.channel.append(end.queue)
         for _ in range(3):
             end.queue.put(can.Message(arbitration_id=0x81, is_extended_id=False))
-        assert [frame.arbitration_id for frame in (end.recv(0.0), end.recv(0.0)) if frame] == [0x81, 0x81]
+        assert [frame.arbitration_id for frame in (end.recv(0.0), end.recv(0.0)) if frame] == [
+            0x81,
+            0x81,
+        ]
 
 
 def test_an_end_of_python_cans_own_is_on_the_same_bus() -> None:
     frame = can.Message(arbitration_id=0x81, is_extended_id=False, data=b"\x01\xab")
-    with can.Bus(interface="virtual", channel="mixed") as theirs, open_bus(BusAddress("virtual", "mixed")) as ours:
+    with (
+        can.Bus(interface="virtual", channel="mixed") as theirs,
+        open_bus(BusAddress("virtual", "mixed")) as ours,
+    ):
         ours.send(frame)
         assert same(theirs.recv(WAIT_S), frame)
         theirs.send(frame)
@@ -114,7 +121,12 @@ def test_a_frame_that_changes_after_it_was_sent_arrives_as_it_was_sent() -> None
         frame.data[0], frame.arbitration_id = 2, 0x82
         heard = far.recv(WAIT_S)
     assert heard is not None
-    assert (heard.arbitration_id, bytes(heard.data), heard.is_rx, heard.channel) == (0x81, b"\x01", True, "changed")
+    assert (heard.arbitration_id, bytes(heard.data), heard.is_rx, heard.channel) == (
+        0x81,
+        b"\x01",
+        True,
+        "changed",
+    )
     with pytest.raises(can.CanOperationError, match="closed"):
         far.recv(0.0)
     with pytest.raises(can.CanOperationError, match="closed"):
@@ -159,7 +171,10 @@ def test_no_one_listens() -> None:
         with pytest.raises(BusError, match=str(port)):
             open_bus(BusAddress("socketcand", "can0", port=port))
         taken.listen()
-        with pytest.raises(BusError, match=f"{port}: .*another hub runs on this port"), Hub(("can0",), port=port):
+        with (
+            pytest.raises(BusError, match=f"{port}: .*another hub runs on this port"),
+            Hub(("can0",), port=port),
+        ):
             pass
 
 
@@ -194,21 +209,31 @@ def test_python_cans_own_client_understands_the_hub() -> None:
         (b"< send 080 0 >", b"< error unknown command >"),
         (b"< rawmode >", b"< error unknown command >"),
         (b"< open can0 >< rawmode >< send 080 2 1 >", b"< ok >< ok >< error malformed frame >"),
-        (b"< open can0 >< rawmode >< send 080 9 1 1 1 1 1 1 1 1 1 >", b"< ok >< ok >< error malformed frame >"),
+        (
+            b"< open can0 >< rawmode >< send 080 9 1 1 1 1 1 1 1 1 1 >",
+            b"< ok >< ok >< error malformed frame >",
+        ),
         (b"< echo >", b"< echo >"),
     ],
 )
 def test_the_hub_answers_what_it_does_not_understand(said: bytes, answer: bytes) -> None:
-    with Hub(("can0",)) as hub, socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
+    with (
+        Hub(("can0",)) as hub,
+        socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client,
+    ):
         client.sendall(said)
-        expected, heard = b"< hi >" + answer, b""
+        expected = b"< hi >" + answer
+        heard = b""
         while len(heard) < len(expected):
             heard += client.recv(256)
         assert heard == expected
 
 
 def test_the_hub_hangs_up_on_what_is_no_socketcand() -> None:
-    with Hub(("can0",)) as hub, socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
+    with (
+        Hub(("can0",)) as hub,
+        socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client,
+    ):
         client.sendall(b"GET / HTTP/1.1 " + b"x" * 1000)
         heard = b""
         while chunk := client.recv(256):
@@ -239,7 +264,9 @@ HOSTILE_FRAMES = (
 
 
 def _arrives_alone(hub: Hub, ends: Sequence[can.BusABC]) -> None:
-    """Send a frame from the first end to the second: it is the next one, and the hub answers in time."""
+    """Send a frame from the first end to the second:
+    it is the next one, and the hub answers in time.
+    """
     frame = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\x2a")
     ends[0].send(frame)
     assert same(ends[1].recv(WAIT_S), frame)
@@ -252,7 +279,8 @@ def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
         with raw_client(hub) as hostile:
             hostile.sendall(line)
             hostile.settimeout(WAIT_S)
-            with suppress(ConnectionResetError):  # the hub may hang up on it, and on no other client
+            # The hub may hang up on it, and on no other client
+            with suppress(ConnectionResetError):
                 assert hostile.recv(256)[:8] in (b"< error ", b"")
             _arrives_alone(hub, ends)
         for end in ends:
@@ -260,11 +288,16 @@ def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
 
 
 @settings(
-    max_examples=150, deadline=None, database=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=150,
+    deadline=None,
+    database=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 @given(lines=st.lists(st.one_of(
     st.binary(max_size=40),
-    st.from_regex(rb"< ?send [0-9A-Fa-f]{1,20} [0-9A-Fa-f]{1,3} ([0-9A-Fa-f]{1,2} ){0,10}>", fullmatch=True),
+    st.from_regex(rb"< ?send [0-9A-Fa-f]{1,20} [0-9A-Fa-f]{1,3} "
+                  rb"([0-9A-Fa-f]{1,2} ){0,10}>", fullmatch=True),
 ), max_size=8))  # fmt: skip
 def test_a_frame_that_arrives_is_one_that_a_bus_carries(lines: list[bytes]) -> None:
     with Hub(("can0",)) as hub:
@@ -279,9 +312,13 @@ def test_a_frame_that_arrives_is_one_that_a_bus_carries(lines: list[bytes]) -> N
         listening.shutdown()
 
 
-@pytest.mark.parametrize("unfinished", [b"<" + b" " * 200_000, b"< send " + b"1" * 200_000, b"<\t " * 60_000])
+@pytest.mark.parametrize(
+    "unfinished", [b"<" + b" " * 200_000, b"< send " + b"1" * 200_000, b"<\t " * 60_000]
+)
 def test_an_unfinished_line_holds_up_no_other(unfinished: bytes) -> None:
-    """The hub reads each byte a bounded number of times: these took it minutes, and no other client was served."""
+    """The hub reads each byte a bounded number of times:
+    these took it minutes, and no other client was served.
+    """
     with Hub(("can0",)) as hub:
         ends = [open_bus(hub.address()) for _ in range(2)]
         with raw_client(hub) as hostile, suppress(ConnectionResetError, BrokenPipeError):
@@ -293,7 +330,9 @@ def test_an_unfinished_line_holds_up_no_other(unfinished: bytes) -> None:
             end.shutdown()
 
 
-def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("drivers.canopen.bus.SEND_S", 0.02)
     ours, theirs = socket.socketpair()
     theirs.sendall(b"< hi >< ok >< ok >")
@@ -305,7 +344,8 @@ def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(monkeypatch: pyt
         with pytest.raises(can.CanOperationError, match=r"accepts nothing for 0\.02 s"):
             for _ in range(100_000):
                 end.send_burst((frame,) * 100)
-        with pytest.raises(can.CanOperationError, match="accepts nothing"):  # half a frame may have gone out
+        # Half a frame may have gone out
+        with pytest.raises(can.CanOperationError, match="accepts nothing"):
             end.send(frame)
     end.shutdown()
 
@@ -330,7 +370,11 @@ def test_a_server_that_never_ends_a_message_is_reported_and_not_parsed_ever_slow
     end = SocketcandBus("can0", HOST, 1)
     with theirs:
         theirs.sendall(ENDLESS[kind])
-        with pytest.raises(can.CanOperationError, match=r"without the end of a message.*socketcand server"):
+        with pytest.raises(
+            can.CanOperationError,
+            match=r"without the end of a "
+            r"message.*socketcand server",
+        ):
             for _ in range(100):
                 end.recv(WAIT_S)
     end.shutdown()
@@ -345,8 +389,12 @@ def test_a_handshake_without_end_is_reported(monkeypatch: pytest.MonkeyPatch) ->
         SocketcandBus("can0", HOST, 1)
 
 
-@pytest.mark.parametrize("said", ["< frame 123456789 1.0 00 >", "< frame 123 1.0 000000000000000000 >"])
-def test_a_frame_that_no_bus_carries_is_reported(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "said", ["< frame 123456789 1.0 00 >", "< frame 123 1.0 000000000000000000 >"]
+)
+def test_a_frame_that_no_bus_carries_is_reported(
+    said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ours, theirs = socket.socketpair()
     theirs.sendall(b"< hi >< ok >< ok >")
     monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)

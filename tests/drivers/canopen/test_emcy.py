@@ -33,7 +33,9 @@ def test_every_code_says_something(code: int) -> None:
 
 
 def test_every_code_has_a_remedy_of_its_class() -> None:
-    assert remedy_of(0x7305).startswith("check the plugs and cables of encoder and brake; then reset the fault")
+    assert remedy_of(0x7305).startswith(
+        "check the plugs and cables of encoder and brake; then reset the fault"
+    )
     assert remedy_of(0x8611).startswith("check brake, load and collision")
     assert remedy_of(0x8130).startswith("check the bus's cable")
     assert remedy_of(0xFF01).startswith("see the drive's manual")

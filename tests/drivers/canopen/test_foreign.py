@@ -1,4 +1,6 @@
-"""Drives of other makers, built on their data sheets: what they lack is found before anything is written."""
+"""Drives of other makers, built on their data sheets:
+what they lack is found before anything is written.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,15 @@ def written(bus: ScriptedBus) -> list[str]:
     return [
         f"{frame.arbitration_id:03X} {frame.data.hex(' ')}"
         for frame in bus.sent
-        if frame.arbitration_id == 0 or (0x600 < frame.arbitration_id < 0x680 and frame.data[0] >> 5 == 1)
+        if frame.arbitration_id == 0
+        or (0x600 < frame.arbitration_id < 0x680 and frame.data[0] >> 5 == 1)
     ]
 
 
 @pytest.mark.parametrize(("file", "profile"), MAKES.items())
-def test_a_drive_of_this_data_sheet_is_set_up_moved_and_restored(file: str, profile: str, shared_data: Path) -> None:
+def test_a_drive_of_this_data_sheet_is_set_up_moved_and_restored(
+    file: str, profile: str, shared_data: Path
+) -> None:
     network, bus = foreign_cell(shared_data / "eds" / file, shipped(profile))
     before = [settings(node) for node in bus.nodes]
     with network:
@@ -36,7 +41,10 @@ def test_a_drive_of_this_data_sheet_is_set_up_moved_and_restored(file: str, prof
         samples = list(execute(network, stream, (MOVE,), permission()))
         assert not any(sample.missing for sample in samples)
         # A drive that acts in its 6040h callback would have gone to the target of before.
-        assert [(node.position, len(node.setpoint_cycles)) for node in bus.nodes] == [(3000, 1), (-2000, 1)]
+        assert [(node.position, len(node.setpoint_cycles)) for node in bus.nodes] == [
+            (3000, 1),
+            (-2000, 1),
+        ]
         assert samples[-1].position_counts == (3000, -2000)
     assert [settings(node) for node in bus.nodes] == before
 
@@ -47,12 +55,17 @@ def settings(node: object) -> dict[str, int]:
     for base in (0x1400, 0x1800):
         for number in node.numbers(base):
             keys += [(base + number, sub) for sub in (1, 2)]
-            keys += [(base + 0x200 + number, sub) for sub in range(node.value(base + 0x200 + number, 0) + 1)]
+            keys += [
+                (base + 0x200 + number, sub)
+                for sub in range(node.value(base + 0x200 + number, 0) + 1)
+            ]
     return {f"{index:04X}h:{sub:02X}": node.value(index, sub) for index, sub in keys}
 
 
 def test_a_fixed_mapping_that_carries_the_same_is_used_as_it_is(shared_data: Path) -> None:
-    network, bus = foreign_cell(shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True)
+    network, bus = foreign_cell(
+        shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True
+    )
     for node in bus.nodes:
         for base, number, words in (
             (0x1A00, 0, (0x60410010, 0x60770010, 0x60640020)),  # the default in the data sheet
@@ -71,7 +84,9 @@ def test_a_fixed_mapping_that_carries_the_same_is_used_as_it_is(shared_data: Pat
 
 
 def test_a_fixed_mapping_that_does_not_carry_the_same_is_refused(shared_data: Path) -> None:
-    network, _ = foreign_cell(shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True)
+    network, _ = foreign_cell(
+        shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True
+    )
     with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1: writing .*read only"), network:
         network.prepare()
 
@@ -79,21 +94,35 @@ def test_a_fixed_mapping_that_does_not_carry_the_same_is_refused(shared_data: Pa
 @pytest.mark.parametrize(
     ("file", "missing", "fitting"),
     [
-        ("pilz_prbt_0_1.dcf", "no object 6074h:00 (current)", "`schunk-pilz-prbt` (current from 6077h:00)"),
-        ("Schunk_0_63_cob.dcf", "no object 6074h:00 (current)", "`schunk-pilz-prbt` (current from 6077h:00)"),
+        (
+            "pilz_prbt_0_1.dcf",
+            "no object 6074h:00 (current)",
+            "`schunk-pilz-prbt` (current from 6077h:00)",
+        ),
+        (
+            "Schunk_0_63_cob.dcf",
+            "no object 6074h:00 (current)",
+            "`schunk-pilz-prbt` (current from 6077h:00)",
+        ),
         (
             "maxon_epos4.eds",
             "no object 6074h:00 (current), no object 6075h:00 (scale of the current)",
             "`maxon-epos4` (current from 30D0h:00, rated current from 3001h:01)",
         ),
-        ("ros2_canopen_cia402_slave.eds", "no object 6074h:00 (current)", "no shipped profile fits this drive"),
+        (
+            "ros2_canopen_cia402_slave.eds",
+            "no object 6074h:00 (current)",
+            "no shipped profile fits this drive",
+        ),
     ],
 )
 def test_a_profile_that_does_not_fit_is_refused_before_anything_is_written(
     file: str, missing: str, fitting: str, shared_data: Path
 ) -> None:
     others = tuple(map(shipped, ("elmo-gold", "maxon-epos4", "schunk-pilz-prbt", "copley")))
-    network, bus = foreign_cell(shared_data / "eds" / file, shipped("generic-cia402"), profiles=lambda: others)
+    network, bus = foreign_cell(
+        shared_data / "eds" / file, shipped("generic-cia402"), profiles=lambda: others
+    )
     with pytest.raises(SetupRefused) as refused, network:
         network.prepare()
     assert missing in str(refused.value)
@@ -102,7 +131,9 @@ def test_a_profile_that_does_not_fit_is_refused_before_anything_is_written(
 
 
 def test_too_few_pdos_are_named_before_anything_is_written(shared_data: Path) -> None:
-    network, bus = foreign_cell(shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"))
+    network, bus = foreign_cell(
+        shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt")
+    )
     for node in bus.nodes:
         assert isinstance(node, ForeignNode)
         del node.local.object_dictionary[0x1401]
@@ -128,19 +159,29 @@ PROFILE_RPDOS = (rpdo(2, 0x60810020, 0x60830020), rpdo(3, 0x60840020))
         ((rpdo(0, 0x607A0020, 0x60400010, 0x60600008),), False),
         ((rpdo(0, 0x60400010), rpdo(1, 0x607A0020, 0x60400010)), False),
     ],
-    ids=["target first", "earlier frame", "controlword first", "later frame", "another object", "twice"],
+    ids=[
+        "target first",
+        "earlier frame",
+        "controlword first",
+        "later frame",
+        "another object",
+        "twice",
+    ],
 )
 def test_own_rpdos_are_used_only_if_the_target_comes_first_and_nothing_else(
     command: tuple[PdoRecord, ...], fits: bool
 ) -> None:
     used = fixed_setpoints(command + PROFILE_RPDOS)
-    assert [record.number for record in used] == ([r.number for r in command + PROFILE_RPDOS] if fits else [])
+    assert [record.number for record in used] == (
+        [r.number for r in command + PROFILE_RPDOS] if fits else []
+    )
     assert all(record.transmission == 1 for record in used)
 
 
 _ELMO = {"elmo-gold", "generic-cia402", "schunk-pilz-prbt"}
 _SCHUNK = {"schunk-pilz-prbt", "beckhoff-el72x1"}
-FITTING: dict[str, set[str]] = {  # profiles whose objects the sheet has; a scale of another make is for a person to see
+# Profiles whose objects the sheet has; a scale of another make is for a person to see
+FITTING: dict[str, set[str]] = {
     "pilz_prbt_0_1.dcf": _SCHUNK,
     "Schunk_0_63_cob.dcf": _SCHUNK,
     "Elmo_cob.dcf": _ELMO,
@@ -148,9 +189,12 @@ FITTING: dict[str, set[str]] = {  # profiles whose objects the sheet has; a scal
     "maxon_epos4.eds": {"maxon-epos4"},
     "ros2_canopen_cia402_slave.eds": set(),
 }
+# technosoft-ipos needs an entry of a person.
 PROFILES = sorted(
-    path.stem for path in (shipped_configurations() / "drives").glob("*.yaml") if path.stem != "technosoft-ipos"
-)  # which needs an entry of a person
+    path.stem
+    for path in (shipped_configurations() / "drives").glob("*.yaml")
+    if path.stem != "technosoft-ipos"
+)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -159,7 +203,9 @@ def test_each_data_sheet_is_set_up_by_each_profile_or_refused_in_words_and_left_
     file: str, profile: str, shared_data: Path
 ) -> None:
     others = tuple(map(shipped, PROFILES))
-    network, bus = foreign_cell(shared_data / "eds" / file, shipped(profile), profiles=lambda: others)
+    network, bus = foreign_cell(
+        shared_data / "eds" / file, shipped(profile), profiles=lambda: others
+    )
     before = [settings(node) for node in bus.nodes]
     refused = None
     with contextlib.suppress(SetupRefused), network:

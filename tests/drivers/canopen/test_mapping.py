@@ -30,7 +30,9 @@ def test_everything_is_packed_once_and_fits(objects: list[ObjectEntry]) -> None:
 
 
 @given(st.lists(entries, min_size=1, max_size=6, unique_by=word), st.data())
-def test_layout_decodes_what_a_drive_would_send(objects: list[ObjectEntry], data: st.DataObject) -> None:
+def test_layout_decodes_what_a_drive_would_send(
+    objects: list[ObjectEntry], data: st.DataObject
+) -> None:
     for pdo in pack(objects):
         values = [
             data.draw(
@@ -58,5 +60,10 @@ def test_what_cannot_be_packed_is_refused() -> None:
 
 
 def test_setpoints_have_the_predefined_cob_ids() -> None:
-    assert [record.cob_id for record in records(Direction.RPDO, 5, SETPOINT_PDOS)] == [0x205, 0x305, 0x405]
-    assert records(Direction.RPDO, 5, SETPOINT_PDOS)[0].entries == (0x607A0020, 0x60400010)  # the target first
+    assert [record.cob_id for record in records(Direction.RPDO, 5, SETPOINT_PDOS)] == [
+        0x205,
+        0x305,
+        0x405,
+    ]
+    # The target first
+    assert records(Direction.RPDO, 5, SETPOINT_PDOS)[0].entries == (0x607A0020, 0x60400010)

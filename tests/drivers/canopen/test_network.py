@@ -28,7 +28,15 @@ from drivers.errors import (
 from drivers.messages import EventKind
 from drivers.profiles.cia402 import State
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
-from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell, lose_first_answer
+from tests.drivers.scripted import (
+    ADDRESS,
+    PROFILE,
+    FakeClock,
+    ScriptedBus,
+    ScriptedNode,
+    cell,
+    lose_first_answer,
+)
 
 
 def test_scan_reports_who_is_there_and_changes_nothing() -> None:
@@ -74,8 +82,16 @@ def test_prepare_sets_up_and_leaving_restores_everything() -> None:
         network.prepare()
         node = bus.nodes[0]
         assert node.nmt == NmtState.OPERATIONAL
-        assert (node.value(0x1800, 1), node.value(0x1800, 2), node.value(0x1A00, 0)) == (0x181, 1, 3)
-        assert [node.value(0x1A00, sub) for sub in (1, 2, 3)] == [0x60640020, 0x60740010, 0x60410010]
+        assert (node.value(0x1800, 1), node.value(0x1800, 2), node.value(0x1A00, 0)) == (
+            0x181,
+            1,
+            3,
+        )
+        assert [node.value(0x1A00, sub) for sub in (1, 2, 3)] == [
+            0x60640020,
+            0x60740010,
+            0x60410010,
+        ]
         assert node.value(0x1801, 1) >> 31 == 1  # the default TPDO2 would come between ours
         assert node.value(0x6061, 0) == 1
         assert network.ampere_per_unit() == pytest.approx((0.002, 0.002))
@@ -128,7 +144,14 @@ def test_a_missing_node_is_named_with_those_that_answered() -> None:
     bus = ScriptedBus((ScriptedNode(1),), clock)
     axes = (Axis("J1", 1, PROFILE), Axis("J2", 2, PROFILE))
     network = CanopenNetwork(ADDRESS, axes, clock=clock, opener=lambda address: bus)
-    with network, pytest.raises(NodeMissing, match=r"J2 \(node 2\) did not answer .*answered: 1") as missing:
+    with (
+        network,
+        pytest.raises(
+            NodeMissing,
+            match=r"J2 \(node 2\) did not answer "
+            r".*answered: 1",
+        ) as missing,
+    ):
         network.prepare()
     assert missing.value.node_ids == (2,)
 
@@ -138,7 +161,9 @@ def test_a_missing_node_is_named_with_those_that_answered() -> None:
     [(1, "vendor id", "0x1234"), (2, "product code", "0x1234"), (4, "serial number", "4660")],
     ids=["vendor", "product", "serial"],
 )
-def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field: str, number: str) -> None:
+def test_another_amplifier_is_refused_before_anything_is_written(
+    sub: int, field: str, number: str
+) -> None:
     network, bus = cell(2)
     bus.nodes[1].store(0x1018, sub, 0x1234)
     with network, pytest.raises(SetupRefused, match=rf"J2 \(node 2\): {field} .*is {number},"):
@@ -150,7 +175,14 @@ def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field
 def test_a_node_that_ignores_nmt_is_refused() -> None:
     network, bus = cell(2)
     bus.nodes[1].obeys_nmt = False
-    with network, pytest.raises(StateRefused, match=r"J2 \(node 2\): asked for NMT OPERATIONAL.*PRE-OPERATIONAL"):
+    with (
+        network,
+        pytest.raises(
+            StateRefused,
+            match=r"J2 \(node 2\): asked for NMT "
+            r"OPERATIONAL.*PRE-OPERATIONAL",
+        ),
+    ):
         network.prepare()
     assert bus.nodes[0].value(0x1800, 2) == 255
 
@@ -185,10 +217,16 @@ def test_a_drive_with_node_guarding_alone_is_refused_before_anything_is_written(
     bus.nodes[1].objects[0x100C, 0] = (100, 2)
     with (
         network,
-        pytest.raises(SetupRefused, match=r"no object 1017h:00 \(heartbeat period\).*node guarding \(100Ch\)"),
+        pytest.raises(
+            SetupRefused,
+            match=r"no object 1017h:00 \(heartbeat period\).*node guarding "
+            r"\(100Ch\)",
+        ),
     ):
         network.prepare()
-    assert [frame for frame in bus.sent if frame.arbitration_id == 0x602 and frame.data[0] >> 5 == 1] == []
+    assert [
+        frame for frame in bus.sent if frame.arbitration_id == 0x602 and frame.data[0] >> 5 == 1
+    ] == []
 
 
 REFUSED = 0x08000022  # "because of the present device state"
@@ -197,8 +235,18 @@ REFUSED = 0x08000022  # "because of the present device state"
 @pytest.mark.parametrize(
     ("index", "found", "expected", "remedy"),
     [
-        (0x1017, "writing 1017h:00 is refused", "heartbeats of 20 ms", "firmware of the drive that has heartbeats"),
-        (0x6060, "writing 6060h:00 is refused", "profile position mode (1)", "choose the mode with its own tool"),
+        (
+            0x1017,
+            "writing 1017h:00 is refused",
+            "heartbeats of 20 ms",
+            "firmware of the drive that has heartbeats",
+        ),
+        (
+            0x6060,
+            "writing 6060h:00 is refused",
+            "profile position mode (1)",
+            "choose the mode with its own tool",
+        ),
     ],
 )
 def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
@@ -207,7 +255,15 @@ def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
     """It was the bare abort code of an object."""
     network, bus = cell(2)
     bus.nodes[1].aborts[index, 0] = REFUSED
-    settings = [(0x1017, 0), (0x6060, 0), (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1400, 1), (0x1600, 0)]
+    settings = [
+        (0x1017, 0),
+        (0x6060, 0),
+        (0x1800, 1),
+        (0x1800, 2),
+        (0x1A00, 0),
+        (0x1400, 1),
+        (0x1600, 0),
+    ]
     before = [[node.value(*key) for key in settings] for node in bus.nodes]
     with pytest.raises(SetupRefused) as refused, network:
         network.prepare()
@@ -220,7 +276,9 @@ def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
 
 
 @pytest.mark.parametrize(("modes", "named"), [(0b1, False), (0b1000_0000, True)])
-def test_a_drive_without_profile_position_mode_is_told_from_one_that_is_in_another(modes: int, named: bool) -> None:
+def test_a_drive_without_profile_position_mode_is_told_from_one_that_is_in_another(
+    modes: int, named: bool
+) -> None:
     network, bus = cell(1)
     bus.nodes[0].aborts[0x6060, 0] = 0x06090030
     bus.nodes[0].objects[0x6502, 0] = (modes, 4)
@@ -229,7 +287,9 @@ def test_a_drive_without_profile_position_mode_is_told_from_one_that_is_in_anoth
     assert ("6502h = 0x80, bit 0 is 0" in str(refused.value)) is named
 
 
-def test_a_drive_that_waits_for_sync_with_a_counter_gets_it_without_and_its_own_setting_back() -> None:
+def test_a_drive_that_waits_for_sync_with_a_counter_gets_it_without_and_its_own_setting_back() -> (
+    None
+):
     network, bus = cell(2)
     bus.nodes[1].objects[0x1019, 0] = (10, 1)
     with network:
@@ -242,8 +302,16 @@ def test_a_drive_that_waits_for_sync_with_a_counter_gets_it_without_and_its_own_
 def test_a_drive_that_keeps_waiting_for_a_counter_is_named() -> None:
     network, bus = cell(2)
     bus.nodes[1].objects[0x1019, 0] = (10, 1)
-    bus.nodes[1].aborts[0x1019, 0] = REFUSED  # CiA 301: while its communication cycle period (1006h) is not 0
-    with pytest.raises(SetupRefused, match=r"J2 .*writing 1019h:00 is refused.*counter \(1019h = 10\)"), network:
+    # CiA 301: while its communication cycle period (1006h) is not 0
+    bus.nodes[1].aborts[0x1019, 0] = REFUSED
+    with (
+        pytest.raises(
+            SetupRefused,
+            match=r"J2 .*writing 1019h:00 is refused.*counter "
+            r"\(1019h = 10\)",
+        ),
+        network,
+    ):
         network.prepare()
     assert bus.nodes[1].on_sync(0) == []
 
@@ -256,7 +324,8 @@ class BootingNode(ScriptedNode):
         self._clock = clock
         self._up_ns = clock() + round(boots_s * 1e9)
         self.nmt = 0
-        self.store(0x1017, 0, 60_000)  # one heartbeat when it is up: that of state 0 is the boot-up message
+        # One heartbeat when it is up: that of state 0 is the boot-up message
+        self.store(0x1017, 0, 60_000)
         self.next_beat_ns = self._up_ns
 
     def sdo(self, data: bytes) -> bytes | None:
@@ -284,7 +353,14 @@ def test_a_drive_that_boots_while_it_is_searched_is_asked_again() -> None:
 
 def test_a_drive_that_boots_later_is_said_to_be_missing_or_booting() -> None:
     network, _ = slowly_booting(60.0)
-    with network, pytest.raises(NodeMissing, match=r"J2 \(node 2\) did not answer .*switched on just now"):
+    with (
+        network,
+        pytest.raises(
+            NodeMissing,
+            match=r"J2 \(node 2\) did not answer .*switched "
+            r"on just now",
+        ),
+    ):
         network.prepare()
 
 
@@ -296,7 +372,14 @@ def network_listens_s() -> float:
 def test_a_mapping_that_reads_back_differently_is_refused() -> None:
     network, bus = cell(1)
     bus.nodes[0].lies[0x1A00, 2] = 0x60770010
-    with pytest.raises(SetupRefused, match=r"TPDO1: reads back as .*60770010.*written was .*60740010"), network:
+    with (
+        pytest.raises(
+            SetupRefused,
+            match=r"TPDO1: reads back as .*60770010.*written was "
+            r".*60740010",
+        ),
+        network,
+    ):
         network.prepare()
 
 
@@ -320,10 +403,22 @@ def test_a_pdo_whose_cob_id_is_fixed_gets_the_rest() -> None:
     bus.nodes[0].aborts[0x1801, 1] = 0x06010002
     before = copy.deepcopy(bus.nodes[0].objects)
     with network:
-        network.prepare()  # TPDO2 carries the statusword by default: it cannot be switched off, but it can be used
-        assert [record.entries for record in network.pdos[0].feedback] == [(0x60640020, 0x60740010), (0x60410010,)]
+        # TPDO2 carries the statusword by default: it cannot be switched off, but it can be used
+        network.prepare()
+        assert [record.entries for record in network.pdos[0].feedback] == [
+            (0x60640020, 0x60740010),
+            (0x60410010,),
+        ]
         assert bus.nodes[0].value(0x1801, 2) == 1
-    for key in ((0x1800, 1), (0x1800, 2), (0x1801, 1), (0x1801, 2), (0x1A00, 0), (0x1A00, 1), (0x1A01, 0)):
+    for key in (
+        (0x1800, 1),
+        (0x1800, 2),
+        (0x1801, 1),
+        (0x1801, 2),
+        (0x1A00, 0),
+        (0x1A00, 1),
+        (0x1A01, 0),
+    ):
         assert bus.nodes[0].objects[key] == before[key]
 
 
@@ -374,8 +469,14 @@ def test_sdo_failures_name_node_object_and_reason() -> None:
             access.read(ObjectEntry(0x6074, 0, 32, signed=True))
         with pytest.raises(ObjectAccessError, match="does not fit 16 bits"):
             access.write(ObjectEntry(0x6040, 0, 16, signed=False), 70000)
-        with pytest.raises(ObjectAccessError, match=r"node 9: .*no answer within 0.01 s, asked 3 times"):
-            network.link.objects(9, SdoPolicy(0.01, 3)).read(ObjectEntry(0x6041, 0, 16, signed=False))
+        with pytest.raises(
+            ObjectAccessError,
+            match=r"node 9: .*no answer within 0.01 s, "
+            r"asked 3 times",
+        ):
+            network.link.objects(9, SdoPolicy(0.01, 3)).read(
+                ObjectEntry(0x6041, 0, 16, signed=False)
+            )
         bus.broken = True
         with pytest.raises(BusError, match="wire was cut"):
             access.read(ObjectEntry(0x6041, 0, 16, signed=False))
@@ -395,9 +496,17 @@ def test_faults_are_reset_only_on_request_and_never_into_power() -> None:
 def test_bus_off_is_an_error_and_other_error_frames_are_not() -> None:
     network, bus = cell(1)
     with network:
-        bus.inject(can.Message(arbitration_id=0x04, is_extended_id=True, is_error_frame=True, data=bytes(8)))
+        bus.inject(
+            can.Message(
+                arbitration_id=0x04, is_extended_id=True, is_error_frame=True, data=bytes(8)
+            )
+        )
         network.link.pump(0.0)
-        bus.inject(can.Message(arbitration_id=0x40, is_extended_id=True, is_error_frame=True, data=bytes(8)))
+        bus.inject(
+            can.Message(
+                arbitration_id=0x40, is_extended_id=True, is_error_frame=True, data=bytes(8)
+            )
+        )
         with pytest.raises(BusError, match="bus-off"):
             network.link.pump(0.0)
 
@@ -425,7 +534,11 @@ def test_preparing_twice_still_restores_the_first_settings() -> None:
     with network:
         network.prepare()
         network.prepare()
-    assert (bus.nodes[0].value(0x1800, 2), bus.nodes[0].value(0x6060, 0), bus.nodes[0].value(0x1017, 0)) == (255, 8, 0)
+    assert (
+        bus.nodes[0].value(0x1800, 2),
+        bus.nodes[0].value(0x6060, 0),
+        bus.nodes[0].value(0x1017, 0),
+    ) == (255, 8, 0)
 
 
 def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> None:
@@ -448,9 +561,12 @@ def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> 
 
 
 @pytest.mark.parametrize("times", [1, 100])
-def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_axes_with_power(times: int) -> None:
+def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_axes_with_power(
+    times: int,
+) -> None:
     network, bus = cell(2)
-    send, reported = bus.send, 0
+    send = bus.send
+    reported = 0
 
     def fail(msg: can.Message, timeout: float | None = None) -> None:
         nonlocal reported
@@ -531,11 +647,24 @@ def test_asked_a_second_time_nothing_more_is_restored_and_every_axis_is_named() 
         yield lambda: True
 
     network.block_signals = block_signals
-    with pytest.raises(BusError, match=r"settings not restored \(asked a second time\)") as left, network:
+    with (
+        pytest.raises(
+            BusError,
+            match=r"settings not restored \(asked a "
+            r"second time\)",
+        ) as left,
+        network,
+    ):
         network.prepare()
         bus.sent.clear()
-    writes = [(m.arbitration_id, bytes(m.data)) for m in bus.sent if 0x600 < m.arbitration_id < 0x680]
-    assert [index for _, data in writes if data[0] >> 5 == 1 and (index := data[2] << 8 | data[1]) != 0x6040] == []
+    writes = [
+        (m.arbitration_id, bytes(m.data)) for m in bus.sent if 0x600 < m.arbitration_id < 0x680
+    ]
+    assert [
+        index
+        for _, data in writes
+        if data[0] >> 5 == 1 and (index := data[2] << 8 | data[1]) != 0x6040
+    ] == []
     assert re.findall(r"(J\d): TPDO1", str(left.value)) == ["J1", "J2", "J3"]
 
 
@@ -546,7 +675,9 @@ def test_an_axis_that_had_power_and_fell_silent_is_named_alone() -> None:
         network.powered.update(network.node_ids)
         bus.tamper = lambda m: () if m.arbitration_id == 0x582 else (m,)
         raise ValueError("cause")
-    assert [note for note in error.value.__notes__ if note.startswith(POWERED)] == [f"{POWERED}J2 (node 2)"]
+    assert [note for note in error.value.__notes__ if note.startswith(POWERED)] == [
+        f"{POWERED}J2 (node 2)"
+    ]
 
 
 @pytest.mark.parametrize("cause", [True, False], ids=["beside another error", "alone"])
@@ -568,4 +699,8 @@ def test_a_bus_that_is_cut_leaves_the_settings_of_all_axes_and_that_is_said() ->
         network.prepare()
         bus.broken = True
         raise ValueError("cause")
-    assert [note for note in error.value.__notes__ if "settings of J1 (node 1), J2 (node 2) not restored" in note]
+    assert [
+        note
+        for note in error.value.__notes__
+        if "settings of J1 (node 1), J2 (node 2) not restored" in note
+    ]

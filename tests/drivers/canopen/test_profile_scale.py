@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 from drivers.canopen.scale import FINE, ScaleReading, check_nameplate, read_scale
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError, SetupRefused
-from drivers.profiles.profile import Amplitude, CurrentScale, ObjectEntry, RatedMotor, ScaleForm, TapPoint
+from drivers.profiles.profile import (
+    Amplitude,
+    CurrentScale,
+    ObjectEntry,
+    RatedMotor,
+    ScaleForm,
+    TapPoint,
+)
 from tests.drivers.scripted import PROFILE, ScriptedNode, cell
 
 RATED_CURRENT = ObjectEntry(0x6075, 0, 32, signed=False)
@@ -39,7 +46,11 @@ def test_a_drive_reports_its_ampere_and_its_motor() -> None:
         node.objects[0x6076, 0] = (1500, 4)
         found = read_scale(access, RATED)
     assert found.ampere_per_unit == pytest.approx(0.002)
-    assert (found.objects, found.rated_current_a, found.rated_torque_nm) == ({"6075h:00": 2000}, 2.0, 1.5)
+    assert (found.objects, found.rated_current_a, found.rated_torque_nm) == (
+        {"6075h:00": 2000},
+        2.0,
+        1.5,
+    )
     assert found.warnings == ()
 
 
@@ -76,7 +87,9 @@ def test_a_drive_that_was_never_set_up_has_no_ampere() -> None:
     with drive() as (access, node):
         node.store(0x6075, 0, 0)
         with pytest.raises(
-            SetupRefused, match=r"J1 \(node 1\): profile generic: found 6075h:00 = 0; .*rated current and torque"
+            SetupRefused,
+            match=r"J1 \(node 1\): profile generic: found 6075h:00 = 0; .*rated "
+            r"current and torque",
         ):
             read_scale(access, RATED)
 
@@ -106,7 +119,9 @@ def test_a_step_that_does_not_fit_the_motor_is_named(ampere_per_unit: float) -> 
 @pytest.mark.parametrize(("choice", "share"), [(0, math.sqrt(0.5)), (1, 1.0)])
 def test_a_switch_chooses_the_weight(choice: int, share: float) -> None:
     switch = ObjectEntry(0x2002, 0x54, 32, signed=False)
-    scale = CurrentScale(1e-6, (RATED_CURRENT,), ScaleForm.SWITCHED_PER_MILLE, switch, (math.sqrt(0.5), 1.0))
+    scale = CurrentScale(
+        1e-6, (RATED_CURRENT,), ScaleForm.SWITCHED_PER_MILLE, switch, (math.sqrt(0.5), 1.0)
+    )
     with drive() as (access, node):
         node.objects[0x2002, 0x54] = (choice, 4)
         found = read_scale(access, replace(RATED, current_scale=scale))
@@ -118,7 +133,9 @@ def test_a_switch_chooses_the_weight(choice: int, share: float) -> None:
 
 
 def test_a_missing_scale_object_is_an_error_and_not_a_warning() -> None:
-    missing = replace(PROFILE, current_scale=CurrentScale(1e-6, (ObjectEntry(0x203B, 1, 32, signed=False),)))
+    missing = replace(
+        PROFILE, current_scale=CurrentScale(1e-6, (ObjectEntry(0x203B, 1, 32, signed=False),))
+    )
     with drive() as (access, _), pytest.raises(ObjectAccessError, match="203Bh:01"):
         read_scale(access, missing)
 
@@ -126,9 +143,16 @@ def test_a_missing_scale_object_is_an_error_and_not_a_warning() -> None:
 RATIO = st.floats(0.01, 100.0)
 
 
-@given(current_a=st.floats(0.05, 200.0), torque_nm=st.floats(0.01, 500.0), ratio=RATIO, sign=st.sampled_from((-1, 1)))
+@given(
+    current_a=st.floats(0.05, 200.0),
+    torque_nm=st.floats(0.01, 500.0),
+    ratio=RATIO,
+    sign=st.sampled_from((-1, 1)),
+)
 @settings(deadline=None)
-def test_nameplates_agree_or_warn_by_their_ratio(current_a: float, torque_nm: float, ratio: float, sign: int) -> None:
+def test_nameplates_agree_or_warn_by_their_ratio(
+    current_a: float, torque_nm: float, ratio: float, sign: int
+) -> None:
     reported = reading(current_a, torque_nm)
     declared = sign * torque_nm / current_a / ratio
     spread = max(ratio, 1.0 / ratio)
@@ -156,7 +180,9 @@ def test_what_a_drive_does_not_report_is_not_compared() -> None:
     choice=st.integers(0, 2),
 )
 @settings(deadline=None)
-def test_a_scale_is_proportional_to_each_of_its_objects(factor: float, values: tuple[int, ...], choice: int) -> None:
+def test_a_scale_is_proportional_to_each_of_its_objects(
+    factor: float, values: tuple[int, ...], choice: int
+) -> None:
     scale = CurrentScale(factor, (), weights=(0.5, 1.0, 2.0))
     whole = scale.ampere_per_unit(values, choice)
     assert whole > 0.0
@@ -170,5 +196,7 @@ def test_a_scale_is_proportional_to_each_of_its_objects(factor: float, values: t
 
 def test_an_actual_current_is_shouted() -> None:
     assert PROFILE.signal == "current reference 6074h:00"
-    assert replace(PROFILE, tap=TapPoint.LIMITED_REFERENCE).signal == "limited current reference 6074h:00"
+    assert replace(PROFILE, tap=TapPoint.LIMITED_REFERENCE).signal == (
+        "limited current reference 6074h:00"
+    )
     assert replace(PROFILE, tap=TapPoint.ACTUAL).signal == "ACTUAL current 6074h:00"

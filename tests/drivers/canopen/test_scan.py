@@ -1,4 +1,6 @@
-"""A scan of nodes that answer badly, without end or twice: every node is reported, in a bounded time."""
+"""A scan of nodes that answer badly, without end or twice:
+every node is reported, in a bounded time.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,10 @@ def test_every_node_is_reported_whatever_one_of_them_does(answer: Answer, proble
     with network:
         found = network.scan(wait_s=0.05)
     assert [node.node_id for node in found] == [1, 2, 3]
-    assert [node.identity is not None and node.device_name == "axis" for node in found[::2]] == [True, True]
+    assert [node.identity is not None and node.device_name == "axis" for node in found[::2]] == [
+        True,
+        True,
+    ]
     assert [node.problems for node in found[::2]] == [(), ()]
     assert any(re.search(problem, text) for text in found[1].problems)
     assert bus.clock.now_ns - begun_ns < 5_000_000_000
@@ -50,10 +55,21 @@ def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:
     network, bus = cell(1)
     bus.nodes = (Hostile(1, bus, endless),)
     with network:
-        with pytest.raises(ObjectAccessError, match="no end, expected at most 4096 bytes within 2 s"):
+        with pytest.raises(
+            ObjectAccessError, match="no end, expected at most 4096 bytes within 2 s"
+        ):
             network.link.objects(1).read_bytes(NAME, 0)
         assert network.link.objects(1).read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
-    assert len([frame for frame in bus.sent if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME]) == 1
+    assert (
+        len(
+            [
+                frame
+                for frame in bus.sent
+                if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME
+            ]
+        )
+        == 1
+    )
 
 
 def test_a_slow_node_is_said_to_be_slow() -> None:
@@ -72,17 +88,22 @@ TEXT = b"a name that its node has by block transfer alone " * 20
 
 
 class BlockServer(ScriptedNode):
-    """A node that gives its name by block upload alone (CiA 301); `spoilt` sends another checksum."""
+    """A node that gives its name by block upload alone (CiA 301);
+    `spoilt` sends another checksum.
+    """
 
     def __init__(self, bus: ScriptedBus, *, spoilt: bool = False) -> None:
         super().__init__(1)
-        self._bus, self._spoilt = bus, spoilt
+        self._bus = bus
+        self._spoilt = spoilt
         self._rest = [TEXT[at : at + 7] for at in range(0, len(TEXT), 7)]
 
     def sdo(self, data: bytes) -> bytes | None:
         if data[0] >> 5 != 5:
             refused = bytes((0x80, *data[1:4])) + struct.pack("<L", 0x05040001)
-            return refused if about(data) == NAME else super().sdo(data)
+            if about(data) == NAME:
+                return refused
+            return super().sdo(data)
         if data[0] & 3 == 0:
             return bytes((0xC6, *data[1:4])) + struct.pack("<L", len(TEXT))
         if data[0] & 3 == 1:
@@ -114,7 +135,8 @@ def test_a_block_transfer_with_a_wrong_checksum_is_not_believed() -> None:
         network.link.objects(1).read_bytes(NAME, 0)
 
 
-# -- two devices with one node id --------------------------------------------------------------------------------------
+# -- two devices with one node id
+# --------------------------------------------------------------------------------------
 
 
 def twins(serial: int = 8) -> tuple[CanopenNetwork, ScriptedBus]:
@@ -136,7 +158,14 @@ def test_two_devices_with_one_node_id_are_found(serial: int) -> None:
 @pytest.mark.parametrize("serial", [7, 8], ids=["equal answers", "other serial"])
 def test_they_are_refused_before_anything_is_written(serial: int) -> None:
     network, bus = twins(serial)
-    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers to one request .* two have it"):
+    with (
+        network,
+        pytest.raises(
+            SetupRefused,
+            match=r"J2 \(node 2\): found two answers to one "
+            r"request .* two have it",
+        ),
+    ):
         network.prepare()
     assert [f for f in bus.sent if 0x600 < f.arbitration_id < 0x680 and f.data[0] >> 5 == 1] == []
 
@@ -144,20 +173,40 @@ def test_they_are_refused_before_anything_is_written(serial: int) -> None:
 def test_a_second_device_that_refuses_first_is_named_too() -> None:
     network, bus = cell(2)
     other = Hostile(2, bus, lambda data, _: None)
-    other.objects = {key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)}
+    other.objects = {
+        key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)
+    }
     bus.nodes = (bus.nodes[0], other, bus.nodes[1])
-    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers .* two have it"):
+    with (
+        network,
+        pytest.raises(
+            SetupRefused,
+            match=r"J2 \(node 2\): found two answers .* "
+            r"two have it",
+        ),
+    ):
         network.prepare()
 
 
 def test_a_second_device_that_answers_late_and_refuses_is_named() -> None:
-    """It is silent, as a busy one is, until the PDOs are mapped: an abort alone would send one to the mapping."""
+    """It is silent, as a busy one is, until the PDOs are mapped:
+    an abort alone would send one to the mapping.
+    """
     network, bus = cell(2)
     other = Hostile(2, bus, lambda data, _: None if about(data) >= 0x1600 else b"")
-    other.objects = {key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)}
+    other.objects = {
+        key: value for key, value in other.objects.items() if key[0] in (0x1000, 0x1017)
+    }
     other.beats = False
     bus.nodes = (bus.nodes[0], other, bus.nodes[1])
-    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found two answers .* two have it"):
+    with (
+        network,
+        pytest.raises(
+            SetupRefused,
+            match=r"J2 \(node 2\): found two answers .* "
+            r"two have it",
+        ),
+    ):
         network.prepare()
 
 
@@ -207,7 +256,8 @@ def test_one_late_heartbeat_is_no_second_device() -> None:
 def test_heartbeats_of_two_states_in_turn_are_two_devices() -> None:
     network, bus = cell(2)
     with network:
-        assert listen(network, bus, [5, 127, 5], 100_000_000).shared_id(2, 0) == ""  # one change may be commanded
+        # One change may be commanded
+        assert listen(network, bus, [5, 127, 5], 100_000_000).shared_id(2, 0) == ""
         assert listen(network, bus, [127, 5], 100_000_000).shared_id(2, 0) == (
             "heartbeats OPERATIONAL and PRE-OPERATIONAL in turn"
         )
@@ -217,7 +267,9 @@ def sync() -> can.Message:
     return can.Message(arbitration_id=0x80, is_extended_id=False)
 
 
-def listen_beside_sync(network: CanopenNetwork, bus: ScriptedBus, beats: int, every_ms: int) -> Link:
+def listen_beside_sync(
+    network: CanopenNetwork, bus: ScriptedBus, beats: int, every_ms: int
+) -> Link:
     """Hear heartbeats, each behind a SYNC of another producer."""
     for _ in range(beats):
         bus.inject(sync())
@@ -252,12 +304,20 @@ def test_two_devices_are_found_by_their_answers_beside_sync(serial: int) -> None
 
 MASTERS = {
     "SYNC": (sync(), r"a SYNC \(080h\)"),
-    "NMT": (can.Message(arbitration_id=0, is_extended_id=False, data=bytes((1, 0))), "an NMT command"),
+    "NMT": (
+        can.Message(arbitration_id=0, is_extended_id=False, data=bytes((1, 0))),
+        "an NMT command",
+    ),
     "SDO": (
-        can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes.fromhex("4041600000000000")),
+        can.Message(
+            arbitration_id=0x602, is_extended_id=False, data=bytes.fromhex("4041600000000000")
+        ),
         r"an SDO request to J2 \(node 2\)",
     ),
-    "set-point": (can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6)), r"a set-point of J1"),
+    "set-point": (
+        can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6)),
+        r"a set-point of J1",
+    ),
 }
 """A frame of another master, and its description."""
 
@@ -275,7 +335,9 @@ def test_a_scan_beside_another_master_sends_nothing(name: str) -> None:
         assert len(network.scan(wait_s=0.05)) == 2  # the other master has ended
 
 
-def test_the_scan_of_the_library_beside_another_master_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_scan_of_the_library_beside_another_master_sends_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     network, bus = cell(2)
     monkeypatch.setattr("drivers.canopen.node_scan.Link", lambda *_: network.link)
     bus.inject(sync())
@@ -300,7 +362,9 @@ class Beating(ScriptedNode):
 
 
 def silent_twin(period_ms: int) -> tuple[CanopenNetwork, ScriptedBus]:
-    """Axes 1 and 2 with this period, and beside axis 2 a device that sends its heartbeats as well."""
+    """Axes 1 and 2 with this period, and beside axis 2 a device that sends its heartbeats as
+    well.
+    """
     network, bus = cell(2)
     for node in bus.nodes:
         node.store(0x1017, 0, period_ms)
@@ -314,7 +378,10 @@ def test_a_silent_twin_is_found_by_its_heartbeats(period_ms: int) -> None:
     begun_ns = bus.clock.now_ns
     with network:
         found = network.scan(wait_s=0.05)
-    assert [(node.node_id, "heartbeats in" in node.shared) for node in found] == [(1, False), (2, True)]
+    assert [(node.node_id, "heartbeats in" in node.shared) for node in found] == [
+        (1, False),
+        (2, True),
+    ]
     assert bus.clock.now_ns - begun_ns < 4_000_000_000
 
 
@@ -328,7 +395,14 @@ def test_a_scan_does_not_wait_for_ever_for_a_slow_heartbeat() -> None:
 
 def test_a_silent_twin_is_refused_before_motion() -> None:
     network, bus = silent_twin(20)
-    with network, pytest.raises(SetupRefused, match=r"J2 \(node 2\): found \d heartbeats in .* two have it"):
+    with (
+        network,
+        pytest.raises(
+            SetupRefused,
+            match=r"J2 \(node 2\): found \d heartbeats in .* "
+            r"two have it",
+        ),
+    ):
         network.prepare()
     assert [node.powered_cycles for node in bus.nodes] == [0, 0, 0]
 
@@ -339,13 +413,22 @@ def test_a_silent_twin_that_comes_in_a_run_stops_it(timed: bool) -> None:
     with network:
         network.prepare()
         twin = Beating(2, 20)
-        bus.nodes, twin.nmt = (*bus.nodes, twin), 5
-        pacing = TimedSync(PERIOD_NS, 0, bus.clock) if timed else LockstepSync(PERIOD_NS, clock=bus.clock)
+        bus.nodes = (*bus.nodes, twin)
+        twin.nmt = 5
+        pacing = (
+            TimedSync(PERIOD_NS, 0, bus.clock)
+            if timed
+            else LockstepSync(PERIOD_NS, clock=bus.clock)
+        )
         stream = SyncStream(network, pacing)
         for _ in range(300):
             stream.advance()
         # In lockstep the cell's time is not that of the clock.
-        with pytest.raises(DriveFault, match="two devices have this node id") if timed else nullcontext():
+        with (
+            pytest.raises(DriveFault, match="two devices have this node id")
+            if timed
+            else nullcontext()
+        ):
             stream.check()
             assert not timed
 
@@ -356,8 +439,16 @@ def test_an_answer_to_another_program_is_no_second_device() -> None:
         access = network.link.objects(1)
         for _ in range(3):
             access.read(ObjectEntry(0x6075, 0, 32, signed=False))
-            bus.inject(can.Message(arbitration_id=0x601, is_extended_id=False, data=bytes.fromhex("4075600000000000")))
-            answer = can.Message(arbitration_id=0x581, is_extended_id=False, data=bytes.fromhex("43756000d0070000"))
+            bus.inject(
+                can.Message(
+                    arbitration_id=0x601,
+                    is_extended_id=False,
+                    data=bytes.fromhex("4075600000000000"),
+                )
+            )
+            answer = can.Message(
+                arbitration_id=0x581, is_extended_id=False, data=bytes.fromhex("43756000d0070000")
+            )
             bus.inject(answer)
         assert network.link.shared_id(1, 0) == ""
 

@@ -1,4 +1,6 @@
-"""The end of a SocketCAN bus and its capture process, with a pair of packet sockets in place of the kernel's CAN."""
+"""The end of a SocketCAN bus and its capture process,
+with a pair of packet sockets in place of the kernel's CAN.
+"""
 
 from __future__ import annotations
 
@@ -79,13 +81,17 @@ def test_a_record_comes_out_as_it_went_in(record: tuple[object, ...]) -> None:
     assert RECORD.unpack(RECORD.pack(*record)) == record
 
 
-def test_a_frame_that_was_queued_before_drops_does_not_lower_their_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_was_queued_before_drops_does_not_lower_their_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     wire, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     out, parent = socket.socketpair()
     with wire, bus, out, parent:
         capture = Capture(bus, out, NO_INTERFACE)
         counts = iter((7, 5, 9))
-        monkeypatch.setattr(capture._batch, "about", lambda _number: (FRAME.size, 0, 1, next(counts)))
+        monkeypatch.setattr(
+            capture._batch, "about", lambda _number: (FRAME.size, 0, 1, next(counts))
+        )
         for total in (7, 7, 9):
             wire.send(FRAME.pack(0x181, 0, bytes(8)))
             assert capture.receive() == 0
@@ -98,8 +104,12 @@ def test_a_frame_that_was_queued_before_drops_does_not_lower_their_count(monkeyp
     st.integers(0, 29),
     st.integers(-(10**15), 10**15),
 )
-def test_no_setting_of_the_wall_clock_moves_a_stamp(frames: list[tuple[int, int]], when: int, jump_ns: int) -> None:
-    """Each frame comes some time after the last and waits to be read; once the clock is set while one waits."""
+def test_no_setting_of_the_wall_clock_moves_a_stamp(
+    frames: list[tuple[int, int]], when: int, jump_ns: int
+) -> None:
+    """Each frame comes some time after the last and waits to be read;
+    once the clock is set while one waits.
+    """
     now_ns = offset_ns = last_ns = 10**18
     time = MonotonicTime(now_ns + offset_ns, now_ns)
     for number, (gap_ns, wait_ns) in enumerate(frames):
@@ -109,8 +119,12 @@ def test_no_setting_of_the_wall_clock_moves_a_stamp(frames: list[tuple[int, int]
         offset_ns += jump_ns if number == when else 0
         found_ns = time.of(stamp_ns, now_ns + offset_ns, now_ns)
         assert last_ns <= found_ns <= now_ns
-        # A step that could as well be time that has passed since the last frame cannot be distinguished from it.
-        doubt_ns = abs(jump_ns) if number == when and abs(jump_ns) <= gap_ns + wait_ns + 10**6 else 0
+        # A step that could as well be time that has passed since the last frame cannot be
+        # distinguished from it.
+        if number == when and abs(jump_ns) <= gap_ns + wait_ns + 10**6:
+            doubt_ns = abs(jump_ns)
+        else:
+            doubt_ns = 0
         assert abs(found_ns - true_ns) <= doubt_ns
         last_ns = found_ns
 
@@ -135,11 +149,14 @@ frames = st.builds(
 def test_what_is_sent_is_what_the_other_end_receives(burst: list[can.Message]) -> None:
     # Two buses over one wire: what the first packs the second unpacks.
     ours, wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    first, second = SocketcanBus(NO_INTERFACE, ours), SocketcanBus(NO_INTERFACE, wire)
+    first = SocketcanBus(NO_INTERFACE, ours)
+    second = SocketcanBus(NO_INTERFACE, wire)
     for frame in burst:
         first.send(frame)
     for frame in burst:
-        assert received(second).equals(frame, timestamp_delta=None, check_channel=False, check_direction=False)
+        assert received(second).equals(
+            frame, timestamp_delta=None, check_channel=False, check_direction=False
+        )
     assert second.recv(0.0) is None
     first.shutdown()
     second.shutdown()
@@ -165,7 +182,9 @@ def test_a_stamp_of_0_is_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
     with wire, bus, out, parent:
         capture = Capture(bus, out, NO_INTERFACE)
         stamps = iter((0, None))
-        monkeypatch.setattr(capture._batch, "about", lambda _number: (FRAME.size, 0, next(stamps), None))
+        monkeypatch.setattr(
+            capture._batch, "about", lambda _number: (FRAME.size, 0, next(stamps), None)
+        )
         for _ in range(2):
             wire.send(FRAME.pack(0x181, 0, bytes(8)))
         before_ns = time.time_ns()
@@ -188,7 +207,9 @@ def test_a_bus_is_behind_until_it_has_read_to_a_time(until_ns: int | None, behin
 
 
 def test_a_full_backlog_is_counted_to_the_frame() -> None:
-    """Without a reader, frames beyond the backlog and the pair are lost, and the next record carries their count."""
+    """Without a reader, frames beyond the backlog and the pair are lost,
+    and the next record carries their count.
+    """
     wire, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     out, parent = socket.socketpair()
     sent = 0
@@ -241,7 +262,8 @@ def test_an_interrupt_while_records_are_read_loses_and_misaligns_none(
     pair: Pair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bus, wire = pair
-    make, calls = bus._message, 0
+    make = bus._message
+    calls = 0
 
     def interrupted(*fields: Any) -> CapturedMessage:
         nonlocal calls
@@ -282,7 +304,9 @@ def test_shutdown_ends_the_capture(pair: Pair) -> None:
 def _dispatch(*frames: bytes) -> Link:
     """A link that has heard these frames."""
     ours, wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link = Link(ADDRESS, SdoPolicy(), FakeClock(), lambda _address: SocketcanBus(NO_INTERFACE, ours))
+    link = Link(
+        ADDRESS, SdoPolicy(), FakeClock(), lambda _address: SocketcanBus(NO_INTERFACE, ours)
+    )
     link.open()
     with wire:
         for frame in frames:
@@ -315,7 +339,9 @@ def test_bus_off_ends_it() -> None:
         (_error_frame(0x100), EventKind.CONTROLLER, "restarted"),
     ],
 )
-def test_what_the_controller_says_of_itself_is_an_event(frame: bytes, kind: EventKind, says: str) -> None:
+def test_what_the_controller_says_of_itself_is_an_event(
+    frame: bytes, kind: EventKind, says: str
+) -> None:
     (event,) = _dispatch(frame).take_events(5, ())
     assert (event.kind, event.axis, event.time_ns) == (kind, None, 5)
     assert says in event.text
@@ -357,9 +383,15 @@ def test_the_filter_passes_all_that_is_watched(monkeypatch: pytest.MonkeyPatch) 
     with network:
         network.prepare()
     commands = {0x000, 0x080, 0x7E4, 0x7E5, *range(0x601, 0x680)}
-    of_axes = {service + node for service in (0x080, *range(0x180, 0x600, 0x80), 0x700) for node in (1, 2)}
+    of_axes = {
+        service + node for service in (0x080, *range(0x180, 0x600, 0x80), 0x700) for node in (1, 2)
+    }
     own = {service + network.recorder_id for service in range(0x080, 0x780, 0x80)}
-    passed = {number for number in range(0x800) if any((number ^ wanted) & mask == 0 for wanted, mask in filters)}
+    passed = {
+        number
+        for number in range(0x800)
+        if any((number ^ wanted) & mask == 0 for wanted, mask in filters)
+    }
     assert (commands | of_axes | own) - passed == set()
     assert {
         0x181 + 0x20,

@@ -1,4 +1,6 @@
-"""Several buses as one: every frame to its bus, every frame back in order, and one that fails takes no other along."""
+"""Several buses as one: every frame to its bus, every frame back in order,
+and one that fails takes no other along.
+"""
 
 from __future__ import annotations
 
@@ -15,26 +17,40 @@ from drivers.canopen.bus import BusAddress, open_bus, send_burst
 from drivers.canopen.link import Link, NmtCommand
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import CapturedMessage, Losses, losses_of, remarks_of
-from drivers.canopen.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_cell_bus
+from drivers.canopen.split_bus import (
+    BUS_OFF,
+    LARGEST_RUN,
+    BusPart,
+    SplitAddress,
+    SplitBus,
+    open_cell_bus,
+)
 from drivers.errors import BusError, NodeMisplaced
 from drivers.simulation.hub import Hub
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends
 from tests.drivers.scripted import FakeClock
 
-LEFT, RIGHT = frozenset((1, 3, 5)), frozenset((2, 4, 6))
+LEFT = frozenset((1, 3, 5))
+RIGHT = frozenset((2, 4, 6))
 NAMES = ("left", "right")
 
 
 class Wire(can.BusABC):
-    """An end whose frames a test writes down; it may break. ``log`` is shared by the ends of one split bus."""
+    """An end whose frames a test writes down; it may break.
+
+    ``log`` is shared by the ends of one split bus.
+    """
 
     def __init__(self, name: str, log: list[tuple[str, int]], clock: FakeClock) -> None:
-        self.name, self.log, self.clock = name, log, clock
+        self.name = name
+        self.log = log
+        self.clock = clock
         self.coming: deque[can.Message] = deque()
         self.broken = self.stuck = False
         self.asked_s: list[float] = []
         self.closed = 0
-        self.losses, self.remarks = Losses(), tuple[str, ...]()
+        self.losses = Losses()
+        self.remarks = tuple[str, ...]()
         super().__init__(channel=name)
 
     def _check(self) -> None:
@@ -85,7 +101,9 @@ def pair() -> Iterator[Pair]:
 
 
 def frame(identifier: int, at_s: float = 0.0, data: bytes = b"", **more: bool) -> can.Message:
-    return can.Message(timestamp=at_s, arbitration_id=identifier, data=data, **{"is_extended_id": False, **more})
+    return can.Message(
+        timestamp=at_s, arbitration_id=identifier, data=data, **{"is_extended_id": False, **more}
+    )
 
 
 class FarEnd(SplitBus):
@@ -93,7 +111,9 @@ class FarEnd(SplitBus):
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         while (message := super().recv(timeout)) is not None:
-            if len(self.address.route(message)) == 1 or message.channel == str(self.address.parts[0]):
+            if len(self.address.route(message)) == 1 or message.channel == str(
+                self.address.parts[0]
+            ):
                 return message
         return None
 
@@ -104,7 +124,9 @@ def _split(kind: type[SplitBus], address: SplitAddress) -> SplitBus:
 
 def _three(one: BusAddress, other: BusAddress) -> Iterator[Ends]:
     low = frozenset(range(1, 64))
-    address = SplitAddress((BusPart("low", one, low), BusPart("high", other, frozenset(range(64, 128)))))
+    address = SplitAddress(
+        (BusPart("low", one, low), BusPart("high", other, frozenset(range(64, 128))))
+    )
     ends = _split(SplitBus, address), _split(FarEnd, address), _split(FarEnd, address)
     try:
         yield ends
@@ -117,7 +139,9 @@ class TestSplitVirtual(BusContract):
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
         name = request.node.nodeid
-        yield from _three(BusAddress("virtual", name + "-low"), BusAddress("virtual", name + "-high"))
+        yield from _three(
+            BusAddress("virtual", name + "-low"), BusAddress("virtual", name + "-high")
+        )
 
 
 def test_every_frame_goes_to_the_bus_of_its_node(pair: Pair) -> None:
@@ -156,16 +180,22 @@ def test_the_syncs_of_a_burst_follow_each_other_behind_all_setpoints(pair: Pair)
     left=st.lists(st.integers(0, 50), max_size=30),
     right=st.lists(st.integers(0, 50), max_size=30),
 )
-def test_received_frames_come_in_the_order_of_their_time_stamps(left: list[int], right: list[int]) -> None:
+def test_received_frames_come_in_the_order_of_their_time_stamps(
+    left: list[int], right: list[int]
+) -> None:
     pair = Pair()
     for wire, node, stamps in ((pair.left, 1, sorted(left)), (pair.right, 2, sorted(right))):
-        wire.coming.extend(frame(0x180 + node, at_s, n.to_bytes(2, "big")) for n, at_s in enumerate(stamps))
+        wire.coming.extend(
+            frame(0x180 + node, at_s, n.to_bytes(2, "big")) for n, at_s in enumerate(stamps)
+        )
     received = []
     while (message := pair.bus.recv(0.0)) is not None:
         received.append(message)
     assert [message.timestamp for message in received] == sorted([*left, *right])
     for identifier, stamps in ((0x181, left), (0x182, right)):
-        numbers = [int.from_bytes(m.data, "big") for m in received if m.arbitration_id == identifier]
+        numbers = [
+            int.from_bytes(m.data, "big") for m in received if m.arbitration_id == identifier
+        ]
         assert numbers == list(range(len(stamps)))
     names = dict(zip((0x181, 0x182), map(str, pair.address.parts), strict=True))
     assert all(message.channel == names[message.arbitration_id] for message in received)
@@ -192,8 +222,12 @@ def test_waiting_at_one_bus_never_lasts_while_the_other_may_have_frames(pair: Pa
 @pytest.mark.parametrize("name", NAMES)
 def test_buses_with_file_descriptors_are_waited_for_together(name: str) -> None:
     with Hub(NAMES) as hub:
-        parts = tuple(BusPart(part, hub.address(part), nodes) for part, nodes in zip(NAMES, (LEFT, RIGHT), strict=True))
-        bus, far = open_cell_bus(SplitAddress(parts)), open_bus(hub.address(name))
+        parts = tuple(
+            BusPart(part, hub.address(part), nodes)
+            for part, nodes in zip(NAMES, (LEFT, RIGHT), strict=True)
+        )
+        bus = open_cell_bus(SplitAddress(parts))
+        far = open_bus(hub.address(name))
         try:
             assert bus.recv(0.0) is None
             far.send(frame(0x201))
@@ -251,8 +285,15 @@ def test_frames_behind_one_that_is_left_out_are_not_waited_for(pair: Pair) -> No
 
 @pytest.mark.parametrize("failing", NAMES)
 @pytest.mark.parametrize("sending", [True, False])
-def test_a_bus_that_fails_is_named_once_and_the_other_goes_on(pair: Pair, failing: str, sending: bool) -> None:
-    broken, sound = (pair.left, pair.right) if failing == "left" else (pair.right, pair.left)
+def test_a_bus_that_fails_is_named_once_and_the_other_goes_on(
+    pair: Pair, failing: str, sending: bool
+) -> None:
+    if failing == "left":
+        broken = pair.left
+        sound = pair.right
+    else:
+        broken = pair.right
+        sound = pair.left
     node_id = 2 if failing == "left" else 1
     broken.broken = True
     with pytest.raises(BusError, match=rf"{failing} \(scripted:{failing}\): the wire was cut"):
@@ -285,7 +326,11 @@ def test_a_controller_that_went_off_its_bus_is_named(pair: Pair) -> None:
 def test_a_node_on_the_other_bus_is_reported_once_and_not_believed(pair: Pair) -> None:
     pair.right.coming.extend(frame(0x181, data=bytes(8)) for _ in range(3))
     pair.left.coming.append(frame(0x181, 1.0, b"mine"))
-    with pytest.raises(NodeMisplaced, match=r"J1 \(node 1\) is heard on bus right .* has it on bus left"):
+    with pytest.raises(
+        NodeMisplaced,
+        match=r"J1 \(node 1\) is heard on bus right .* has it "
+        r"on bus left",
+    ):
         pair.bus.recv(0.0)
     heard = pair.bus.recv(0.0)
     assert heard is not None
@@ -311,12 +356,18 @@ def test_a_flood_of_frames_that_are_left_out_does_not_keep_the_reader(
 
 
 def test_one_node_id_on_two_buses_is_refused_before_anything_is_opened() -> None:
-    parts = tuple(BusPart(name, BusAddress("carrier-pigeon", name), frozenset((3, 4))) for name in NAMES)
-    with pytest.raises(BusError, match="node 3 is on left and on right; give one of the two another"):
+    parts = tuple(
+        BusPart(name, BusAddress("carrier-pigeon", name), frozenset((3, 4))) for name in NAMES
+    )
+    with pytest.raises(
+        BusError, match="node 3 is on left and on right; give one of the two another"
+    ):
         open_cell_bus(SplitAddress(parts))
 
 
-def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     opened: list[can.BusABC] = []
 
     def remember(address: BusAddress) -> can.BusABC:
@@ -351,8 +402,12 @@ def test_losses_of_all_buses_count_and_remarks_have_their_bus(pair: Pair) -> Non
 
 
 @pytest.mark.parametrize("step_s", [0.0, -3600.0, 3600.0])
-def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(pair: Pair, step_s: float) -> None:
-    """Also when the wall clock is set between them; its seconds as a float cannot resolve 100 ns."""
+def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(
+    pair: Pair, step_s: float
+) -> None:
+    """Also when the wall clock is set between them;
+    its seconds as a float cannot resolve 100 ns.
+    """
     for number, wire in enumerate((pair.left, pair.right, pair.left, pair.right)):
         at_ns = 5_000_000_000 + 100 * number
         message = CapturedMessage(
@@ -361,7 +416,9 @@ def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(pair: Pair
             is_extended_id=False,
             data=bytes((number,)),
         )
-        message.kernel_ns, message.monotonic_ns, message.local = 0, at_ns, False
+        message.kernel_ns = 0
+        message.monotonic_ns = at_ns
+        message.local = False
         wire.coming.append(message)
     got = [pair.bus.recv(0.0) for _ in range(4)]
     assert [message.data[0] for message in got if message is not None] == [0, 1, 2, 3]

@@ -1,4 +1,6 @@
-"""Frozen data: the way that a set-point has gone, and when equal values prove that nothing is measured any more."""
+"""Frozen data: the way that a set-point has gone, and when equal values prove that nothing is
+measured any more.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ PERIOD_NS = 1_000_000
 MOVE = Move((50_000, 0), (100_000, 1), (1_000_000, 1))
 
 
-def alarms(positions: list[int], currents: list[int], missing: list[int] | None = None) -> list[int]:
+def alarms(
+    positions: list[int], currents: list[int], missing: list[int] | None = None
+) -> list[int]:
     data = FrozenData(MOVE, (0, 0), (0,), PERIOD_NS)
     reported = []
     for cycle, (position, current) in enumerate(zip(positions, currents, strict=True)):

@@ -39,13 +39,16 @@ def test_an_amplifier_watches_the_recorder_and_gets_its_settings_back(before: in
         assert [node.value(0x6007, 0) for node in bus.nodes] == [3, 3]
         assert network.unguarded() == ()
     expected = 0 if before >> 16 == RECORDER else before
-    assert [(node.value(0x1016, 1), node.value(0x6007, 0)) for node in bus.nodes] == [(expected, 1)] * 2
+    assert [(node.value(0x1016, 1), node.value(0x6007, 0)) for node in bus.nodes] == [
+        (expected, 1)
+    ] * 2
 
 
 def test_what_an_amplifier_lacks_is_said() -> None:
     network, bus = cell(3)
     give_guard(bus.nodes[1], option=None)
-    give_guard(bus.nodes[2], entry=0x0005_01F4)  # it watches another device, and must not be changed
+    # It watches another device, and must not be changed
+    give_guard(bus.nodes[2], entry=0x0005_01F4)
     with network:
         network.prepare()
         assert network.unguarded() == (
@@ -65,7 +68,12 @@ def test_what_an_amplifier_lacks_is_said() -> None:
             RECORDER << 16 | 500,
             1,
         ),
-        ((0x1016, 1), "it does NOT stop by itself when the recorder is killed: 1016h is aborted", 0, 1),
+        (
+            (0x1016, 1),
+            "it does NOT stop by itself when the recorder is killed: 1016h is aborted",
+            0,
+            1,
+        ),
     ],
 )
 def test_an_amplifier_that_refuses_to_watch_is_recorded_all_the_same(
@@ -108,7 +116,8 @@ def test_our_heartbeat_comes_in_its_period_while_axes_have_power_and_at_no_other
         count = len(beats_ns)
         assert count > 5
         assert max(b - a for a, b in pairwise(beats_ns)) <= 1.5 * network.heartbeat_ms * 1e6
-        assert [node.value(0x1016, 1) for node in bus.nodes] == [0, 0]  # no watch while the log is finished
+        # No watch while the log is finished
+        assert [node.value(0x1016, 1) for node in bus.nodes] == [0, 0]
     assert len(beats_ns) == count
     assert all(powered)
 
@@ -124,18 +133,27 @@ def join(bus: ScriptedBus, node_id: int, *, beat_ms: int = 0, answers: bool = Tr
     return device
 
 
-HEARTBEAT_OF_ANOTHER = can.Message(arbitration_id=0x700 + RECORDER, is_extended_id=False, data=b"\x05")
-BOOT_UP_OF_ANOTHER = can.Message(arbitration_id=0x700 + RECORDER, is_extended_id=False, data=b"\x00")
+HEARTBEAT_OF_ANOTHER = can.Message(
+    arbitration_id=0x700 + RECORDER, is_extended_id=False, data=b"\x05"
+)
+BOOT_UP_OF_ANOTHER = can.Message(
+    arbitration_id=0x700 + RECORDER, is_extended_id=False, data=b"\x00"
+)
 
 
 @pytest.mark.parametrize(
-    ("beat_ms", "answers"), [(400, False), (100, True), (0, True)], ids=["heartbeat", "both", "SDO server"]
+    ("beat_ms", "answers"),
+    [(400, False), (100, True), (0, True)],
+    ids=["heartbeat", "both", "SDO server"],
 )
-def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(beat_ms: int, answers: bool) -> None:
+def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
+    beat_ms: int, answers: bool
+) -> None:
     """Its heartbeat would keep the axes running when the recorder is killed."""
     network, bus = cell(2)
     for node in bus.nodes:
-        give_guard(node, RECORDER << 16 | 500)  # and it is not a recorder's that was killed, though it looks like one
+        # And it is not a recorder's that was killed, though it looks like one
+        give_guard(node, RECORDER << 16 | 500)
         node.objects[0x1016, 0], node.objects[0x1016, 2] = (2, 1), (0, 4)
     join(bus, 127, beat_ms=beat_ms, answers=answers)
     join(bus, 126, beat_ms=beat_ms, answers=answers)
@@ -149,7 +167,9 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(beat_ms: int, 
         list(execute(network, stream, (move,), permission()))
         beats = {frame.arbitration_id for frame in bus.sent if frame.arbitration_id > 0x700}
         assert beats == {0x700 + 125}
-    assert [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]] == [[RECORDER << 16 | 500, 0]] * 2
+    assert [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]] == [
+        [RECORDER << 16 | 500, 0]
+    ] * 2
 
 
 def test_a_node_id_that_an_amplifier_waits_for_is_left_to_the_device_that_is_off_now() -> None:
@@ -175,7 +195,9 @@ def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
     assert bus.nodes[0].value(0x1016, 1) == 0
 
 
-def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_run_is_refused() -> None:
+def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_run_is_refused() -> (
+    None
+):
     for node_id in range(1, 128):
         network, bus = cell(2)
         for node in bus.nodes:
@@ -188,7 +210,9 @@ def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_r
         with network:
             network.prepare()
             assert network.recorder_id == (126 if node_id == 127 else 127)
-            assert [node.value(0x1016, 1) >> 16 for node in bus.nodes[:2]] == [network.recorder_id] * 2
+            assert [node.value(0x1016, 1) >> 16 for node in bus.nodes[:2]] == [
+                network.recorder_id
+            ] * 2
 
 
 def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> None:
@@ -197,13 +221,22 @@ def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> 
         give_guard(node)
     for node_id in range(3, 128):
         join(bus, node_id)
-    with pytest.raises(BusBusy, match=r"found no free node id.*expected an id.*nothing has moved"), network:
+    with (
+        pytest.raises(
+            BusBusy,
+            match=r"found no free node id.*expected an id.*nothing "
+            r"has moved",
+        ),
+        network,
+    ):
         network.prepare()
     assert [node.value(0x1016, 1) for node in bus.nodes[:2]] == [0, 0]
     assert all(node.powered_cycles == 0 for node in bus.nodes)
 
 
-@pytest.mark.parametrize("frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"])
+@pytest.mark.parametrize(
+    "frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"]
+)
 def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: can.Message) -> None:
     network, bus = cell(2)
     with network:
@@ -212,7 +245,12 @@ def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: c
         bus.inject(frame)
         with pytest.raises(BusBusy, match="77Fh of another device, which has node id 127 too"):
             list(
-                execute(network, stream, (Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000)),), permission())
+                execute(
+                    network,
+                    stream,
+                    (Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000)),),
+                    permission(),
+                )
             )
     assert all(node.powered_cycles == 0 for node in bus.nodes)
 
@@ -221,20 +259,25 @@ def frame_of_another(identifier: int) -> can.Message:
     return can.Message(arbitration_id=identifier, is_extended_id=False, data=bytes(8))
 
 
-EVERY_FRAME_OF_OUR_ID = [frame_of_another(service + RECORDER) for service in range(0x80, 0x600, 0x80)]
+EVERY_FRAME_OF_OUR_ID = [
+    frame_of_another(service + RECORDER) for service in range(0x80, 0x600, 0x80)
+]
 LSS_FRAMES = [frame_of_another(0x7E4), frame_of_another(0x7E5)]
 
 
 @pytest.mark.parametrize(
     ("frame", "words"),
     [
-        *((frame, f"a frame {frame.arbitration_id:03X}h of another device, which has node id 127 too")
+        *((frame, f"a frame {frame.arbitration_id:03X}h of another device, which has node "
+                  "id 127 too")
           for frame in EVERY_FRAME_OF_OUR_ID),
         *((frame, f"a layer setting service, which changes node ids .{frame.arbitration_id:03X}h.")
           for frame in LSS_FRAMES),
     ],
 )  # fmt: skip
-def test_any_frame_with_our_node_id_and_any_lss_frame_stops_the_axes(frame: can.Message, words: str) -> None:
+def test_any_frame_with_our_node_id_and_any_lss_frame_stops_the_axes(
+    frame: can.Message, words: str
+) -> None:
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node)
@@ -254,25 +297,41 @@ def test_another_master_that_writes_stops_the_axes(command: int) -> None:
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node)
-    reading = can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)))
-    writing = can.Message(arbitration_id=0x602, is_extended_id=False, data=bytes((command, 0x81, 0x60, 0, 1, 0, 0, 0)))
+    reading = can.Message(
+        arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
+    )
+    writing = can.Message(
+        arbitration_id=0x602, is_extended_id=False, data=bytes((command, 0x81, 0x60, 0, 1, 0, 0, 0))
+    )
     with network:
         network.prepare()
         bus.cycle = -1
-        bus.on_cycle = lambda cycle: bus.inject(reading if cycle < 60 else writing) if cycle in (50, 60) else None
+        bus.on_cycle = lambda cycle: (
+            bus.inject(reading if cycle < 60 else writing) if cycle in (50, 60) else None
+        )
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
-        with pytest.raises(BusBusy, match=r"an SDO download \(it writes\) to J2 \(node 2\) \(602h\)"):
+        with pytest.raises(
+            BusBusy,
+            match=r"an SDO download \(it writes\) to J2 \(node "
+            r"2\) \(602h\)",
+        ):
             list(execute(network, stream, (MOVE,), permission()))
         assert 60 <= bus.cycle < 70
     assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
 
 
-@pytest.mark.parametrize(("node_id", "command"), [(2, 0x40), (2, 0x60), (2, 0xA4), (2, 0x80), (9, 0x23)])
-def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move(node_id: int, command: int) -> None:
+@pytest.mark.parametrize(
+    ("node_id", "command"), [(2, 0x40), (2, 0x60), (2, 0xA4), (2, 0x80), (9, 0x23)]
+)
+def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move(
+    node_id: int, command: int
+) -> None:
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node)
-    frame = can.Message(arbitration_id=0x600 + node_id, is_extended_id=False, data=bytes((command, *bytes(7))))
+    frame = can.Message(
+        arbitration_id=0x600 + node_id, is_extended_id=False, data=bytes((command, *bytes(7)))
+    )
     events: list[CellEvent] = []
     with network:
         network.prepare()
@@ -282,7 +341,8 @@ def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move
         for _ in execute(network, stream, (MOVE,), permission()):
             pass
         assert (
-            f"an SDO request to {'J2 (node 2)' if node_id == 2 else 'node 9'} (60{node_id}h)" in network.other_master()
+            f"an SDO request to {'J2 (node 2)' if node_id == 2 else 'node 9'} "
+            f"(60{node_id}h)" in network.other_master()
         )
     assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x600 + node_id]
     late = MotionTimeout(0, (1,), (), 1.0, other_master=network.other_master())
@@ -298,7 +358,9 @@ def test_axes_without_guard_are_named() -> None:
         assert network.without_guard() == ("J2",)
 
 
-@pytest.mark.parametrize("frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"])
+@pytest.mark.parametrize(
+    "frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"]
+)
 def test_a_device_with_our_node_id_that_joins_in_the_run_stops_the_axes(frame: can.Message) -> None:
     network, bus = cell(2)
     events: list[CellEvent] = []
@@ -307,10 +369,17 @@ def test_a_device_with_our_node_id_that_joins_in_the_run_stops_the_axes(frame: c
         bus.cycle = -1
         bus.on_cycle = lambda cycle: bus.inject(frame) if cycle in (60, 61) else None
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append)
-        with pytest.raises(BusBusy, match=r"found a heartbeat 77Fh .*expected an id .*give that device another"):
+        with pytest.raises(
+            BusBusy,
+            match=r"found a heartbeat 77Fh .*expected an id .*give that "
+            r"device another",
+        ):
             list(
                 execute(
-                    network, stream, (Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000)),), permission()
+                    network,
+                    stream,
+                    (Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000)),),
+                    permission(),
                 )
             )
         assert bus.cycle < 70

@@ -29,7 +29,9 @@ from drivers.stream.sync import LockstepSync
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell, permission
 
 Moving = tuple[CanopenNetwork, SyncStream, ScriptedBus, list[CellEvent]]
-BOUNDS = MotionBounds(enable_s=0.1, acknowledge_s=0.05, settle_s=0.05, stop_s=0.1, standstill_cycles=5)
+BOUNDS = MotionBounds(
+    enable_s=0.1, acknowledge_s=0.05, settle_s=0.05, stop_s=0.1, standstill_cycles=5
+)
 MARKS = (EventKind.MOVE_START, EventKind.MOVE_END)
 FAR = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
 
@@ -41,7 +43,12 @@ def moving() -> Iterator[Moving]:
     with network:
         network.prepare()
         bus.cycle = -1
-        yield network, SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append), bus, events
+        yield (
+            network,
+            SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append),
+            bus,
+            events,
+        )
         bus.tamper = lambda message: (message,)
         bus.broken = False
         for node in bus.nodes:
@@ -49,7 +56,9 @@ def moving() -> Iterator[Moving]:
 
 
 def powerless(bus: ScriptedBus) -> bool:
-    return all(node.statusword & 0x6F in (0x40, 0x08, 0x28) and not node.moving for node in bus.nodes)
+    return all(
+        node.statusword & 0x6F in (0x40, 0x08, 0x28) and not node.moving for node in bus.nodes
+    )
 
 
 def run(moving: Moving, *moves: Move) -> list[Sample]:
@@ -80,7 +89,9 @@ def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> Non
 
 
 def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Moving) -> None:
-    """Slow readings and another motion may follow in the same network; a closing network keeps its limit."""
+    """Slow readings and another motion may follow in the same network;
+    a closing network keeps its limit.
+    """
     network, _, _, _ = moving
     run(moving, FAR)
     assert network.link.allowed_s(3600.0) == 3600.0
@@ -93,13 +104,17 @@ def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Mov
 def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     _, _, bus, _ = moving
     run(moving, FAR)
-    written = [tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)) for node in bus.nodes]
+    written = [
+        tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)) for node in bus.nodes
+    ]
     assert written == [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
 
 
 def test_an_axis_with_no_way_to_go_gets_no_setpoint(moving: Moving) -> None:
     _, _, bus, _ = moving
-    samples = run(moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), Move((5_000, 0), (1, 1), (1, 1), 4))
+    samples = run(
+        moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), Move((5_000, 0), (1, 1), (1, 1), 4)
+    )
     assert samples[-1].position_counts == (5_000, 0)
     assert bus.nodes[1].setpoint_cycles == []
 
@@ -117,7 +132,9 @@ def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) ->
     bus.tamper = lambda m: () if m.arbitration_id == 0x182 and bus.cycle < 2 else (m,)
     run(moving, Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000)))
     targets = [
-        int.from_bytes(frame.data[:4], "little", signed=True) for frame in bus.sent if frame.arbitration_id == 0x202
+        int.from_bytes(frame.data[:4], "little", signed=True)
+        for frame in bus.sent
+        if frame.arbitration_id == 0x202
     ]
     assert min(targets) == 20_000
 
@@ -126,7 +143,9 @@ def test_without_permission_nothing_is_even_enabled(moving: Moving) -> None:
     network, stream, bus, _ = moving
     with pytest.raises(MotionRefused, match="motion is disabled; pass a MotionPermission"):
         list(execute(network, stream, (FAR,), None, BOUNDS))
-    with pytest.raises(MotionRefused, match="J1: move 0 goes to 50000 counts, allowed is -40000 to 40000"):
+    with pytest.raises(
+        MotionRefused, match="J1: move 0 goes to 50000 counts, allowed is -40000 to 40000"
+    ):
         list(execute(network, stream, (FAR,), permission(span=40_000), BOUNDS))
     with pytest.raises(MotionRefused, match="limits for 3 axes"):
         list(execute(network, stream, (FAR,), permission(axes=3), BOUNDS))
@@ -196,7 +215,10 @@ def test_every_failure_stops_all_axes(
 @pytest.mark.parametrize("interrupt", [GeneratorExit, KeyboardInterrupt, ZeroDivisionError])
 def test_leaving_the_loop_stops_all_axes(moving: Moving, interrupt: type[BaseException]) -> None:
     network, stream, bus, _ = moving
-    with pytest.raises(interrupt), closing(execute(network, stream, (FAR,), permission(), BOUNDS)) as samples:
+    with (
+        pytest.raises(interrupt),
+        closing(execute(network, stream, (FAR,), permission(), BOUNDS)) as samples,
+    ):
         for sample in samples:
             if sample.cycle == 60:
                 raise interrupt
@@ -221,7 +243,10 @@ def test_a_fault_during_the_last_stop_is_not_forgotten(moving: Moving) -> None:
     _, _, bus, events = moving
 
     def fault_at_stop(cycle: int) -> None:
-        if any(event.kind is EventKind.STOP for event in events) and bus.nodes[1].statusword & 0x6F == 0x40:
+        if (
+            any(event.kind is EventKind.STOP for event in events)
+            and bus.nodes[1].statusword & 0x6F == 0x40
+        ):
             bus.nodes[1].fault()
 
     bus.on_cycle = fault_at_stop
@@ -238,8 +263,12 @@ def test_a_setpoint_that_is_never_acknowledged_ends_in_a_timeout(moving: Moving)
     assert powerless(bus)
 
 
-def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_move(moving: Moving) -> None:
-    """A drive without a buffer of set-points: bit 12 came too late for the time limit of the acknowledgement."""
+def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_move(
+    moving: Moving,
+) -> None:
+    """A drive without a buffer of set-points:
+    bit 12 came too late for the time limit of the acknowledgement.
+    """
     _, _, bus, _ = moving
     for node in bus.nodes:
         node.holds_acknowledge = True
@@ -249,29 +278,41 @@ def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_mov
     assert [len(node.setpoint_cycles) for node in bus.nodes] == [3, 3]
 
 
-def test_an_acknowledge_that_stays_for_ever_is_named_and_the_axes_lose_power(moving: Moving) -> None:
+def test_an_acknowledge_that_stays_for_ever_is_named_and_the_axes_lose_power(
+    moving: Moving,
+) -> None:
     _, _, bus, _ = moving
     bus.nodes[1].keeps_acknowledge = True
     with pytest.raises(
-        MotionTimeout, match=r"move 0: J2 \(node 2\) did not clear statusword bit 12.*earlier set-point"
+        MotionTimeout,
+        match=r"move 0: J2 \(node 2\) did not clear statusword bit 12.*earlier "
+        r"set-point",
     ):
         run(moving, FAR)
     assert powerless(bus)
 
 
 def test_an_acknowledge_of_before_the_first_setpoint_starts_no_move(moving: Moving) -> None:
-    """By that bit the first set-point would be taken as accepted, and the time of the move waited for."""
+    """By that bit the first set-point would be taken as accepted,
+    and the time of the move waited for.
+    """
     _, _, bus, _ = moving
     bus.nodes[1].keeps_acknowledge = True
     bus.nodes[1].statusword |= 0x1000
-    with pytest.raises(MotionTimeout, match=r"move 0: J2 \(node 2\) did not clear statusword bit 12"):
+    with pytest.raises(
+        MotionTimeout,
+        match=r"move 0: J2 \(node 2\) did not clear "
+        r"statusword bit 12",
+    ):
         run(moving, FAR)
     assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
     assert powerless(bus)
 
 
 def test_a_drive_whose_rpdos_act_before_sync_makes_the_same_moves(moving: Moving) -> None:
-    """Target and controlword are in one frame, the target first, and velocities come before: no order is assumed."""
+    """Target and controlword are in one frame, the target first, and velocities come before:
+    no order is assumed.
+    """
     _, _, bus, _ = moving
     for node in bus.nodes:
         node.acts_at_once = True
@@ -290,7 +331,8 @@ def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving)
     def stuck(cycle: int) -> None:
         bus.nodes[1].moving = False
         bus.nodes[1].statusword |= 0x0400
-        bus.nodes[1].store(0x6074, 0, cycle & 1)  # a live current: what stands still is the axis, not its data
+        # A live current: what stands still is the axis, not its data
+        bus.nodes[1].store(0x6074, 0, cycle & 1)
 
     bus.on_cycle = stuck
     with pytest.raises(MotionTimeout, match="J2"):
@@ -317,7 +359,9 @@ def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, w
     assert at_end.position_counts == (way, way)
 
 
-def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, _, bus, _ = moving
     receive = bus.recv
     last_profile = 0x302
@@ -340,7 +384,9 @@ def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(moving: Moving, monk
 
 
 def stop_with(moving: Moving, drift_counts: tuple[float, ...]) -> list[int]:
-    """Cycles from the stop to its end of drives that stay in QUICK STOP ACTIVE while their encoders show this."""
+    """Cycles from the stop to its end of drives that stay in QUICK STOP ACTIVE while their encoders
+    show this.
+    """
     _, _, bus, events = moving
     stopping: list[int] = []
 
@@ -368,7 +414,9 @@ def test_an_axis_that_creeps_does_not_stand_still(moving: Moving) -> None:
     assert len(stop_with(moving, (7.0,))) >= bound_cycles
 
 
-def test_every_axis_that_could_not_be_stopped_is_reported(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_axis_that_could_not_be_stopped_is_reported(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     network, _, bus, _ = moving
     for node in bus.nodes:
         node.quick_stop_stays = True
@@ -397,12 +445,18 @@ def test_late_answers_are_waited_for_once_no_axis_has_power(
     _, stream, bus, _ = moving
     waits = list[tuple[int, bool]]()
     monkeypatch.setattr(
-        stream, "read_on", lambda seconds, lag_s: waits.append((round(seconds * 1e9) // PERIOD_NS, lag_s > 0))
+        stream,
+        "read_on",
+        lambda seconds, lag_s: waits.append((round(seconds * 1e9) // PERIOD_NS, lag_s > 0)),
     )
     bus.nodes[0].quick_stop_stays = not confirmed
     near = Move((500, 500), (100_000, 100_000), (10_000_000, 10_000_000))
     with suppress(StateRefused):
-        list(execute(moving[0], stream, (near,), permission(), replace(BOUNDS, standstill_cycles=10_000)))
+        list(
+            execute(
+                moving[0], stream, (near,), permission(), replace(BOUNDS, standstill_cycles=10_000)
+            )
+        )
     assert waits == [(periods, confirmed)]
 
 
@@ -433,7 +487,9 @@ class FullSink:
             raise ValueError("the log takes no event")
 
 
-def test_events_that_cannot_be_logged_delay_no_stop_and_do_not_hide_its_cause(moving: Moving) -> None:
+def test_events_that_cannot_be_logged_delay_no_stop_and_do_not_hide_its_cause(
+    moving: Moving,
+) -> None:
     network, stream, bus, _ = moving
     stream.bus.emit = sink = FullSink()
 
@@ -452,7 +508,9 @@ def test_events_that_cannot_be_logged_delay_no_stop_and_do_not_hide_its_cause(mo
     ]
 
 
-def test_events_of_the_last_stop_that_cannot_be_logged_are_an_error_after_it(moving: Moving) -> None:
+def test_events_of_the_last_stop_that_cannot_be_logged_are_an_error_after_it(
+    moving: Moving,
+) -> None:
     network, stream, bus, _ = moving
     stream.bus.emit = sink = FullSink()
     near = Move((2_000, 2_000), (100_000, 80_000), (1_000_000, 800_000))
@@ -552,7 +610,8 @@ def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
     moving: Moving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network, _, bus, events = moving
-    disable, reported = network.disable, []
+    disable = network.disable
+    reported = []
 
     def note(axis: Axis) -> None:
         reported.append([node.statusword & 0x6F for node in bus.nodes])
@@ -572,7 +631,9 @@ def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
     assert powerless(bus)
 
 
-@pytest.mark.parametrize("error", [BusError("bus B", "bus-off"), NodeMisplaced(9, "A", "B")], ids=["bus", "misplaced"])
+@pytest.mark.parametrize(
+    "error", [BusError("bus B", "bus-off"), NodeMisplaced(9, "A", "B")], ids=["bus", "misplaced"]
+)
 def test_a_bus_that_ends_the_stop_by_pdo_does_not_keep_the_others_from_being_stopped(
     moving: Moving, error: DriverError
 ) -> None:

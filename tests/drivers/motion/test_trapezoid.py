@@ -21,12 +21,18 @@ from drivers.move import (
 )
 
 AXES = 3
-distances = st.tuples(*[st.floats(-1e3, 1e3).filter(lambda d: d == 0 or abs(d) > 1e-3)] * AXES).filter(any)
+distances = st.tuples(
+    *[st.floats(-1e3, 1e3).filter(lambda d: d == 0 or abs(d) > 1e-3)] * AXES
+).filter(any)
 limits = st.tuples(*[st.floats(1e-2, 1e3)] * AXES)
 
 
-def made(distance: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Trapezoid:
-    return synchronised(np.zeros(AXES), np.array(distance), np.array(velocity), np.array(acceleration))
+def made(
+    distance: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]
+) -> Trapezoid:
+    return synchronised(
+        np.zeros(AXES), np.array(distance), np.array(velocity), np.array(acceleration)
+    )
 
 
 @given(distances, limits, limits)
@@ -73,7 +79,9 @@ ROOM = (AxisLimits(-3_000_000, 3_000_000, 900_000.0, 4_000_000.0),) * AXES
 
 
 @given(counts, counts)
-def test_whole_numbers_keep_limits_and_end_times(start: tuple[int, ...], target: tuple[int, ...]) -> None:
+def test_whole_numbers_keep_limits_and_end_times(
+    start: tuple[int, ...], target: tuple[int, ...]
+) -> None:
     move = synchronised_move(start, target, ROOM)
     check_moves(start, (move,), MotionPermission("test", ROOM), ("a", "b", "c"))
     going = [

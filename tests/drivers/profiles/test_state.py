@@ -6,31 +6,47 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, ControlCommand, Goal, State, decode, next_command
+from drivers.profiles.cia402 import (
+    FAULT_RESET_SEQUENCE,
+    POWERLESS,
+    ControlCommand,
+    Goal,
+    State,
+    decode,
+    next_command,
+)
 
 STATES = tuple(state for state in State if state is not State.UNKNOWN)
 
 
 def transition(state: State, command: int) -> State:
-    """Reaction of the standard's drive to a controlword (transitions 2 to 16; 605Ah = 5, so a stop is held)."""
+    """Reaction of the standard's drive to a controlword (transitions 2 to 16;
+    605Ah = 5, so a stop is held).
+    """
     powered = state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
     after: State
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE, State.NOT_READY_TO_SWITCH_ON):
-        after = State.SWITCH_ON_DISABLED if state is State.FAULT and command & 0x80 else state
+        if state is State.FAULT and command & 0x80:
+            after = State.SWITCH_ON_DISABLED
+        else:
+            after = state
     elif command & 0x02 == 0 or (command & 0x04 == 0 and not powered):
         after = State.SWITCH_ON_DISABLED
     elif command & 0x04 == 0:
         after = State.QUICK_STOP_ACTIVE
     elif state is State.QUICK_STOP_ACTIVE:
-        after = State.OPERATION_ENABLED if command & 0x0F == 0x0F else state  # transition 16, which some drives have
+        # Transition 16, which some drives have
+        after = State.OPERATION_ENABLED if command & 0x0F == 0x0F else state
     elif command & 0x01 == 0:
         after = State.READY_TO_SWITCH_ON
     elif state is State.SWITCH_ON_DISABLED:
         after = state
     elif state is State.READY_TO_SWITCH_ON:
         after = State.SWITCHED_ON
+    elif command & 0x08:
+        after = State.OPERATION_ENABLED
     else:
-        after = State.OPERATION_ENABLED if command & 0x08 else State.SWITCHED_ON
+        after = State.SWITCHED_ON
     return after
 
 
@@ -92,4 +108,5 @@ def test_a_fault_reset_ends_without_power() -> None:
     for command in FAULT_RESET_SEQUENCE:
         state = transition(state, command)
     assert state is State.SWITCH_ON_DISABLED
-    assert FAULT_RESET_SEQUENCE[0] & ControlCommand.FAULT_RESET == 0  # otherwise there is no rising edge
+    # Otherwise there is no rising edge
+    assert FAULT_RESET_SEQUENCE[0] & ControlCommand.FAULT_RESET == 0

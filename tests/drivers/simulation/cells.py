@@ -74,13 +74,26 @@ class Master:
         return int(struct.unpack_from("<" + kind, answer, 4)[0])
 
     def set_up(self, node_ids: range) -> None:
-        """Map position, current reference and statusword into TPDO1 and the controlword into RPDO1, both on SYNC."""
+        """Map position, current reference and statusword into TPDO1 and the controlword into RPDO1,
+        both on SYNC.
+        """
         for node_id in node_ids:
             steps = [(0x1017, 0, "H", 0), (0x6060, 0, "b", 1)]
             steps += [(0x1800, 1, "I", 0xC0000180 + node_id), (0x1A00, 0, "B", 0)]
-            steps += [(0x1A00, k, "I", entry) for k, entry in enumerate((0x60640020, 0x60740010, 0x60410010), start=1)]
-            steps += [(0x1A00, 0, "B", 3), (0x1800, 2, "B", 1), (0x1800, 1, "I", 0x40000180 + node_id)]
-            steps += [(0x1400, 1, "I", 0x80000200 + node_id), (0x1400, 2, "B", 1), (0x1400, 1, "I", 0x200 + node_id)]
+            steps += [
+                (0x1A00, k, "I", entry)
+                for k, entry in enumerate((0x60640020, 0x60740010, 0x60410010), start=1)
+            ]
+            steps += [
+                (0x1A00, 0, "B", 3),
+                (0x1800, 2, "B", 1),
+                (0x1800, 1, "I", 0x40000180 + node_id),
+            ]
+            steps += [
+                (0x1400, 1, "I", 0x80000200 + node_id),
+                (0x1400, 2, "B", 1),
+                (0x1400, 1, "I", 0x200 + node_id),
+            ]
             for step in steps:
                 assert self.write(node_id, *step) == 0, step
         self.send(0x000, bytes([1, 0]))
@@ -113,14 +126,18 @@ class Master:
 
 def abort_code(answer: bytes) -> int:
     """0 where the answer is no abort."""
-    return int(struct.unpack_from("<I", answer, 4)[0]) if answer[0] == 0x80 else 0
+    if answer[0] == 0x80:
+        return int(struct.unpack_from("<I", answer, 4)[0])
+    return 0
 
 
 @contextmanager
 def running(
     spec: CellSpec, channel: str, clock: Callable[[], float] = STOPPED_CLOCK
 ) -> Iterator[tuple[SimulatedCell, Master]]:
-    """A cell in a thread and a master on one virtual bus; the master's bus is open before the cell boots."""
+    """A cell in a thread and a master on one virtual bus;
+    the master's bus is open before the cell boots.
+    """
     with (
         can.Bus(interface="virtual", channel=channel) as near,
         can.Bus(interface="virtual", channel=channel) as far,

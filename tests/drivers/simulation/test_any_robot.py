@@ -32,7 +32,7 @@ URDF = f"""<robot name="lift"><link name="base"/>
 <limit lower="0.1" upper="1.1" velocity="1" effort="99"/></joint>
 <link name="reach"><inertial><mass value="{BEHIND_KG}"/>
 <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-</robot>"""
+</robot>"""  # noqa: E501
 """A cylindrical robot: the reach changes the inertia that the turn meets."""
 
 
@@ -90,7 +90,9 @@ def test_a_lift_falls_with_the_mass_of_its_rotor_in_tow() -> None:
     assert plant.motor_rad == pytest.approx(np.diag([100.0, SCREW, SCREW]) @ plant.position_rad)
 
 
-@pytest.mark.parametrize("payload", [None, Body(5.0, (0.1, 0.0, 0.0), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))])
+@pytest.mark.parametrize(
+    "payload", [None, Body(5.0, (0.1, 0.0, 0.0), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))]
+)
 def test_the_current_that_holds_it_is_its_weight_over_the_gain(payload: Body | None) -> None:
     """Newton per ampere: what the identification must find again."""
     weight = 9.81 * (MASS_KG + BEHIND_KG + (0.0 if payload is None else payload.mass_kg))
@@ -100,7 +102,9 @@ def test_the_current_that_holds_it_is_its_weight_over_the_gain(payload: Body | N
 
 
 def test_the_loops_are_tuned_over_the_travel_of_a_prismatic_joint() -> None:
-    """The turn meets the inertia of the reach at its two ends: their geometric mean, not one of places it cannot be."""
+    """The turn meets the inertia of the reach at its two ends:
+    their geometric mean, not one of places it cannot be.
+    """
     spec = _spec()
     plant = Plant(spec)
     seen = [1.0 + 1.0 + 0.1 + BEHIND_KG * reach**2 + 0.5 for reach in (0.1, 1.1)]

@@ -1,4 +1,6 @@
-"""Whole simulated cell: it follows moves, stops on faults, and gives equal answers to equal frames."""
+"""Whole simulated cell: it follows moves, stops on faults,
+and gives equal answers to equal frames.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ from tests.drivers.simulation.cells import STOPPED_CLOCK, FloatArray, Master, cl
 SIX = range(1, 7)
 LIMIT_SPEED = np.deg2rad([200, 200, 260, 340, 300, 420])  # of configs/cells/demo.yaml
 LIMIT_ACCELERATION = np.deg2rad([800, 800, 1100, 2000, 1800, 3000])
-REACHED, LIMITED, ACKNOWLEDGED, FOLLOWING_ERROR = 1 << 10, 1 << 11, 1 << 12, 1 << 13
+REACHED = 1 << 10
+LIMITED = 1 << 11
+ACKNOWLEDGED = 1 << 12
+FOLLOWING_ERROR = 1 << 13
 
 
 def counts(spec: CellSpec, joint: FloatArray) -> list[int]:
@@ -27,7 +32,9 @@ def counts(spec: CellSpec, joint: FloatArray) -> list[int]:
     return [int(value) for value in np.rint(spec.ratio @ joint * per_rad)]
 
 
-def begin_move(master: Master, spec: CellSpec, target: FloatArray, duration_s: float, ramp_s: float) -> None:
+def begin_move(
+    master: Master, spec: CellSpec, target: FloatArray, duration_s: float, ramp_s: float
+) -> None:
     """A synchronised trapezoid; it starts with the next SYNC."""
     speed = (target - spec.start_rad) / (duration_s - ramp_s)
     rows = zip(counts(spec, target), counts(spec, speed), counts(spec, speed / ramp_s), strict=True)
@@ -40,7 +47,9 @@ def begin_move(master: Master, spec: CellSpec, target: FloatArray, duration_s: f
 
 
 @pytest.mark.parametrize("payload", [None, "disc"])
-@pytest.mark.parametrize("effects", [(), (UndeclaredEffect("load-friction", 2, {"coefficient": 0.12}),)])
+@pytest.mark.parametrize(
+    "effects", [(), (UndeclaredEffect("load-friction", 2, {"coefficient": 0.12}),)]
+)
 def test_a_fast_move_is_followed_and_reached(
     payload: str | None, effects: tuple[UndeclaredEffect, ...], request: pytest.FixtureRequest
 ) -> None:
@@ -53,7 +62,8 @@ def test_a_fast_move_is_followed_and_reached(
         master.set_up(SIX)
         master.enable(SIX)
         begin_move(master, spec, target, duration_s, ramp_s)
-        words, errors = [], []
+        words = []
+        errors = []
         for cycle in range(int(1000 * duration_s) + 60):
             answer = master.sync()
             words.append([word for _, _, word in answer])
@@ -71,7 +81,9 @@ def test_a_fast_move_is_followed_and_reached(
     assert (np.abs(found - ends) <= 655).all()
 
 
-def test_equal_frames_give_equal_bytes_and_another_seed_gives_others(request: pytest.FixtureRequest) -> None:
+def test_equal_frames_give_equal_bytes_and_another_seed_gives_others(
+    request: pytest.FixtureRequest,
+) -> None:
     def story(spec: CellSpec) -> list[tuple[int, bytes]]:
         with running(spec, request.node.name) as (_, master):
             master.set_up(SIX)
@@ -110,7 +122,9 @@ def test_one_sync_is_one_sample_period(request: pytest.FixtureRequest) -> None:
         assert cell.time_us == 25_000
 
 
-def test_a_following_error_is_a_fault_with_its_emergency_and_can_be_reset(request: pytest.FixtureRequest) -> None:
+def test_a_following_error_is_a_fault_with_its_emergency_and_can_be_reset(
+    request: pytest.FixtureRequest,
+) -> None:
     spec = clean_cell()
     with running(spec, request.node.name) as (_, master):
         master.set_up(SIX)
@@ -135,7 +149,9 @@ def test_a_following_error_is_a_fault_with_its_emergency_and_can_be_reset(reques
         assert (0x082, bytes(8)) in master.others
 
 
-def test_saturation_is_reported_in_bit_11_and_the_reference_stays_at_the_limit(request: pytest.FixtureRequest) -> None:
+def test_saturation_is_reported_in_bit_11_and_the_reference_stays_at_the_limit(
+    request: pytest.FixtureRequest,
+) -> None:
     spec = clean_cell()
     with running(spec, request.node.name) as (_, master):
         master.set_up(SIX)
@@ -190,7 +206,9 @@ def test_a_waiting_set_point_follows_the_first(request: pytest.FixtureRequest) -
         assert max(abs(a[0] - end) for a, end in zip(answer, ends, strict=True)) <= 655
 
 
-def test_nmt_stop_while_enabled_is_a_fault_and_the_brake_holds(request: pytest.FixtureRequest) -> None:
+def test_nmt_stop_while_enabled_is_a_fault_and_the_brake_holds(
+    request: pytest.FixtureRequest,
+) -> None:
     with running(clean_cell("disc"), request.node.name) as (cell, master):
         master.set_up(SIX)
         master.enable(SIX)
@@ -222,7 +240,10 @@ def test_noise_of_the_reference_is_as_declared_and_on_nothing_else() -> None:
 
 def test_a_failure_in_the_thread_reaches_the_owner(request: pytest.FixtureRequest) -> None:
     channel = request.node.name
-    with can.Bus(interface="virtual", channel=channel) as near, can.Bus(interface="virtual", channel=channel) as far:
+    with (
+        can.Bus(interface="virtual", channel=channel) as near,
+        can.Bus(interface="virtual", channel=channel) as far,
+    ):
         cell = SimulatedCell(clean_cell(), far, STOPPED_CLOCK)
         cell.plant.velocity_rad_s[0] = np.nan
         with pytest.raises(FrictionUnsolved), cell:

@@ -1,4 +1,6 @@
-"""The driver against the simulated cell: two programs that share nothing but the standards, over two kinds of bus."""
+"""The driver against the simulated cell: two programs that share nothing but the standards,
+over two kinds of bus.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,11 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 PERIOD_NS = 1_000_000
 ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
 PERMISSION = MotionPermission("the test", ROOM)
-#: A busy machine keeps any of the three threads waiting for seconds: no limit of the wall clock decides a test.
-PATIENT = Bounds(answer_s=30.0, silence_s=10.0, nmt_s=30.0, mode_s=30.0, disable_s=30.0, closing_s=120.0)
+#: A busy machine keeps any of the three threads waiting for seconds: no limit of the wall clock
+#: decides a test.
+PATIENT = Bounds(
+    answer_s=30.0, silence_s=10.0, nmt_s=30.0, mode_s=30.0, disable_s=30.0, closing_s=120.0
+)
 GUARD_MS = 60_000
 
 
@@ -59,8 +64,19 @@ def cell(address: BusAddress) -> Iterator[SimulatedCell]:
 
 
 def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
-    """Objects that ``prepare`` changes: heartbeat, mode, and the communication and mapping of the first PDOs."""
-    objects = ((0x1017, 0), (0x6060, 0), (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1A00, 1), (0x1400, 2), (0x1600, 0))
+    """Objects that ``prepare`` changes: heartbeat, mode,
+    and the communication and mapping of the first PDOs.
+    """
+    objects = (
+        (0x1017, 0),
+        (0x6060, 0),
+        (0x1800, 1),
+        (0x1800, 2),
+        (0x1A00, 0),
+        (0x1A00, 1),
+        (0x1400, 2),
+        (0x1600, 0),
+    )
     return [
         tuple(network.link.objects(node_id).read_bytes(index, sub) for index, sub in objects)
         for node_id in network.node_ids
@@ -72,15 +88,21 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
     events: list[CellEvent] = []
     with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         found = network.scan(range(1, 20))
-        assert [(node.node_id, node.state) for node in found] == [(n, State.SWITCH_ON_DISABLED) for n in range(1, 7)]
+        assert [(node.node_id, node.state) for node in found] == [
+            (n, State.SWITCH_ON_DISABLED) for n in range(1, 7)
+        ]
         assert [node.identity for node in found] == [axis.identity for axis in axes]
         before = settings(network)
         network.prepare()
         assert settings(network) != before
-        assert network.ampere_per_unit() == pytest.approx((0.002, 0.002, 0.002, 0.0015, 0.0015, 0.0015))
+        assert network.ampere_per_unit() == pytest.approx(
+            (0.002, 0.002, 0.002, 0.0015, 0.0015, 0.0015)
+        )
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0), events.append)
         start = next(stream).position_counts
-        target = tuple(position + step for position, step in zip(start, (1, -1, 0, 2, -2, 3), strict=True))
+        target = tuple(
+            position + step for position, step in zip(start, (1, -1, 0, 2, -2, 3), strict=True)
+        )
         target = tuple(a + 30_000 * (b - a) for a, b in zip(start, target, strict=True))
         moves = (
             synchronised_move(start, target, ROOM, dwell_cycles=20),
@@ -90,8 +112,15 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
             recorded = list(samples)
         assert [sample.cycle for sample in recorded] == list(range(1, len(recorded) + 1))
         assert stream.statistics.frames == 6 * stream.statistics.cycles
-        assert stream.statistics.missing == stream.statistics.duplicate == stream.statistics.surplus == 0
-        marks = [event for event in events if event.kind in (EventKind.MOVE_START, EventKind.MOVE_END)]
+        assert (
+            stream.statistics.missing
+            == stream.statistics.duplicate
+            == stream.statistics.surplus
+            == 0
+        )
+        marks = [
+            event for event in events if event.kind in (EventKind.MOVE_START, EventKind.MOVE_END)
+        ]
         assert [mark.code for mark in marks] == [0, 0, 1, 1]
         arrived = next(sample for sample in recorded if sample.time_ns == marks[1].time_ns)
         for position, wanted in zip(arrived.position_counts, target, strict=True):
@@ -103,7 +132,9 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
 
 
 @pytest.mark.usefixtures("cell")
-def test_a_closed_run_leaves_no_axis_with_power(address: BusAddress, axes: tuple[Axis, ...]) -> None:
+def test_a_closed_run_leaves_no_axis_with_power(
+    address: BusAddress, axes: tuple[Axis, ...]
+) -> None:
     with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         network.prepare()
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
@@ -119,7 +150,9 @@ def test_a_closed_run_leaves_no_axis_with_power(address: BusAddress, axes: tuple
 
 
 @pytest.mark.usefixtures("cell")
-def test_an_emergency_of_a_node_stops_the_others(address: BusAddress, axes: tuple[Axis, ...]) -> None:
+def test_an_emergency_of_a_node_stops_the_others(
+    address: BusAddress, axes: tuple[Axis, ...]
+) -> None:
     intruder = open_bus(address)
     try:
         with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
@@ -133,7 +166,11 @@ def test_an_emergency_of_a_node_stops_the_others(address: BusAddress, axes: tupl
             ):
                 for sample in samples:
                     if sample.cycle == 100:
-                        emcy = can.Message(arbitration_id=0x83, is_extended_id=False, data=b"\x10\x23\x03" + bytes(5))
+                        emcy = can.Message(
+                            arbitration_id=0x83,
+                            is_extended_id=False,
+                            data=b"\x10\x23\x03" + bytes(5),
+                        )
                         intruder.send(emcy)
             assert all(word & 0x6F == 0x40 for word in network.statuswords())
     finally:

@@ -11,7 +11,8 @@ from drivers.simulation.spec import CellSpec
 from tests.drivers.simulation.cells import FloatArray, running
 from tests.drivers.simulation.test_closures import ROBOTS, cell
 
-REACHED, FOLLOWING_ERROR = 1 << 10, 1 << 13
+REACHED = 1 << 10
+FOLLOWING_ERROR = 1 << 13
 
 
 def counts(spec: CellSpec, joint: FloatArray) -> list[int]:
@@ -25,24 +26,33 @@ def pose(plant: Plant, along: FloatArray, size: float) -> FloatArray:
     assert plant.mechanism is not None
     n = len(plant._gain)
     moved = plant._basis @ along
-    return plant.mechanism.closed(plant.mechanism.start_rad + size * moved / np.abs(moved[:n]).max())[:n]
+    return plant.mechanism.closed(
+        plant.mechanism.start_rad + size * moved / np.abs(moved[:n]).max()
+    )[:n]
 
 
 @pytest.mark.parametrize("payload", [False, True])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_moves_are_reached_and_the_loops_stay_closed(name: str, payload: bool, request: pytest.FixtureRequest) -> None:
+def test_moves_are_reached_and_the_loops_stay_closed(
+    name: str, payload: bool, request: pytest.FixtureRequest
+) -> None:
     bodies = {"five-bar": "disc", "orthoglide": "block", "dualv": "disc"}
     spec = cell(name, bodies[name] if payload else None)
     nodes = range(1, len(spec.axes) + 1)
     goal = pose(
-        Plant(spec), np.array([1.0, -0.6, 0.5][: 3 if name != "five-bar" else 2]), 0.04 if name[0] == "o" else 0.3
+        Plant(spec),
+        np.array([1.0, -0.6, 0.5][: 3 if name != "five-bar" else 2]),
+        0.04 if name[0] == "o" else 0.3,
     )
-    duration_s, ramp_s = 0.4, 0.15
+    duration_s = 0.4
+    ramp_s = 0.15
     with running(spec, request.node.name) as (there, master):
         master.set_up(nodes)
         master.enable(nodes)
         speed = goal / (duration_s - ramp_s)
-        rows = zip(counts(spec, goal), counts(spec, speed), counts(spec, speed / ramp_s), strict=True)
+        rows = zip(
+            counts(spec, goal), counts(spec, speed), counts(spec, speed / ramp_s), strict=True
+        )
         for node, (place, velocity, acceleration) in zip(nodes, rows, strict=True):
             settings = [(0x607A, "i", place), (0x6081, "I", abs(velocity))]
             settings += [(index, "I", abs(acceleration)) for index in (0x6083, 0x6084)]
@@ -69,12 +79,15 @@ def test_redundant_drives_preload_the_platform_while_their_trapezoids_disagree()
     assert (amplifiers.loops["integral_1_s"] == 0.0).all()
     plant.set_brakes(np.zeros(4, dtype=np.bool_))
     amplifiers.loops["enabled"] = 1
-    goal, start = pose(plant, np.array([1.0, -0.6, 0.5]), 0.4), np.zeros(4)
+    goal = pose(plant, np.array([1.0, -0.6, 0.5]), 0.4)
+    start = np.zeros(4)
     inner = []
     for k in range(4000):
         share = min(1.0, k / 2000)
         blend = share * share * (3.0 - 2.0 * share)
-        amplifiers.loops["demand"] = amplifiers.loops["target"] = np.rint(counts(spec, start + blend * (goal - start)))
+        amplifiers.loops["demand"] = amplifiers.loops["target"] = np.rint(
+            counts(spec, start + blend * (goal - start))
+        )
         amplifiers.control(plant.motor_rad)
         plant.step(amplifiers.loops["current_a"])
         torque = plant._rows.T @ (plant._gain * amplifiers.loops["current_a"])

@@ -61,7 +61,8 @@ class Constrained:
 
     def __init__(self, spec: CellSpec, plant: Plant) -> None:
         assert plant.mechanism is not None
-        self.spec, self.order = spec, plant.mechanism.order
+        self.spec = spec
+        self.order = plant.mechanism.order
         self.model = link_model(spec)
         self.data = self.model.createData()
         self.n = len(self.order)
@@ -72,18 +73,24 @@ class Constrained:
         return out
 
     def rows(self, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Jacobian of the closures and its change times the velocity, both in the order of the plant."""
-        q, v = self._sorted(q), self._sorted(v)
+        """Jacobian of the closures and its change times the velocity,
+        both in the order of the plant.
+        """
+        q = self._sorted(q)
+        v = self._sorted(v)
         pin.forwardKinematics(self.model, self.data, q, v, np.zeros(self.n))
         pin.updateFramePlacements(self.model, self.data)
         aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobians, changes = [], []
+        jacobians = []
+        changes = []
         for closure in self.spec.closures:
             sides = []
             for link in (closure.first, closure.second):
                 frame = self.model.getFrameId(link, pin.FrameType.BODY)
                 jacobian = pin.computeFrameJacobian(self.model, self.data, q, frame, aligned)
-                acceleration = pin.getFrameClassicalAcceleration(self.model, self.data, frame, aligned)
+                acceleration = pin.getFrameClassicalAcceleration(
+                    self.model, self.data, frame, aligned
+                )
                 turning = pin.getFrameVelocity(self.model, self.data, frame, aligned).angular
                 sides.append((jacobian.copy(), acceleration.vector.copy(), turning.copy()))
             (j1, a1, w1), (j2, a2, w2) = sides
@@ -99,16 +106,27 @@ class Constrained:
     def accelerations(
         self, q: FloatArray, v: FloatArray, torque: FloatArray, change: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Accelerations with J_c a = −change, and the torque that passes from each joint to the links."""
+        """Accelerations with J_c a = −change, and the torque that passes from each joint to the
+        links.
+        """
         jacobian = self.rows(q, v)[0]
         order = np.ix_(self.order, self.order)
         mass = np.array(pin.crba(self.model, self.data, self._sorted(q)))[order]
-        bias = pin.nonLinearEffects(self.model, self.data, self._sorted(q), self._sorted(v))[self.order]
-        rows = np.hstack([motor_rows(self.spec.ratio), np.zeros((len(self.spec.axes), self.n - len(self.spec.axes)))])
+        bias = pin.nonLinearEffects(self.model, self.data, self._sorted(q), self._sorted(v))[
+            self.order
+        ]
+        rows = np.hstack(
+            [
+                motor_rows(self.spec.ratio),
+                np.zeros((len(self.spec.axes), self.n - len(self.spec.axes))),
+            ]
+        )
         rotor = rows.T @ np.diag([a.motor_inertia_kg_m2 for a in self.spec.axes]) @ rows
         c = len(jacobian)
         system = np.block([[mass + rotor, jacobian.T], [jacobian, np.zeros((c, c))]])
-        solution = np.linalg.lstsq(system, np.concatenate([rows.T @ torque - bias, -change]), rcond=1e-13)[0]
+        solution = np.linalg.lstsq(
+            system, np.concatenate([rows.T @ torque - bias, -change]), rcond=1e-13
+        )[0]
         return solution[: self.n], torque @ rows - rotor @ solution[: self.n]
 
 
@@ -118,8 +136,10 @@ def test_accelerations_are_those_of_a_solution_with_multipliers(name: str, paylo
     bodies = {"five-bar": "block", "orthoglide": "spindle", "dualv": "disc"}
     spec = frictionless(cell(name, bodies[name] if payload else None))
     plant = released(spec)
-    reference, rng = Constrained(spec, plant), np.random.default_rng(3)
-    step_s, n = plant._mechanics.step_s, len(plant.position_rad)
+    reference = Constrained(spec, plant)
+    rng = np.random.default_rng(3)
+    step_s = plant._mechanics.step_s
+    n = len(plant.position_rad)
     assert plant.mechanism is not None
     assert plant.mechanism.mobility == MOBILITY[name]
     for _ in range(4):
@@ -128,7 +148,8 @@ def test_accelerations_are_those_of_a_solution_with_multipliers(name: str, paylo
         jacobian, _ = reference.rows(q, np.zeros(n))
         v = plant._basis @ rng.uniform(-1.0, 1.0, plant.mechanism.mobility)
         assert np.abs(jacobian @ v).max() < 1e-12
-        # The speed of a step is closed where the step began, J_c(q − h v) v = 0, so that J_c(q) v = h J̇_c v at its end.
+        # The speed of a step is closed where the step began, J_c(q − h v) v = 0, so that J_c(q) v =
+        # h J̇_c v at its end.
         change = reference.rows(q, v)[1]
         v += step_s * np.linalg.pinv(jacobian, rcond=1e-10) @ change
         current = rng.normal(0.0, 2.0, len(spec.axes))
@@ -142,21 +163,26 @@ def test_accelerations_are_those_of_a_solution_with_multipliers(name: str, paylo
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
-    """Against Pinocchio's own constrained dynamics, its proximal iterations taking the redundant rows."""
+    """Against Pinocchio's own constrained dynamics,
+    its proximal iterations taking the redundant rows.
+    """
     spec = frictionless(cell(name))
     spec = replace(spec, axes=tuple(replace(a, motor_inertia_kg_m2=0.0) for a in spec.axes))
     plant = released(spec)
     assert plant.mechanism is not None
     posed(plant, np.random.default_rng(4))
-    order, n = plant.mechanism.order, len(plant.position_rad)
+    order = plant.mechanism.order
+    n = len(plant.position_rad)
     model = link_model(spec)
     data = model.createData()
     constraints = pin.StdVec_RigidConstraintModel()
     for closure in spec.closures:
         first, second = (
-            model.frames[model.getFrameId(link, pin.FrameType.BODY)] for link in (closure.first, closure.second)
+            model.frames[model.getFrameId(link, pin.FrameType.BODY)]
+            for link in (closure.first, closure.second)
         )
-        # A plane closes the third translation by itself; two points on the free axis close the two other rotations.
+        # A plane closes the third translation by itself; two points on the free axis close the two
+        # other rotations.
         points = [np.zeros(3)]
         if len(closure.directions) == 5:
             points.append(0.1 * np.array([f"r{axis}" not in closure.directions for axis in "xyz"]))
@@ -174,7 +200,8 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
                 )
             )
     current = np.random.default_rng(5).normal(0.0, 1.0, len(spec.axes))
-    torque, q = np.zeros(n), np.zeros(n)
+    torque = np.zeros(n)
+    q = np.zeros(n)
     torque[order[: len(spec.axes)]] = motor_rows(spec.ratio).T @ (plant._gain * current)
     q[order] = plant.position_rad
     datas = pin.StdVec_RigidConstraintData()
@@ -182,15 +209,21 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
         datas.append(constraint.createData())
     pin.initConstraintDynamics(model, data, constraints, datas)
     settings = pin.ProximalSettings(1e-13, 1e-10, 200)
-    expected = pin.constraintDynamics(model, data, q, np.zeros(n), torque, constraints, datas, settings)[order]
+    expected = pin.constraintDynamics(
+        model, data, q, np.zeros(n), torque, constraints, datas, settings
+    )[order]
     plant.step(current)
     found = plant.velocity_rad_s / plant._mechanics.step_s
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def slides_of(place_m: FloatArray) -> FloatArray:
-    """Inverse kinematics of an Orthoglide with rods of 310 mm, zero in the isotropic pose (Pashkevich et al. 2006)."""
-    others = np.array([np.hypot(place_m[1], place_m[2]), np.hypot(place_m[2], place_m[0]), np.hypot(*place_m[:2])])
+    """Inverse kinematics of an Orthoglide with rods of 310 mm,
+    zero in the isotropic pose (Pashkevich et al. 2006).
+    """
+    others = np.array(
+        [np.hypot(place_m[1], place_m[2]), np.hypot(place_m[2], place_m[0]), np.hypot(*place_m[:2])]
+    )
     return np.asarray(place_m + 0.310 - np.sqrt(0.310**2 - others**2))
 
 
@@ -204,7 +237,9 @@ def test_an_orthoglide_moves_as_it_should_and_turns_nothing() -> None:
     for place_m in np.random.default_rng(6).uniform(-0.04, 0.1, (5, 3)):
         position = plant.mechanism.start_rad
         for share in np.linspace(0.1, 1.0, 10):
-            position = plant.mechanism.closed(np.concatenate([slides_of(share * place_m), position[3:]]), (3,))
+            position = plant.mechanism.closed(
+                np.concatenate([slides_of(share * place_m), position[3:]]), (3,)
+            )
         sorted_position = np.empty(len(position))
         sorted_position[plant.mechanism.order] = position
         pin.framesForwardKinematics(model, data, sorted_position)
@@ -215,30 +250,45 @@ def test_an_orthoglide_moves_as_it_should_and_turns_nothing() -> None:
 def test_the_rods_of_the_orthoglide_follow_from_its_design_rule() -> None:
     """Transmission factors of 0.5 to 2 in a cube of 200 mm (Chablat and Wenger 2003)."""
     factors = []
-    for corner in np.stack(np.meshgrid(*[np.linspace(-0.073, 0.127, 5)] * 3), axis=-1).reshape(-1, 3):
-        columns = [(slides_of(corner + 1e-6 * e) - slides_of(corner - 1e-6 * e)) / 2e-6 for e in np.eye(3)]
+    for corner in np.stack(np.meshgrid(*[np.linspace(-0.073, 0.127, 5)] * 3), axis=-1).reshape(
+        -1, 3
+    ):
+        columns = [
+            (slides_of(corner + 1e-6 * e) - slides_of(corner - 1e-6 * e)) / 2e-6 for e in np.eye(3)
+        ]
         factors.append(1.0 / np.linalg.svd(np.array(columns).T, compute_uv=False))
     assert np.min(factors) == pytest.approx(0.5, abs=0.005)
     assert np.max(factors) == pytest.approx(2.0, abs=0.02)
 
 
 def test_a_five_bar_follows_its_lagrangian() -> None:
-    """Absolute angles θ of the cranks and ϕ of the rods, written out by hand with two multipliers."""
+    """Absolute angles θ of the cranks and ϕ of the rods,
+    written out by hand with two multipliers.
+    """
     spec = frictionless(cell("five-bar"))
     plant = released(spec)
     rng = np.random.default_rng(8)
     model = link_model(replace(spec, payload=None))
     bodies = {name: model.inertias[model.getJointId(name)] for name in model.names[1:]}
-    crank_m, rod_m = 0.25, 0.45
-    zero = {"crank-1": -2.35619449, "crank-2": -0.7853981634, "elbow-1": 1.598133444, "elbow-2": -1.598133444}
+    crank_m = 0.25
+    rod_m = 0.45
+    zero = {
+        "crank-1": -2.35619449,
+        "crank-2": -0.7853981634,
+        "elbow-1": 1.598133444,
+        "elbow-2": -1.598133444,
+    }
     step_s = plant._mechanics.step_s
     for _ in range(5):
         posed(plant, rng)
         x = dict(zip(("crank-1", "crank-2", "elbow-1", "elbow-2"), plant.position_rad, strict=True))
         angle = np.array([x[f"crank-{k}"] + zero[f"crank-{k}"] for k in (1, 2)])
         rod = angle + [x[f"elbow-{k}"] + zero[f"elbow-{k}"] for k in (1, 2)]
-        # Coordinates y = (θ₁, θ₂, ϕ₁, ϕ₂); closure A₁ + l₁ e(θ₁) + l₂ e(ϕ₁) = A₂ + l₁ e(θ₂) + l₂ e(ϕ₂).
-        mass, bias, closure = np.zeros((4, 4)), np.zeros(4), np.zeros((2, 4))
+        # Coordinates y = (θ₁, θ₂, ϕ₁, ϕ₂); closure A₁ + l₁ e(θ₁) + l₂ e(ϕ₁) = A₂ + l₁ e(θ₂) + l₂
+        # e(ϕ₂).
+        mass = np.zeros((4, 4))
+        bias = np.zeros(4)
+        closure = np.zeros((2, 4))
         speed = rng.normal(0.0, 1.0, 2)
         across = np.array([-np.sin(angle), np.cos(angle)]) * crank_m * [1, -1]
         across_rod = np.array([-np.sin(rod), np.cos(rod)]) * rod_m * [1, -1]
@@ -248,12 +298,15 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
         closure[:, :2], closure[:, 2:] = across, across_rod
         rates += step_s * np.linalg.pinv(closure) @ curve  # as in the test above
         for k in (0, 1):
-            crank, link = bodies[f"crank-{k + 1}"], bodies[f"elbow-{k + 1}"]
-            c, r = crank.lever[:2], link.lever[:2]
+            crank = bodies[f"crank-{k + 1}"]
+            link = bodies[f"elbow-{k + 1}"]
+            c = crank.lever[:2]
+            r = link.lever[:2]
             mass[k, k] = crank.inertia[2, 2] + crank.mass * c @ c + link.mass * crank_m**2
             mass[k, k] += spec.axes[k].motor_inertia_kg_m2
             mass[2 + k, 2 + k] = link.inertia[2, 2] + link.mass * r @ r
-            along, beside = np.cos(rod[k] - angle[k]), np.sin(rod[k] - angle[k])
+            along = np.cos(rod[k] - angle[k])
+            beside = np.sin(rod[k] - angle[k])
             mass[k, 2 + k] = mass[2 + k, k] = link.mass * crank_m * (r[0] * along - r[1] * beside)
             push = link.mass * crank_m * (r[0] * beside + r[1] * along)
             bias[k] = -push * rates[2 + k] ** 2
@@ -265,13 +318,17 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
         current = rng.normal(0.0, 1.0, 2)
         torque = np.concatenate([motor_rows(spec.ratio).T @ (plant._gain * current), np.zeros(2)])
         system = np.block([[mass, closure.T], [closure, np.zeros((2, 2))]])
-        expected = np.linalg.solve(system, np.concatenate([torque - bias, -closure @ rates / step_s]))[:4]
+        expected = np.linalg.solve(
+            system, np.concatenate([torque - bias, -closure @ rates / step_s])
+        )[:4]
         before = np.concatenate([rates[:2], rates[2:] - rates[:2]])
         plant.velocity_rad_s[:] = before
         plant.step(current)
         found = (plant.velocity_rad_s - before) / step_s
         np.testing.assert_allclose(
-            found, np.concatenate([expected[:2], expected[2:] - expected[:2]]), atol=1e-7 * np.abs(expected).max()
+            found,
+            np.concatenate([expected[:2], expected[2:] - expected[:2]]),
+            atol=1e-7 * np.abs(expected).max(),
         )
 
 
@@ -285,9 +342,13 @@ def test_energy_drift_vanishes_with_the_step(name: str) -> None:
         rotor = np.array([a.motor_inertia_kg_m2 for a in spec.axes])
 
         def energy() -> float:
-            q, v = reference._sorted(plant.position_rad), reference._sorted(plant.velocity_rad_s)
+            q = reference._sorted(plant.position_rad)
+            v = reference._sorted(plant.velocity_rad_s)
             motors = motor_rows(spec.ratio) @ plant.velocity_rad_s[: len(spec.axes)]
-            kinetic = pin.computeKineticEnergy(reference.model, reference.data, q, v) + 0.5 * rotor @ motors**2
+            kinetic = (
+                pin.computeKineticEnergy(reference.model, reference.data, q, v)
+                + 0.5 * rotor @ motors**2
+            )
             return float(kinetic + pin.computePotentialEnergy(reference.model, reference.data, q))
 
         kick = 3.0 * plant._basis @ np.linspace(0.4, 0.8, plant._basis.shape[1])
@@ -297,7 +358,8 @@ def test_energy_drift_vanishes_with_the_step(name: str) -> None:
             plant.step(np.zeros(len(spec.axes)))
         return abs(energy() - start)
 
-    coarse, fine = drift(4), drift(16)
+    coarse = drift(4)
+    fine = drift(16)
     assert coarse > 1e-9
     assert coarse / fine == pytest.approx(4.0, rel=0.3)
 
@@ -313,7 +375,10 @@ def test_closures_hold_in_a_long_run_and_friction_only_takes_energy(name: str) -
     for k in range(4000):
         place = 0.12 * np.sin(2 * np.pi * 1.1 * k * plant._mechanics.step_s + np.arange(n))
         place *= 0.3 if name == "orthoglide" else 1.0
-        pull = stiffness * (place - plant.position_rad[:n]) - 0.1 * stiffness * plant.velocity_rad_s[:n]
+        pull = (
+            stiffness * (place - plant.position_rad[:n])
+            - 0.1 * stiffness * plant.velocity_rad_s[:n]
+        )
         plant.step(np.linalg.solve(motor_rows(spec.ratio).T, pull) / plant._gain)
         rubbing = plant._mechanics.directions.T @ plant._impulse
         assert rubbing @ plant.velocity_rad_s <= 1e-9
@@ -363,8 +428,11 @@ def test_a_braked_motor_stays_while_the_others_move(name: str) -> None:
 
 def test_an_effect_acts_on_a_passive_joint() -> None:
     spec = cell("five-bar")
-    spring = UndeclaredEffect("spring", -1, {"stiffness_nm_per_rad": 5.0, "rest_rad": 1.0}, joint="elbow-2")
-    plain, sprung = released(frictionless(spec)), released(frictionless(replace(spec, effects=(spring,))))
+    spring = UndeclaredEffect(
+        "spring", -1, {"stiffness_nm_per_rad": 5.0, "rest_rad": 1.0}, joint="elbow-2"
+    )
+    plain = released(frictionless(spec))
+    sprung = released(frictionless(replace(spec, effects=(spring,))))
     plain.step(np.zeros(2))
     sprung.step(np.zeros(2))
     change = (sprung.velocity_rad_s - plain.velocity_rad_s) / plain._mechanics.step_s
@@ -382,8 +450,11 @@ def test_a_serial_plant_takes_the_same_step_as_before() -> None:
     model = link_model(spec)
     data = model.createData()
     other = released(spec)
-    position, velocity, impulse = other.position_rad.copy(), np.zeros(6), np.zeros(len(other._impulse))
-    load, motor = np.zeros(6), np.zeros(6)
+    position = other.position_rad.copy()
+    velocity = np.zeros(6)
+    impulse = np.zeros(len(other._impulse))
+    load = np.zeros(6)
+    motor = np.zeros(6)
     bound = other._bound * other._mechanics.step_s
     for k in range(300):
         current = 1.5 * np.sin(0.01 * k * np.arange(1.0, 7.0))
@@ -422,9 +493,21 @@ def test_what_does_not_close_or_move_is_refused() -> None:
     with pytest.raises(SpecInvalid, match="motors: the URDF has no joint hip"):
         Plant(replace(spec, motors=("crank-1", "hip")))
     with pytest.raises(SpecInvalid, match="no position of elbow-2"):
-        Plant(replace(spec, assembly_rad={k: v for k, v in spec.assembly_rad.items() if k != "elbow-2"}))
+        Plant(
+            replace(
+                spec, assembly_rad={k: v for k, v in spec.assembly_rad.items() if k != "elbow-2"}
+            )
+        )
     with pytest.raises(SpecInvalid, match="2 degrees of freedom"):
-        Plant(replace(spec, motors=spec.motors[:1], axes=spec.axes[:1], ratio=np.eye(1), start_rad=np.zeros(1)))
+        Plant(
+            replace(
+                spec,
+                motors=spec.motors[:1],
+                axes=spec.axes[:1],
+                ratio=np.eye(1),
+                start_rad=np.zeros(1),
+            )
+        )
     with pytest.raises(SpecInvalid, match="start of crank-"):
         other = cell("dualv")
         Plant(replace(other, start_rad=np.array([0.2, 0.0, 0.0, 0.0])))
@@ -458,8 +541,10 @@ def test_a_closure_of_two_rotations_leaves_the_third_free() -> None:
     <joint name="hinge" type="revolute"><origin xyz="0 0 0"/><parent link="base"/><child link="door"/>
     <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="3" effort="9"/></joint>
     <link name="door"><inertial><mass value="2"/>
-    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link></robot>"""
-    axis = replace(cell("five-bar").axes[0], motor_inertia_kg_m2=0.5, viscous_nm_s_rad=0.0, coulomb_nm=0.0)
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link></robot>"""  # noqa: E501
+    axis = replace(
+        cell("five-bar").axes[0], motor_inertia_kg_m2=0.5, viscous_nm_s_rad=0.0, coulomb_nm=0.0
+    )
     spec = replace(
         cell("five-bar"),
         urdf=urdf,

@@ -29,7 +29,9 @@ def extra_torque_nm(
     load_nm: float = 0.0,
     time_s: float = 0.0,
 ) -> FloatArray:
-    """Return the torque that the effect adds on each joint in one step, from its change of velocity."""
+    """Return the torque that the effect adds on each joint in one step,
+    from its change of velocity.
+    """
     after = []
     for effects in ((), (effect,)):
         plant = Plant(clean_cell(effects=effects))
@@ -46,7 +48,11 @@ def extra_torque_nm(
     model = link_model(replace(spec, payload=None))
     viscous = np.diag([axis.viscous_nm_s_rad for axis in spec.axes])
     motor = [axis.motor_inertia_kg_m2 + STEP_S * axis.motor_viscous_nm_s_rad for axis in spec.axes]
-    inertia = pin.crba(model, model.createData(), posture) + rows.T @ np.diag(motor) @ rows + STEP_S * viscous
+    inertia = (
+        pin.crba(model, model.createData(), posture)
+        + rows.T @ np.diag(motor) @ rows
+        + STEP_S * viscous
+    )
     return np.asarray(inertia @ (after[1] - after[0]) / STEP_S)
 
 
@@ -59,14 +65,25 @@ def only(axis: int, value: float) -> FloatArray:
 @pytest.mark.parametrize("axis", range(6))
 def test_odd_friction_opposes_the_motion_with_its_law(axis: int, direction: float) -> None:
     speed = direction * SPEED
-    v, s = abs(SPEED[axis]), np.sign(speed[axis])
+    v = abs(SPEED[axis])
+    s = np.sign(speed[axis])
     cases = (
-        (UndeclaredEffect("stribeck", axis, {"rise_nm": 2.0, "speed_rad_s": 0.3}), 2.0 * math.exp(-v / 0.3)),
         (
-            UndeclaredEffect("nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 1 / 3}),
+            UndeclaredEffect("stribeck", axis, {"rise_nm": 2.0, "speed_rad_s": 0.3}),
+            2.0 * math.exp(-v / 0.3),
+        ),
+        (
+            UndeclaredEffect(
+                "nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 1 / 3}
+            ),
             1.5 * v ** (1 / 3),
         ),
-        (UndeclaredEffect("nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 2.0}), 1.5 * v**2),
+        (
+            UndeclaredEffect(
+                "nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 2.0}
+            ),
+            1.5 * v**2,
+        ),
     )
     for effect, size in cases:
         np.testing.assert_allclose(extra_torque_nm(effect, speed), only(axis, -s * size), atol=1e-6)
@@ -82,12 +99,14 @@ def test_load_friction_is_proportional_to_the_size_of_the_load(load_nm: float) -
 @pytest.mark.parametrize("load_nm", [-40.0, -3.0, 0.0, 25.0])
 def test_a_gear_passes_a_part_of_the_power_whichever_side_drives(load_nm: float) -> None:
     """Power into the gear times η is the power out of it, friction of the joint included."""
-    axis, eta = clean_cell().axes[2], 0.8
+    axis = clean_cell().axes[2]
+    eta = 0.8
     friction = np.sign(SPEED[2]) * axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[2]
     out = load_nm + friction
     lost = -extra_torque_nm(UndeclaredEffect("efficiency", 2, {"efficiency": eta}), load_nm=load_nm)
     into = out + lost[2]
-    power_in, power_out = into * SPEED[2], out * SPEED[2]
+    power_in = into * SPEED[2]
+    power_out = out * SPEED[2]
     assert (power_out if power_in > 0.0 else power_in) == pytest.approx(
         eta * (power_in if power_in > 0.0 else power_out), abs=1e-6
     )
@@ -97,7 +116,9 @@ def test_a_gear_passes_a_part_of_the_power_whichever_side_drives(load_nm: float)
 def test_load_friction_knows_the_payload() -> None:
     torque = {}
     for payload in (None, "disc"):
-        plant = Plant(clean_cell(payload, (UndeclaredEffect("load-friction", 1, {"coefficient": 0.1}),)))
+        plant = Plant(
+            clean_cell(payload, (UndeclaredEffect("load-friction", 1, {"coefficient": 0.1}),))
+        )
         plant.step(np.zeros(6))
         model = link_model(clean_cell(payload))
         weight = pin.computeGeneralizedGravity(model, model.createData(), clean_cell().start_rad)
@@ -108,7 +129,8 @@ def test_load_friction_knows_the_payload() -> None:
 
 def test_asymmetric_viscous_is_even_in_speed() -> None:
     effect = UndeclaredEffect("asymmetric-viscous", 1, {"coefficient_nm_s_rad": 0.8})
-    forwards, backwards = extra_torque_nm(effect, -SPEED), extra_torque_nm(effect, SPEED)
+    forwards = extra_torque_nm(effect, -SPEED)
+    backwards = extra_torque_nm(effect, SPEED)
     # Implicit in the step, so it acts on the speed at its end.
     np.testing.assert_allclose(forwards, only(1, -0.8 * abs(SPEED[1])), atol=0.05)
     np.testing.assert_allclose(backwards, forwards, atol=0.05)
@@ -117,7 +139,9 @@ def test_asymmetric_viscous_is_even_in_speed() -> None:
 def test_spring_depends_on_position_alone() -> None:
     effect = UndeclaredEffect("spring", 1, {"stiffness_nm_per_rad": 30.0, "rest_rad": 0.2})
     for speed in (SPEED, -SPEED):
-        np.testing.assert_allclose(extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6)
+        np.testing.assert_allclose(
+            extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("name", ["cable", "slack-cable"])
@@ -125,13 +149,20 @@ def test_spring_depends_on_position_alone() -> None:
 def test_a_cable_pulls_both_joints_that_it_is_led_around(name: str, rest_m: float) -> None:
     """Its torques are the slopes of one energy, ½ k stretch²."""
     parameters = {"other_axis": 4.0, "radius_m": 0.1, "other_radius_m": -0.05}
-    effect = UndeclaredEffect(name, 2, {**parameters, "stiffness_n_per_m": 2500.0, "rest_m": rest_m})
+    effect = UndeclaredEffect(
+        name, 2, {**parameters, "stiffness_n_per_m": 2500.0, "rest_m": rest_m}
+    )
 
     def energy(turned: FloatArray) -> float:
         stretch_m = float(0.1 * turned[2] - 0.05 * turned[3]) - rest_m
-        return 0.0 if name == "slack-cable" and stretch_m < 0.0 else 1250.0 * stretch_m**2
+        if name == "slack-cable" and stretch_m < 0.0:
+            return 0.0
+        return 1250.0 * stretch_m**2
 
-    slopes = [energy(POSTURE + only(joint, 1e-5)) - energy(POSTURE - only(joint, 1e-5)) for joint in range(6)]
+    slopes = [
+        energy(POSTURE + only(joint, 1e-5)) - energy(POSTURE - only(joint, 1e-5))
+        for joint in range(6)
+    ]
     np.testing.assert_allclose(extra_torque_nm(effect), -np.array(slopes) / 2e-5, atol=1e-5)
 
 
@@ -141,21 +172,36 @@ def test_a_clipped_current_gives_no_more_than_its_limit() -> None:
     for current in (-5.0, -1.0, 2.0, 3.0):
         given_a = min(max(current, -2.0), 2.0)
         lost = gain * (current - given_a)
-        np.testing.assert_allclose(extra_torque_nm(effect, current=only(0, current)), only(0, -lost), atol=1e-6)
+        np.testing.assert_allclose(
+            extra_torque_nm(effect, current=only(0, current)), only(0, -lost), atol=1e-6
+        )
 
 
 def test_an_offset_that_drifts_fades_with_time() -> None:
     effect = UndeclaredEffect("offset-drift", 1, {"offset_nm": 3.0, "time_constant_s": 50.0})
     np.testing.assert_allclose(extra_torque_nm(effect), only(1, -3.0), atol=1e-6)
-    np.testing.assert_allclose(extra_torque_nm(effect, time_s=100.0), only(1, -3.0 * math.exp(-2.0)), atol=1e-6)
+    np.testing.assert_allclose(
+        extra_torque_nm(effect, time_s=100.0), only(1, -3.0 * math.exp(-2.0)), atol=1e-6
+    )
 
 
 @given(angle=st.floats(-3.0, 3.0))
 @settings(max_examples=10)
 def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
-    """Foot, lever and joint make a triangle; the torque is the slope of the energy F ds summed from the shortest."""
-    base_m, lever_m, phase_rad, stiffness, preload = 0.5, 0.2, 0.4, 900.0, 60.0
-    parameters = {"base_m": base_m, "lever_m": lever_m, "phase_rad": phase_rad, "stiffness_n_per_m": stiffness}
+    """Foot, lever and joint make a triangle;
+    the torque is the slope of the energy F ds summed from the shortest.
+    """
+    base_m = 0.5
+    lever_m = 0.2
+    phase_rad = 0.4
+    stiffness = 900.0
+    preload = 60.0
+    parameters = {
+        "base_m": base_m,
+        "lever_m": lever_m,
+        "phase_rad": phase_rad,
+        "stiffness_n_per_m": stiffness,
+    }
     effect = UndeclaredEffect("counterbalance", 1, {**parameters, "preload_n": preload})
 
     def energy(q: float) -> float:
@@ -165,7 +211,9 @@ def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
 
     expected = -(energy(angle + 1e-5) - energy(angle - 1e-5)) / 2e-5
     posture = np.where(np.arange(6) == 1, angle, POSTURE)
-    np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), only(1, expected), atol=1e-4)
+    np.testing.assert_allclose(
+        extra_torque_nm(effect, posture=posture), only(1, expected), atol=1e-4
+    )
 
 
 def test_position_friction_follows_the_joint_angle_and_the_sign_of_speed() -> None:
@@ -182,7 +230,8 @@ def test_cogging_repeats_with_the_motor_and_acts_along_its_gear() -> None:
     for turn in (0.0, 0.01, 2 * np.pi / (4 * 32)):
         posture = POSTURE + only(5, turn)
         ripple = -0.7 * math.sin(4.0 * float(ratio[5] @ posture))
-        expected = np.array([0.0, 0.0, 0.0, 0.0, ripple, ripple])  # motor 6 pulls on joints 5 and 6 (eq. 24)
+        # Motor 6 pulls on joints 5 and 6 (eq. 24)
+        expected = np.array([0.0, 0.0, 0.0, 0.0, ripple, ripple])
         np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), expected, atol=1e-6)
 
 
@@ -197,20 +246,25 @@ def test_saturation_takes_a_cubic_share_of_the_torque() -> None:
 
 def test_warm_up_fades_with_time() -> None:
     effect = UndeclaredEffect("warm-up", 0, {"cold_fraction": 0.5, "time_constant_s": 100.0})
-    cold, later = extra_torque_nm(effect)[0], extra_torque_nm(effect, time_s=100.0)[0]
+    cold = extra_torque_nm(effect)[0]
+    later = extra_torque_nm(effect, time_s=100.0)[0]
     axis = clean_cell().axes[0]
-    assert cold == pytest.approx(-0.5 * (axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[0]), rel=0.02)
+    assert cold == pytest.approx(
+        -0.5 * (axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[0]), rel=0.02
+    )
     assert later / cold == pytest.approx(math.exp(-1.0), rel=1e-3)
 
 
 HEATED = {
-    "viscous_percent_per_k": -2.0, "coulomb_percent_per_k": 0.5, "time_constant_s": 10.0, "resistance_k_per_w": 0.4,
+    "viscous_percent_per_k": -2.0, "coulomb_percent_per_k": 0.5, "time_constant_s": 10.0, "resistance_k_per_w": 0.4,  # noqa: E501
 }  # fmt: skip
 
 
 def test_losses_heat_a_drive_to_their_balance_and_its_friction_follows() -> None:
     """Dry 5 Nm and viscous 10 Nm s/rad at 0.8 rad/s, and 2 Ω at 3 A, for 10 s and then for ever."""
-    effect = build_effect(UndeclaredEffect("temperature-friction", 0, HEATED | {"winding_ohm": 2.0}), 1)
+    effect = build_effect(
+        UndeclaredEffect("temperature-friction", 0, HEATED | {"winding_ohm": 2.0}), 1
+    )
     assert not isinstance(effect, Lag)
     moment = Moment(0.0, 0.1, *(np.zeros(1) for _ in range(10)))
     moment.temperature_c[0], moment.velocity_rad_s[0], moment.current_a[0] = 25.0, -0.8, 3.0
@@ -221,14 +275,17 @@ def test_losses_heat_a_drive_to_their_balance_and_its_friction_follows() -> None
         effect(moment)
         assert moment.bound_nm[0] == pytest.approx(5.0 * (1.0 + 0.005 * warm_k))
         assert moment.viscous_nm_s_rad[0] == pytest.approx(10.0 * (1.0 - 0.02 * warm_k))
-        dry_w, viscous_w = moment.bound_nm[0] * 0.8, moment.viscous_nm_s_rad[0] * 0.64
+        dry_w = moment.bound_nm[0] * 0.8
+        viscous_w = moment.viscous_nm_s_rad[0] * 0.64
         # Euler's steps of a hundredth of the time constant.
         above_k += 0.01 * (0.4 * (2.0 * 9.0 + dry_w + viscous_w) - above_k)
         assert moment.temperature_c[0] - 25.0 == pytest.approx(above_k, rel=0.02)
         if step == 99:
             assert 0.6 < above_k / (0.4 * (18.0 + dry_w + viscous_w)) < 0.66
     # At the balance the temperature is resistance times losses.
-    assert moment.temperature_c[0] - 25.0 == pytest.approx(0.4 * (18.0 + dry_w + viscous_w), rel=1e-3)
+    assert moment.temperature_c[0] - 25.0 == pytest.approx(
+        0.4 * (18.0 + dry_w + viscous_w), rel=1e-3
+    )
 
 
 def test_a_plant_without_that_effect_stays_at_the_temperature_of_its_surroundings() -> None:
@@ -247,7 +304,8 @@ def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
     effect.bristle = -1.0
     moment = Moment(0.0, STEP_S, *(np.zeros(1) for _ in range(10)))
     moment.velocity_rad_s[0] = 0.4
-    travelled, torque = 0.0, []
+    travelled = 0.0
+    torque = []
     while travelled < 0.05:
         moment.bound_nm[0], moment.torque_nm[0] = 5.0, 0.0
         effect(moment)
@@ -260,19 +318,27 @@ def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
 
 
 def test_coupling_rubs_on_the_sum_of_two_joints() -> None:
-    effect = UndeclaredEffect("coupling", 3, {"other_axis": 5, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3})
+    effect = UndeclaredEffect(
+        "coupling", 3, {"other_axis": 5, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}
+    )
     same = SPEED.copy()
     same[3:5] = [0.5, 0.9]
     size = -(0.4 + 0.3 * 1.4)
-    np.testing.assert_allclose(extra_torque_nm(effect, same), only(3, size) + only(4, size), atol=1e-6)
+    np.testing.assert_allclose(
+        extra_torque_nm(effect, same), only(3, size) + only(4, size), atol=1e-6
+    )
     against = SPEED.copy()
     against[3:5] = [0.9, -0.4]
     size = -(0.4 + 0.3 * 0.5)
-    np.testing.assert_allclose(extra_torque_nm(effect, against), only(3, size) + only(4, size), atol=1e-6)
+    np.testing.assert_allclose(
+        extra_torque_nm(effect, against), only(3, size) + only(4, size), atol=1e-6
+    )
 
 
 def held_twist_rad(effect: UndeclaredEffect, current_a: float) -> float:
-    """Return the twist between motor 1, driven by a current with its brake open, and its unloaded joint."""
+    """Return the twist between motor 1, driven by a current with its brake open,
+    and its unloaded joint.
+    """
     spec = clean_cell(effects=(effect,))
     # A joint that does not move under this current: the twist is the drive's alone.
     axes = (replace(spec.axes[0], coulomb_nm=500.0, offset_nm=0.0), *spec.axes[1:])
@@ -285,7 +351,9 @@ def held_twist_rad(effect: UndeclaredEffect, current_a: float) -> float:
 
 
 def test_an_elastic_drive_twists_by_torque_over_stiffness() -> None:
-    effect = UndeclaredEffect("elasticity", 0, {"stiffness_nm_per_rad": 8000.0, "damping_nm_s_per_rad": 60.0})
+    effect = UndeclaredEffect(
+        "elasticity", 0, {"stiffness_nm_per_rad": 8000.0, "damping_nm_s_per_rad": 60.0}
+    )
     gain = clean_cell().axes[0].gain_nm_per_a
     for current in (-1.0, 2.0):
         assert held_twist_rad(effect, current) == pytest.approx(gain * current / 8000.0, rel=1e-6)
@@ -308,9 +376,16 @@ def test_lag_is_of_first_order() -> None:
         assert reported[1] == pytest.approx(1.0 - math.exp(-k * STEP_S / 0.005))
 
 
-@given(speed=st.floats(-3.0, 3.0), load=st.floats(-60.0, 60.0), angle=st.floats(-3.0, 3.0), time=st.floats(0.0, 1e4))
+@given(
+    speed=st.floats(-3.0, 3.0),
+    load=st.floats(-60.0, 60.0),
+    angle=st.floats(-3.0, 3.0),
+    time=st.floats(0.0, 1e4),
+)
 @settings(max_examples=60, deadline=None)
-def test_bounds_of_dry_friction_never_become_negative(speed: float, load: float, angle: float, time: float) -> None:
+def test_bounds_of_dry_friction_never_become_negative(
+    speed: float, load: float, angle: float, time: float
+) -> None:
     for name, parameters in (
         ("stribeck", {"rise_nm": 2.0, "speed_rad_s": 0.1}),
         ("load-friction", {"coefficient": 0.2}),
@@ -335,30 +410,54 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
     with pytest.raises(SpecInvalid, match="stribeck, load-friction"):
         build_effect(UndeclaredEffect("striebeck", 0, {}), 6)
     with pytest.raises(
-        SpecInvalid, match=r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, speed_rad_s"
+        SpecInvalid,
+        match=r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, "
+        r"speed_rad_s",
     ):
         build_effect(UndeclaredEffect("stribeck", 0, {"rise": 1.0, "speed_rad_s": 0.1}), 6)
     with pytest.raises(SpecInvalid, match="axis 7"):
-        build_effect(UndeclaredEffect("spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}), 6)
+        build_effect(
+            UndeclaredEffect("spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}), 6
+        )
     with pytest.raises(SpecInvalid, match="other_axis"):
-        build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
-    cable = {"other_axis": 7, "radius_m": 0.1, "other_radius_m": 0.1, "stiffness_n_per_m": 1.0, "rest_m": 0.0}
+        build_effect(
+            UndeclaredEffect(
+                "coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}
+            ),
+            6,
+        )
+    cable = {
+        "other_axis": 7,
+        "radius_m": 0.1,
+        "other_radius_m": 0.1,
+        "stiffness_n_per_m": 1.0,
+        "rest_m": 0.0,
+    }
     with pytest.raises(SpecInvalid, match="other_axis"):
         build_effect(UndeclaredEffect("cable", 3, cable), 6)
     with pytest.raises(SpecInvalid, match="unknown parameter bristle"):
-        build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
+        build_effect(
+            UndeclaredEffect(
+                "presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}
+            ),
+            6,
+        )
     assert len(UNDECLARED_EFFECTS) == 21
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
-    effect = UndeclaredEffect("elasticity", 5, {"stiffness_nm_per_rad": 1e7, "damping_nm_s_per_rad": 1.0})
+    effect = UndeclaredEffect(
+        "elasticity", 5, {"stiffness_nm_per_rad": 1e7, "damping_nm_s_per_rad": 1.0}
+    )
     with pytest.raises(SpecInvalid, match="too stiff"):
         Plant(clean_cell(effects=(effect,)))
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(axis=st.integers(3, 5), stiffness=st.floats(10.0, 1e5), damping=st.floats(0.0, 10.0))
-def test_a_drive_that_is_not_refused_comes_to_rest(axis: int, stiffness: float, damping: float) -> None:
+def test_a_drive_that_is_not_refused_comes_to_rest(
+    axis: int, stiffness: float, damping: float
+) -> None:
     """The flange without payload is lighter than its motor."""
     parameters = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
     try:

@@ -17,15 +17,23 @@ def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray,
     # Inertias of condition up to 1e6, turned any way: far worse than an arm's.
     turn, _ = np.linalg.qr(rng.standard_normal((joints, joints)))
     factor = turn * 10.0 ** rng.uniform(-1.5, 1.5, joints)
-    directions = np.vstack([np.eye(joints), rng.integers(-1, 2, (extra, joints)) + np.eye(joints)[:extra] * 3.0])
+    directions = np.vstack(
+        [np.eye(joints), rng.integers(-1, 2, (extra, joints)) + np.eye(joints)[:extra] * 3.0]
+    )
     delassus = directions @ np.linalg.inv(factor @ factor.T) @ directions.T
     free = directions @ rng.standard_normal(joints)
-    return delassus, free, np.abs(rng.standard_normal(len(directions))) * rng.integers(0, 2, len(directions))
+    return (
+        delassus,
+        free,
+        np.abs(rng.standard_normal(len(directions))) * rng.integers(0, 2, len(directions)),
+    )
 
 
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), extra=st.integers(0, 2))
 @settings(max_examples=150, deadline=None)
-def test_solution_meets_its_conditions_and_only_dissipates(seed: int, joints: int, extra: int) -> None:
+def test_solution_meets_its_conditions_and_only_dissipates(
+    seed: int, joints: int, extra: int
+) -> None:
     delassus, free, bound = problem(seed, joints, min(extra, joints))
     impulse = np.zeros(len(free))
     certificate = solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
@@ -49,28 +57,51 @@ def test_solution_agrees_with_bounded_least_squares(seed: int, joints: int) -> N
     lower = np.linalg.cholesky(delassus)
     # min ½ λᵀ W λ + w_freeᵀ λ = min ½ ‖Lᵀ λ + L⁻¹ w_free‖² up to a constant.
     box = (-bound, bound)
-    other = lsq_linear(lower.T, -np.linalg.solve(lower, free), bounds=box, method="bvls", tol=1e-14, max_iter=1000)
+    other = lsq_linear(
+        lower.T, -np.linalg.solve(lower, free), bounds=box, method="bvls", tol=1e-14, max_iter=1000
+    )
     assert other.success
     np.testing.assert_allclose(impulse, other.x, atol=1e-6)
 
 
 def test_the_start_value_does_not_change_the_speeds() -> None:
     delassus, free, bound = problem(7, 5, 2)
-    cold, warm = np.zeros(7), np.full(7, 3.0)
+    cold = np.zeros(7)
+    warm = np.full(7, 3.0)
     solve(delassus, free, bound, cold, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     solve(delassus, free, bound, warm, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     np.testing.assert_allclose(delassus @ cold, delassus @ warm, atol=1e-8)
 
 
 def test_an_unfinished_solution_says_so() -> None:
-    delassus, free = np.array([[1.0, 0.999], [0.999, 1.0]]), np.array([1.0, -1.0])
+    delassus = np.array([[1.0, 0.999], [0.999, 1.0]])
+    free = np.array([1.0, -1.0])
     impulse = np.zeros(2)
-    assert solve(delassus, free, np.full(2, 1e6), impulse, TOLERANCE_RAD_S, 3, DEPENDENT) > TOLERANCE_RAD_S
+    assert (
+        solve(delassus, free, np.full(2, 1e6), impulse, TOLERANCE_RAD_S, 3, DEPENDENT)
+        > TOLERANCE_RAD_S
+    )
 
 
 def test_known_case() -> None:
     impulse = np.zeros(1)
-    solve(np.array([[2.0]]), np.array([3.0]), np.array([1.0]), impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
+    solve(
+        np.array([[2.0]]),
+        np.array([3.0]),
+        np.array([1.0]),
+        impulse,
+        TOLERANCE_RAD_S,
+        MAX_SWEEPS,
+        DEPENDENT,
+    )
     assert impulse[0] == pytest.approx(-1.0)  # slides: 3 − 2·1 > 0
-    solve(np.array([[2.0]]), np.array([3.0]), np.array([9.0]), impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
+    solve(
+        np.array([[2.0]]),
+        np.array([3.0]),
+        np.array([9.0]),
+        impulse,
+        TOLERANCE_RAD_S,
+        MAX_SWEEPS,
+        DEPENDENT,
+    )
     assert impulse[0] == pytest.approx(-1.5)  # sticks: exactly what stops it

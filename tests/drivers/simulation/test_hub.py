@@ -52,14 +52,17 @@ def frame(number: int) -> can.Message:
 
 
 def test_a_client_that_sends_without_end_waits_for_the_cell_and_no_frame_is_lost() -> None:
-    """20 MB from one client disconnected the cell itself after 8 MB: `simulate` ended with exit code 5."""
+    """20 MB from one client disconnected the cell itself after 8 MB:
+    `simulate` ended with exit code 5.
+    """
     with Hub(("can0",)) as hub:
         cell = open_bus(hub.address())
         with raw_client(hub) as hostile:
             flood = Flood(hostile, FRAME)
             flood.start()
             waiting = until_still(lambda: flood.sent)
-            assert waiting * len(FRAME) < FLOOD_BYTES  # the rest is not taken from it while the cell reads nothing
+            # The rest is not taken from it while the cell reads nothing
+            assert waiting * len(FRAME) < FLOOD_BYTES
             assert hub.cells["can0"] in hub.clients
             received = 0
             expected = -(-FLOOD_BYTES // (LINES * len(FRAME))) * LINES
@@ -89,7 +92,9 @@ def test_a_cell_that_reads_late_keeps_little_waiting_for_it() -> None:
 def test_a_deaf_client_that_is_answered_holds_up_nobody_and_fills_no_output(
     line: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Thousands of lines "socket.send() raised exception" came from asyncio, one for each answer to a closed client."""
+    """Thousands of lines "socket.send() raised exception" came from asyncio,
+    one for each answer to a closed client.
+    """
     with caplog.at_level(logging.WARNING), Hub(("can0",)) as hub:
         ends = [open_bus(hub.address()) for _ in range(2)]
         with raw_client(hub) as deaf:
@@ -107,7 +112,9 @@ def test_a_deaf_client_that_is_answered_holds_up_nobody_and_fills_no_output(
     assert caplog.messages == []
 
 
-def test_a_deaf_client_is_disconnected_and_the_others_hear_everything(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_deaf_client_is_disconnected_and_the_others_hear_everything(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     with caplog.at_level(logging.WARNING), Hub(("can0",)) as hub:
         cell = open_bus(hub.address())
         with raw_client(hub), raw_client(hub) as reading:

@@ -1,4 +1,6 @@
-"""A cell whose master is gone: after the heartbeat guard has expired its time goes on without SYNC, never before."""
+"""A cell whose master is gone: after the heartbeat guard has expired its time goes on without SYNC,
+never before.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ from drivers.simulation.drive import PowerState
 from tests.drivers.simulation.cells import Master, clean_cell, running
 from tests.drivers.simulation.test_cell import SIX, begin_move
 
-GUARD_MS, RECORDER = 500, 127
+GUARD_MS = 500
+RECORDER = 127
 CYCLES = 200  #: SYNCs of the master: in the middle of the move
 
 
@@ -27,7 +30,10 @@ def set_up(master: Master, guarded: range = SIX, option: int = 2) -> None:
     """Map the nodes, let some watch the master, and enable all."""
     master.set_up(SIX)
     for node_id in SIX:
-        watched = RECORDER << 16 | GUARD_MS if node_id in guarded else 0
+        if node_id in guarded:
+            watched = RECORDER << 16 | GUARD_MS
+        else:
+            watched = 0
         assert master.write(node_id, 0x1016, 1, "I", watched) == 0
         assert master.write(node_id, 0x6007, 0, "h", 3) == 0
         assert master.write(node_id, 0x605A, 0, "h", option) == 0
@@ -40,14 +46,18 @@ def let_go_on(master: Master, clock: Clock, seconds: float) -> None:
     for _ in range(round(seconds / 0.02)):
         clock.now_s += 0.02
         master.read(1, 0x6041, 0, "H")
-    master.read(1, 0x6041, 0, "H")  # answered when the cell has done what the last look at the clock called for
+    # Answered when the cell has done what the last look at the clock called for
+    master.read(1, 0x6041, 0, "H")
 
 
-@pytest.mark.parametrize(("option", "state"), [(2, PowerState.SWITCH_ON_DISABLED), (6, PowerState.QUICK_STOP_ACTIVE)])
+@pytest.mark.parametrize(
+    ("option", "state"), [(2, PowerState.SWITCH_ON_DISABLED), (6, PowerState.QUICK_STOP_ACTIVE)]
+)
 def test_axes_of_a_killed_master_come_to_rest_without_sync(
     option: int, state: PowerState, request: pytest.FixtureRequest
 ) -> None:
-    spec, clock = clean_cell(), Clock()
+    spec = clean_cell()
+    clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master, option=option)
         begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
@@ -56,7 +66,8 @@ def test_axes_of_a_killed_master_come_to_rest_without_sync(
         assert np.abs(cell.plant.velocity_rad_s).min() > 0.5
         frozen = cell.cycles
         let_go_on(master, clock, 0.001 * GUARD_MS - 0.04)
-        assert cell.cycles == frozen  # the guard has not expired: a late master finds everything as it was
+        # The guard has not expired: a late master finds everything as it was
+        assert cell.cycles == frozen
         let_go_on(master, clock, 2.0)
         assert {node.drive.state for node in cell.nodes} == {state}
         assert np.abs(cell.plant.velocity_rad_s).max() < 1e-3
@@ -70,7 +81,8 @@ def test_axes_of_a_killed_master_come_to_rest_without_sync(
 def test_an_axis_that_watches_no_one_ends_its_move_as_at_a_bus_with_time_of_its_own(
     request: pytest.FixtureRequest,
 ) -> None:
-    spec, clock = clean_cell(), Clock()
+    spec = clean_cell()
+    clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master, guarded=range(2, 7))
         begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
@@ -83,7 +95,9 @@ def test_an_axis_that_watches_no_one_ends_its_move_as_at_a_bus_with_time_of_its_
         assert cell.plant.position_rad[1] < spec.start_rad[1] + 0.7
 
 
-def test_an_axis_that_is_only_switched_on_goes_off_with_its_master(request: pytest.FixtureRequest) -> None:
+def test_an_axis_that_is_only_switched_on_goes_off_with_its_master(
+    request: pytest.FixtureRequest,
+) -> None:
     clock = Clock()
     with running(clean_cell(), request.node.name, clock) as (cell, master):
         set_up(master)
@@ -96,8 +110,11 @@ def test_an_axis_that_is_only_switched_on_goes_off_with_its_master(request: pyte
 
 
 def test_a_sync_ends_the_time_without_sync(request: pytest.FixtureRequest) -> None:
-    """The next program brings its own time: between its SYNCs nothing moves, however long it takes."""
-    spec, clock = clean_cell(), Clock()
+    """The next program brings its own time:
+    between its SYNCs nothing moves, however long it takes.
+    """
+    spec = clean_cell()
+    clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master)
         begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
@@ -112,11 +129,16 @@ def test_a_sync_ends_the_time_without_sync(request: pytest.FixtureRequest) -> No
         assert cell.cycles == stopping + 1
 
 
-def test_a_master_that_is_late_within_the_guard_gets_the_same_bytes(request: pytest.FixtureRequest) -> None:
-    """A busy machine keeps a recorder waiting for almost as long as its guard allows, again and again."""
+def test_a_master_that_is_late_within_the_guard_gets_the_same_bytes(
+    request: pytest.FixtureRequest,
+) -> None:
+    """A busy machine keeps a recorder waiting for almost as long as its guard allows,
+    again and again.
+    """
 
     def story(pause_s: float) -> list[tuple[int, bytes]]:
-        spec, clock = clean_cell("disc"), Clock()
+        spec = clean_cell("disc")
+        clock = Clock()
         with running(spec, request.node.name, clock) as (_, master):
             set_up(master)
             begin_move(master, spec, spec.start_rad + 0.3, 0.25, 0.1)

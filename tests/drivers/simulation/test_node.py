@@ -15,9 +15,15 @@ from tests.drivers.simulation.cells import STOPPED_CLOCK, Master, clean_cell, ru
 
 SIX = range(1, 7)
 
-UNSUPPORTED, NO_OBJECT, NO_SUBINDEX = 0x06010000, 0x06020000, 0x06090011
-READ_ONLY, NOT_MAPPABLE, TOO_LONG_PDO = 0x06010002, 0x06040041, 0x06040042
-TOO_LONG, TOO_SHORT, INVALID_VALUE = 0x06070012, 0x06070013, 0x06090030
+UNSUPPORTED = 0x06010000
+NO_OBJECT = 0x06020000
+NO_SUBINDEX = 0x06090011
+READ_ONLY = 0x06010002
+NOT_MAPPABLE = 0x06040041
+TOO_LONG_PDO = 0x06040042
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
+INVALID_VALUE = 0x06090030
 
 
 @pytest.fixture
@@ -37,12 +43,16 @@ def test_boot_up_and_identity(master: Master) -> None:
 
 def test_an_independent_sdo_client_understands_the_server(request: pytest.FixtureRequest) -> None:
     channel = request.node.name
-    with can.Bus(interface="virtual", channel=channel) as far, SimulatedCell(clean_cell(), far, STOPPED_CLOCK):
+    with (
+        can.Bus(interface="virtual", channel=channel) as far,
+        SimulatedCell(clean_cell(), far, STOPPED_CLOCK),
+    ):
         network = canopen.Network()
         network.connect(interface="virtual", channel=channel)
         try:
             node = network.add_node(3, canopen.ObjectDictionary())
-            assert node.sdo.upload(0x1008, 0).decode() == "drivegain simulated CiA 402 amplifier"  # segmented
+            # Segmented
+            assert node.sdo.upload(0x1008, 0).decode() == "drivegain simulated CiA 402 amplifier"
             node.sdo.download(0x6081, 0, struct.pack("<I", 1234))
             assert node.sdo.upload(0x6081, 0) == struct.pack("<I", 1234)
             node.sdo.download(0x6083, 0, struct.pack("<I", 77), force_segment=True)
@@ -72,7 +82,9 @@ def test_an_independent_sdo_client_understands_the_server(request: pytest.Fixtur
         (0x1A00, 0, "B", 0, UNSUPPORTED),  # mapped while the PDO exists
     ],
 )
-def test_refusals(master: Master, index: int, subindex: int, kind: str, value: int, abort: int) -> None:
+def test_refusals(
+    master: Master, index: int, subindex: int, kind: str, value: int, abort: int
+) -> None:
     assert master.write(2, index, subindex, kind, value) == abort
 
 
@@ -88,7 +100,11 @@ def test_mapping_in_the_right_order_and_in_no_other(master: Master) -> None:
     assert master.write(1, 0x1A00, 0, "B", 3) == TOO_LONG_PDO
     assert master.write(1, 0x1A00, 0, "B", 2) == 0
     assert master.write(1, 0x1800, 1, "I", 0x40000181) == 0
-    assert [master.read(1, 0x1A00, k, "I" if k else "B") for k in range(3)] == [2, 0x60640020, 0x606C0020]
+    assert [master.read(1, 0x1A00, k, "I" if k else "B") for k in range(3)] == [
+        2,
+        0x60640020,
+        0x606C0020,
+    ]
 
 
 def test_transmission_type_counts_syncs(master: Master) -> None:
@@ -101,7 +117,9 @@ def test_transmission_type_counts_syncs(master: Master) -> None:
     assert frames == [0, 0, 1, 1, 1, 2, 2, 2, 3]
 
 
-def test_synchronous_receive_pdos_wait_for_sync_and_event_driven_ones_do_not(master: Master) -> None:
+def test_synchronous_receive_pdos_wait_for_sync_and_event_driven_ones_do_not(
+    master: Master,
+) -> None:
     master.set_up(SIX)
     master.control(SIX, 0x06)
     assert master.read(1, 0x6041, 0, "H") & 0x6F == 0x40
@@ -188,8 +206,12 @@ def test_no_object_reports_the_true_gain(request: pytest.FixtureRequest) -> None
         axes = tuple(replace(axis, gain_nm_per_a=scale * axis.gain_nm_per_a) for axis in spec.axes)
         with can.Bus(interface="virtual", channel=request.node.name) as far:
             cell = SimulatedCell(replace(spec, axes=axes), far, STOPPED_CLOCK)
-            entries = [(i, s) for i in range(0x1000, 0x7000) for s in range(9) if not 0x1400 <= i <= 0x1BFF]
-            known = [key for key in entries if key in cell.nodes[0]._dictionary and key != (0x1003, 1)]
+            entries = [
+                (i, s) for i in range(0x1000, 0x7000) for s in range(9) if not 0x1400 <= i <= 0x1BFF
+            ]
+            known = [
+                key for key in entries if key in cell.nodes[0]._dictionary and key != (0x1003, 1)
+            ]
             reported.append([node.read(*key) for node in cell.nodes for key in known])
     assert len(reported[0]) > 200
     assert reported[0] == reported[1]

@@ -36,7 +36,9 @@ def disturbed(percent: FloatArray, correlation_s: float, seed: int = 1) -> CellS
 
 
 def hold(spec: CellSpec, steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Hold the start position; return disturbance [Nm], current [A] and motor angle [rad], shape (steps, 6) each."""
+    """Hold the start position; return disturbance [Nm], current [A] and motor angle [rad],
+    shape (steps, 6) each.
+    """
     plant = Plant(spec)
     amplifiers = AmplifierSet(spec, plant)
     plant.set_brakes(np.zeros(6, dtype=np.bool_))
@@ -50,23 +52,37 @@ def hold(spec: CellSpec, steps: int) -> tuple[FloatArray, FloatArray, FloatArray
     return disturbance_nm, current_a, motor_rad
 
 
-@given(sigma=st.floats(0.01, 30.0), correlation_s=st.sampled_from([0.0, 0.002, 0.01, 0.05]), seed=st.integers(0, 99))
+@given(
+    sigma=st.floats(0.01, 30.0),
+    correlation_s=st.sampled_from([0.0, 0.002, 0.01, 0.05]),
+    seed=st.integers(0, 99),
+)
 @settings(max_examples=5)
 def test_coloured_noise_has_its_deviation_and_its_correlation_from_the_first_value_on(
     sigma: float, correlation_s: float, seed: int
 ) -> None:
     n = 600
-    noise = ColouredNoise(random_streams(seed, n, 7), np.full(n, sigma), np.full(n, correlation_s), STEP_S)
+    noise = ColouredNoise(
+        random_streams(seed, n, 7), np.full(n, sigma), np.full(n, correlation_s), STEP_S
+    )
     values = [noise.value, *(noise.advance() for _ in range(8))]
     for lag in (0, 1, 8):
-        expected = np.exp(-lag * STEP_S / correlation_s) if correlation_s else float(lag == 0)
-        assert np.mean(values[0] * values[lag]) / sigma**2 == pytest.approx(expected, abs=5.0 * np.sqrt(2.0 / n))
+        if correlation_s:
+            expected = np.exp(-lag * STEP_S / correlation_s)
+        else:
+            expected = float(lag == 0)
+        assert np.mean(values[0] * values[lag]) / sigma**2 == pytest.approx(
+            expected, abs=5.0 * np.sqrt(2.0 / n)
+        )
 
 
 def test_the_disturbance_is_a_share_of_the_rated_torque_with_its_correlation_time() -> None:
     spec = disturbed(PERCENT, 0.002)
     plant = Plant(spec)
-    values = np.array([plant._disturbance.advance() for _ in range(40_000)]) if plant._disturbance else np.zeros((1, 6))
+    if plant._disturbance:
+        values = np.array([plant._disturbance.advance() for _ in range(40_000)])
+    else:
+        values = np.zeros((1, 6))
     rated_nm = np.array([abs(axis.gain_nm_per_a) * axis.rated_current_a for axis in spec.axes])
     # 10 s are 2 500 independent values of a correlation time of 2 ms.
     np.testing.assert_allclose(values.std(axis=0) / rated_nm, 0.01 * PERCENT, rtol=0.06)
@@ -76,7 +92,9 @@ def test_the_disturbance_is_a_share_of_the_rated_torque_with_its_correlation_tim
     assert np.abs(np.corrcoef(values.T) - np.eye(6)).max() < 0.1  # each axis has its own
 
 
-def test_below_the_bandwidth_the_current_carries_the_disturbance_and_above_it_the_arm_moves() -> None:
+def test_below_the_bandwidth_the_current_carries_the_disturbance_and_above_it_the_arm_moves() -> (
+    None
+):
     spec = disturbed(np.full(6, 5.0), 0.05)
     disturbance_nm, current_a, motor_rad = (values[2_000:] for values in hold(spec, 10_000))
     gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
@@ -86,21 +104,33 @@ def test_below_the_bandwidth_the_current_carries_the_disturbance_and_above_it_th
         return np.asarray(np.fft.rfft(window * (values - values.mean(axis=0)), axis=0))
 
     frequency_hz = np.fft.rfftfreq(len(current_a), STEP_S)
-    force, answer = spectrum(disturbance_nm), spectrum(gain * current_a)
-    low, high = (frequency_hz > 0.4) & (frequency_hz < 2.0), (frequency_hz > 100.0) & (frequency_hz < 300.0)
+    force = spectrum(disturbance_nm)
+    answer = spectrum(gain * current_a)
+    low = (frequency_hz > 0.4) & (frequency_hz < 2.0)
+    high = (frequency_hz > 100.0) & (frequency_hz < 300.0)
     for band, expected, tolerance in ((low, -1.0, 0.03), (high, 0.0, 0.1)):
-        transfer = np.sum(answer[band] * np.conj(force[band]), axis=0) / np.sum(np.abs(force[band]) ** 2, axis=0)
+        transfer = np.sum(answer[band] * np.conj(force[band]), axis=0) / np.sum(
+            np.abs(force[band]) ** 2, axis=0
+        )
         np.testing.assert_allclose(transfer.real, expected, atol=tolerance)
-    counts = motor_rad.std(axis=0) * np.array([axis.counts_per_revolution for axis in spec.axes]) / (2.0 * np.pi)
+    counts = (
+        motor_rad.std(axis=0)
+        * np.array([axis.counts_per_revolution for axis in spec.axes])
+        / (2.0 * np.pi)
+    )
     assert (counts > 5.0).all()  # and the encoders see it
 
 
-def test_without_a_disturbance_nothing_changes_and_with_one_the_current_noise_stays_the_same() -> None:
+def test_without_a_disturbance_nothing_changes_and_with_one_the_current_noise_stays_the_same() -> (
+    None
+):
     def noise(spec: CellSpec) -> FloatArray:
         amplifiers = AmplifierSet(spec, Plant(spec))
         return np.array([amplifiers._noise.advance() for _ in range(50)])
 
-    without, zero, with_one = clean_cell(), disturbed(np.zeros(6), 0.03), disturbed(PERCENT, 0.03)
+    without = clean_cell()
+    zero = disturbed(np.zeros(6), 0.03)
+    with_one = disturbed(PERCENT, 0.03)
     assert Plant(zero)._disturbance is None
     np.testing.assert_array_equal(noise(with_one), noise(without))
     moved = hold(with_one, 40)[2] - hold(zero, 40)[2]

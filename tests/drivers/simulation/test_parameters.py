@@ -1,4 +1,6 @@
-"""Stored parameters of a simulated amplifier: an entered gain is stored by 1010h and restored at power-on."""
+"""Stored parameters of a simulated amplifier:
+an entered gain is stored by 1010h and restored at power-on.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ import pytest
 from drivers.simulation.faults import FaultKind, FaultSpec
 from tests.drivers.simulation.cells import clean_cell, running
 
-GAIN, SAVE, NOT_IN_THIS_STATE = 0x2003, int.from_bytes(b"save", "little"), 0x08000022
+GAIN = 0x2003
+SAVE = int.from_bytes(b"save", "little")
+NOT_IN_THIS_STATE = 0x08000022
 
 
 def test_the_entered_gain_is_reported_in_both_objects(request: pytest.FixtureRequest) -> None:
@@ -18,8 +22,11 @@ def test_the_entered_gain_is_reported_in_both_objects(request: pytest.FixtureReq
     axes = (replace(spec.axes[0], entered_gain_nm_per_a=-11.52), *spec.axes[1:])
     with running(replace(spec, axes=axes), request.node.name) as (_, master):
         assert master.read(1, GAIN, 1, "i") == -11520
-        assert struct.unpack("<f", struct.pack("<I", master.read(1, GAIN, 2, "I")))[0] == pytest.approx(-11.52)
-        assert master.read(2, GAIN, 1, "i") == 0  # not entered, and the cell does not reveal its true gain
+        assert struct.unpack("<f", struct.pack("<I", master.read(1, GAIN, 2, "I")))[
+            0
+        ] == pytest.approx(-11.52)
+        # Not entered, and the cell does not reveal its true gain
+        assert master.read(2, GAIN, 1, "i") == 0
 
 
 def test_what_was_stored_comes_back_with_the_power(request: pytest.FixtureRequest) -> None:
@@ -46,10 +53,18 @@ def test_nothing_is_stored_while_the_motor_has_power(request: pytest.FixtureRequ
 
 @pytest.mark.parametrize(
     ("kind", "gain", "save"),
-    [(FaultKind.REFUSES_WRITE, NOT_IN_THIS_STATE, 0), (FaultKind.REFUSES_SAVE, 0, NOT_IN_THIS_STATE)],
+    [
+        (FaultKind.REFUSES_WRITE, NOT_IN_THIS_STATE, 0),
+        (FaultKind.REFUSES_SAVE, 0, NOT_IN_THIS_STATE),
+    ],
 )
-def test_an_amplifier_may_refuse(request: pytest.FixtureRequest, kind: FaultKind, gain: int, save: int) -> None:
+def test_an_amplifier_may_refuse(
+    request: pytest.FixtureRequest, kind: FaultKind, gain: int, save: int
+) -> None:
     spec = replace(clean_cell(), faults=(FaultSpec(kind, 1),))
     with running(spec, request.node.name) as (_, master):
-        assert (master.write(2, GAIN, 1, "i", 5), master.write(2, 0x1010, 1, "I", SAVE)) == (gain, save)
+        assert (master.write(2, GAIN, 1, "i", 5), master.write(2, 0x1010, 1, "I", SAVE)) == (
+            gain,
+            save,
+        )
         assert (master.write(1, GAIN, 1, "i", 5), master.write(1, 0x1010, 1, "I", SAVE)) == (0, 0)

@@ -21,7 +21,13 @@ def _spec(robot: str, closure: str, **parameters: float) -> CellSpec:
 def _coasted(spec: CellSpec, seconds: float) -> Plant:
     """A plant without weight and without other losses, that was given a speed and no current."""
     axes = tuple(
-        replace(axis, viscous_nm_s_rad=0.0, coulomb_nm=0.0, offset_nm=0.0, torque_disturbance_percent=0.0)
+        replace(
+            axis,
+            viscous_nm_s_rad=0.0,
+            coulomb_nm=0.0,
+            offset_nm=0.0,
+            torque_disturbance_percent=0.0,
+        )
         for axis in spec.axes
     )
     plant = Plant(replace(spec, axes=axes, passive={}, gravity_m_s2=(0.0, 0.0, 0.0)))

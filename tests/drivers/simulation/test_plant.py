@@ -81,7 +81,8 @@ def test_inverse_dynamics_gives_back_the_applied_torque(payload: str | None) -> 
     checked = 0
     for k in range(1200):
         current = 1.5 * np.sin(2 * np.pi * np.array([2.0, 2.3, 3.1, 3.7, 4.1, 5.3]) * k * step_s)
-        q, v = plant.position_rad.copy(), plant.velocity_rad_s.copy()
+        q = plant.position_rad.copy()
+        v = plant.velocity_rad_s.copy()
         plant.step(current)
         after = plant.velocity_rad_s
         motor = rows @ after
@@ -104,7 +105,8 @@ def test_energy_drift_of_a_free_arm_vanishes_with_the_step() -> None:
         model, data = links(spec)
 
         def energy() -> float:
-            q, v = plant.position_rad, plant.velocity_rad_s
+            q = plant.position_rad
+            v = plant.velocity_rad_s
             kinetic = 0.5 * v @ apparent_inertia(spec, q) @ v
             return float(kinetic + pin.computePotentialEnergy(model, data, q))
 
@@ -113,7 +115,8 @@ def test_energy_drift_of_a_free_arm_vanishes_with_the_step() -> None:
             plant.step(np.zeros(6))
         return abs(energy() - start)
 
-    assert drift(4) / drift(16) == pytest.approx(4.0, rel=0.3)  # semi-implicit Euler is of first order
+    # Semi-implicit Euler is of first order
+    assert drift(4) / drift(16) == pytest.approx(4.0, rel=0.3)
 
 
 def test_friction_and_brakes_only_take_energy() -> None:
@@ -127,9 +130,14 @@ def test_friction_and_brakes_only_take_energy() -> None:
         assert friction_nm(plant) @ plant.velocity_rad_s <= 1e-9 * (1.0 + np.abs(before).max())
 
 
-@given(share=st.lists(st.floats(-0.97, 0.97), min_size=6, max_size=6), payload=st.sampled_from([None, "disc", "plate"]))
+@given(
+    share=st.lists(st.floats(-0.97, 0.97), min_size=6, max_size=6),
+    payload=st.sampled_from([None, "disc", "plate"]),
+)
 @settings(max_examples=25, deadline=None)
-def test_a_joint_loaded_below_its_friction_stays_exactly_where_it_is(share: list[float], payload: str | None) -> None:
+def test_a_joint_loaded_below_its_friction_stays_exactly_where_it_is(
+    share: list[float], payload: str | None
+) -> None:
     spec = clean_cell(payload)
     model, data = links(spec)
     gravity = pin.computeGeneralizedGravity(model, data, spec.start_rad)
@@ -149,9 +157,15 @@ def test_a_joint_loaded_below_its_friction_stays_exactly_where_it_is(share: list
 def test_a_joint_loaded_above_its_friction_moves_that_way(joint: int, sign: float) -> None:
     spec = clean_cell()
     model, data = links(spec)
-    load = pin.computeGeneralizedGravity(model, data, spec.start_rad) + [axis.offset_nm for axis in spec.axes]
+    load = pin.computeGeneralizedGravity(model, data, spec.start_rad) + [
+        axis.offset_nm for axis in spec.axes
+    ]
     # Motor 6 rubs on joints 5 and 6, so both bounds are given in full.
-    own = spec.axes[joint].coulomb_nm + spec.axes[joint].motor_coulomb_nm + (joint == 4) * spec.axes[5].motor_coulomb_nm
+    own = (
+        spec.axes[joint].coulomb_nm
+        + spec.axes[joint].motor_coulomb_nm
+        + (joint == 4) * spec.axes[5].motor_coulomb_nm
+    )
     load[joint] += sign * 1.2 * own
     plant = Plant(spec)
     plant.set_brakes(OPEN)
@@ -214,7 +228,8 @@ def test_a_payload_adds_exactly_its_weight_to_what_the_brakes_hold(payload: str)
 
     step = 1e-6
     expected = [
-        (potential_j(spec.start_rad + step * e) - potential_j(spec.start_rad - step * e)) / (2 * step)
+        (potential_j(spec.start_rad + step * e) - potential_j(spec.start_rad - step * e))
+        / (2 * step)
         for e in np.eye(6)
     ]
     np.testing.assert_allclose(held[payload] - held[None], expected, atol=1e-6)
@@ -229,7 +244,12 @@ def test_what_does_not_fit_together_is_refused() -> None:
     with pytest.raises(SpecInvalid, match="cannot be read"):
         Plant(replace(spec, urdf="<robot"))
     with pytest.raises(SpecInvalid, match="continuous"):
-        Plant(replace(spec, urdf=spec.urdf.replace('name="J1" type="revolute"', 'name="J1" type="continuous"')))
+        Plant(
+            replace(
+                spec,
+                urdf=spec.urdf.replace('name="J1" type="revolute"', 'name="J1" type="continuous"'),
+            )
+        )
 
 
 def test_a_plant_that_cannot_be_advanced_says_so() -> None:

@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from drivers.simulation.drive import PowerState as P
 from drivers.simulation.drive import next_state
 
-SHUTDOWN, SWITCH_ON, ENABLE, DISABLE_VOLTAGE, QUICK_STOP, FAULT_RESET = 0x06, 0x07, 0x0F, 0x00, 0x02, 0x80
+SHUTDOWN = 0x06
+SWITCH_ON = 0x07
+ENABLE = 0x0F
+DISABLE_VOLTAGE = 0x00
+QUICK_STOP = 0x02
+FAULT_RESET = 0x80
 
 TRANSITIONS = (
     (2, P.SWITCH_ON_DISABLED, SHUTDOWN, P.READY_TO_SWITCH_ON),
@@ -35,11 +40,19 @@ def test_transition(number: int, state: P, controlword: int, after: P) -> None:
 
 
 def test_transition_16_exists_only_where_the_option_keeps_quick_stop() -> None:
-    assert next_state(P.QUICK_STOP_ACTIVE, ENABLE, QUICK_STOP, stays_in_quick_stop=True) is P.OPERATION_ENABLED
-    assert next_state(P.QUICK_STOP_ACTIVE, ENABLE, QUICK_STOP, stays_in_quick_stop=False) is P.QUICK_STOP_ACTIVE
+    assert (
+        next_state(P.QUICK_STOP_ACTIVE, ENABLE, QUICK_STOP, stays_in_quick_stop=True)
+        is P.OPERATION_ENABLED
+    )
+    assert (
+        next_state(P.QUICK_STOP_ACTIVE, ENABLE, QUICK_STOP, stays_in_quick_stop=False)
+        is P.QUICK_STOP_ACTIVE
+    )
 
 
-@given(state=st.sampled_from(P), controlword=st.integers(0, 0xFFFF), previous=st.integers(0, 0xFFFF))
+@given(
+    state=st.sampled_from(P), controlword=st.integers(0, 0xFFFF), previous=st.integers(0, 0xFFFF)
+)
 def test_power_only_through_switched_on_and_faults_only_left_by_an_edge(
     state: P, controlword: int, previous: int
 ) -> None:
@@ -51,5 +64,9 @@ def test_power_only_through_switched_on_and_faults_only_left_by_an_edge(
         assert controlword & 0x80
         assert not previous & 0x80
         assert after is P.SWITCH_ON_DISABLED
-    if not controlword & 0x02 and state not in (P.FAULT, P.FAULT_REACTION_ACTIVE, P.NOT_READY_TO_SWITCH_ON):
+    if not controlword & 0x02 and state not in (
+        P.FAULT,
+        P.FAULT_REACTION_ACTIVE,
+        P.NOT_READY_TO_SWITCH_ON,
+    ):
         assert after is P.SWITCH_ON_DISABLED

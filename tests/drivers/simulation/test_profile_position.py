@@ -22,9 +22,21 @@ def end_of(move: ProfileMove, position: float, velocity: float) -> tuple[float, 
     return position, velocity, fastest
 
 
-@given(start=PLACE, target=PLACE, velocity=st.floats(-2e4, 2e4), speed=LIMIT, acceleration=LIMIT, deceleration=LIMIT)
+@given(
+    start=PLACE,
+    target=PLACE,
+    velocity=st.floats(-2e4, 2e4),
+    speed=LIMIT,
+    acceleration=LIMIT,
+    deceleration=LIMIT,
+)
 def test_a_move_ends_at_rest_on_its_target_within_its_limits(
-    start: float, target: float, velocity: float, speed: float, acceleration: float, deceleration: float
+    start: float,
+    target: float,
+    velocity: float,
+    speed: float,
+    acceleration: float,
+    deceleration: float,
 ) -> None:
     move = plan(start, velocity, target, speed, acceleration, deceleration)
     position, left, fastest = end_of(move, start, velocity)
@@ -45,9 +57,13 @@ def test_a_textbook_trapezoid() -> None:
 
 
 @given(start=PLACE, velocity=st.floats(-1e5, 1e5), deceleration=LIMIT)
-def test_a_stop_ends_at_rest_where_it_says(start: float, velocity: float, deceleration: float) -> None:
+def test_a_stop_ends_at_rest_where_it_says(
+    start: float, velocity: float, deceleration: float
+) -> None:
     move = ramp_down(start, velocity, deceleration)
     position, left, _ = end_of(move, start, velocity)
-    assert position == pytest.approx(move.target, abs=1e-6 * (1.0 + abs(start) + velocity**2 / deceleration))
+    assert position == pytest.approx(
+        move.target, abs=1e-6 * (1.0 + abs(start) + velocity**2 / deceleration)
+    )
     assert abs(left) <= 1e-6 * (1.0 + abs(velocity))
     assert (move.target - start) * velocity >= 0.0

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from drivers.simulation.cell import PATIENCE, SyncGate
 
-BOTH, LEFT = frozenset((0, 1)), frozenset((0,))
+BOTH = frozenset((0, 1))
+LEFT = frozenset((0,))
 
 
 def test_one_bus_needs_no_node_ids() -> None:
@@ -53,8 +54,12 @@ def test_every_round_of_syncs_is_one_cycle(buses: int, rounds: list[list[int]]) 
 
 @given(st.lists(st.integers(0, 1), max_size=200))
 def test_a_bus_that_is_handed_on_in_bursts_loses_no_cycle(order: list[int]) -> None:
-    """As long as no bus is further ahead than the patience, the n-th SYNCs of the buses belong together."""
-    gate, come, cycles = SyncGate(2), Counter[int](), 0
+    """As long as no bus is further ahead than the patience,
+    the n-th SYNCs of the buses belong together.
+    """
+    gate = SyncGate(2)
+    come = Counter[int]()
+    cycles = 0
     for bus in order:
         if come[bus] - come[1 - bus] >= PATIENCE:
             continue

@@ -1,4 +1,6 @@
-"""Slow readings beside the stream: they come without a sample that waits, and never in the way of a set-point."""
+"""Slow readings beside the stream: they come without a sample that waits,
+and never in the way of a set-point.
+"""
 
 from __future__ import annotations
 
@@ -21,15 +23,20 @@ from tests.drivers import scripted
 from tests.drivers.motion.test_motion import BOUNDS
 from tests.drivers.scripted import PROFILE, ScriptedBus, permission
 
-RATED = RatedMotor(ObjectEntry(0x6075, 0, 32, signed=False), torque=ObjectEntry(0x6076, 0, 32, signed=False))
-TORQUE, TEMPERATURE = ObjectEntry(0x6077, 0, 16, signed=True), ObjectEntry(0x2005, 0, 16, signed=True)
+RATED = RatedMotor(
+    ObjectEntry(0x6075, 0, 32, signed=False), torque=ObjectEntry(0x6076, 0, 32, signed=False)
+)
+TORQUE = ObjectEntry(0x6077, 0, 16, signed=True)
+TEMPERATURE = ObjectEntry(0x2005, 0, 16, signed=True)
 WARM = replace(PROFILE, rated=RATED, torque=TORQUE, temperature=Thermometer(TEMPERATURE, 0.1))
 CYCLES = 1200  #: More than a second
 
 
 @dataclass
 class Bench:
-    """Two prepared drives of 1.5 Nm, at 31.5 and -4 °C and with −200 and 300 thousandths of torque."""
+    """Two prepared drives of 1.5 Nm, at 31.5 and -4 °C and with −200 and 300 thousandths of
+    torque.
+    """
 
     network: CanopenNetwork
     bus: ScriptedBus
@@ -45,8 +52,12 @@ class Bench:
         return polling
 
     def requests(self) -> list[tuple[int, int]]:
-        """Node of each SDO request since the stream began, and the frames sent with it before the next SYNC."""
-        sent, found, since = self.bus.sent, [], 0
+        """Node of each SDO request since the stream began,
+        and the frames sent with it before the next SYNC.
+        """
+        sent = self.bus.sent
+        found = []
+        since = 0
         for frame in sent[self.begun :]:
             if frame.arbitration_id == 0x80:
                 since = 0
@@ -62,7 +73,11 @@ def bench() -> Iterator[Bench]:
     network, bus = scripted.cell(2)
     network.axes = tuple(replace(axis, profile=WARM) for axis in network.axes)
     for node, (torque, temperature) in zip(bus.nodes, ((-200, 315), (300, -40)), strict=True):
-        node.objects |= {(0x6076, 0): (1500, 4), (0x6077, 0): (torque, 2), (0x2005, 0): (temperature, 2)}
+        node.objects |= {
+            (0x6076, 0): (1500, 4),
+            (0x6077, 0): (torque, 2),
+            (0x2005, 0): (temperature, 2),
+        }
     with network:
         network.prepare()
         stream = SyncStream(network, LockstepSync(scripted.PERIOD_NS, 0.005, clock=bus.clock))
@@ -107,7 +122,9 @@ def test_a_lost_answer_delays_nothing_and_its_object_is_read_again(bench: Bench)
     given_up = GIVEN_UP_NS // scripted.PERIOD_NS
     waited = [r for r in bench.readings if r.time_ns < samples[given_up].time_ns]
     assert waited == []
-    assert {(r.axis, r.quantity) for r in bench.readings} == {(a, q) for a in (0, 1) for q in Quantity}
+    assert {(r.axis, r.quantity) for r in bench.readings} == {
+        (a, q) for a in (0, 1) for q in Quantity
+    }
 
 
 def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) -> None:
@@ -135,7 +152,10 @@ def test_an_object_that_a_drive_lacks_is_named_and_left_also_in_the_run(bench: B
     del bench.bus.nodes[0].objects[0x6077, 0]
     for _ in range(CYCLES):
         next(bench.stream)
-    assert {(r.axis, r.quantity) for r in bench.readings} == {(1, Quantity.TORQUE), (0, Quantity.TEMPERATURE)}
+    assert {(r.axis, r.quantity) for r in bench.readings} == {
+        (1, Quantity.TORQUE),
+        (0, Quantity.TEMPERATURE),
+    }
     gone = "J1: the torque in 6077h:00 is no longer there; it is not logged"
     captured = [event for event in events if event.kind is EventKind.CAPTURE]
     assert [(event.axis, event.code, event.text) for event in captured] == [(0, 0x6077, gone)]
@@ -149,7 +169,8 @@ def test_an_answer_of_another_size_is_no_reading(bench: Bench) -> None:
         next(bench.stream)
     assert (0, Quantity.TORQUE) not in {(r.axis, r.quantity) for r in bench.readings}
     assert polling.remarks == (
-        "J1: the torque in 6077h:00 answers with 8 bits, expected 16: correct the drive profile; it is not logged",
+        "J1: the torque in 6077h:00 answers with 8 bits, expected 16: correct the drive profile; "
+        "it is not logged",
     )
 
 
@@ -198,7 +219,9 @@ def test_an_object_that_a_drive_refuses_once_is_read_again(bench: Bench, begun: 
         assert polling.remarks == ()
     else:
         (remark,) = polling.remarks
-        assert remark.startswith("J1: the drive refused its torque in 6077h:00 at first (aborted, Code 0x08000022")
+        assert remark.startswith(
+            "J1: the drive refused its torque in 6077h:00 at first (aborted, Code 0x08000022"
+        )
 
 
 def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None:
@@ -207,7 +230,10 @@ def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None
     for _ in range(CYCLES):
         next(bench.stream)
     assert not [frame for frame in bench.bus.sent[before:] if frame.arbitration_id > 0x600]
-    assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == [(9, 0, 31.5), (9, 1, -4.0)]
+    assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == [
+        (9, 0, 31.5),
+        (9, 1, -4.0),
+    ]
 
 
 def test_a_torque_without_rated_torque_has_no_unit_and_is_not_read(bench: Bench) -> None:

@@ -21,11 +21,20 @@ def with_sync_objects(node: ScriptedNode, cob_id: int = 0x80, period_us: int = 0
 
 def written(bus: ScriptedBus, node_id: int) -> list[tuple[int, int]]:
     """Index and value of every object that was written, in their order."""
-    requests = [bytes(m.data) for m in bus.sent if m.arbitration_id == 0x600 + node_id and m.data[0] >> 5 == 1]
-    return [(int.from_bytes(data[1:3], "little"), int.from_bytes(data[4:8], "little")) for data in requests]
+    requests = [
+        bytes(m.data)
+        for m in bus.sent
+        if m.arbitration_id == 0x600 + node_id and m.data[0] >> 5 == 1
+    ]
+    return [
+        (int.from_bytes(data[1:3], "little"), int.from_bytes(data[4:8], "little"))
+        for data in requests
+    ]
 
 
-@pytest.mark.parametrize(("cob_id", "period_us"), [(0x80, 0), (0x80, 500), (0x80 | PRODUCES, 1000), (0x85, 0)])
+@pytest.mark.parametrize(
+    ("cob_id", "period_us"), [(0x80, 0), (0x80, 500), (0x80 | PRODUCES, 1000), (0x85, 0)]
+)
 def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us: int) -> None:
     network, bus = cell()
     node = with_sync_objects(bus.nodes[1], cob_id, period_us)
@@ -34,7 +43,11 @@ def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us:
             assert network.link.sync_producer is None
             producer.start()
             assert network.link.sync_producer == "J2"
-            assert written(bus, 2) == [(0x1005, 0x80), (0x1006, PERIOD_US), (0x1005, 0x80 | PRODUCES)]
+            assert written(bus, 2) == [
+                (0x1005, 0x80),
+                (0x1006, PERIOD_US),
+                (0x1005, 0x80 | PRODUCES),
+            ]
             bus.sent.clear()
         assert network.link.sync_producer is None
         assert written(bus, 2)[0] == (0x1005, cob_id & ~PRODUCES)  # it falls silent first
@@ -100,7 +113,9 @@ def test_the_kernel_sends_on_its_own_buses_alone() -> None:
 
 
 @pytest.mark.parametrize("period_us", [1000, 20_000, 1_000_000])
-def test_the_kernel_sends_for_less_than_the_amplifiers_wait_and_then_no_more(period_us: int) -> None:
+def test_the_kernel_sends_for_less_than_the_amplifiers_wait_and_then_no_more(
+    period_us: int,
+) -> None:
     """Struct bcm_msg_head: `count` frames every ival1, and then, with ival2 = 0, none."""
     opcode, flags, count, *rest = struct.unpack_from("@3I4l2I0q", setup_message(1, period_us))
     assert (opcode, flags, rest) == (1, 1, [*divmod(period_us, 1_000_000), 0, 0, 0x80, 1])

@@ -32,8 +32,10 @@ class Timeline(can.BusABC):
 
     Attributes:
         clock: advances only while a caller waits.
-        delays_ns: of the answers of each axis to each SYNC; later than a period, they come after the next SYNC.
-        stops_ns: begin and end of the times, since the first SYNC, in which the capture process is stopped.
+        delays_ns: of the answers of each axis to each SYNC; later than a period, they come after
+            the next SYNC.
+        stops_ns: begin and end of the times, since the first SYNC, in which the capture process is
+            stopped.
         producer: SYNC comes by itself.
         nodes: that are on this bus.
     """
@@ -55,7 +57,9 @@ class Timeline(can.BusABC):
     @property
     def read_until_ns(self) -> int:
         now_ns = self.clock.now_ns - self.begun_ns
-        return self.begun_ns + min([now_ns, *(begin for begin, end in self.stops_ns if begin <= now_ns < end)])
+        return self.begun_ns + min(
+            [now_ns, *(begin for begin, end in self.stops_ns if begin <= now_ns < end)]
+        )
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if msg.arbitration_id == 0x80:
@@ -74,8 +78,12 @@ class Timeline(can.BusABC):
         self.syncs += 1
 
     def _put(self, at_ns: int, identifier: int, data: bytes, *, is_rx: bool = True) -> None:
-        message = CapturedMessage(arbitration_id=identifier, is_extended_id=False, data=data, is_rx=is_rx)
-        message.kernel_ns, message.monotonic_ns, message.local = at_ns, at_ns, True
+        message = CapturedMessage(
+            arbitration_id=identifier, is_extended_id=False, data=data, is_rx=is_rx
+        )
+        message.kernel_ns = at_ns
+        message.monotonic_ns = at_ns
+        message.local = True
         heappush(self._frames, (at_ns, len(self.sent_ns) * 10 + identifier % 0x80, message))
 
     def pause(self) -> None:
@@ -83,7 +91,16 @@ class Timeline(can.BusABC):
         self.producer = False
 
     def _readable_ns(self, at_ns: int) -> int:
-        return max([at_ns, *(self.begun_ns + end for begin, end in self.stops_ns if begin <= at_ns - self.begun_ns)])
+        return max(
+            [
+                at_ns,
+                *(
+                    self.begun_ns + end
+                    for begin, end in self.stops_ns
+                    if begin <= at_ns - self.begun_ns
+                ),
+            ]
+        )
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         end_ns = self.clock.now_ns + (max(1, round(timeout * 1e9)) if timeout else 0)
@@ -118,16 +135,27 @@ def run(
     buses: int = 1,
     to_the_end: bool = False,
 ) -> tuple[list[Sample], StreamStatistics, list[DriverError]]:
-    """Samples, statistics and faults of the bus of a stream; on two buses the capture process of the first stops."""
+    """Samples, statistics and faults of the bus of a stream;
+    on two buses the capture process of the first stops.
+    """
     network, scripted = cell()
-    clock, faults = scripted.clock, list[DriverError]()
+    clock = scripted.clock
+    faults = list[DriverError]()
     ends = [
-        Timeline(clock, delays_ns, () if number else stops_ns, producer, (1, 2) if buses == 1 else (number + 1,))
+        Timeline(
+            clock,
+            delays_ns,
+            () if number else stops_ns,
+            producer,
+            (1, 2) if buses == 1 else (number + 1,),
+        )
         for number in range(buses)
     ]
     bus: can.BusABC = ends[0]
     if buses == 2:
-        parts = [BusPart(f"{n}", BusAddress("virtual", f"{n}"), frozenset((n + 1,))) for n in range(2)]
+        parts = [
+            BusPart(f"{n}", BusAddress("virtual", f"{n}"), frozenset((n + 1,))) for n in range(2)
+        ]
         bus = SplitBus(SplitAddress(tuple(parts)), ends, lambda: clock.now_ns * 1e-9)
     network.link._bus = bus
     network.link.sync_producer = "J1" if producer else None
@@ -148,7 +176,9 @@ def run(
     return samples, found, faults
 
 
-delays = st.one_of(st.integers(0, PERIOD_NS - 2000), st.integers(0, PERIOD_NS - 2000), st.just(NEVER))
+delays = st.one_of(
+    st.integers(0, PERIOD_NS - 2000), st.integers(0, PERIOD_NS - 2000), st.just(NEVER)
+)
 late_too = st.one_of(delays, st.integers(PERIOD_NS, 2 * PERIOD_NS - 2000))
 stops = st.lists(
     st.tuples(st.integers(0, CYCLES * PERIOD_NS), st.sampled_from((1, 3, 10))), max_size=3
@@ -156,7 +186,11 @@ stops = st.lists(
 
 
 @settings(deadline=None, max_examples=15)
-@given(st.lists(st.lists(late_too, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2), stops, st.booleans())
+@given(
+    st.lists(st.lists(late_too, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2),
+    stops,
+    st.booleans(),
+)
 def test_a_capture_process_that_is_stopped_changes_no_sample(
     delays_ns: list[list[int]], stops_ns: list[tuple[int, int]], producer: bool
 ) -> None:
@@ -168,7 +202,11 @@ def test_a_capture_process_that_is_stopped_changes_no_sample(
 
 
 @settings(deadline=None, max_examples=15)
-@given(st.lists(st.lists(late_too, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2), stops, st.booleans())
+@given(
+    st.lists(st.lists(late_too, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2),
+    stops,
+    st.booleans(),
+)
 def test_no_sample_without_its_bit_holds_another_cycles_answer(
     delays_ns: list[list[int]], stops_ns: list[tuple[int, int]], producer: bool
 ) -> None:
@@ -176,7 +214,9 @@ def test_no_sample_without_its_bit_holds_another_cycles_answer(
     for of_axis in delays_ns:
         for number, delay_ns in enumerate(of_axis[1:], start=1):
             before_ns = of_axis[number - 1]
-            if PERIOD_NS <= before_ns < NEVER and (delay_ns >= PERIOD_NS or delay_ns + PERIOD_NS <= before_ns):
+            if PERIOD_NS <= before_ns < NEVER and (
+                delay_ns >= PERIOD_NS or delay_ns + PERIOD_NS <= before_ns
+            ):
                 of_axis[number] = before_ns - PERIOD_NS + 1000
     samples, _, _ = run(delays_ns, stops_ns, producer=producer)
     for axis in range(2):
@@ -187,7 +227,9 @@ def test_no_sample_without_its_bit_holds_another_cycles_answer(
 
 @settings(deadline=None, max_examples=15)
 @given(st.lists(st.lists(delays, min_size=CYCLES, max_size=CYCLES), min_size=2, max_size=2), stops)
-def test_each_bus_of_two_has_its_own_order(delays_ns: list[list[int]], stops_ns: list[tuple[int, int]]) -> None:
+def test_each_bus_of_two_has_its_own_order(
+    delays_ns: list[list[int]], stops_ns: list[tuple[int, int]]
+) -> None:
     plain, counts, _ = run(delays_ns, (), producer=False)
     stopped, counts_stopped, _ = run(delays_ns, stops_ns, producer=False, buses=2)
     assert [(s.cycle, s.position_counts, s.missing) for s in stopped] == [
@@ -209,7 +251,13 @@ def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> Non
     late = [300_000] * 4 + [PERIOD_NS + 200_000, PERIOD_NS + 200_000] + [300_000] * (CYCLES - 6)
     samples, counts, _ = run([late] * 2, (), producer=producer)
     assert [sample.missing for sample in samples] == [0] * 4 + [3, 3] + [0] * (CYCLES - 6)
-    assert [sample.position_counts[0] for sample in samples if not sample.missing] == [0, 1, 2, 3, *range(6, CYCLES)]
+    assert [sample.position_counts[0] for sample in samples if not sample.missing] == [
+        0,
+        1,
+        2,
+        3,
+        *range(6, CYCLES),
+    ]
     assert (counts.missing, counts.duplicate) == (4, 0)
 
 
@@ -218,7 +266,9 @@ def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> Non
 def test_answers_that_stay_late_are_not_accepted(late_ns: int, producer: bool) -> None:
     delays_ns = [[300_000] * 4 + [PERIOD_NS + late_ns] * (CYCLES - 4), [300_000] * CYCLES]
     # The capture process is stopped at the end: what it has not received yet counts too.
-    samples, counts, _ = run(delays_ns, [(12_500_000, 90_000_000)], producer=producer, to_the_end=True)
+    samples, counts, _ = run(
+        delays_ns, [(12_500_000, 90_000_000)], producer=producer, to_the_end=True
+    )
     assert [sample.position_counts[1] for sample in samples] == list(range(CYCLES))
     assert counts.duplicate >= 1
 
@@ -249,7 +299,9 @@ def test_a_capture_process_that_stays_stopped_is_a_fault(producer: bool) -> None
 
 def test_sync_goes_out_on_schedule_while_frames_are_waited_for() -> None:
     network, scripted = cell()
-    network.link._bus = bus = Timeline(scripted.clock, [[0] * CYCLES] * 2, [(3 * PERIOD_NS, 7 * PERIOD_NS)])
+    network.link._bus = bus = Timeline(
+        scripted.clock, [[0] * CYCLES] * 2, [(3 * PERIOD_NS, 7 * PERIOD_NS)]
+    )
     stream = SyncStream(network, TimedSync(PERIOD_NS, 0, scripted.clock))
     for _ in range(CYCLES):
         stream.advance()

@@ -24,7 +24,9 @@ Prepared = tuple[SyncStream, ScriptedBus, list[CellEvent]]
 
 
 def prepared(axes: int = 2, timed: bool = False) -> Iterator[Prepared]:
-    """A lockstep (or timed) stream of a prepared network; the position of every axis is its cycle number."""
+    """A lockstep (or timed) stream of a prepared network;
+    the position of every axis is its cycle number.
+    """
     network, bus = cell(axes)
     events: list[CellEvent] = []
 
@@ -36,11 +38,16 @@ def prepared(axes: int = 2, timed: bool = False) -> Iterator[Prepared]:
         network.prepare()
         bus.cycle = -1
         bus.on_cycle = count_cycles
-        pacing = TimedSync(PERIOD_NS, 77, bus.clock) if timed else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
+        pacing = (
+            TimedSync(PERIOD_NS, 77, bus.clock)
+            if timed
+            else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
+        )
         yield SyncStream(network, pacing, events.append), bus, events
         bus.tamper = lambda message: (message,)
         for node in bus.nodes:
-            node.beats, node.nmt = True, 5
+            node.beats = True
+            node.nmt = 5
 
 
 @pytest.fixture
@@ -86,7 +93,9 @@ def test_a_missing_frame_is_a_bit_and_repeats_the_last_value(lockstep: Prepared)
     assert [sample.position_counts[0] for sample in samples] == [0, 1, 2, 3, 4]
     assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1)
     lost = [event for event in events if event.kind is EventKind.SAMPLE_LOST]
-    assert [(event.axis, event.code, event.time_ns) for event in lost] == [(1, 2, samples[2].time_ns)]
+    assert [(event.axis, event.code, event.time_ns) for event in lost] == [
+        (1, 2, samples[2].time_ns)
+    ]
 
 
 def test_a_late_frame_is_never_taken_for_the_next_cycles(lockstep: Prepared) -> None:
@@ -97,7 +106,9 @@ def test_a_late_frame_is_never_taken_for_the_next_cycles(lockstep: Prepared) -> 
         if message.arbitration_id == 0x182 and bus.cycle == 2:
             held.append(message)
             return ()
-        return (held.pop(), message) if held and message.arbitration_id == 0x182 else (message,)
+        if held and message.arbitration_id == 0x182:
+            return (held.pop(), message)
+        return (message,)
 
     bus.tamper = hold_one
     samples = [next(stream) for _ in range(5)]
@@ -138,7 +149,9 @@ def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> 
 
     def cut(message: can.Message) -> tuple[can.Message, ...]:
         if message.arbitration_id == 0x181 and bus.cycle == 1:
-            return (can.Message(arbitration_id=0x181, is_extended_id=False, data=message.data[:length]),)
+            return (
+                can.Message(arbitration_id=0x181, is_extended_id=False, data=message.data[:length]),
+            )
         return (message,)
 
     bus.tamper = cut
@@ -148,10 +161,13 @@ def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> 
 
 def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
-    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))  # before the first SYNC
+    # Before the first SYNC
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))
     next(stream)
-    bus.inject(can.Message(arbitration_id=0x385, is_extended_id=False, data=bytes(8)))  # of a foreign node
-    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=True, data=b"\xff" * 8))  # another identifier
+    # Of a foreign node
+    bus.inject(can.Message(arbitration_id=0x385, is_extended_id=False, data=bytes(8)))
+    # Another identifier
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=True, data=b"\xff" * 8))
     assert next(stream).position_counts == (1, 1)
     assert stream.statistics == StreamStatistics(cycles=2, frames=4, foreign=3)
 
@@ -159,7 +175,8 @@ def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> Non
 def test_a_frame_that_an_axis_was_not_asked_to_send_is_surplus(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     next(stream)
-    bus.inject(can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8)))  # TPDO4 of node 1
+    # TPDO4 of node 1
+    bus.inject(can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8)))
     assert next(stream).position_counts == (1, 1)
     assert stream.statistics == StreamStatistics(cycles=2, frames=4, surplus=1)
 
@@ -186,7 +203,9 @@ def test_emcy_is_an_event_then_a_fault(lockstep: Prepared) -> None:
 
 
 @pytest.mark.parametrize("following_error", [False, True])
-def test_a_new_fault_is_seen_in_the_sample_and_raised_after_it(lockstep: Prepared, following_error: bool) -> None:
+def test_a_new_fault_is_seen_in_the_sample_and_raised_after_it(
+    lockstep: Prepared, following_error: bool
+) -> None:
     stream, bus, events = lockstep
     next(stream)
     bus.nodes[0].fault(following_error)
@@ -203,7 +222,9 @@ def test_a_fault_from_before_does_not_forbid_to_look(lockstep: Prepared) -> None
 
 
 @pytest.mark.parametrize("following_error", [False, True])
-def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(lockstep: Prepared, following_error: bool) -> None:
+def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(
+    lockstep: Prepared, following_error: bool
+) -> None:
     """Its statusword before its first answer is undefined: the first one is no change."""
     stream, bus, events = lockstep
     bus.nodes[1].fault(following_error)
@@ -211,7 +232,9 @@ def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(lockstep: Prepar
     samples = [next(stream) for _ in range(6)]
     assert [sample.missing for sample in samples] == [2, 2, 0, 0, 0, 0]
     states = [event for event in events if event.kind is EventKind.STATE and event.axis == 1]
-    assert [(event.time_ns, event.code) for event in states] == [(samples[2].time_ns, samples[2].statusword[1])]
+    assert [(event.time_ns, event.code) for event in states] == [
+        (samples[2].time_ns, samples[2].statusword[1])
+    ]
     bus.nodes[1].fault()
     bus.nodes[0].fault()
     next(stream)
@@ -291,7 +314,8 @@ def test_a_slipped_schedule_leaves_periods_out_and_counts_them(timed: Prepared) 
     stream, bus, _ = timed
     first = next(stream).time_ns
     bus.clock.now_ns += round(3.5 * PERIOD_NS)
-    second, third = next(stream), next(stream)
+    second = next(stream)
+    third = next(stream)
     assert stream.statistics.skipped_periods == 2
     assert (second.cycle, third.cycle) == (3, 4)  # periods 1 and 2 had no SYNC
     assert (third.time_ns - first) == third.cycle * PERIOD_NS
@@ -301,8 +325,11 @@ def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
     stream, bus, _ = timed
     drop(bus, 0x181, range(1, 3))
     samples = [next(stream) for _ in range(5)]
-    assert [sample.missing for sample in samples] == [0, 1, 1, 1, 0]  # the answer after it may be a late one
-    assert [sample.time_ns - samples[0].time_ns for sample in samples] == [PERIOD_NS * k for k in range(5)]
+    # The answer after it may be a late one
+    assert [sample.missing for sample in samples] == [0, 1, 1, 1, 0]
+    assert [sample.time_ns - samples[0].time_ns for sample in samples] == [
+        PERIOD_NS * k for k in range(5)
+    ]
 
 
 @settings(deadline=None)
@@ -312,7 +339,9 @@ def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -
         bus.tamper = lambda m, bus=bus: () if (bus.cycle, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
         samples = [stream.advance() for _ in range(30)]
         for sample in samples:
-            expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (sample.cycle, cob) in dropped)
+            expected = sum(
+                axis for axis, cob in ((1, 0x181), (2, 0x182)) if (sample.cycle, cob) in dropped
+            )
             assert sample.missing == expected
             for axis in range(2):
                 if not sample.missing >> axis & 1:
@@ -322,7 +351,8 @@ def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -
 
 
 class Producer(sync.Producer):
-    """Sends SYNC on the scripted bus, whether the stream reads or not; each axis' position is its number.
+    """Sends SYNC on the scripted bus, whether the stream reads or not;
+    each axis' position is its number.
 
     Attributes:
         pulses: SYNCs sent.
@@ -340,7 +370,9 @@ class Producer(sync.Producer):
         """A SYNC so long after the last one, and its answers."""
         self.at_ns += after_ns
         sync = CapturedMessage(arbitration_id=0x80, is_extended_id=False)
-        sync.kernel_ns, sync.monotonic_ns, sync.local = 0, self.at_ns, local
+        sync.kernel_ns = 0
+        sync.monotonic_ns = self.at_ns
+        sync.local = local
         self._bus.inject(sync)
         for node in self._bus.nodes:
             node.position = self.pulses
@@ -370,14 +402,16 @@ def followed_stream() -> Iterator[Followed]:
         def recv(timeout: float | None = None) -> can.Message | None:
             message = receive(timeout)
             if message is None and timeout == 0.0 and producer.pulses == 0:
-                producer.pulse()  # the first: once the stream has thrown away what waited before it began
+                # The first: once the stream has thrown away what waited before it began
+                producer.pulse()
             return message
 
         bus.recv = recv  # type: ignore[method-assign]
         yield stream, bus, producer, events
         bus.tamper = lambda message: (message,)
         for node in bus.nodes:
-            node.beats, node.nmt = True, 5
+            node.beats = True
+            node.nmt = 5
 
 
 @pytest.fixture
@@ -412,7 +446,8 @@ def test_a_reader_that_is_late_loses_nothing(followed: Followed) -> None:
     assert [sample.position_counts for sample in samples] == [(k, k) for k in range(1, 1001)]
     assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(1, 1001)]
     assert stream.statistics == StreamStatistics(cycles=1001, frames=2002)
-    with pytest.raises(BusError, match=r"read 1000\.0 s late"):  # but axes do not move on such old news
+    # But axes do not move on such old news
+    with pytest.raises(BusError, match=r"read 1000\.0 s late"):
         stream.check()
     stream.check()
 
@@ -437,7 +472,8 @@ def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
     producer.pulse()
     producer.pulse()
     samples = [next(stream) for _ in range(3)]
-    assert [sample.missing for sample in samples] == [2, 2, 0]  # the answer after it may be a late one
+    # The answer after it may be a late one
+    assert [sample.missing for sample in samples] == [2, 2, 0]
     assert [sample.position_counts for sample in samples] == [(1, 0), (2, 0), (3, 3)]
     assert stream.statistics == StreamStatistics(cycles=4, frames=6, missing=2, late=1)
 
@@ -465,7 +501,9 @@ def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
     assert bus.sent[-1] is frame
 
 
-def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(followed: Followed) -> None:
+def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(
+    followed: Followed,
+) -> None:
     stream, bus, _, events = followed
     next(stream)
     last_ns = stream.time_ns
@@ -480,12 +518,15 @@ def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(follo
 
 
 def test_the_periods_without_a_producer_are_a_gap_in_the_cycles(followed: Followed) -> None:
-    """Number and time of a sample belong together, also when this program sends SYNC after a wait."""
+    """Number and time of a sample belong together,
+    also when this program sends SYNC after a wait.
+    """
     stream, bus, producer, _ = followed
     first = next(stream)
     producer.pulse()
     bus.clock.now_ns = producer.at_ns
-    before, after = next(stream), stream.advance()
+    before = next(stream)
+    after = stream.advance()
     passed = (after.time_ns - first.time_ns + PERIOD_NS // 2) // PERIOD_NS
     assert (before.cycle, after.cycle) == (1, passed)
     assert passed >= 11  # the producer may be silent for ten periods
@@ -494,21 +535,26 @@ def test_the_periods_without_a_producer_are_a_gap_in_the_cycles(followed: Follow
 
 
 def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
-    """A bus is never silent for as long as a producer may be: the drives' heartbeats come in between."""
+    """A bus is never silent for as long as a producer may be:
+    the drives' heartbeats come in between.
+    """
     for stream, bus, _, events in followed_stream():
         bus.nodes[0].store(0x1017, 0, 8)
         bus.nodes[1].store(0x1017, 0, 8)
         bus.nodes[1].next_beat_ns = bus.clock.now_ns + 4_000_000
         next(stream)
         stream.network.link.start_heartbeat(127, 5)
-        begun_ns, sent = bus.clock.now_ns, len(bus.sent)
+        begun_ns = bus.clock.now_ns
+        sent = len(bus.sent)
         assert stream.advance().missing == 0
         assert bus.clock.now_ns - begun_ns <= 12_000_000
         assert [event.kind for event in events].count(EventKind.SYNC_LOST) == 1
         assert 0x77F in [frame.arbitration_id for frame in bus.sent[sent:]]  # and ours goes on
 
 
-def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(followed: Followed) -> None:
+def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(
+    followed: Followed,
+) -> None:
     stream, bus, producer, events = followed
     next(stream)
     bus.tamper = lambda m: () if m.arbitration_id == 0x182 else (m,)
@@ -564,7 +610,8 @@ def test_a_flood_of_other_frames_is_no_sign_of_a_producer(followed: Followed) ->
 def test_a_bus_that_never_falls_silent_does_not_keep_the_sync_for_ever(timed: Prepared) -> None:
     stream, bus, _ = timed
     next(stream)
-    receive, before = bus.recv, bus.cycle
+    receive = bus.recv
+    before = bus.cycle
 
     def flood(timeout: float | None = None) -> can.Message | None:
         if bus.cycle > before:
@@ -593,7 +640,8 @@ def test_a_schedule_that_slips_by_more_than_a_second_is_a_fault(timed: Prepared)
 def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     next(stream)
-    bus.inject(can.Message(arbitration_id=0x27E, is_extended_id=False, data=bytes(6)))  # of a node that is no axis
+    # Of a node that is no axis
+    bus.inject(can.Message(arbitration_id=0x27E, is_extended_id=False, data=bytes(6)))
     own = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6), is_rx=False)
     bus.inject(own)
     next(stream)
@@ -612,7 +660,9 @@ def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None
     bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
     next(stream)
     next(stream)
-    before, sent, begun_ns = stream.statistics, len(bus.sent), bus.clock.now_ns
+    before = stream.statistics
+    sent = len(bus.sent)
+    begun_ns = bus.clock.now_ns
     bus.losses = Losses(interface=3)
     stream.read_on(0.25)
     assert bus.clock.now_ns - begun_ns == 250_000_000
@@ -624,7 +674,8 @@ def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None
 def test_cycles_of_a_producer_that_goes_on_are_no_ones(followed: Followed) -> None:
     stream, bus, producer, _ = followed
     next(stream)
-    bus.inject(can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8)))  # doubled, before the next SYNC
+    # Doubled, before the next SYNC
+    bus.inject(can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8)))
     for _ in range(5):
         producer.pulse()
     stream.read_on(0.05)
@@ -644,7 +695,8 @@ def test_a_second_producer_is_another_master(followed: Followed) -> None:
 @settings(deadline=None)
 @given(st.lists(st.integers(-400_000, 400_000), min_size=50, max_size=50))
 def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
-    rate, before_ns = SyncRate(PERIOD_NS), 0
+    rate = SyncRate(PERIOD_NS)
+    before_ns = 0
     for number, late in enumerate(late_ns, start=1):
         at_ns = number * PERIOD_NS * 9999 // 10000 + late  # and its clock is 100 ppm fast
         assert not rate.too_fast(at_ns - before_ns)
@@ -670,13 +722,17 @@ def test_after_an_answer_dropped_from_a_followed_cycle_the_next_is_doubtful(
 ) -> None:
     for stream, bus, producer, _ in followed_stream():
         next(stream)
-        bus.tamper = lambda m, p=producer: () if (p.pulses - 1, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
+        bus.tamper = lambda m, p=producer: (
+            () if (p.pulses - 1, m.arbitration_id) in dropped else (m,)
+        )  # type: ignore[misc]
         for _ in range(31):
             producer.pulse()
         samples = [stream.advance() for _ in range(30)]
         for number, sample in enumerate(samples):
             expected = sum(
-                axis for axis, cob in ((1, 0x181), (2, 0x182)) if {(number, cob), (number - 1, cob)} & dropped
+                axis
+                for axis, cob in ((1, 0x181), (2, 0x182))
+                if {(number, cob), (number - 1, cob)} & dropped
             )
             assert sample.missing == expected
             for axis in range(2):
@@ -689,10 +745,18 @@ def test_after_an_answer_dropped_from_a_followed_cycle_the_next_is_doubtful(
 @settings(deadline=None)
 @given(st.integers(250, 100_000), st.floats(0.0, 0.1), st.floats(-0.002, 0.002))
 def test_the_kernel_is_steered_to_its_period(period_us: int, late: float, noise: float) -> None:
-    """Each interval becomes longer by what the timer is late: the schedule still keeps the period."""
-    interval_us, phase_ns, window = period_us, 0.0, max(8, round(250_000 / period_us))
+    """Each interval becomes longer by what the timer is late:
+    the schedule still keeps the period.
+    """
+    interval_us = period_us
+    phase_ns = 0.0
+    window = max(8, round(250_000 / period_us))
     for number in range(40):
-        lasts_ns = window * 1000 * (interval_us + late * period_us + (noise if number % 2 else -noise) * period_us)
+        lasts_ns = (
+            window
+            * 1000
+            * (interval_us + late * period_us + (noise if number % 2 else -noise) * period_us)
+        )
         late_ns = lasts_ns - window * 1000 * period_us
         phase_ns += late_ns
         interval_us = steered_us(period_us, interval_us, round(late_ns), round(phase_ns), window)
@@ -710,7 +774,9 @@ def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepar
         cycles=3, frames=6, kernel_dropped=2, backlog_dropped=1, interface_dropped=4
     )
     reported = [event for event in events if event.kind is EventKind.FRAMES_DROPPED]
-    assert [(event.code, event.time_ns) for event in reported] == [(count, sample.time_ns) for count in (2, 4, 1)]
+    assert [(event.code, event.time_ns) for event in reported] == [
+        (count, sample.time_ns) for count in (2, 4, 1)
+    ]
 
 
 def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepared) -> None:
@@ -730,7 +796,8 @@ def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
     def echo(msg: can.Message, timeout: float | None = None) -> None:
         if msg.arbitration_id == 0x80:
             sync = CapturedMessage(arbitration_id=0x80, is_extended_id=False, is_rx=False)
-            sync.kernel_ns, sync.local = 0, True
+            sync.kernel_ns = 0
+            sync.local = True
             sync.monotonic_ns = bus.clock.now_ns + 1000 + 10 * (bus.cycle + 1)
             bus.inject(sync)
         send(msg, timeout)

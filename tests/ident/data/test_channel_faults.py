@@ -1,4 +1,6 @@
-"""Readings that are none are found where they were planted and nowhere else, and are filled in, left out or refused."""
+"""Readings that are none are found where they were planted and nowhere else, and are filled in,
+left out or refused.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ TRUTH = three_axes_truth()
 
 
 def motion(seed: int = 0) -> FloatArray:
-    """Motor angles of two axes that start, move and rest [rad], in counts of an encoder, shape (k, 2)."""
+    """Motor angles of two axes that start, move and rest [rad], in counts of an encoder, shape (k,
+    2).
+    """
     rng = np.random.default_rng(seed)
     pace = np.clip(np.interp(TIME_S, [0.3, 0.8, 4.7, 5.2], [0.0, 1.0, 1.0, 0.0]), 0.0, 1.0)
     passed_s = np.cumsum(pace) / RATE_HZ
@@ -45,7 +49,9 @@ def currents(position: FloatArray, seed: int = 0) -> FloatArray:
     """Currents with friction, inertia and noise, shape (k, 2)."""
     noise = np.random.default_rng(seed).normal(scale=NOISE_A, size=position.shape)
     velocity = np.gradient(position, 1.0 / RATE_HZ, axis=0)
-    return np.asarray(0.8 * np.tanh(velocity) + 0.004 * velocity + 0.6 * np.cos(position / 30.0) + noise)
+    return np.asarray(
+        0.8 * np.tanh(velocity) + 0.004 * velocity + 0.6 * np.cos(position / 30.0) + noise
+    )
 
 
 def planted(
@@ -76,7 +82,9 @@ def test_a_sound_recording_has_no_fault(seed: int) -> None:
 SOUND: dict[str, Callable[[], FloatArray]] = {
     "at rest": lambda: np.full(6000, 0.3),
     "at rest with an encoder that flickers": lambda: 0.3 + COUNT_RAD * (np.arange(6000) % 977 == 0),
-    "at rest for most of the run": lambda: np.where(TIME_S < 5.7, 0.0, 1.0 - np.cos(10.0 * (TIME_S - 5.7))),
+    "at rest for most of the run": lambda: np.where(
+        TIME_S < 5.7, 0.0, 1.0 - np.cos(10.0 * (TIME_S - 5.7))
+    ),
     "really slow": lambda: np.round(0.001 * TIME_S / COUNT_RAD) * COUNT_RAD,
     "coarse encoder": lambda: np.round(np.sin(TIME_S) / 0.02) * 0.02,
     "sharp corners": lambda: np.abs(np.mod(TIME_S, 2.0) - 1.0),
@@ -121,14 +129,18 @@ def test_a_glitch_is_found_where_it_is_and_filled_in(
     assert not found.is_refused
     sound = motion(seed)
     inside = 10 < start < 5980
-    assert np.abs(mended(position, (found,), RATE_HZ) - sound).max() < (3.0 * COUNT_RAD if inside else 0.05)
+    assert np.abs(mended(position, (found,), RATE_HZ) - sound).max() < (
+        3.0 * COUNT_RAD if inside else 0.05
+    )
 
 
 @pytest.mark.parametrize("samples", [1, 3, 20, 50])
 def test_a_dropout_to_zero_is_filled_in(samples: int) -> None:
     zeros = slice(2000, 2000 + samples)
     for in_current in (False, True):
-        position, current = planted(lambda channel: np.copyto(channel[zeros], 0.0), in_current=in_current, seed=1)
+        position, current = planted(
+            lambda channel: np.copyto(channel[zeros], 0.0), in_current=in_current, seed=1
+        )
         if in_current:
             current += 4.0
             current[zeros, 1] = 0.0
@@ -141,7 +153,9 @@ def test_a_dropout_to_zero_is_filled_in(samples: int) -> None:
 
 
 def test_a_current_where_a_joint_breaks_loose_is_no_glitch() -> None:
-    """As on a real robot at 250 Hz: for a sample the controller asks for three times the current, which rings on."""
+    """As on a real robot at 250 Hz: for a sample the controller asks for three times the current,
+    which rings on.
+    """
     position, current = planted(lambda _: None)
     current[2000:2005, 1] += [-1.4, -0.2, 0.5, 0.5, 0.4]
     assert find_faults(position, current, RATE_HZ) == ()
@@ -229,7 +243,9 @@ def test_negative_currents_without_their_sign_are_refused() -> None:
     def change(channel: FloatArray) -> None:
         channel[:] = np.mod(np.round(channel / 0.001) * 0.001, whole)
 
-    assert kinds(*planted(change, in_current=True)) == [(FaultKind.UNSIGNED, ChannelKind.CURRENT, 1)]
+    assert kinds(*planted(change, in_current=True)) == [
+        (FaultKind.UNSIGNED, ChannelKind.CURRENT, 1)
+    ]
 
 
 def test_a_current_that_friction_turns_between_two_values_has_its_sign() -> None:
@@ -278,12 +294,16 @@ def test_a_robot_that_is_stopped_at_once_is_not_frozen() -> None:
 
 def test_an_axis_without_acceleration_that_is_done_before_the_others_is_not_frozen() -> None:
     position, _ = planted(lambda _: None)
-    position[:, 1] = np.interp(TIME_S, [0.0, 1.0, 1.6, 2.0, 2.4, 3.0], [0.0, 5.0, 2.0, 9.0, 1.0, 6.0])
+    position[:, 1] = np.interp(
+        TIME_S, [0.0, 1.0, 1.6, 2.0, 2.4, 3.0], [0.0, 5.0, 2.0, 9.0, 1.0, 6.0]
+    )
     assert find_faults(position, currents(position), RATE_HZ) == ()
 
 
 def test_a_frozen_current_is_left_out_on_its_axis() -> None:
-    position, current = planted(lambda channel: np.copyto(channel[1500:1800], channel[1500]), in_current=True)
+    position, current = planted(
+        lambda channel: np.copyto(channel[1500:1800], channel[1500]), in_current=True
+    )
     (found,) = find_faults(position, current, RATE_HZ)
     assert (found.kind, found.quantity, found.axis) == (FaultKind.FROZEN, ChannelKind.CURRENT, 1)
     data = differentiate(Run("r", TIME_S, position, current), DriveTrain(np.eye(2)), SMALL_TWO)
@@ -305,9 +325,13 @@ def test_a_position_at_the_end_of_its_range_is_left_out(percentile: float) -> No
 
 
 def test_an_axis_that_stops_and_goes_on_without_acceleration_is_not_frozen() -> None:
-    """As of a simple device, or of a robot that ran into something; it goes on from where it stood."""
+    """As of a simple device, or of a robot that ran into something;
+    it goes on from where it stood.
+    """
     position, _ = planted(lambda _: None)
-    position[:, 1] = np.interp(TIME_S, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.0, 5.0, 5.0, 2.0, 2.0, 9.0, 12.0])
+    position[:, 1] = np.interp(
+        TIME_S, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.0, 5.0, 5.0, 2.0, 2.0, 9.0, 12.0]
+    )
     assert find_faults(position, currents(position), RATE_HZ) == ()
 
 
@@ -348,5 +372,9 @@ def test_a_fit_refuses_an_encoder_that_lost_its_place() -> None:
         channel[3000:] += 1.0
 
     damaged = [*runs[:3], with_position(runs[3], change)]
-    with pytest.raises(ReadingsDamaged, match=r"run 'r3': axis J2: found a position that steps by 50 rad of the motor"):
+    with pytest.raises(
+        ReadingsDamaged,
+        match=r"run 'r3': axis J2: found a position that steps by "
+        r"50 rad of the motor",
+    ):
         identify(TRUTH.model, damaged, SMALL, axes=AXES)

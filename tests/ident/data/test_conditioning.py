@@ -18,7 +18,9 @@ from ident.data.conditioning import decimator, low_pass
     extra=st.integers(0, 700),
     seed=st.integers(0, 2**31),
 )
-def test_each_row_is_its_whole_window_weighted(rate_hz: float, cutoff_hz: float, extra: int, seed: int) -> None:
+def test_each_row_is_its_whole_window_weighted(
+    rate_hz: float, cutoff_hz: float, extra: int, seed: int
+) -> None:
     filter_ = decimator(rate_hz, cutoff_hz)
     samples = len(filter_.taps) + extra
     columns = np.random.default_rng(seed).normal(size=(2, samples))
@@ -35,19 +37,25 @@ def test_the_low_pass_is_scipys(order: int, cutoff_hz: float) -> None:
     values = np.cumsum(np.random.default_rng(order).normal(size=(2, 3000)), axis=1) + 40.0
     sections = signal.butter(order, cutoff_hz, fs=1000.0, output="sos")
     expected = signal.sosfiltfilt(sections, values, axis=1)
-    assert low_pass(values, 1000.0, cutoff_hz, order) == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
+    assert low_pass(values, 1000.0, cutoff_hz, order) == pytest.approx(
+        expected, abs=1e-12 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize(("rate_hz", "cutoff_hz"), [(1000.0, 20.0), (250.0, 7.5), (999.0, 90.0)])
 def test_the_taps_are_scipys(rate_hz: float, cutoff_hz: float) -> None:
     taps = decimator(rate_hz, cutoff_hz).taps
-    assert taps == pytest.approx(signal.firwin(len(taps), cutoff_hz, fs=rate_hz, window="hamming"), abs=1e-15)
+    assert taps == pytest.approx(
+        signal.firwin(len(taps), cutoff_hz, fs=rate_hz, window="hamming"), abs=1e-15
+    )
 
 
 def test_passes_what_is_slow_and_stops_what_is_fast() -> None:
     filter_ = decimator(1000.0, 20.0)
     time = np.arange(2000) / 1000.0
-    slow, edge, fast = (np.sqrt(2) * np.std(filter_(np.sin(2 * np.pi * f * time)[None])) for f in (3.0, 20.0, 60.0))
+    slow, edge, fast = (
+        np.sqrt(2) * np.std(filter_(np.sin(2 * np.pi * f * time)[None])) for f in (3.0, 20.0, 60.0)
+    )
     assert slow == pytest.approx(1.0, abs=0.02)
     assert edge == pytest.approx(0.5, abs=0.03)
     assert fast < 0.01

@@ -26,7 +26,9 @@ def test_derivatives_of_slow_sines_are_the_sines_own() -> None:
     data = differentiate(_run(), TRAIN, Conditioning(standstill_rad_s=(0.1, 0.1)))
     middle = slice(500, -500)
     w = 2 * np.pi
-    assert data.velocity_rad_s[middle, 0] == pytest.approx(w * np.cos(w * data.time_s[middle]), abs=2e-3 * w)
+    assert data.velocity_rad_s[middle, 0] == pytest.approx(
+        w * np.cos(w * data.time_s[middle]), abs=2e-3 * w
+    )
     assert data.acceleration_rad_s2[middle, 0] == pytest.approx(
         -(w**2) * np.sin(w * data.time_s[middle]), abs=2e-3 * w**2
     )
@@ -49,10 +51,15 @@ def test_moves_part_where_all_joints_rest() -> None:
     [
         (lambda run: replace(run, current_a=run.current_a[:, :1]), "one column per axis"),
         (
-            lambda run: replace(run, position_rad=np.where(run.time_s[:, None] == 1.0, np.nan, run.position_rad)),
+            lambda run: replace(
+                run, position_rad=np.where(run.time_s[:, None] == 1.0, np.nan, run.position_rad)
+            ),
             "sample 1000",
         ),
-        (lambda run: replace(run, time_s=np.delete(np.arange(len(run.time_s) + 1) / 1000.0, 9)), "not uniform"),
+        (
+            lambda run: replace(run, time_s=np.delete(np.arange(len(run.time_s) + 1) / 1000.0, 9)),
+            "not uniform",
+        ),
         (lambda _: _run(seconds=1.0), "at least 2 s"),
         (lambda _: _run(seconds=9.0, rate_hz=80.0), "needs more than 100 Hz"),
     ],

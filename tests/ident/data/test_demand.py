@@ -19,11 +19,16 @@ from ident.model.model import DriveTrain
 FloatArray = NDArray[np.float64]
 RATE_HZ = 250.0
 CONDITIONING = Conditioning(standstill_rad_s=(0.03, 0.03))
-STRAIGHT, COUPLED = DriveTrain(np.diag([40.0, 30.0])), DriveTrain(np.array([[40.0, 0.0], [30.0, 30.0]]))
+STRAIGHT = DriveTrain(np.diag([40.0, 30.0]))
+COUPLED = DriveTrain(np.array([[40.0, 0.0], [30.0, 30.0]]))
 
 
-def trapezoid(stops: FloatArray, rng: np.random.Generator, speed: float, acceleration: float) -> FloatArray:
-    """Positions of one motor that goes from stop to stop at trapezoidal speed, with rests of 0.2 s or more."""
+def trapezoid(
+    stops: FloatArray, rng: np.random.Generator, speed: float, acceleration: float
+) -> FloatArray:
+    """Positions of one motor that goes from stop to stop at trapezoidal speed,
+    with rests of 0.2 s or more.
+    """
     parts = [np.repeat(stops[0], round(0.3 * RATE_HZ))]
     for start, end in pairwise(stops):
         way = abs(end - start)
@@ -46,25 +51,35 @@ def two_motors(seed: int) -> FloatArray:
     rng = np.random.default_rng(seed)
     motors = [trapezoid(rng.uniform(-2.0, 2.0, 7), rng, speed, 6.0) for speed in (2.0, 1.4)]
     longest = max(map(len, motors))
-    return np.stack([np.pad(motor, (0, longest - len(motor)), mode="edge") for motor in motors], axis=1)
+    return np.stack(
+        [np.pad(motor, (0, longest - len(motor)), mode="edge") for motor in motors], axis=1
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_moves_are_found_beneath_a_disturbance(seed: int) -> None:
     asked = two_motors(seed)
     rng = np.random.default_rng(seed + 1)
-    wave = 0.002 * np.sin(2.0 * np.pi * rng.uniform(5.0, 15.0) * np.arange(len(asked)) / RATE_HZ)[:, None]
+    wave = (
+        0.002
+        * np.sin(2.0 * np.pi * rng.uniform(5.0, 15.0) * np.arange(len(asked)) / RATE_HZ)[:, None]
+    )
     found = demanded_positions(dataset(np.asarray(asked + wave, dtype=np.float64)), STRAIGHT)
     assert found is not None
     speed = np.diff(asked[1:-1], axis=0)
-    assert np.all(np.sum((np.diff(found, axis=0) - speed) ** 2, axis=0) < 0.01 * np.sum(speed**2, axis=0))
+    assert np.all(
+        np.sum((np.diff(found, axis=0) - speed) ** 2, axis=0) < 0.01 * np.sum(speed**2, axis=0)
+    )
     # Three numbers a move follow next to nothing of what the disturbance adds to the acceleration.
-    added, left = np.diff(wave[1:-1], n=2, axis=0), np.diff(found - asked[1:-1], n=2, axis=0)
+    added = np.diff(wave[1:-1], n=2, axis=0)
+    left = np.diff(found - asked[1:-1], n=2, axis=0)
     assert np.all(np.abs(np.sum(added * left, axis=0)) < 0.06 * np.sum(added**2))
 
 
 def test_coupled_motors_make_the_trapezoids() -> None:
-    """Joint 2 is the difference of two motors that start and stop at different times: no trapezoid of its own."""
+    """Joint 2 is the difference of two motors that start and stop at different times:
+    no trapezoid of its own.
+    """
     motors = two_motors(3)
     joints = np.asarray(np.linalg.solve(COUPLED.direction, motors.T).T, dtype=np.float64)
     found = demanded_positions(dataset(joints, COUPLED), COUPLED)
@@ -74,7 +89,11 @@ def test_coupled_motors_make_the_trapezoids() -> None:
 
 def test_continuous_motion_has_no_moves() -> None:
     time = np.arange(2000)[:, None] / RATE_HZ
-    motion = np.sin(2.0 * time + np.array([0.0, 1.0])) + 0.5 * np.cos(3.3 * time) + 0.3 * np.sin(5.1 * time)
+    motion = (
+        np.sin(2.0 * time + np.array([0.0, 1.0]))
+        + 0.5 * np.cos(3.3 * time)
+        + 0.3 * np.sin(5.1 * time)
+    )
     data = dataset(motion)
     assert demanded_positions(data, STRAIGHT) is None
     assert with_demand(data, STRAIGHT, CONDITIONING) is data
@@ -99,10 +118,17 @@ def test_derivatives_are_those_of_the_demanded_positions() -> None:
 def test_what_corrects_a_run_corrects_its_demand() -> None:
     given = dataset(two_motors(4))
     placed = (PlacedEffect(LatePosition(applied_s=0.004), 1),)
-    demanded_of_corrected = as_demanded(with_demand(corrected_dataset(given, placed), STRAIGHT, CONDITIONING))
-    corrected_demand = corrected_dataset(as_demanded(with_demand(given, STRAIGHT, CONDITIONING)), placed)
+    demanded_of_corrected = as_demanded(
+        with_demand(corrected_dataset(given, placed), STRAIGHT, CONDITIONING)
+    )
+    corrected_demand = corrected_dataset(
+        as_demanded(with_demand(given, STRAIGHT, CONDITIONING)), placed
+    )
     assert np.max(np.abs(corrected_demand.position_rad - demanded_of_corrected.position_rad)) < 1e-4
-    assert np.max(np.abs(corrected_demand.velocity_rad_s - demanded_of_corrected.velocity_rad_s)) < 0.02
+    assert (
+        np.max(np.abs(corrected_demand.velocity_rad_s - demanded_of_corrected.velocity_rad_s))
+        < 0.02
+    )
     assert np.max(np.abs(given.position_rad - demanded_of_corrected.position_rad)) > 0.005
 
 

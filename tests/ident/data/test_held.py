@@ -1,4 +1,6 @@
-"""Held readings are filled in; what only repeats because it rests, or because it is coarse, stays as it is."""
+"""Held readings are filled in; what only repeats because it rests, or because it is coarse,
+stays as it is.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def stale(values: FloatArray, samples: int) -> FloatArray:
     return np.asarray(values[np.arange(len(values)) // samples * samples])
 
 
-@given(seed=st.integers(0, 999), samples=st.integers(2, 20), count=st.sampled_from([0.0, COUNT_RAD]))
+@given(
+    seed=st.integers(0, 999), samples=st.integers(2, 20), count=st.sampled_from([0.0, COUNT_RAD])
+)
 @settings(max_examples=25, deadline=None)
 def test_a_held_motion_is_filled_in(seed: int, samples: int, count: float) -> None:
     motion = waves(seed)
@@ -123,7 +127,9 @@ def test_recordings_without_held_readings_are_left_alone(runs: list[Run]) -> Non
 def test_a_fit_of_held_readings_has_the_same_gains_and_says_so(runs: list[Run]) -> None:
     used = [held(run, 3) for run in runs]
     said = [one for one in diagnosed(TRUTH, used) if one.name == "readings-held"]
-    assert [one.runs for one in said] == [(run.name,) for run in runs for _ in ("positions", "currents")]
+    assert [one.runs for one in said] == [
+        (run.name,) for run in runs for _ in ("positions", "currents")
+    ]
     assert all(one.axes == tuple(AXES) for one in said)
     gains = identify(TRUTH.model, used, SMALL, axes=AXES).estimate.gains
     assert gains == pytest.approx(TRUTH.gains, rel=0.03)
@@ -132,8 +138,8 @@ def test_a_fit_of_held_readings_has_the_same_gains_and_says_so(runs: list[Run]) 
 def test_positions_of_a_real_arm_that_are_held_for_10_ms_cost_little(shared_data: Path) -> None:
     """The error of its six axes is 5.05 %, and was 5.63 % with these positions.
 
-    Currents that are held, too, leave 8.9 %: above 300 Hz the current of J1 has noise of 0.16 A, and a hundred
-    readings a second fold it into the band of the rows.
+    Currents that are held, too, leave 8.9 %: above 300 Hz the current of J1 has noise of 0.16 A,
+    and a hundred readings a second fold it into the band of the rows.
     """
     recording = tx40(shared_data)
     (run,) = recording.runs

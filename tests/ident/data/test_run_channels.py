@@ -1,4 +1,6 @@
-"""Faults of single channels: they are named from the channel, and not by what they leave in a fit."""
+"""Faults of single channels: they are named from the channel,
+and not by what they leave in a fit.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def fitted(truth: Truth, runs: list[Run]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_joint_that_never_moves_in_the_only_run_of_a_mounting_is_named(runs: list[Run], number: int) -> None:
+def test_a_joint_that_never_moves_in_the_only_run_of_a_mounting_is_named(
+    runs: list[Run], number: int
+) -> None:
     used = runs[:2]
     used[number] = with_still_joint(used[number])
     with pytest.raises(JointStill) as caught:
@@ -67,11 +71,15 @@ def test_a_joint_that_never_moves_in_the_only_run_of_a_mounting_is_named(runs: l
 
 
 def test_a_joint_that_never_moves_in_any_run_is_named(runs: list[Run]) -> None:
-    with pytest.raises(JointStill, match="axis J3: found J3 never moves above its standstill speed in any run"):
+    with pytest.raises(
+        JointStill, match="axis J3: found J3 never moves above its standstill speed in any run"
+    ):
         identify(TRUTH.model, [with_still_joint(run) for run in runs], SMALL, axes=AXES)
 
 
-def test_an_encoder_that_stands_still_while_its_joint_moves_is_named_and_no_payload(runs: list[Run]) -> None:
+def test_an_encoder_that_stands_still_while_its_joint_moves_is_named_and_no_payload(
+    runs: list[Run],
+) -> None:
     used = [*runs[:3], with_still_joint(runs[3], axis=1)]
     first, *_ = diagnose(identify(TRUTH.model, used, SMALL, axes=AXES), AXES, TRUTH.gains)
     assert (first.name, first.runs, first.axes) == ("joint-still", ("r3",), ("J2",))
@@ -87,7 +95,9 @@ def test_without_a_run_without_load_the_still_joint_is_not_the_cause(runs: list[
 
 
 @pytest.mark.parametrize(("size", "words"), [(0.0, "zero throughout"), (1.5, "1.5 throughout")])
-def test_a_constant_current_of_a_motor_that_moves_is_refused(runs: list[Run], size: float, words: str) -> None:
+def test_a_constant_current_of_a_motor_that_moves_is_refused(
+    runs: list[Run], size: float, words: str
+) -> None:
     used = [*runs[:3], with_constant_current(runs[3], size)]
     with pytest.raises(CurrentConstant, match=rf"run 'r3': axis J2: found a current .*{words}"):
         identify(TRUTH.model, used, SMALL, axes=AXES)
@@ -95,7 +105,9 @@ def test_a_constant_current_of_a_motor_that_moves_is_refused(runs: list[Run], si
 
 def test_a_constant_current_of_a_held_out_run_is_refused(runs: list[Run]) -> None:
     with pytest.raises(CurrentConstant, match="r3"):
-        identify(TRUTH.model, runs[:3], SMALL, holdout=[with_constant_current(runs[3], 1.0)], axes=AXES)
+        identify(
+            TRUTH.model, runs[:3], SMALL, holdout=[with_constant_current(runs[3], 1.0)], axes=AXES
+        )
 
 
 # A clipped current
@@ -112,7 +124,9 @@ def test_clipped_samples_are_named_and_left_out(runs: list[Run]) -> None:
 
 def test_whole_recordings_are_not_clipped(runs: list[Run]) -> None:
     for run in runs:
-        assert not channels_of(TRUTH.model, differentiate(run, TRUTH.model.drive_train, SMALL)).clipped_percent.any()
+        assert not channels_of(
+            TRUTH.model, differentiate(run, TRUTH.model.drive_train, SMALL)
+        ).clipped_percent.any()
 
 
 SAMPLES = np.arange(8000) * 0.002
@@ -129,7 +143,9 @@ COARSE = 0.05  #: One count of a coarse current [A]
     ],
     ids=["coarse sine", "held between slow readings", "levels of constant acceleration", "limit"],
 )
-def test_only_a_limit_is_a_limit(current: Callable[[np.ndarray], np.ndarray], request: pytest.FixtureRequest) -> None:
+def test_only_a_limit_is_a_limit(
+    current: Callable[[np.ndarray], np.ndarray], request: pytest.FixtureRequest
+) -> None:
     values = current(SAMPLES)[:, None]
     found = clipped_samples(values, np.ones_like(values, dtype=np.bool_))
     assert found.any() == request.node.callspec.id.endswith("limit")

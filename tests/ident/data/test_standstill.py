@@ -1,4 +1,6 @@
-"""A standstill speed that no one declared: derived from the run, as good as a declared one, and better than none."""
+"""A standstill speed that no one declared:
+derived from the run, as good as a declared one, and better than none.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +33,21 @@ def _at_rest(run: Run) -> NDArray[np.bool_]:
 
 
 def _sticking(run: Run, truth: Truth, rng: np.random.Generator) -> Run:
-    """The same run on a real arm: a resting joint holds any torque within its dry friction, and encoders are noisy."""
+    """The same run on a real arm: a resting joint holds any torque within its dry friction,
+    and encoders are noisy.
+    """
     at_rest = _at_rest(run)
     dwell = np.cumsum(np.diff(at_rest, axis=0, prepend=False), axis=0)
     names = [column.name for column in truth.model.columns]
-    dry = np.array([truth.parameters[names.index(f"fs{joint + 1}")] for joint in range(at_rest.shape[1])])
+    dry = np.array(
+        [truth.parameters[names.index(f"fs{joint + 1}")] for joint in range(at_rest.shape[1])]
+    )
     held = np.stack(
-        [rng.uniform(-1.0, 1.0, dwell[-1, joint] + 1)[dwell[:, joint]] for joint in range(len(dry))], axis=1
+        [
+            rng.uniform(-1.0, 1.0, dwell[-1, joint] + 1)[dwell[:, joint]]
+            for joint in range(len(dry))
+        ],
+        axis=1,
     )
     torque = np.where(at_rest, dry * held, 0.0)
     noisy = run.position_rad + ENCODER_NOISE_RAD * rng.standard_normal(run.position_rad.shape)
@@ -69,7 +79,9 @@ def test_it_distinguishes_rest_from_motion(
     for exact, run in zip(noisy_runs, sticking, strict=True):
         data = _derived(truth, run)
         # The low-pass smears the last of a move over some samples of the rest that follows.
-        resting = np.apply_along_axis(lambda rest: np.convolve(rest, np.ones(61), "same") > 60.5, 0, _at_rest(exact))
+        resting = np.apply_along_axis(
+            lambda rest: np.convolve(rest, np.ones(61), "same") > 60.5, 0, _at_rest(exact)
+        )
         assert resting.any(axis=0).all()
         assert not data.moving[resting[1:-1]].any()
         speed = np.abs(data.velocity_rad_s)
@@ -81,16 +93,22 @@ def test_gains_are_as_good_as_with_declared_speeds(truth: Truth, sticking: tuple
     assert _gain_error(truth, sticking, DERIVED) < 1.3 * _gain_error(truth, sticking, CONDITIONING)
 
 
-def test_without_current_noise_only_standstill_biases_the_gains(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+def test_without_current_noise_only_standstill_biases_the_gains(
+    truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
     rng = np.random.default_rng(4)
     runs = tuple(_sticking(run, truth, rng) for run in clean_runs)
-    derived, declared, never = (_gain_error(truth, runs, choice) for choice in (DERIVED, CONDITIONING, NEVER))
+    derived, declared, never = (
+        _gain_error(truth, runs, choice) for choice in (DERIVED, CONDITIONING, NEVER)
+    )
     assert derived < 2e-4
     assert declared < 2e-4
     assert never > 1e-2
 
 
-def test_no_row_that_counts_holds_more_rest_than_its_share(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+def test_no_row_that_counts_holds_more_rest_than_its_share(
+    truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
     # By the exact positions: the low-pass must not let a joint that rests pass for a moving one.
     strict = replace(DERIVED, standstill_share=0.05)
     for run in clean_runs:
@@ -101,7 +119,9 @@ def test_no_row_that_counts_holds_more_rest_than_its_share(truth: Truth, clean_r
 
 
 def _largest_share_of_rest(truth: Truth, run: Run, conditioning: Conditioning) -> float:
-    """Largest share of its dry friction that a row can have from a joint at rest, over all rows that count."""
+    """Largest share of its dry friction that a row can have from a joint at rest,
+    over all rows that count.
+    """
     data = differentiate(run, truth.model.drive_train, conditioning)
     use, _ = row_masks(truth.model, data, conditioning)
     taps = row_filter(data, conditioning)
@@ -111,10 +131,15 @@ def _largest_share_of_rest(truth: Truth, run: Run, conditioning: Conditioning) -
 
 
 @pytest.mark.parametrize("noise_rad", [0.0, ENCODER_NOISE_RAD, 1e-4])
-def test_a_joint_that_is_held_never_moves(truth: Truth, noisy_runs: tuple[Run, ...], noise_rad: float) -> None:
+def test_a_joint_that_is_held_never_moves(
+    truth: Truth, noisy_runs: tuple[Run, ...], noise_rad: float
+) -> None:
     position = noisy_runs[0].position_rad.copy()
     position[:, 3] = 0.7 + noise_rad * np.random.default_rng(1).standard_normal(len(position))
-    held = [replace(noisy_runs[0], position_rad=position), replace(noisy_runs[1], position_rad=position)]
+    held = [
+        replace(noisy_runs[0], position_rad=position),
+        replace(noisy_runs[1], position_rad=position),
+    ]
     assert not _derived(truth, held[0]).moving[:, 3].any()
     with pytest.raises(DataUnfit, match="J4 never moves"):
         identify(truth.model, held, DERIVED)

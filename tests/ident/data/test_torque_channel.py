@@ -1,4 +1,6 @@
-"""The slope of a controller's own torque over the current: its value, its σ, and where there is none."""
+"""The slope of a controller's own torque over the current:
+its value, its σ, and where there is none.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,20 @@ RATE_HZ = 20.0
 
 
 def channel(
-    rng: np.random.Generator, seconds: float = 30.0, offset_nm: float = 0.4, noise_nm: float = 0.5, noise_a: float = 0.2
+    rng: np.random.Generator,
+    seconds: float = 30.0,
+    offset_nm: float = 0.4,
+    noise_nm: float = 0.5,
+    noise_a: float = 0.2,
 ) -> TorqueChannel:
-    """Noise of the torque that is correlated, as behind a filter, and noise of the current, 6 % of its square."""
+    """Noise of the torque that is correlated, as behind a filter, and noise of the current,
+    6 % of its square.
+    """
     count = round(seconds * RATE_HZ)
     time_s = np.arange(count) / RATE_HZ
-    true_a = np.sin(2.0 * np.pi * time_s / 3.0 + rng.uniform(0.0, 6.0)) + 0.3 * rng.standard_normal(count)
+    true_a = np.sin(2.0 * np.pi * time_s / 3.0 + rng.uniform(0.0, 6.0)) + 0.3 * rng.standard_normal(
+        count
+    )
     current_a, nearby_a = true_a + noise_a * rng.standard_normal((2, count))
     noise = np.convolve(rng.standard_normal(count + 1), (noise_nm, noise_nm), "valid")
     return TorqueChannel(time_s, current_a, nearby_a, SLOPE * true_a + offset_nm + noise)
@@ -31,7 +41,8 @@ def test_the_slope_is_within_its_sigma_and_offsets_of_runs_do_not_matter() -> No
     slopes = [slope for slope in found if slope is not None]
     assert [slope.readings for slope in slopes] == [1200] * 200
     assert max(slope.std for slope in slopes) < 0.15
-    # 200 draws know a deviation to 5 %, and a mean to 7 % of one; least squares is 6 % too small, many σ.
+    # 200 draws know a deviation to 5 %, and a mean to 7 % of one; least squares is 6 % too small,
+    # many σ.
     misses = [(slope.value - SLOPE) / slope.std for slope in slopes]
     assert 0.85 < np.std(misses) < 1.15
     assert abs(np.mean(misses)) < 0.2

@@ -1,4 +1,6 @@
-"""Currents without their sign are refused by axis; a current that has one sign by its nature is not."""
+"""Currents without their sign are refused by axis;
+a current that has one sign by its nature is not.
+"""
 
 from __future__ import annotations
 
@@ -42,14 +44,23 @@ def test_sizes_are_refused_and_the_axes_named(
 ) -> None:
     names = ", ".join(AXES[axis] for axis in axes)
     other = "negative" if sign > 0.0 else "positive"
-    with pytest.raises(CurrentUnsigned, match=f"axis {names}: found currents that are never {other} .* both ways"):
+    with pytest.raises(
+        CurrentUnsigned, match=f"axis {names}: found currents that are never {other} .* both ways"
+    ):
         identify(small_truth.model, [sized(run, axes, sign) for run in runs], SMALL, axes=AXES)
 
 
 def test_sizes_in_a_held_out_run_are_refused(small_truth: Truth, runs: list[Run]) -> None:
     unseen = replace(sized(small_recordings(small_truth, 1, count=1)[0], [1]), name="unseen")
     with pytest.raises(CurrentUnsigned, match="run 'unseen': axis J2"):
-        identify(small_truth.model, runs[:1], SMALL, holdout=[unseen], fixed_gains=small_truth.gains, axes=AXES)
+        identify(
+            small_truth.model,
+            runs[:1],
+            SMALL,
+            holdout=[unseen],
+            fixed_gains=small_truth.gains,
+            axes=AXES,
+        )
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -63,7 +74,9 @@ def test_currents_with_a_sign_are_taken(small_truth: Truth, seed: int) -> None:
 def test_a_current_that_has_one_sign_by_its_nature_is_taken(
     small_truth: Truth, runs: list[Run], least: float, upwards: bool, steps: int
 ) -> None:
-    """A shoulder that always lifts, however near to zero its current comes, and however coarse its counts are."""
+    """A shoulder that always lifts, however near to zero its current comes,
+    and however coarse its counts are.
+    """
     current = shifted(runs[0].current_a if upwards else -runs[0].current_a, least)
     if steps:
         count = current.max(axis=0) / steps
@@ -72,7 +85,9 @@ def test_a_current_that_has_one_sign_by_its_nature_is_taken(
     assert not unsigned_currents(lifting, small_truth.model.drive_train.ratio).any()
 
 
-def test_a_brake_that_takes_the_load_at_each_stop_is_no_size(small_truth: Truth, runs: list[Run]) -> None:
+def test_a_brake_that_takes_the_load_at_each_stop_is_no_size(
+    small_truth: Truth, runs: list[Run]
+) -> None:
     """The current of an axis that always lifts is zero while its brake is on."""
     current = shifted(runs[0].current_a, 0.3)
     stops = np.arange(len(current)) % 220 < 40  # 0.2 s of 1.1
@@ -81,13 +96,17 @@ def test_a_brake_that_takes_the_load_at_each_stop_is_no_size(small_truth: Truth,
     assert not unsigned_currents(braked, small_truth.model.drive_train.ratio).any()
 
 
-def test_an_axis_that_moves_one_way_alone_is_not_judged(small_truth: Truth, runs: list[Run]) -> None:
+def test_an_axis_that_moves_one_way_alone_is_not_judged(
+    small_truth: Truth, runs: list[Run]
+) -> None:
     turning = replace(runs[0], position_rad=np.cumsum(np.abs(runs[0].position_rad), axis=0))
     assert not unsigned_currents(sized(turning, [0, 1, 2]), np.eye(3)).any()
     assert unsigned_currents(sized(runs[0], [0, 1, 2]), small_truth.model.drive_train.ratio).all()
 
 
-def test_sizes_that_are_reported_slowly_or_coarsely_are_found(small_truth: Truth, runs: list[Run]) -> None:
+def test_sizes_that_are_reported_slowly_or_coarsely_are_found(
+    small_truth: Truth, runs: list[Run]
+) -> None:
     """A drive reports every third sample anew, in counts of 2 % of the largest current."""
     slow = np.repeat(np.abs(runs[1].current_a[::3]), 3, axis=0)[: len(runs[1].time_s)]
     count = 0.02 * slow.max(axis=0)

@@ -42,7 +42,9 @@ def _held_out(small: Evidence, count: int) -> Evidence:
     return replace(small, held_out=count, training=training, holdout=rows.only(rows.run >= first))
 
 
-def _planted(small: Evidence, truth: Truth, torque: Callable[[Dataset], FloatArray], held_out: int = 1) -> Evidence:
+def _planted(
+    small: Evidence, truth: Truth, torque: Callable[[Dataset], FloatArray], held_out: int = 1
+) -> Evidence:
     """Recordings with a torque, and the last one held out."""
     made = bent(small, truth, torque)
     cut = _held_out(made, held_out)
@@ -54,7 +56,9 @@ def _sticks(data: Dataset) -> FloatArray:
     return acting_on(1, 3, 6.0 * np.sign(v) * np.exp(-np.abs(v) / 0.3))
 
 
-def _only_in(names: tuple[str, ...], torque: Callable[[Dataset], FloatArray]) -> Callable[[Dataset], FloatArray]:
+def _only_in(
+    names: tuple[str, ...], torque: Callable[[Dataset], FloatArray]
+) -> Callable[[Dataset], FloatArray]:
     """A torque that the recordings of some names have, and the others do not."""
     return lambda data: torque(data) * (data.name in names)
 
@@ -67,7 +71,21 @@ def _steps(start: Evidence, effects: tuple[PlacedEffect, ...]) -> tuple[Step, ..
     """What a search that has found these effects returns."""
     after = with_effects(start, effects)
     found = [
-        Finding(one.effect, one.axis, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8))
+        Finding(
+            one.effect,
+            one.axis,
+            np.ones(1),
+            np.ones(1),
+            0.0,
+            1.0,
+            0.1,
+            5.0,
+            4.0,
+            0.2,
+            9.0,
+            True,
+            np.ones(8),
+        )
         for one in effects
     ]
     turns = [Step((), (), np.zeros(3), one, after) for one in found]
@@ -92,12 +110,16 @@ def test_a_true_effect_is_confirmed_and_stays(sticking: Evidence) -> None:
     assert verdict.after.axes[1] < 0.9 * verdict.before.axes[1]
 
 
-def test_a_refuted_effect_leaves_and_the_rest_is_fitted_again(small: Evidence, small_truth: Truth) -> None:
+def test_a_refuted_effect_leaves_and_the_rest_is_fitted_again(
+    small: Evidence, small_truth: Truth
+) -> None:
     """Runs of the fit have a torque that the held-out one lacks: no law of the arm."""
     fitted = _only_in(("run0", "run1", "run2"), _asymmetric)
     start = _planted(small, small_truth, lambda data: _sticks(data) + fitted(data))
     said: list[str] = []
-    (*_, last) = accept_on_holdout(start, _steps(start, (STICKING, ASYMMETRIC)), axes=NAMES, progress=said.append)
+    (*_, last) = accept_on_holdout(
+        start, _steps(start, (STICKING, ASYMMETRIC)), axes=NAMES, progress=said.append
+    )
     assert last.after.effects == (STICKING,)
     verdicts = _by_place(last)
     assert verdicts[ASYMMETRIC].judgement is Judgement.REFUTED
@@ -108,7 +130,9 @@ def test_a_refuted_effect_leaves_and_the_rest_is_fitted_again(small: Evidence, s
     assert last.after.estimate.parameters == pytest.approx(again.estimate.parameters)
 
 
-def test_an_undecided_effect_is_reported_and_not_written_unless_asked_for(sticking: Evidence) -> None:
+def test_an_undecided_effect_is_reported_and_not_written_unless_asked_for(
+    sticking: Evidence,
+) -> None:
     steps = _steps(sticking, (STICKING, SPRING))  # there is no spring
     (*_, last) = accept_on_holdout(sticking, steps, axes=NAMES)
     assert last.after.effects == (STICKING,)
@@ -123,14 +147,25 @@ def test_an_undecided_effect_is_reported_and_not_written_unless_asked_for(sticki
 
 
 def test_sigma_contains_what_an_undecided_effect_would_move(small_truth: Truth) -> None:
-    """A motor saturates, and a held-out run of four moves decides nothing: without the effect, its gain is 7 % off."""
+    """A motor saturates, and a held-out run of four moves decides nothing:
+    without the effect, its gain is 7 % off.
+    """
     rng = np.random.default_rng(3)
     runs = [
-        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=seconds)
+        record(
+            small_truth,
+            f"run{index}",
+            rng,
+            MOUNTED if index % 2 else None,
+            noise_a=0.3,
+            seconds=seconds,
+        )
         for index, seconds in enumerate((22.0, 22.0, 22.0, 22.0, 5.0))
     ]
     linear = gathered(small_truth, tuple(runs))
-    current_a = linear.estimate.predicted_torque(linear.rows_without_effects) / small_truth.gains[:, None]
+    current_a = (
+        linear.estimate.predicted_torque(linear.rows_without_effects) / small_truth.gains[:, None]
+    )
     added_a = np.zeros_like(current_a)
     added_a[1] = 0.3 * current_a[1] ** 3 / np.max(np.abs(current_a[1])) ** 2
     start = with_effects(_held_out(with_current(linear, added_a), 1), ())
@@ -146,7 +181,9 @@ def test_sigma_contains_what_an_undecided_effect_would_move(small_truth: Truth) 
     assert abs(errors[1]) > 3.0 * start.estimate.gains_std[1]
     assert np.all(np.abs(errors) < 3.0 * last.after.estimate.gains_std)
     assert last.choice_std is not None
-    assert last.after.estimate.gains_std == pytest.approx(np.hypot(start.estimate.gains_std, last.choice_std), rel=1e-6)
+    assert last.after.estimate.gains_std == pytest.approx(
+        np.hypot(start.estimate.gains_std, last.choice_std), rel=1e-6
+    )
 
 
 def test_a_refuted_effect_adds_nothing_to_sigma(small: Evidence, small_truth: Truth) -> None:
@@ -160,7 +197,9 @@ def test_a_refuted_effect_adds_nothing_to_sigma(small: Evidence, small_truth: Tr
 
 
 def test_what_is_left_passes_every_gate_again(sticking: Evidence) -> None:
-    """A spring that is not there, with a σ that shows it: the folds and the random signs of the moves do not."""
+    """A spring that is not there, with a σ that shows it:
+    the folds and the random signs of the moves do not.
+    """
     steps = _steps(sticking, (STICKING, SPRING))
     joined = with_effects(sticking, (SPRING,))
     own = len(joined.estimate.gains) + own_unknowns(joined.estimate, joined.effects)
@@ -176,7 +215,9 @@ def test_what_is_left_passes_every_gate_again(sticking: Evidence) -> None:
     assert last.set_aside[-1].words.startswith("without what has left, ")
     # Where nothing has left, the search itself has just asked.
     unchanged = (*steps[:-1], replace(steps[-1], after=certain))
-    assert end_search(unchanged, model, Gates(draws=199), rng=np.random.default_rng(0)).after.effects == (SPRING,)
+    assert end_search(
+        unchanged, model, Gates(draws=199), rng=np.random.default_rng(0)
+    ).after.effects == (SPRING,)
 
 
 def test_few_held_out_moves_decide_nothing(small: Evidence, small_truth: Truth) -> None:

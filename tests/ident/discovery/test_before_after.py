@@ -1,4 +1,6 @@
-"""Before and after: one metric for every error, and changes of gains that are distinguished from noise."""
+"""Before and after: one metric for every error, and changes of gains that are distinguished from
+noise.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ def compared(start: Evidence, after: Evidence) -> Account:
 
 
 def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, compared: Account) -> None:
-    """From the definition: e_i = v_i − (T τ)_i/g_i over the motor's rows, motor by motor, and weighed by the gains."""
+    """From the definition: e_i = v_i − (T τ)_i/g_i over the motor's rows, motor by motor,
+    and weighed by the gains.
+    """
     estimate = start.estimate
     for rows, error in (
         (start.training, compared.total.before.in_sample),
@@ -79,7 +83,8 @@ def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, compare
         assert rows is not None
         assert error is not None
         torque = np.linalg.solve(rows.drive_train.direction.T, estimate.predicted_torque(rows))
-        left, size = [], []
+        left = []
+        size = []
         for motor in range(6):
             used = rows.motor_use[motor]
             v = rows.current[motor, used]
@@ -98,7 +103,8 @@ def test_an_uncoupled_axis_has_the_error_of_table_6(start: Evidence, compared: A
 
 
 def test_parts_of_the_data_add_up(start: Evidence) -> None:
-    rows, weights = start.training, start.estimate.gains
+    rows = start.training
+    weights = start.estimate.gains
     whole = error_on(rows, start.estimate)
     parts = CurrentError(np.zeros(6), np.zeros(6))
     for run in range(3):
@@ -109,7 +115,9 @@ def test_parts_of_the_data_add_up(start: Evidence) -> None:
 
 def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> None:
     estimate = start.estimate
-    problem = linearise(start.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
+    problem = linearise(
+        start.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False
+    )
     folds = cut_into_folds(problem)
     seen = replace(folds, residual=folds.linearisation.residual)
     assert error_left_out(seen).left == pytest.approx(error_on(start.training, estimate).left)
@@ -117,7 +125,8 @@ def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> N
 
 
 def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(compared: Account) -> None:
-    before, after = compared.total.before, compared.total.after
+    before = compared.total.before
+    after = compared.total.after
     pairs = (
         (before.in_sample, after.in_sample),
         (before.cross_validated, after.cross_validated),
@@ -163,7 +172,9 @@ def test_what_is_taken_out_again_is_reported(start: Evidence, after: Evidence) -
     assert (back.added, back.removed) == ((), (SPRING,))
 
 
-def test_the_declared_model_is_found_again_behind_its_effects(start: Evidence, after: Evidence) -> None:
+def test_the_declared_model_is_found_again_behind_its_effects(
+    start: Evidence, after: Evidence
+) -> None:
     again = without_effects(after, start.estimate)
     assert np.array_equal(again.training.regressor, start.training.regressor)
     assert again.holdout is not None
@@ -174,9 +185,17 @@ def test_the_declared_model_is_found_again_behind_its_effects(start: Evidence, a
 
 def test_gains_carry_their_own_sigma(start: Evidence, after: Evidence, compared: Account) -> None:
     for motor, gain in enumerate(compared.total.gains):
-        assert (gain.before, gain.before_std) == (start.estimate.gains[motor], start.estimate.gains_std[motor])
-        assert (gain.after, gain.after_std) == (after.estimate.gains[motor], after.estimate.gains_std[motor])
-        assert gain.change_percent == pytest.approx(100.0 * (gain.after - gain.before) / gain.before)
+        assert (gain.before, gain.before_std) == (
+            start.estimate.gains[motor],
+            start.estimate.gains_std[motor],
+        )
+        assert (gain.after, gain.after_std) == (
+            after.estimate.gains[motor],
+            after.estimate.gains_std[motor],
+        )
+        assert gain.change_percent == pytest.approx(
+            100.0 * (gain.after - gain.before) / gain.before
+        )
 
 
 def test_the_jackknife_of_a_gain_is_that_of_its_estimate(start: Evidence) -> None:
@@ -196,7 +215,8 @@ def test_an_effect_that_is_not_there_changes_no_gain_and_one_that_is_does(
     weights = small.estimate.gains
     idle = before_after(assess(small, weights), assess(with_effects(small, (saturation,)), weights))
     assert not any(gain.significant for gain in idle.gains)
-    # The change shares its noise with both estimates: it is known better than either where the effect says little.
+    # The change shares its noise with both estimates: it is known better than either where the
+    # effect says little.
     assert idle.gains[0].change_std < 0.5 * idle.gains[0].before_std
     runs = []
     for run in small_runs:
@@ -204,9 +224,13 @@ def test_an_effect_that_is_not_there_changes_no_gain_and_one_that_is_does(
         current[:, 1] *= 1.0 + 0.004 * current[:, 1] ** 2
         runs.append(replace(run, current_a=current))
     bent = gathered(small_truth, tuple(runs))
-    changed = before_after(assess(bent, weights), assess(with_effects(bent, (saturation,)), weights))
+    changed = before_after(
+        assess(bent, weights), assess(with_effects(bent, (saturation,)), weights)
+    )
     assert changed.gains[1].significant
-    assert abs(changed.gains[1].after - small_truth.gains[1]) < abs(changed.gains[1].before - small_truth.gains[1])
+    assert abs(changed.gains[1].after - small_truth.gains[1]) < abs(
+        changed.gains[1].before - small_truth.gains[1]
+    )
 
 
 def test_a_left_out_run_is_predicted_by_the_others_alone(
@@ -238,10 +262,16 @@ def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> No
     assert np.isnan(error.total)
 
 
-def test_a_refuted_floor_bounds_no_error(start: Evidence, after: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refuted_floor_bounds_no_error(
+    start: Evidence, after: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     left_a = left_on(after.training, after.estimate)
-    factors = np.array([0.9, 1.1, 2.0, 0.9, 1.1, 2.0])  # of what the model leaves; these floors are known to 9 %
-    floors = tuple(MotorNoiseFloor(float(noise_a), FloorSource.STANDSTILL, 20, 100.0) for noise_a in factors * left_a)
+    # Of what the model leaves; these floors are known to 9 %
+    factors = np.array([0.9, 1.1, 2.0, 0.9, 1.1, 2.0])
+    floors = tuple(
+        MotorNoiseFloor(float(noise_a), FloorSource.STANDSTILL, 20, 100.0)
+        for noise_a in factors * left_a
+    )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
     made = account(start, [Step((), (), np.zeros(6), None, after)])
     assert made.floors == floors
@@ -256,20 +286,30 @@ def test_a_refuted_floor_bounds_no_error(start: Evidence, after: Evidence, monke
 def test_no_floor_exceeds_the_error_on_the_same_rows(
     start: Evidence, after: Evidence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The floors are a tenth above what the model leaves, and known to 9 %: the model is at the floor."""
+    """The floors are a tenth above what the model leaves, and known to 9 %:
+    the model is at the floor.
+    """
     left_a = left_on(after.training, after.estimate)
     floors = tuple(
-        MotorNoiseFloor(1.1 * float(left), FloorSource.REPEATED_MOVES, 20, 100.0, is_bound=True) for left in left_a
+        MotorNoiseFloor(1.1 * float(left), FloorSource.REPEATED_MOVES, 20, 100.0, is_bound=True)
+        for left in left_a
     )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
     made = account(start, [Step((), (), np.zeros(6), None, after)])
-    before, last = made.total.before, made.total.after
-    pairs = ((made.floor, before.in_sample, last.in_sample), (made.holdout_floor, before.holdout, last.holdout))
+    before = made.total.before
+    last = made.total.after
+    pairs = (
+        (made.floor, before.in_sample, last.in_sample),
+        (made.holdout_floor, before.holdout, last.holdout),
+    )
     for floor, *errors in pairs:
         for error in errors:
             assert floor is not None
             assert error is not None
-            assert np.all(np.array((*floor.axes, floor.total)) <= np.array((*error.axes, error.total)) * (1.0 + 1e-9))
+            assert np.all(
+                np.array((*floor.axes, floor.total))
+                <= np.array((*error.axes, error.total)) * (1.0 + 1e-9)
+            )
     assert made.floor.axes[2] == pytest.approx(last.in_sample.axes[2])
     assert made.floors == floors  # as measured
     # The lower limit of such a floor, a seventh below it, is below the error.
@@ -278,7 +318,9 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
     ratio = np.array(made.least_floor.axes) / last.in_sample.axes
     assert ratio == pytest.approx(expected)
     # Standstill alone bounds nothing.
-    at_rest = tuple(replace(floor, source=FloorSource.STANDSTILL, is_bound=False) for floor in floors)
+    at_rest = tuple(
+        replace(floor, source=FloorSource.STANDSTILL, is_bound=False) for floor in floors
+    )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: at_rest)
     unbound = account(start, [Step((), (), np.zeros(6), None, after)])
     assert np.isnan(unbound.least_floor.axes).all()
@@ -293,14 +335,19 @@ def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) ->
     assert all(gain.change_std == 0.0 and not gain.significant for gain in changed.gains)
 
 
-def test_a_change_and_its_estimates_leave_out_the_same_blocks(start: Evidence, after: Evidence) -> None:
+def test_a_change_and_its_estimates_leave_out_the_same_blocks(
+    start: Evidence, after: Evidence
+) -> None:
     """Where the moves of one model are correlated, the change is judged by its longer blocks."""
     weights = start.estimate.gains
-    first, last = assess(start, weights), assess(after, weights)
+    first = assess(start, weights)
+    last = assess(after, weights)
     assert first.moves is not None
     assert last.moves is not None
     slow = (np.arange(len(first.moves.runs)) // 8 % 2)[:, None] * 2.0 - 1.0
-    correlated = replace(first, moves=replace(first.moves, scores=np.abs(first.moves.scores) * slow))
+    correlated = replace(
+        first, moves=replace(first.moves, scores=np.abs(first.moves.scores) * slow)
+    )
     assert correlated.moves is not None
     starts = correlated.moves.blocks()
     assert len(starts) < len(last.moves.blocks())

@@ -27,7 +27,9 @@ PLACED = PlacedEffect(Presliding(0.04), AXIS)
 
 
 def _clear_rows(evidence: Evidence) -> NDArray[np.bool_]:
-    """Rows of each joint that hold no more standstill than a row that is clear of stops, shape (n, r)."""
+    """Rows of each joint that hold no more standstill than a row that is clear of stops, shape (n,
+    r).
+    """
     allowed = evidence.conditioning.standstill_share
     strict = replace(evidence.conditioning, standstill_share=CLEAR_SHARE * allowed)
     masks = [row_masks(evidence.model, data, strict)[0] for data in evidence.datasets]
@@ -78,5 +80,7 @@ def test_rows_that_are_clear_are_those_of_a_smaller_share_of_standstill(small: E
         (Lag(), False),
     ],
 )
-def test_only_what_turns_with_the_motion_could_be_friction_at_rest(effect: Effect, is_asked: bool) -> None:
+def test_only_what_turns_with_the_motion_could_be_friction_at_rest(
+    effect: Effect, is_asked: bool
+) -> None:
     assert turns_with_motion(effect) is is_asked

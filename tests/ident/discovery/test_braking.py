@@ -1,4 +1,6 @@
-"""Friction brakes at every speed: a fit in which terms of the speed drive the arm together is not written."""
+"""Friction brakes at every speed: a fit in which terms of the speed drive the arm together is not
+written.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,15 @@ from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import AsymmetricViscous, NonlinearViscous, SpeedFriction, Stribeck
-from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, three_axes_truth
+from tests.ident.recordings import (
+    MOUNTED,
+    Truth,
+    acting_on,
+    bent,
+    gathered,
+    record,
+    three_axes_truth,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +47,16 @@ def clean(truth: Truth) -> Evidence:
     rng = np.random.default_rng(11)
     payloads = (None, MOUNTED, None, MOUNTED)
     runs = [
-        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0, averaged=2)
+        record(
+            truth,
+            f"run{number}",
+            rng,
+            payload,
+            noise_a=0.03,
+            seconds=18.0,
+            rate_hz=500.0,
+            averaged=2,
+        )
         for number, payload in enumerate(payloads)
     ]
     return gathered(truth, tuple(runs))
@@ -55,8 +74,11 @@ def _with_friction(clean: Evidence, truth: Truth, friction_nm: object) -> Eviden
     return bent(clean, truth, torque)
 
 
-def test_terms_that_push_together_at_low_speed_are_named_with_speed_and_size(clean: Evidence, truth: Truth) -> None:
-    # Drag by a root of the speed where there is none, and 20 Nm less dry friction than the axis has.
+def test_terms_that_push_together_at_low_speed_are_named_with_speed_and_size(
+    clean: Evidence, truth: Truth
+) -> None:
+    # Drag by a root of the speed where there is none, and 20 Nm less dry friction than the axis
+    # has.
     worn = _with_friction(clean, truth, lambda speed: 25.0 * speed ** (1.0 / 3.0) - 20.0)
     placed = PlacedEffect(NonlinearViscous(1.0 / 3.0), AXIS)
     fitted = with_effects(worn, (placed,))
@@ -93,7 +115,9 @@ def test_friction_that_brakes_is_still_found(
     assert pushing(end, AXIS) == ""
 
 
-def test_a_direction_in_which_the_arm_would_be_driven_is_seen(clean: Evidence, truth: Truth) -> None:
+def test_a_direction_in_which_the_arm_would_be_driven_is_seen(
+    clean: Evidence, truth: Truth
+) -> None:
     placed = PlacedEffect(AsymmetricViscous(), AXIS)
     fitted = with_effects(clean, (placed,))
     index = [column.name for column in fitted.estimate.unknowns].index(placed.columns[0].name)
@@ -112,15 +136,28 @@ def test_columns_are_the_torque_at_the_speed_of_the_joint(effect: SpeedFriction)
     columns = effect.at_speed(velocity)
     assert columns.shape == (len(effect.coefficients), len(velocity))
     is_even = isinstance(effect, AsymmetricViscous)
-    np.testing.assert_allclose(columns, effect.at_speed(-velocity) * (1.0 if is_even else -1.0), atol=1e-12)
+    np.testing.assert_allclose(
+        columns, effect.at_speed(-velocity) * (1.0 if is_even else -1.0), atol=1e-12
+    )
 
 
 def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
-    """Without load the axis brakes; with it, what the payload adds to the friction is more than there was."""
+    """Without load the axis brakes; with it, what the payload adds to the friction is more than
+    there was.
+    """
     by_payload = replace(truth, model=replace(truth.model, friction_by_payload=True))
     rng = np.random.default_rng(12)
     runs = [
-        record(truth, f"run{number}", rng, payload, noise_a=0.03, seconds=18.0, rate_hz=500.0, averaged=2)
+        record(
+            truth,
+            f"run{number}",
+            rng,
+            payload,
+            noise_a=0.03,
+            seconds=18.0,
+            rate_hz=500.0,
+            averaged=2,
+        )
         for number, payload in enumerate((None, MOUNTED))
     ]
     fitted = with_effects(gathered(by_payload, tuple(runs)), (PlacedEffect(Stribeck(0.3), AXIS),))

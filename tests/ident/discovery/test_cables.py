@@ -1,4 +1,6 @@
-"""Cables and hoses over two joints: where they begin to pull and how they are led, and what is no such cable."""
+"""Cables and hoses over two joints: where they begin to pull and how they are led,
+and what is no such cable.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +19,36 @@ from ident.discovery.search import rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, is_placeable
 from ident.effects.position import Cable, Compensator, Hinge, SlackCable, Spring
-from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, three_axes_truth
+from tests.ident.recordings import (
+    MOUNTED,
+    Truth,
+    bent,
+    gathered,
+    record,
+    search_problem_of,
+    three_axes_truth,
+)
 
 pytestmark = pytest.mark.slow
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 OF_POSITION = tuple(
-    family for family in EFFECTS if isinstance(family[0], Spring | Hinge | Compensator | Cable | SlackCable)
+    family
+    for family in EFFECTS
+    if isinstance(family[0], Spring | Hinge | Compensator | Cable | SlackCable)
 )
 STIFFNESS = 30.0
 RADII = (0.8, -0.6)
 """At which a cable is led around the second and the third joint; together a unit vector."""
 
 
-def _cabled(small: Evidence, truth: Truth, *, radii: tuple[float, float], start_rad: float) -> Evidence:
-    """The arm with a cable along the second and the third joint, as a force that a cable has along its way."""
+def _cabled(
+    small: Evidence, truth: Truth, *, radii: tuple[float, float], start_rad: float
+) -> Evidence:
+    """The arm with a cable along the second and the third joint,
+    as a force that a cable has along its way.
+    """
 
     def torque(data: Dataset) -> FloatArray:
         way = data.position_rad[:, 1:] @ np.array(radii)
@@ -71,7 +87,9 @@ def test_a_slack_cable_is_named_with_its_start_and_its_radii(
     assert np.abs(z).max() < 3.0
 
 
-def test_a_hose_that_pushes_too_is_a_cable_with_one_potential(small: Evidence, small_truth: Truth) -> None:
+def test_a_hose_that_pushes_too_is_a_cable_with_one_potential(
+    small: Evidence, small_truth: Truth
+) -> None:
     (placed,), after = _found(_cabled(small, small_truth, radii=RADII, start_rad=-100.0))
     assert placed == PlacedEffect(Cable(3), 1)
     stiffness = STIFFNESS * np.outer(RADII, RADII)
@@ -99,13 +117,17 @@ def test_no_cable_is_tried_in_few_moves(small_truth: Truth) -> None:
     """A shape with many settings fits the few moves."""
     rng = np.random.default_rng(4)
     runs = tuple(
-        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, seconds=8.0) for index in range(4)
+        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, seconds=8.0)
+        for index in range(4)
     )
     start = _cabled(gathered(small_truth, runs), small_truth, radii=RADII, start_rad=0.3)
     problem = search_problem_of(start)
     assert problem.folds.moves < SlackCable(3, 0.5).least_moves
     assert propose_cables(problem, GATES, OF_POSITION) == {}
-    names = {finding.effect.name for finding in rank_effects(problem, np.random.default_rng(0), GATES, OF_POSITION)}
+    names = {
+        finding.effect.name
+        for finding in rank_effects(problem, np.random.default_rng(0), GATES, OF_POSITION)
+    }
     assert names == {"spring", "hinge", "gravity-compensator"}
 
 

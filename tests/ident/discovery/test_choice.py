@@ -1,4 +1,6 @@
-"""Share of the choice of effects in σ: against refits with a rival, and with an effect that stayed out."""
+"""Share of the choice of effects in σ:
+against refits with a rival, and with an effect that stayed out.
+"""
 
 from __future__ import annotations
 
@@ -37,15 +39,24 @@ def sticking(small: Evidence, small_truth: Truth) -> Evidence:
     return _sticking(small, small_truth, 8.0)
 
 
-def _finding(effect: Effect, ambiguity: tuple[PlacedEffect, ...] = (), fold_errors: FloatArray = FOLDS) -> Finding:
+def _finding(
+    effect: Effect, ambiguity: tuple[PlacedEffect, ...] = (), fold_errors: FloatArray = FOLDS
+) -> Finding:
     ones = np.ones(1)
-    return Finding(effect, 1, ones, ones, 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, fold_errors, ambiguity)
+    return Finding(
+        effect, 1, ones, ones, 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, fold_errors, ambiguity
+    )
 
 
 @pytest.mark.parametrize(("lead", "weight"), [(0.0, 0.5), (-1e3, 0.0)])
-def test_a_rival_adds_its_distance_by_its_odds(sticking: Evidence, lead: float, weight: float) -> None:
-    """Refits with either effect are that far apart; a rival that every fold refutes has no weight."""
-    effect, other = Stribeck(SPEED_RAD_S), NonlinearViscous(1.0 / 3.0)
+def test_a_rival_adds_its_distance_by_its_odds(
+    sticking: Evidence, lead: float, weight: float
+) -> None:
+    """Refits with either effect are that far apart;
+    a rival that every fold refutes has no weight.
+    """
+    effect = Stribeck(SPEED_RAD_S)
+    other = NonlinearViscous(1.0 / 3.0)
     joined, instead = (with_effects(sticking, (PlacedEffect(one, 1),)) for one in (effect, other))
     rival = _finding(other, fold_errors=FOLDS - lead + 1e-3 * np.resize((-1.0, 1.0), 8))
     finding = _finding(effect, (PlacedEffect(other, 1),))
@@ -56,10 +67,16 @@ def test_a_rival_adds_its_distance_by_its_odds(sticking: Evidence, lead: float, 
     assert spread == pytest.approx(np.sqrt(weight) * np.abs(apart), abs=0.1 * np.abs(apart).max())
 
 
-def test_what_is_no_noise_but_too_small_adds_what_it_would_move(small: Evidence, small_truth: Truth) -> None:
-    """The declared model alone, although joint 2 sticks: refits without and with the effect are that far apart."""
-    effect, sticking = Stribeck(SPEED_RAD_S), _sticking(small, small_truth, 2.0)
-    joined, problem = with_effects(sticking, (PlacedEffect(effect, 1),)), search_problem_of(sticking)
+def test_what_is_no_noise_but_too_small_adds_what_it_would_move(
+    small: Evidence, small_truth: Truth
+) -> None:
+    """The declared model alone, although joint 2 sticks:
+    refits without and with the effect are that far apart.
+    """
+    effect = Stribeck(SPEED_RAD_S)
+    sticking = _sticking(small, small_truth, 2.0)
+    joined = with_effects(sticking, (PlacedEffect(effect, 1),))
+    problem = search_problem_of(sticking)
     errors = problem.folds.square_sum(problem.folds.residual).sum(axis=1)
     found = _finding(effect, fold_errors=errors - 1e3 + FOLDS)
     std = np.sqrt(np.diag(choice_covariance(problem, sticking.estimate, (), (found,)))[:3])
@@ -68,9 +85,14 @@ def test_what_is_no_noise_but_too_small_adds_what_it_would_move(small: Evidence,
 
 
 def test_a_small_effect_is_possible_and_no_noise_and_fails_a_gate_of_size() -> None:
-    found, gates = _finding(Stribeck(SPEED_RAD_S)), Gates()
+    found = _finding(Stribeck(SPEED_RAD_S))
+    gates = Gates()
     assert not is_small(found, gates)
-    for small in (replace(found, explained=0.01), replace(found, error_fall=0.01), replace(found, folds_better=0.5)):
+    for small in (
+        replace(found, explained=0.01),
+        replace(found, error_fall=0.01),
+        replace(found, folds_better=0.5),
+    ):
         assert is_small(small, gates)
         assert not is_small(replace(small, probability=0.02), gates)
         assert not is_small(replace(small, coefficients=np.array([-99.0])), gates)

@@ -63,9 +63,16 @@ CASES = (
 )
 
 
-def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> tuple[Made, tuple[Run, ...]]:
-    """Recordings in which a joint needs more torque than the model says: on top of the currents, by virtual power."""
-    seconds = 12.0 if torque is _load_friction else 14.0 if mechanism is THREE_LEGS else 18.0
+def _planted(
+    mechanism: Mechanism, joint: str, torque: Torque, size: float
+) -> tuple[Made, tuple[Run, ...]]:
+    """Recordings in which a joint needs more torque than the model says:
+    on top of the currents, by virtual power.
+    """
+    if torque is _load_friction:
+        seconds = 12.0
+    else:
+        seconds = 14.0 if mechanism is THREE_LEGS else 18.0
     made = recorded(mechanism, 7, seconds=seconds, noise_a=0.01)
     runs = []
     index = [one.name for one in made.model.robot.joints].index(joint)
@@ -73,12 +80,16 @@ def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> t
     for run in made.runs:
         data = differentiate(run, made.model.drive_train, made.conditioning)
         followed: TreeMotion = made.model.follow(data.motion())
-        q, v = followed.joints.position_rad[:, index], followed.joints.velocity_rad_s[:, index]
+        q = followed.joints.position_rad[:, index]
+        v = followed.joints.velocity_rad_s[:, index]
         standard = made.standard.copy()
         if run.payload is not None:
             standard[made.model.flange] += made.payload
         loads = made.model.torques(data.motion(), standard)[0]
-        load = loads[driven.index(index)] if index in driven else np.zeros(len(q))
+        if index in driven:
+            load = loads[driven.index(index)]
+        else:
+            load = np.zeros(len(q))
         needed = followed.to_joints[:, index] * (size * torque(q, v, load))[:, None]
         a = followed.to_motors
         motors = np.einsum("kmd,kd->km", a @ np.linalg.inv(np.swapaxes(a, 1, 2) @ a), needed)
@@ -88,9 +99,16 @@ def _planted(mechanism: Mechanism, joint: str, torque: Torque, size: float) -> t
     return made, tuple(runs)
 
 
-@pytest.mark.parametrize(("mechanism", "joint", "torque", "family"), CASES, ids=lambda one: getattr(one, "name", None))
-def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torque: Torque, family: str) -> None:
-    size = 0.12 if torque is _load_friction else {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
+@pytest.mark.parametrize(
+    ("mechanism", "joint", "torque", "family"), CASES, ids=lambda one: getattr(one, "name", None)
+)
+def test_an_effect_is_named_on_its_joint(
+    mechanism: Mechanism, joint: str, torque: Torque, family: str
+) -> None:
+    if torque is _load_friction:
+        size = 0.12
+    else:
+        size = {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
     made, runs = _planted(mechanism, joint, torque, size)
     identified = identify(made.model, runs, made.conditioning, keep_rows=True)
     steps = find_effects(gather(identified), np.random.default_rng(0), GATES)
@@ -98,11 +116,16 @@ def test_an_effect_is_named_on_its_joint(mechanism: Mechanism, joint: str, torqu
     found = [(placed.effect.name, places[placed.axis]) for placed in steps[-1].after.effects]
     assert found == [(family, joint)]
     gains = steps[-1].after.estimate
-    assert np.all(np.abs(gains.gains / mechanism.gains - 1.0) < 4.0 * gains.gains_std / np.abs(gains.gains))
+    assert np.all(
+        np.abs(gains.gains / mechanism.gains - 1.0) < 4.0 * gains.gains_std / np.abs(gains.gains)
+    )
     axes = [f"J{number}" for number in range(1, len(mechanism.gains) + 1)]
     calibration = calibration_of(identified, axes, mechanism.gains, steps=steps)
     (accepted,) = calibration.effects
-    named = joint if joint in made.model.robot.passive_names else axes[places.index(joint)]
+    if joint in made.model.robot.passive_names:
+        named = joint
+    else:
+        named = axes[places.index(joint)]
     assert (accepted.name, accepted.axis) == (family, named)
     assert placed_effect(accepted, calibration)[0] == steps[-1].after.effects[0]
     without = calibration_of(identified, axes, mechanism.gains)
@@ -115,16 +138,22 @@ def _error(calibration: Calibration, made: Made, run: Run) -> float:
     use = row_masks(made.model, data, made.conditioning)[0]
     filter_ = row_filter(data, made.conditioning)
     measured = filter_(measured_torque(calibration, made.model, data.current_a, data.motion()).T)
-    return relative_error(measured, filter_(predict_torque(calibration, made.model, data).T), use).total
+    return relative_error(
+        measured, filter_(predict_torque(calibration, made.model, data).T), use
+    ).total
 
 
 def test_internal_preload_is_in_no_comparison() -> None:
     made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01)
     identified = identify(made.model, made.runs, made.conditioning)
-    calibration = calibration_of(identified, ["J1", "J2", "J3", "J4"][: len(PLANAR.gains)], PLANAR.gains)
+    calibration = calibration_of(
+        identified, ["J1", "J2", "J3", "J4"][: len(PLANAR.gains)], PLANAR.gains
+    )
     calibration = replace(
         calibration,
-        gains=tuple(replace(g, value=float(v)) for g, v in zip(calibration.gains, PLANAR.gains, strict=True)),
+        gains=tuple(
+            replace(g, value=float(v)) for g, v in zip(calibration.gains, PLANAR.gains, strict=True)
+        ),
     )
     data = differentiate(made.runs[0], made.model.drive_train, made.conditioning)
     whole, _ = np.linalg.qr(made.model.follow(data.motion()).to_motors, mode="complete")
@@ -132,32 +161,54 @@ def test_internal_preload_is_in_no_comparison() -> None:
     preloaded = data.current_a + 0.5 * preload / PLANAR.gains
     arguments = calibration, made.model
     seen = measured_torque(*arguments, data.current_a, data.motion())
-    assert_allclose(measured_torque(*arguments, preloaded, data.motion()), seen, rtol=0.0, atol=1e-10)
+    assert_allclose(
+        measured_torque(*arguments, preloaded, data.motion()), seen, rtol=0.0, atol=1e-10
+    )
     assert not np.allclose(
-        measured_torque(*arguments, preloaded), measured_torque(*arguments, data.current_a), atol=0.1
+        measured_torque(*arguments, preloaded),
+        measured_torque(*arguments, data.current_a),
+        atol=0.1,
     )
     shown = measured_current(*arguments, preloaded, data.motion())
     assert_allclose(shown * PLANAR.gains, seen, rtol=0.0, atol=1e-10)
-    assert _error(calibration, made, replace(made.runs[0], current_a=_at_samples(made.runs[0], preloaded))) < 5.0
+    assert (
+        _error(
+            calibration, made, replace(made.runs[0], current_a=_at_samples(made.runs[0], preloaded))
+        )
+        < 5.0
+    )
 
 
 def test_internal_preload_is_no_error() -> None:
-    """Preload is far larger than the error; the model is exact, so seen moves are predicted as well as unseen ones."""
+    """Preload is far larger than the error; the model is exact,
+    so seen moves are predicted as well as unseen ones.
+    """
     made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01, preload_nm=2.0)
     evidence = gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
-    rows, estimate = evidence.training, evidence.estimate
+    rows = evidence.training
+    estimate = evidence.estimate
     errors = assess(evidence, estimate.gains).errors
-    assert 0.8 * errors.cross_validated.total < errors.in_sample.total < errors.cross_validated.total
-    # e shows three of four shares of the noise: what it leaves, divided by these, is the noise of the currents.
+    assert (
+        0.8 * errors.cross_validated.total < errors.in_sample.total < errors.cross_validated.total
+    )
+    # e shows three of four shares of the noise: what it leaves, divided by these, is the noise of
+    # the currents.
     assert left_on(rows, estimate) == pytest.approx(estimate.axis_noise, rel=0.02)
-    floors = [MotorNoiseFloor(float(noise), FloorSource.STANDSTILL, 20, 1e4) for noise in estimate.axis_noise]
+    floors = [
+        MotorNoiseFloor(float(noise), FloorSource.STANDSTILL, 20, 1e4)
+        for noise in estimate.axis_noise
+    ]
     floor = floor_on(rows, estimate, floors).relative(estimate.gains)
     assert floor.axes == pytest.approx(errors.in_sample.axes, rel=0.02)
     search_problem = search_problem_of(evidence)
-    shown = [search_problem.folds.linearisation.shown(motor) for motor in range(len(estimate.gains))]
+    shown = [
+        search_problem.folds.linearisation.shown(motor) for motor in range(len(estimate.gains))
+    ]
     assert sum(shown) == pytest.approx(made.model.assembly.mobility * np.sum(rows.motor_use[0]))
     worse = replace(estimate, parameters=1.01 * estimate.parameters)
-    change = holdout_change(replace(evidence, holdout=rows), replace(evidence, holdout=rows, estimate=worse))
+    change = holdout_change(
+        replace(evidence, holdout=rows), replace(evidence, holdout=rows, estimate=worse)
+    )
     assert change is not None
     assert change.is_rise
     rise = error_on(rows, worse).left - error_on(rows, estimate).left
@@ -165,30 +216,39 @@ def test_internal_preload_is_no_error() -> None:
 
 
 def test_an_effect_is_taken_out_of_the_rows_of_all_motors() -> None:
-    """The derivative to a gain holds the corrected current: without an effect, that of the same fit without it."""
+    """The derivative to a gain holds the corrected current:
+    without an effect, that of the same fit without it.
+    """
     made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01, preload_nm=2.0)
     bare = gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
     placed = PlacedEffect(Spring(), 1)
     joined = with_effects(bare, (placed,))
     estimate = joined.estimate
-    declared = replace(estimate, parameters=np.delete(estimate.parameters, own_unknowns(estimate, (placed,))))
+    declared = replace(
+        estimate, parameters=np.delete(estimate.parameters, own_unknowns(estimate, (placed,)))
+    )
     problems = (
         without_effects_of(search_problem_of(joined), estimate, (placed,)).search_problem,
         prepare_search(made.model, joined.fit_runs, bare.training, declared),
     )
-    found, expected = (problem.folds.linearisation.jacobian.columns(np.arange(4)) for problem in problems)
+    found, expected = (
+        problem.folds.linearisation.jacobian.columns(np.arange(4)) for problem in problems
+    )
     assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def _at_samples(run: Run, inner: FloatArray) -> FloatArray:
-    """Currents of a run from those of its differentiated samples, which lack the first and the last one."""
+    """Currents of a run from those of its differentiated samples,
+    which lack the first and the last one.
+    """
     return np.concatenate((run.current_a[:1], inner, run.current_a[-1:]))
 
 
 @pytest.mark.parametrize("mechanism", [FIVE_BAR, PLANAR], ids=lambda one: one.name)
 def test_no_diagnosis_fails_on_a_closed_chain(mechanism: Mechanism) -> None:
     made = recorded(mechanism, 7, seconds=12.0, noise_a=0.01)
-    axes, limit = [joint.name for joint in made.model.robot.axes], np.full(len(mechanism.gains), 1e3)
+    axes = [joint.name for joint in made.model.robot.axes]
+    limit = np.full(len(mechanism.gains), 1e3)
     for gains in (None, mechanism.gains):
         identified = identify(made.model, made.runs, made.conditioning, fixed_gains=gains)
         assert diagnose(identified, axes, mechanism.gains, limit) == ()
@@ -202,6 +262,8 @@ def test_a_clean_closed_chain_has_no_effect() -> None:
     for mechanism in (FIVE_BAR, PLANAR):
         made = recorded(mechanism, 8, seconds=18.0, noise_a=0.01)
         steps = find_effects(
-            gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)), np.random.default_rng(0), GATES
+            gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)),
+            np.random.default_rng(0),
+            GATES,
         )
         assert not steps[-1].after.effects

@@ -1,4 +1,6 @@
-"""A balancer on the second axis of a heavy arm: declared it is fitted, left out it is found, and it bends no gain."""
+"""A balancer on the second axis of a heavy arm:
+declared it is fitted, left out it is found, and it bends no gain.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,11 @@ from tests.ident.balanced import (
 pytestmark = pytest.mark.slow
 
 GATES = Gates(draws=99)
-LIKE_IT = tuple(family for family in EFFECTS if family[0].name in ("counterbalance", "gravity-compensator", "spring"))
+LIKE_IT = tuple(
+    family
+    for family in EFFECTS
+    if family[0].name in ("counterbalance", "gravity-compensator", "spring")
+)
 JOINTS = ("J1", "J2", "J3", "J4", "J5", "J6")
 FREE_WITHOUT_PRELOAD_M = 0.53  #: Where the spring is shortest, it is 0.505 m long
 FREE_BEYOND_ITS_REACH_M = 0.7  #: It pushes where it should pull
@@ -41,7 +47,9 @@ NEAR = PlacedEffect(Counterbalance(0.35, -1.2), AXIS)
 
 
 def _gathered(balanced: bool) -> Evidence:
-    return gather(identify(heavy_model(), heavy_runs(balanced), CONDITIONING, keep_rows=True, judge=False))
+    return gather(
+        identify(heavy_model(), heavy_runs(balanced), CONDITIONING, keep_rows=True, judge=False)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +83,9 @@ def _assert_known(evidence: Evidence) -> None:
     assert placed.effect.phase_rad == pytest.approx(TOWARDS_RAD, abs=0.1)
 
 
-def test_declared_it_is_fitted_from_a_rough_geometry(balanced: Evidence, declared: tuple[Step, ...]) -> None:
+def test_declared_it_is_fitted_from_a_rough_geometry(
+    balanced: Evidence, declared: tuple[Step, ...]
+) -> None:
     after = declared[-1].after
     assert declared[-1].declared
     assert after.declared == 1
@@ -89,12 +99,18 @@ def test_declared_it_is_fitted_from_a_rough_geometry(balanced: Evidence, declare
 
 def test_left_out_it_is_found_on_its_joint(balanced: Evidence) -> None:
     steps = find_effects(balanced, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
-    found = [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted is not None]
+    found = [
+        (step.accepted.effect.name, step.accepted.axis)
+        for step in steps
+        if step.accepted is not None
+    ]
     assert found == [("counterbalance", AXIS)]
     _assert_known(steps[-1].after)
 
 
-def test_a_search_keeps_what_is_declared_and_finds_nothing_beside_it(declared: tuple[Step, ...]) -> None:
+def test_a_search_keeps_what_is_declared_and_finds_nothing_beside_it(
+    declared: tuple[Step, ...],
+) -> None:
     start = declared[-1].after
     steps = find_effects(start, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
     assert [step.accepted for step in steps] == [None]
@@ -122,11 +138,15 @@ def test_a_calibration_predicts_with_it(balanced: Evidence, declared: tuple[Step
     measured = GAINS[AXIS] * data.current_a[:, AXIS]
     assert np.linalg.norm(torque - measured) < 0.12 * np.linalg.norm(measured)
     with pytest.raises(EffectImpossible, match="physics allows"):
-        with_declared(balanced, [PlacedEffect(Counterbalance(0.35, 1.7), AXIS)], np.random.default_rng(0))
+        with_declared(
+            balanced, [PlacedEffect(Counterbalance(0.35, 1.7), AXIS)], np.random.default_rng(0)
+        )
 
 
 def _leaning(free_m: float) -> Evidence:
-    """A fit with gravity declared three degrees off, and a balancer whose spring has this length without force."""
+    """A fit with gravity declared three degrees off, and a balancer whose spring has this length
+    without force.
+    """
     upright = heavy_model()
     lean_rad = np.radians(-3.0)
     declared = 9.81 * np.array([0.0, np.sin(lean_rad), -np.cos(lean_rad)])
@@ -135,14 +155,19 @@ def _leaning(free_m: float) -> Evidence:
     return gather(identify(model, runs, CONDITIONING, keep_rows=True, judge=False))
 
 
-def test_a_balancer_that_only_a_leaning_base_makes_impossible_stays_and_the_search_corrects_gravity() -> None:
+def test_a_balancer_that_only_a_leaning_base_makes_impossible_stays_and_the_search_corrects_gravity() -> (  # noqa: E501
+    None
+):
     steps = with_declared(_leaning(FREE_WITHOUT_PRELOAD_M), [NEAR], np.random.default_rng(0))
     before = steps[-1].after
     assert "preload" in impossible_declared(before, JOINTS)
     # Its own families apart: with this little preload another name of a spring explains as much.
     found = find_effects(before, np.random.default_rng(0), GATES, families=())
     after = found[-1].after
-    assert [placed.effect.name for placed in after.effects] == ["counterbalance", "gravity-direction"]
+    assert [placed.effect.name for placed in after.effects] == [
+        "counterbalance",
+        "gravity-direction",
+    ]
     assert impossible_declared(after, JOINTS) == ""
     assert np.max(np.abs(after.estimate.gains / GAINS - 1.0)) < 0.005
 

@@ -24,14 +24,18 @@ MOTORS = 3
 
 
 def _change(by_move: FloatArray, level: float = 1.0) -> ErrorChange:
-    """Two models whose squared errors differ by so much in each move and motor, shape (moves, motors)."""
+    """Two models whose squared errors differ by so much in each move and motor, shape (moves,
+    motors).
+    """
     moves, motors = by_move.shape
     move = np.tile(np.repeat(np.arange(moves), ROWS), motors)
     motor = np.repeat(np.arange(motors), moves * ROWS)
     before = np.full(len(move), level)
     after = before + by_move[move, motor] / ROWS
     run = np.zeros(len(move), dtype=np.int64)
-    return change_of_errors(before=before, after=after, motor=motor, move=move, run=run, motors=motors)
+    return change_of_errors(
+        before=before, after=after, motor=motor, move=move, run=run, motors=motors
+    )
 
 
 def test_a_fall_that_is_more_than_noise_is_confirmed() -> None:
@@ -40,7 +44,9 @@ def test_a_fall_that_is_more_than_noise_is_confirmed() -> None:
 
 
 def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
-    """The noise of the other motors hides it in the total; a motor that was not named proves nothing by itself."""
+    """The noise of the other motors hides it in the total;
+    a motor that was not named proves nothing by itself.
+    """
     by_move = np.random.default_rng(7).normal(0.0, 5.0, (20, MOTORS))
     by_move[:, 1:] -= by_move[:, 1:].mean(axis=0) - 0.01
     by_move[:, 0] = np.random.default_rng(8).normal(-0.5, 0.5, 20)
@@ -51,7 +57,9 @@ def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
 
 
 def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
-    """One move that is predicted worse makes the scatter of all so large that the mean shows nothing."""
+    """One move that is predicted worse makes the scatter of all so large that the mean shows
+    nothing.
+    """
     falls = np.array([-30.0, -27.0, -25.0, -24.0, -22.0, -20.0, -19.0, -15.0, -14.0, -3.0])
     one_rise = compare_by_move(np.append(falls, 76.0), np.arange(11))
     assert one_rise.rise < 0.0
@@ -94,22 +102,30 @@ def test_noise_falls_six_times_in_a_hundred_also_with_heavy_tails(freedom: int) 
 
 @pytest.mark.parametrize(("confidence", "expected"), [(0.95, 0.0845), (0.975, 0.0457)])
 def test_noise_falls_most_often_with_five_blocks(confidence: float, expected: float) -> None:
-    """The level that the documentation gives: two tests, each at the level that the confidence says."""
+    """The level that the documentation gives:
+    two tests, each at the level that the confidence says.
+    """
     rng = np.random.default_rng(13)
     draws = rng.standard_normal((3000, FEWEST_BLOCKS))
-    share = np.mean([compare_by_move(draw, np.arange(FEWEST_BLOCKS)).falls(confidence) for draw in draws])
+    share = np.mean(
+        [compare_by_move(draw, np.arange(FEWEST_BLOCKS)).falls(confidence) for draw in draws]
+    )
     assert share == pytest.approx(expected, abs=0.015)  # three deviations of 3000 draws
 
 
 def test_noise_is_confirmed_once_in_ten_at_most() -> None:
-    """The total and the motor that an effect names are judged at half the level each, by means that mostly agree."""
+    """The total and the motor that an effect names are judged at half the level each,
+    by means that mostly agree.
+    """
     rng = np.random.default_rng(12)
     found = [judge_change(_change(rng.normal(0.0, 0.05, (8, MOTORS))), 0)[0] for _ in range(600)]
     assert 0.02 <= np.mean([judgement is Judgement.CONFIRMED for judgement in found]) <= 0.10
 
 
 def test_joined_blocks_are_enough_to_judge_by() -> None:
-    """However strongly neighbours follow each other: of four blocks nothing is judged, and a gate would be open."""
+    """However strongly neighbours follow each other:
+    of four blocks nothing is judged, and a gate would be open.
+    """
     change = np.array([2.0, 2.0, 2.0, 0.5, -0.5, -2.0, -2.0, -2.0])
     assert compare_by_block(change, np.arange(8), np.zeros(8, dtype=np.int64)).moves == 8
     twice = np.repeat(change, 2)
@@ -180,7 +196,9 @@ def test_moves_whose_changes_follow_each_other_count_as_one_block() -> None:
 
 
 def test_independent_blocks_keep_the_false_alarm_where_moves_follow_each_other() -> None:
-    """A change that wanders over sixteen moves seems certain by moves; by blocks, it is a rise about once in twenty."""
+    """A change that wanders over sixteen moves seems certain by moves;
+    by blocks, it is a rise about once in twenty.
+    """
     rng = np.random.default_rng(5)
     move = np.arange(320)
     run = np.zeros(320, dtype=np.int64)

@@ -1,4 +1,6 @@
-"""Candidates on few moves: tested by the others, or not tested, with what to record; they hide no other candidate."""
+"""Candidates on few moves: tested by the others, or not tested, with what to record;
+they hide no other candidate.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +34,16 @@ def search_problem(small: Evidence) -> SearchProblem:
 
 
 def _folds(rng: np.random.Generator, torque: FloatArray) -> Folds:
-    """One motor; the residual is a torque, shape (rows,), and noise that moves share, as far as no column takes it."""
+    """One motor; the residual is a torque, shape (rows,), and noise that moves share,
+    as far as no column takes it.
+    """
     jacobian = rng.normal(size=(MOVES * ROWS, WIDTH))
     loud = np.repeat(rng.uniform(0.5, 1.5, MOVES), ROWS)
-    raw = torque + loud * rng.normal(size=MOVES * ROWS) + np.repeat(0.5 * rng.normal(size=MOVES), ROWS)
+    raw = (
+        torque
+        + loud * rng.normal(size=MOVES * ROWS)
+        + np.repeat(0.5 * rng.normal(size=MOVES), ROWS)
+    )
     problem = Linearisation(
         jacobian=Jacobian((jacobian.T,), (np.arange(WIDTH),), WIDTH),
         residual=raw - jacobian @ np.linalg.lstsq(jacobian, raw, rcond=None)[0],
@@ -58,7 +66,9 @@ def _column(rng: np.random.Generator, large: int, others: float) -> FloatArray:
     return np.asarray(np.repeat(size, ROWS) * rng.normal(size=MOVES * ROWS))
 
 
-def _trial(rng: np.random.Generator, coefficient: float, *, large: int, others: float) -> CandidateTrial:
+def _trial(
+    rng: np.random.Generator, coefficient: float, *, large: int, others: float
+) -> CandidateTrial:
     column = _column(rng, large, others)
     folds = _folds(rng, coefficient * column)
     sorted_column = column[folds.linearisation.source, None]
@@ -68,7 +78,9 @@ def _trial(rng: np.random.Generator, coefficient: float, *, large: int, others: 
 
 
 def _judged(problem: SearchProblem, *trials: CandidateTrial) -> list[Finding]:
-    """Findings of a saturation in the order of the trials, which are given the shapes of a robot with three motors."""
+    """Findings of a saturation in the order of the trials,
+    which are given the shapes of a robot with three motors.
+    """
     shaped = [replace(one, held_out=np.zeros((8, 3)), fallen=np.ones(3)) for one in trials]
     families = [FamilyTrials(0, ((Saturation(), one),)) for one in shaped]
     ranked = rank_families(problem, families, np.random.default_rng(2), GATES)
@@ -94,7 +106,9 @@ def test_without_the_moves_of_most_leverage_is_a_fit_of_the_others() -> None:
     expected = np.bincount(problem.cluster[others], left * after, minlength=MOVES)
     np.testing.assert_allclose(trial.rest.scatter[:, 0], expected, atol=1e-6)
     np.testing.assert_allclose(
-        trial.rest.gram[:, 0, 0], np.bincount(problem.cluster[others], left**2, minlength=MOVES), atol=1e-6
+        trial.rest.gram[:, 0, 0],
+        np.bincount(problem.cluster[others], left**2, minlength=MOVES),
+        atol=1e-6,
     )
 
 
@@ -118,11 +132,15 @@ def test_a_saturation_on_two_moves_alone_is_not_tested_and_says_what_to_record(
     (finding,) = _judged(search_problem, trial)
     assert finding.probability is None
     assert not finding.passed
-    assert finding.refusals[0] == (f"it rests on two moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}")
+    assert finding.refusals[0] == (
+        f"it rests on two moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}"
+    )
     assert finding.too_few_moves == finding.refusals[0]
 
 
-def test_noise_on_few_moves_that_the_others_do_not_show_is_no_effect(search_problem: SearchProblem) -> None:
+def test_noise_on_few_moves_that_the_others_do_not_show_is_no_effect(
+    search_problem: SearchProblem,
+) -> None:
     """Of 200 candidates on noise 10 ± 3.1 have p ≤ 0.05; the test by the others keeps its size."""
     rng = np.random.default_rng(5)
     false = 0

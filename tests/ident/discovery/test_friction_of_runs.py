@@ -1,4 +1,6 @@
-"""Friction that differs from run to run is no law within the runs: it is given no name, and hides none."""
+"""Friction that differs from run to run is no law within the runs:
+it is given no name, and hides none.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ LOAD_FRICTION = 0.08
 
 
 def _session(truth: Truth, seed: int) -> Evidence:
-    """Four runs, every other one loaded, at an error of about two per cent; the friction of each has its own size."""
+    """Four runs, every other one loaded, at an error of about two per cent;
+    the friction of each has its own size.
+    """
     rng = np.random.default_rng(seed)
     names = [column.name for column in truth.model.columns]
     runs = []
@@ -57,44 +61,60 @@ def _session(truth: Truth, seed: int) -> Evidence:
 def _load(truth: Truth, data: Dataset) -> FloatArray:
     """True load of the second joint, shape (k,)."""
     names = [column.name for column in truth.model.columns]
-    parameters = truth.parameters * np.array([name[:2] not in {"Ia", "fv", "fs", "of"} for name in names])
+    parameters = truth.parameters * np.array(
+        [name[:2] not in {"Ia", "fv", "fs", "of"} for name in names]
+    )
     if data.payload is not None:
         parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
     return np.asarray(np.einsum("ck,c->k", truth.model.regressor(data.motion())[1], parameters))
 
 
-# A search that takes moves of all runs as exchangeable adds a warm-up to both of these, and in the second a warm-up
-# and a lag to the load friction.
+# A search that takes moves of all runs as exchangeable adds a warm-up to both of these, and in the
+# second a warm-up and a lag to the load friction.
 @pytest.mark.parametrize("seed", [3, 4])
-def test_friction_that_differs_from_run_to_run_adds_no_effect(small_truth: Truth, seed: int) -> None:
+def test_friction_that_differs_from_run_to_run_adds_no_effect(
+    small_truth: Truth, seed: int
+) -> None:
     (step,) = find_effects(_session(small_truth, seed), np.random.default_rng(0))
     assert step.accepted is None
     assert not step.set_aside
 
 
-def test_load_friction_is_named_alone_where_friction_differs_from_run_to_run(small_truth: Truth) -> None:
+def test_load_friction_is_named_alone_where_friction_differs_from_run_to_run(
+    small_truth: Truth,
+) -> None:
     start = bent(
         _session(small_truth, 1),
         small_truth,
         lambda data: acting_on(
-            1, 3, LOAD_FRICTION * np.abs(_load(small_truth, data)) * np.sign(data.velocity_rad_s[:, 1])
+            1,
+            3,
+            LOAD_FRICTION * np.abs(_load(small_truth, data)) * np.sign(data.velocity_rad_s[:, 1]),
         ),
     )
     end = find_effects(start, np.random.default_rng(0))[-1].after
     assert [(placed.effect.name, placed.axis) for placed in end.effects] == [("load-friction", 1)]
-    assert end.estimate.parameters[len(end.rows_without_effects.columns)] == pytest.approx(LOAD_FRICTION, rel=0.2)
+    assert end.estimate.parameters[len(end.rows_without_effects.columns)] == pytest.approx(
+        LOAD_FRICTION, rel=0.2
+    )
 
 
 def test_shifts_of_gains_are_those_of_the_estimate(small: Evidence) -> None:
-    """The search alone takes friction as different from run to run; a refit with the torque would not."""
+    """The search alone takes friction as different from run to run;
+    a refit with the torque would not.
+    """
     problem = search_problem_of(small)
     spring = whitened_columns(problem, Spring(), 1)[:, 0]
     estimate = small.estimate
-    plain = linearise(small.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
+    plain = linearise(
+        small.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False
+    )
     torque = plain.whitened(problem.torque(Spring(), 1), small.model.drive_train.to_motor)[:, 0]
     folds = cut_into_folds(replace(plain))
     order = np.lexsort((plain.cluster, plain.cluster % folds.count, plain.motor))
-    assert gain_shifts(problem.folds, spring) == pytest.approx(gain_shifts(folds, torque[order]), rel=1e-6)
+    assert gain_shifts(problem.folds, spring) == pytest.approx(
+        gain_shifts(folds, torque[order]), rel=1e-6
+    )
 
 
 @settings(max_examples=10, deadline=None)
@@ -113,7 +133,11 @@ def test_decorrelated_rows_have_the_identity_as_covariance(seed: int) -> None:
     halved = scatter.decorrelate(0, np.eye(30))
     np.testing.assert_allclose(halved @ covariance @ halved, np.eye(30), atol=1e-9)
     np.testing.assert_allclose(scatter.correlate(0, columns), columns @ covariance, atol=1e-9)
-    np.testing.assert_allclose(scatter.shared(0, columns), columns @ (covariance - np.eye(30)) @ columns.T, atol=1e-9)
     np.testing.assert_allclose(
-        moved.decorrelate(0, columns[:, order]), scatter.decorrelate(0, columns)[:, order], atol=1e-9
+        scatter.shared(0, columns), columns @ (covariance - np.eye(30)) @ columns.T, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        moved.decorrelate(0, columns[:, order]),
+        scatter.decorrelate(0, columns)[:, order],
+        atol=1e-9,
     )

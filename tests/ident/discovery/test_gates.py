@@ -53,7 +53,15 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from ident.model.model import Column
 from tests.ident.loops import record_in_loop
-from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, acting_on, bent, search_problem_of, whole
+from tests.ident.recordings import (
+    CONDITIONING,
+    MOUNTED,
+    Truth,
+    acting_on,
+    bent,
+    search_problem_of,
+    whole,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -95,7 +103,9 @@ def test_a_coefficient_is_impossible_two_sigma_outside_its_range(
 
 
 def test_every_family_declares_its_signs() -> None:
-    """Friction dissipates, a gear gives and a motor weakens; springs, ripples and delays have either sign."""
+    """Friction dissipates, a gear gives and a motor weakens;
+    springs, ripples and delays have either sign.
+    """
     for family in EFFECTS:
         # What two joints of a cable share has the sign of the product of its radii.
         signed = [column for column in family[0].coefficients if column.name != "shared stiffness"]
@@ -104,7 +114,9 @@ def test_every_family_declares_its_signs() -> None:
         falling = {column.name for column in family[0].coefficients if column.largest == 0.0}
         assert falling == ({"viscous"} if family[0].name == "temperature-friction" else set())
         columns = PlacedEffect(family[0], 0).columns
-        assert [column.least for column in columns] == [column.least for column in family[0].coefficients]
+        assert [column.least for column in columns] == [
+            column.least for column in family[0].coefficients
+        ]
 
 
 def test_a_time_constant_is_no_longer_than_the_data(search_problem: SearchProblem) -> None:
@@ -115,7 +127,9 @@ def test_a_time_constant_is_no_longer_than_the_data(search_problem: SearchProble
     assert not WarmUp(1.01 * span_s, 0).fits_in(later, 0)
     assert WarmUp(300.0, 1).fits_in(later, 0)
     assert not WarmUp(400.0, 1).fits_in(later, 0)
-    tried = rank_effects(search_problem, np.random.default_rng(0), GATES, ((WarmUp(900.0, 0),), (Spring(),)))
+    tried = rank_effects(
+        search_problem, np.random.default_rng(0), GATES, ((WarmUp(900.0, 0),), (Spring(),))
+    )
     assert {finding.effect.name for finding in tried} == {"spring"}
 
 
@@ -134,19 +148,24 @@ def test_a_candidate_that_rests_on_one_move_is_not_tested_and_hides_no_other(
     assert judged == {"spring": only[0].probability, "hinge": None}
     (hinge,) = (found for found in ranked if found.effect.name == "hinge")
     assert hinge.refusals[0] == (
-        "it rests on three moves, too few to test it: record more moves to that end of the axis' range"
+        "it rests on three moves, too few to test it: record more moves to that end of the "
+        "axis' range"
     )
 
 
 def test_friction_against_temperature_is_tried_where_every_run_has_one_that_changes(
     search_problem: SearchProblem,
 ) -> None:
-    effect, runs = TemperatureFriction(), search_problem.runs
+    effect = TemperatureFriction()
+    runs = search_problem.runs
     assert not effect.fits_in(runs, 1)  # no temperatures at all
 
     def with_temperature(last_c: float) -> list[Signals]:
         one = np.linspace(30.0, last_c, len(runs[0].time_s))
-        return [replace(run, temperature_c=np.stack((one, one, np.full_like(one, np.nan)))) for run in runs]
+        return [
+            replace(run, temperature_c=np.stack((one, one, np.full_like(one, np.nan))))
+            for run in runs
+        ]
 
     warming = with_temperature(35.0)
     assert effect.fits_in(warming, 1)
@@ -178,16 +197,24 @@ def slipping(small: Evidence, small_truth: Truth) -> Evidence:
     return _sticking(small, small_truth, -6.0)
 
 
-def test_physics_alone_refuses_less_friction_at_low_speed(sticking: Evidence, slipping: Evidence) -> None:
+def test_physics_alone_refuses_less_friction_at_low_speed(
+    sticking: Evidence, slipping: Evidence
+) -> None:
     """In all else the two recordings are mirror images."""
     for start, possible in ((sticking, True), (slipping, False)):
-        best = rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, (STICKING,))[0]
+        best = rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, (STICKING,))[
+            0
+        ]
         assert (best.axis, best.passed) == (1, possible)
-        assert [("physics allows" in words) for words in best.refusals] == ([] if possible else [True])
+        assert [("physics allows" in words) for words in best.refusals] == (
+            [] if possible else [True]
+        )
 
 
 def test_of_a_family_the_possible_setting_is_taken(slipping: Evidence) -> None:
-    """Less friction at low speed resembles drag that grows with the root of the speed, which is possible."""
+    """Less friction at low speed resembles drag that grows with the root of the speed,
+    which is possible.
+    """
     family = (*STICKING, NonlinearViscous(0.5))
     best = rank_effects(search_problem_of(slipping), np.random.default_rng(0), GATES, (family,))[0]
     assert (best.effect, best.axis, best.passed) == (family[1], 1, True)
@@ -195,12 +222,16 @@ def test_of_a_family_the_possible_setting_is_taken(slipping: Evidence) -> None:
 
 @given(st.lists(st.tuples(numbers, st.integers(0, 6)), min_size=2, max_size=30))
 def test_a_change_is_summed_by_move(rows: list[tuple[float, int]]) -> None:
-    change, move = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    change = np.array([row[0] for row in rows])
+    move = np.array([row[1] for row in rows])
     found = compare_by_move(change, move)
     by_move = [change[move == number].sum() for number in np.unique(move)]
     assert found.rise == pytest.approx(change.sum(), abs=1e-6)
     assert found.moves == len(by_move)
-    expected = np.std(by_move, ddof=1) * np.sqrt(len(by_move)) if len(by_move) > 1 else 0.0
+    if len(by_move) > 1:
+        expected = np.std(by_move, ddof=1) * np.sqrt(len(by_move))
+    else:
+        expected = 0.0
     assert found.std == pytest.approx(expected, abs=1e-6)
     assert not (found.is_rise and compare_by_move(-change, move).is_rise)
     order = np.random.default_rng(len(rows)).permutation(len(rows))
@@ -210,7 +241,10 @@ def test_a_change_is_summed_by_move(rows: list[tuple[float, int]]) -> None:
 def test_a_rise_is_more_than_its_noise_once_in_twenty() -> None:
     rng = np.random.default_rng(4)
     move = np.repeat(np.arange(12), 5)
-    rises = [compare_by_move(rng.normal(size=60) + rng.normal(size=12)[move], move).is_rise for _ in range(600)]
+    rises = [
+        compare_by_move(rng.normal(size=60) + rng.normal(size=12)[move], move).is_rise
+        for _ in range(600)
+    ]
     assert 14 <= sum(rises) <= 46  # 30 ± 5.3, three deviations on either side
     assert compare_by_move(rng.normal(size=60) + 3.0, move).is_rise
 
@@ -222,8 +256,11 @@ def test_runs_are_left_out_where_their_payload_is_in_another(small: Evidence) ->
     assert runs_to_leave_out(rows.only(rows.run < MIN_RUNS - 1)) == ()
 
 
-def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem: SearchProblem) -> None:
-    problem, rng = search_problem.folds.linearisation, np.random.default_rng(1)
+def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(
+    search_problem: SearchProblem,
+) -> None:
+    problem = search_problem.folds.linearisation
+    rng = np.random.default_rng(1)
     columns = rng.normal(size=(len(problem.motor), 2)) + 0.3 * problem.residual[:, None]
     run = search_problem.observation.run[problem.source]
     declared = whole(problem.jacobian)
@@ -234,12 +271,19 @@ def test_an_error_on_runs_left_out_is_that_of_a_fit_of_the_others(search_problem
         for matrix, sign in ((both, 1.0), (declared, -1.0)):
             fitted = np.linalg.lstsq(matrix[~own], problem.residual[~own], rcond=None)[0]
             rise += sign * float(np.sum((problem.residual[own] - matrix[own] @ fitted) ** 2))
-    assert PartsLeftOut.of(search_problem).change(columns).total.rise == pytest.approx(rise, rel=1e-4)
+    assert PartsLeftOut.of(search_problem).change(columns).total.rise == pytest.approx(
+        rise, rel=1e-4
+    )
 
 
-def test_what_one_run_alone_shows_stays_where_it_is_without_that_run(search_problem: SearchProblem) -> None:
-    """A hose that one run alone stretches has no row in the others: a fit of these does not move it, nor fails."""
-    folds, observation = search_problem.folds, search_problem.observation
+def test_what_one_run_alone_shows_stays_where_it_is_without_that_run(
+    search_problem: SearchProblem,
+) -> None:
+    """A hose that one run alone stretches has no row in the others:
+    a fit of these does not move it, nor fails.
+    """
+    folds = search_problem.folds
+    observation = search_problem.observation
     last_run = observation.run.max()
     elsewhere = folds.linearisation.of_clusters(observation.run) != last_run
     hessian = folds.cluster_hessian.copy()
@@ -247,21 +291,31 @@ def test_what_one_run_alone_shows_stays_where_it_is_without_that_run(search_prob
     hessian[elsewhere, -1, :] = 0.0
     hessian[elsewhere, :, -1] = 0.0
     score[elsewhere, -1] = 0.0
-    shown_once = replace(search_problem, folds=replace(folds, cluster_hessian=hessian, cluster_score=score))
+    shown_once = replace(
+        search_problem, folds=replace(folds, cluster_hessian=hessian, cluster_score=score)
+    )
 
     others = PartsLeftOut.of(shown_once).others[last_run]
 
     assert others is not None
     step = linalg.cho_solve(others.factor, others.score)
     assert step[-1] == 0.0
-    expected = np.linalg.lstsq(hessian[elsewhere].sum(axis=0)[:-1, :-1], score[elsewhere].sum(axis=0)[:-1], rcond=None)
-    np.testing.assert_allclose(step[:-1], expected[0], rtol=1e-4, atol=1e-6 * np.abs(expected[0]).max())
+    expected = np.linalg.lstsq(
+        hessian[elsewhere].sum(axis=0)[:-1, :-1], score[elsewhere].sum(axis=0)[:-1], rcond=None
+    )
+    np.testing.assert_allclose(
+        step[:-1], expected[0], rtol=1e-4, atol=1e-6 * np.abs(expected[0]).max()
+    )
 
 
 def _levels(small: Evidence, truth: Truth, levels: tuple[float, ...]) -> SearchProblem:
     """A spring at joint 2 that has another stiffness in each run."""
     names = [data.name for data in small.datasets]
-    start = bent(small, truth, lambda data: acting_on(1, 3, levels[names.index(data.name)] * data.position_rad[:, 1]))
+    start = bent(
+        small,
+        truth,
+        lambda data: acting_on(1, 3, levels[names.index(data.name)] * data.position_rad[:, 1]),
+    )
     return search_problem_of(start)
 
 
@@ -272,11 +326,15 @@ def _powers_of_the_run(problem: SearchProblem, powers: int) -> FloatArray:
     return problem.folds.linearisation.whitened(torque, problem.model.drive_train.to_motor)
 
 
-@pytest.mark.parametrize(("levels", "powers"), [((4.0, -4.0, 4.0, -4.0), 3), ((0.0, 3.0, 6.0, 9.0), 1)])
+@pytest.mark.parametrize(
+    ("levels", "powers"), [((4.0, -4.0, 4.0, -4.0), 3), ((0.0, 3.0, 6.0, 9.0), 1)]
+)
 def test_what_only_moves_of_the_same_run_predict_is_refused(
     small: Evidence, small_truth: Truth, levels: tuple[float, ...], powers: int
 ) -> None:
-    """Three powers follow any four levels on moves left out; a run left out shows that they are no law."""
+    """Three powers follow any four levels on moves left out;
+    a run left out shows that they are no law.
+    """
     problem = _levels(small, small_truth, levels)
     columns = _powers_of_the_run(problem, powers)
     (trial,) = score_candidates(problem.folds, columns, (slice(0, powers),))
@@ -285,22 +343,36 @@ def test_what_only_moves_of_the_same_run_predict_is_refused(
     assert bool(PartsLeftOut.of(problem).refusal(columns)) == (powers == 3)
 
 
-def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(sticking: Evidence) -> None:
+def test_without_an_effect_the_joint_fit_is_the_declared_one_to_first_order(
+    sticking: Evidence,
+) -> None:
     placed = PlacedEffect(STICKING[0], 1)
     joined = with_effects(sticking, (placed,))
     assert placed.columns[0] in joined.estimate.unknowns  # with its possible values
     reduced = without_effects_of(search_problem_of(joined), joined.estimate, (placed,))
     noise = (joined.estimate.axis_noise, sticking.estimate.axis_noise)
-    ends = (reduced.search_problem.folds.linearisation, search_problem_of(sticking).folds.linearisation)
-    squares = [np.sum((end.residual * own[end.motor]) ** 2) for end, own in zip(ends, noise, strict=True)]
+    ends = (
+        reduced.search_problem.folds.linearisation,
+        search_problem_of(sticking).folds.linearisation,
+    )
+    squares = [
+        np.sum((end.residual * own[end.motor]) ** 2) for end, own in zip(ends, noise, strict=True)
+    ]
     assert squares[0] == pytest.approx(squares[1], rel=0.01)
     shifts = joined.estimate.gains - sticking.estimate.gains
-    assert reduced.gain_shifts == pytest.approx(shifts, abs=0.5 * float(np.max(sticking.estimate.gains_std)))
+    assert reduced.gain_shifts == pytest.approx(
+        shifts, abs=0.5 * float(np.max(sticking.estimate.gains_std))
+    )
 
 
-def test_gains_that_move_by_more_than_sigma_are_named(search_problem: SearchProblem, small: Evidence) -> None:
-    """A torque that is a part of motor 1's own torque is a change of its gain; fixed gains cannot move."""
-    problem, std = search_problem.folds.linearisation, small.estimate.gains_std
+def test_gains_that_move_by_more_than_sigma_are_named(
+    search_problem: SearchProblem, small: Evidence
+) -> None:
+    """A torque that is a part of motor 1's own torque is a change of its gain;
+    fixed gains cannot move.
+    """
+    problem = search_problem.folds.linearisation
+    std = small.estimate.gains_std
     share = 3.0 * std[0] / small.estimate.gains[0]
     shifts = gain_shifts(search_problem.folds, -share * whole(problem.jacobian)[:, 0])
     assert shifts[0] == pytest.approx(3.0 * std[0], rel=1e-6)
@@ -315,9 +387,13 @@ def test_coefficients_in_their_noise_are_no_effect() -> None:
 
 
 def _term_after(sticking: Evidence, order: tuple[Effect, ...]) -> joining.JointFit | SetAside:
-    """Joint fit of a named effect and a term that can replace it, judged as if the last one had just joined."""
+    """Joint fit of a named effect and a term that can replace it,
+    judged as if the last one had just joined.
+    """
     joined = with_effects(sticking, tuple(PlacedEffect(effect, 1) for effect in order))
-    finding = Finding(order[-1], 1, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8))
+    finding = Finding(
+        order[-1], 1, np.ones(1), np.ones(1), 0.0, 1.0, 0.1, 5.0, 4.0, 0.2, 9.0, True, np.ones(8)
+    )
     return joining._pruned(joining.linearised(joined, {}), finding, np.random.default_rng(0), GATES)
 
 
@@ -332,7 +408,9 @@ def test_a_term_without_a_name_makes_no_named_effect_leave(sticking: Evidence) -
     assert kept.evidence.effects == (PlacedEffect(STICKING[0], 1),)
 
 
-def test_the_number_of_effects_is_bounded_by_the_moves(sticking: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_effects_is_bounded_by_the_moves(
+    sticking: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(loop, "PIECES_PER_EFFECT", 1000)
     (step,) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
     assert step.accepted is None
@@ -347,16 +425,24 @@ def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_tru
         q = data.position_rad[:, 1]
         return acting_on(1, 3, 2.0 * np.log1p(np.exp(4.0 * (q + 0.3))))
 
-    families = tuple(family for family in EFFECTS if family[0].name in {"hinge", "gravity-compensator", "stribeck"})
+    families = tuple(
+        family
+        for family in EFFECTS
+        if family[0].name in {"hinge", "gravity-compensator", "stribeck"}
+    )
     start = bent(small, small_truth, torque)
     steps = find_effects(start, np.random.default_rng(0), GATES, families)
     first, second = steps[:2]
     assert first.accepted is not None
     assert first.accepted.ambiguity
-    passed = [{effect_key(one.effect, one.axis) for one in step.findings if one.passed} for step in (first, second)]
+    passed = [
+        {effect_key(one.effect, one.axis) for one in step.findings if one.passed}
+        for step in (first, second)
+    ]
     for rival in first.accepted.ambiguity:
         assert effect_key(rival.effect, rival.axis) in passed[0] - passed[1]
-    plain, whole = with_effects(start, steps[-1].after.effects).estimate, steps[-1].after.estimate
+    plain = with_effects(start, steps[-1].after.effects).estimate
+    whole = steps[-1].after.estimate
     added = steps[-1].choice_std
     assert added is not None
     assert np.all(added > 0.0)
@@ -365,11 +451,15 @@ def test_rivals_are_those_that_stop_passing_beside_it(small: Evidence, small_tru
 
 @pytest.fixture(scope="module")
 def disturbed(small_truth: Truth) -> Evidence:
-    """Identified from runs with a disturbance in the position loop, and nothing else undeclared in them."""
+    """Identified from runs with a disturbance in the position loop,
+    and nothing else undeclared in them.
+    """
     rng = np.random.default_rng(0)
     conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
     runs = [
-        record_in_loop(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, disturbance_nm=2.0)
+        record_in_loop(
+            small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, disturbance_nm=2.0
+        )
         for index in range(4)
     ]
     return gather(identify(small_truth.model, runs, conditioning), runs)
@@ -384,22 +474,34 @@ def test_a_disturbance_in_the_loop_is_no_effect(
         monkeypatch.setattr(joining, "by_instruments", lambda _: None)
     families = tuple(family for family in EFFECTS if family[0].name == "time-skew")
     geometry = GEOMETRY if has_gate else ()
-    first, *_ = find_effects(disturbed, np.random.default_rng(0), GATES, families, geometry=geometry)
+    first, *_ = find_effects(
+        disturbed, np.random.default_rng(0), GATES, families, geometry=geometry
+    )
     assert (first.accepted is None) == has_gate
-    refused = [one.finding.effect.name for one in first.set_aside if "instruments from the demanded" in one.words]
+    refused = [
+        one.finding.effect.name
+        for one in first.set_aside
+        if "instruments from the demanded" in one.words
+    ]
     assert ("time-skew" in refused) == has_gate
 
 
-def test_an_effect_joins_beside_a_disturbance_in_the_loop(disturbed: Evidence, small_truth: Truth) -> None:
+def test_an_effect_joins_beside_a_disturbance_in_the_loop(
+    disturbed: Evidence, small_truth: Truth
+) -> None:
     bent_by_friction = _sticking(disturbed, small_truth, 12.0)
-    first, *_ = find_effects(bent_by_friction, np.random.default_rng(0), GATES, (STICKING,), geometry=())
+    first, *_ = find_effects(
+        bent_by_friction, np.random.default_rng(0), GATES, (STICKING,), geometry=()
+    )
     assert first.accepted is not None
     assert first.after.effects == (PlacedEffect(STICKING[0], 1),)
 
 
 def test_two_runs_are_judged_on_regions_of_the_workspace(small: Evidence) -> None:
     rows = small.training.run < MIN_RUNS - 1
-    short = replace(small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1])
+    short = replace(
+        small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1]
+    )
     problem = search_problem_of(short)
     parts = PartsLeftOut.of(problem)
     assert parts.name == "regions of the workspace"
@@ -407,7 +509,8 @@ def test_two_runs_are_judged_on_regions_of_the_workspace(small: Evidence) -> Non
     position = np.concatenate([run.position_rad for run in problem.rows], axis=1)
     region = regions_to_leave_out(problem.observation, position)
     observation = problem.observation
-    # A move is in one region, and regions are postures: moves of one are nearer to each other than to all others.
+    # A move is in one region, and regions are postures: moves of one are nearer to each other than
+    # to all others.
     moves = np.unique(observation.move)
     of_move = np.array([np.unique(region[observation.move == move]) for move in moves])
     assert of_move.shape == (len(moves), 1)
@@ -434,9 +537,13 @@ def test_a_region_with_the_only_payload_stays(small: Evidence) -> None:
 
 
 def test_what_holds_in_one_region_alone_is_refused(small: Evidence) -> None:
-    """Dry friction of joint 2 that differs by region at random: seven powers of the region's number follow it."""
+    """Dry friction of joint 2 that differs by region at random:
+    seven powers of the region's number follow it.
+    """
     rows = small.training.run < MIN_RUNS - 1
-    short = replace(small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1])
+    short = replace(
+        small, training=small.training.only(rows), datasets=small.datasets[: MIN_RUNS - 1]
+    )
     problem = search_problem_of(short)
     parts = PartsLeftOut.of(problem)
     linear = problem.folds.linearisation
@@ -463,10 +570,14 @@ def test_an_effect_that_the_reported_sigma_does_not_show_leaves(sticking: Eviden
     covariance = shown.estimate.covariance.copy()
     covariance[own, own] += 1e4
     unsure = replace(shown, estimate=replace(shown.estimate, covariance=covariance))
-    last = loop.end_search(steps, joining.linearised(unsure, {}), GATES, rng=np.random.default_rng(0))
+    last = loop.end_search(
+        steps, joining.linearised(unsure, {}), GATES, rng=np.random.default_rng(0)
+    )
     assert last.after.effects == ()
     assert last.set_aside[-1].finding.effect == STICKING[0]
-    assert last.set_aside[-1].words.startswith("by the σ that is reported, its coefficients may all be zero")
+    assert last.set_aside[-1].words.startswith(
+        "by the σ that is reported, its coefficients may all be zero"
+    )
     assert last.after.estimate.gains == pytest.approx(sticking.estimate.gains, rel=1e-6)
 
 
@@ -481,7 +592,9 @@ def test_the_choice_of_effects_adds_to_gains_and_not_to_what_only_one_model_has(
     monkeypatch.setattr(loop, "choice_covariance", wide)
     (*_, last) = find_effects(sticking, np.random.default_rng(0), GATES, (STICKING,))
     own = own_unknowns(last.after.estimate, last.after.effects)
-    assert last.after.estimate.parameters_std[own] == pytest.approx(shown.after.estimate.parameters_std[own])
+    assert last.after.estimate.parameters_std[own] == pytest.approx(
+        shown.after.estimate.parameters_std[own]
+    )
     assert np.all(last.after.estimate.gains_std > 99.0)
 
 
@@ -497,7 +610,9 @@ def test_an_impossible_part_leaves_with_its_effect(sticking: Evidence) -> None:
     covariance[place, :] = 0.0
     covariance[:, place] = 0.0
     covariance[place, place] = 0.01
-    wrong = replace(joined, estimate=replace(estimate, parameters=parameters, covariance=covariance))
+    wrong = replace(
+        joined, estimate=replace(estimate, parameters=parameters, covariance=covariance)
+    )
     ((placed, why, _),) = loop._unshown(wrong)
     assert placed == joined.effects[1]
     assert "physics allows no less than 0" in why
@@ -517,7 +632,9 @@ def test_values_that_are_not_possible_are_held_and_the_others_follow() -> None:
     assert held[0] == 0.0
     assert held[1:] == pytest.approx(others)
     possible = np.array([0.5, 1.0, 2.0])
-    assert np.array_equal(possible_values((Column("preload", "Nm", least=0.0),), possible, covariance), possible)
+    assert np.array_equal(
+        possible_values((Column("preload", "Nm", least=0.0),), possible, covariance), possible
+    )
 
 
 def _warming(small: Evidence, dry_sigmas: float, viscous_sigmas: float) -> Evidence:
@@ -535,7 +652,9 @@ def _warming(small: Evidence, dry_sigmas: float, viscous_sigmas: float) -> Evide
     return replace(joined, estimate=replace(estimate, parameters=parameters, covariance=covariance))
 
 
-def test_a_part_that_is_a_little_impossible_is_held_at_the_bound_and_carries_no_test(small: Evidence) -> None:
+def test_a_part_that_is_a_little_impossible_is_held_at_the_bound_and_carries_no_test(
+    small: Evidence,
+) -> None:
     warming = _warming(small, -1.9, 8.0)
     assert not loop._unshown(warming)
     held = loop.with_possible_values(warming)

@@ -22,7 +22,8 @@ from ident.estimators.maximum_likelihood import ml
 from tests.ident.recordings import PAYLOAD_TRUTH, Truth, acting_on, bent, search_problem_of
 
 FloatArray = NDArray[np.float64]
-AXIS, ETA = 1, 0.8
+AXIS = 1
+ETA = 0.8
 LOSS = (1.0 - ETA**2) / (1.0 + ETA**2)
 
 
@@ -31,8 +32,12 @@ def _load(truth: Truth, data: Dataset) -> FloatArray:
     parameters = truth.parameters.copy()
     if data.payload is not None:
         parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
-    bodies = np.array([column.name[:2] not in ("Ia", "fv", "fs", "of") for column in truth.model.columns])
-    return np.asarray(np.einsum("ck,c->k", truth.model.regressor(data.motion())[AXIS], parameters * bodies))
+    bodies = np.array(
+        [column.name[:2] not in ("Ia", "fv", "fs", "of") for column in truth.model.columns]
+    )
+    return np.asarray(
+        np.einsum("ck,c->k", truth.model.regressor(data.motion())[AXIS], parameters * bodies)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +53,14 @@ def lossy(small: Evidence, small_truth: Truth) -> Evidence:
 
 
 def _step(evidence: Evidence, *effects: Effect) -> Step:
-    after = with_effects(evidence, tuple(PlacedEffect(effect, AXIS) for effect in effects)) if effects else evidence
+    if effects:
+        after = with_effects(evidence, tuple(PlacedEffect(effect, AXIS) for effect in effects))
+    else:
+        after = evidence
     families = ((Stribeck(0.1),), (Efficiency(1.0),))
-    findings = rank_effects(search_problem_of(after), np.random.default_rng(0), Gates(draws=99), families)
+    findings = rank_effects(
+        search_problem_of(after), np.random.default_rng(0), Gates(draws=99), families
+    )
     return Step(findings, (), np.zeros(3), None, after)
 
 
@@ -60,7 +70,11 @@ def _gain_error(evidence: Evidence, truth: Truth) -> float:
 
 def test_the_shares_are_those_of_the_true_load(small: Evidence, small_truth: Truth) -> None:
     rows = [
-        decimate_rows(data, small.conditioning, np.stack((_load(small_truth, data), data.velocity_rad_s[:, AXIS])))
+        decimate_rows(
+            data,
+            small.conditioning,
+            np.stack((_load(small_truth, data), data.velocity_rad_s[:, AXIS])),
+        )
         for data in small.datasets
     ]
     load, velocity = np.concatenate(rows, axis=-1)[:, small.training.use[AXIS]]
@@ -69,7 +83,9 @@ def test_the_shares_are_those_of_the_true_load(small: Evidence, small_truth: Tru
     assert driving_shares(small.training, small.estimate)[AXIS] == pytest.approx(expected, abs=0.01)
 
 
-def test_the_contrast_of_both_sides_shows_the_loss_and_its_law_the_gain(lossy: Evidence, small_truth: Truth) -> None:
+def test_the_contrast_of_both_sides_shows_the_loss_and_its_law_the_gain(
+    lossy: Evidence, small_truth: Truth
+) -> None:
     found = gear_losses(_step(lossy, LoadFriction(0)))[AXIS]
     assert found.gain_factor is not None
     assert found.loss == pytest.approx(LOSS, rel=0.05)
@@ -77,7 +93,9 @@ def test_the_contrast_of_both_sides_shows_the_loss_and_its_law_the_gain(lossy: E
     assert found.gain_factor == pytest.approx(1.0 / np.sqrt(1.0 - LOSS**2), rel=0.01)
     fitted = with_effects(lossy, (PlacedEffect(LoadFriction(0), AXIS),))
     # 2.5 % that no residual shows: the product of the law's two directions.
-    assert _gain_error(fitted, small_truth) == pytest.approx(1.0 / found.gain_factor - 1.0, abs=0.006)
+    assert _gain_error(fitted, small_truth) == pytest.approx(
+        1.0 / found.gain_factor - 1.0, abs=0.006
+    )
 
 
 def test_a_search_without_the_loss_in_the_model_knows_it_too(lossy: Evidence) -> None:
@@ -87,16 +105,24 @@ def test_a_search_without_the_loss_in_the_model_knows_it_too(lossy: Evidence) ->
     assert not found.gain_carries_it
 
 
-def test_where_the_motor_drives_throughout_the_gain_carries_the_loss(lossy: Evidence, small_truth: Truth) -> None:
-    """Rows in which the load drives this joint are left out: the residual is silent, and the gain is wrong by 1/η."""
+def test_where_the_motor_drives_throughout_the_gain_carries_the_loss(
+    lossy: Evidence, small_truth: Truth
+) -> None:
+    """Rows in which the load drives this joint are left out:
+    the residual is silent, and the gain is wrong by 1/η.
+    """
     observation = lossy.rows_without_effects
     standard = observation.base.independent
     direction = observation.regressor[AXIS, standard.index(14 * AXIS + 12)]
     load = np.concatenate(
-        [decimate_rows(data, lossy.conditioning, _load(small_truth, data)) for data in lossy.datasets]
+        [
+            decimate_rows(data, lossy.conditioning, _load(small_truth, data))
+            for data in lossy.datasets
+        ]
     )
     drives = observation.use[AXIS] & (load * direction > 0.0)
-    use, motor_use = observation.use.copy(), observation.motor_use.copy()
+    use = observation.use.copy()
+    motor_use = observation.motor_use.copy()
     use[AXIS] &= drives
     motor_use[AXIS] &= drives
     kept = replace(observation, use=use, motor_use=motor_use)

@@ -1,4 +1,6 @@
-"""Mistakes of the description, planted into recordings: found as what they are, and gains as if they were not there."""
+"""Mistakes of the description, planted into recordings:
+found as what they are, and gains as if they were not there.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from scipy import signal
 from ident.calibration import calibration_of
 from ident.data.run import Run
 from ident.discovery.before_after import account, left_out_runs
-from ident.discovery.evidence import Evidence, coefficients_of, gather, with_effects, without_effects
+from ident.discovery.evidence import (
+    Evidence,
+    coefficients_of,
+    gather,
+    with_effects,
+    without_effects,
+)
 from ident.discovery.gates import Gates
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.loop import Step, find_effects
@@ -92,7 +100,16 @@ def _runs() -> tuple[Run, ...]:
     truth = three_axes_truth()
     rng = np.random.default_rng(8)
     return tuple(
-        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload)
+        record(
+            truth,
+            f"run {number}",
+            rng,
+            seconds=15.0,
+            rate_hz=500.0,
+            averaged=2,
+            noise_a=NOISE_A,
+            payload=payload,
+        )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED, MOUNTED))
     )
 
@@ -103,7 +120,14 @@ def _polar_runs() -> tuple[Run, ...]:
     rng = np.random.default_rng(5)
     return tuple(
         record(
-            polar_truth(), f"r{number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload
+            polar_truth(),
+            f"r{number}",
+            rng,
+            seconds=15.0,
+            rate_hz=500.0,
+            averaged=2,
+            noise_a=NOISE_A,
+            payload=payload,
         )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
@@ -127,7 +151,8 @@ def _checked(mistake: Mistake) -> GeometryCheck:
 
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
 def test_a_mistake_is_named_alone_with_its_size_and_bends_no_gain(mistake: Mistake) -> None:
-    start, last = _fitted(mistake), _searched(mistake)[-1].after
+    start = _fitted(mistake)
+    last = _searched(mistake)[-1].after
     (placed,) = last.effects
     assert (placed.effect.name, placed.axis) == (mistake.name, mistake.axis)
     values, deviations = coefficients_of(last.estimate, placed)
@@ -137,7 +162,9 @@ def test_a_mistake_is_named_alone_with_its_size_and_bends_no_gain(mistake: Mista
     off = np.abs(last.estimate.gains - truth.gains)
     assert np.all(off < 3.0 * last.estimate.gains_std)
     clean = _fitted(CLEAN)
-    assert last.identification.training_error.total < 1.02 * clean.identification.training_error.total
+    assert (
+        last.identification.training_error.total < 1.02 * clean.identification.training_error.total
+    )
     # The description is what it was without the correction, to the last bit.
     again = without_effects(last, start.estimate)
     assert np.array_equal(again.training.regressor, start.training.regressor)
@@ -183,8 +210,14 @@ def test_a_wrong_zero_and_late_currents_are_both_named() -> None:
     check = check_geometry(gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES)
     found = {(one.effect.name, one.axis): one for one in check.mistakes}
     assert set(found) == {("zero-offset", 1), ("time-skew", 0)}
-    assert abs(found["zero-offset", 1].coefficients[0] + ZERO_RAD) < 3.0 * found["zero-offset", 1].deviations[0]
-    assert abs(found["time-skew", 0].coefficients[0] - 0.003) < 3.0 * found["time-skew", 0].deviations[0]
+    assert (
+        abs(found["zero-offset", 1].coefficients[0] + ZERO_RAD)
+        < 3.0 * found["zero-offset", 1].deviations[0]
+    )
+    assert (
+        abs(found["time-skew", 0].coefficients[0] - 0.003)
+        < 3.0 * found["time-skew", 0].deviations[0]
+    )
 
 
 @dataclass(frozen=True)
@@ -204,8 +237,12 @@ DELAYS = {
     "current of J2": Delays((("lag", 1, 3.0),), currents_ms=(0.0, 3.0, 0.0)),
     "current of J2, early": Delays((("lag", 1, -3.0),), currents_ms=(0.0, -3.0, 0.0)),
     "current of J3": Delays((("lag", 2, 5.0),), currents_ms=(0.0, 0.0, 5.0)),
-    "currents of J1 and J2": Delays((("lag", 0, 3.0), ("lag", 1, 3.0)), currents_ms=(3.0, 3.0, 0.0)),
-    "currents of J2 and J3": Delays((("lag", 1, 5.0), ("lag", 2, 5.0)), currents_ms=(0.0, 5.0, 5.0)),
+    "currents of J1 and J2": Delays(
+        (("lag", 0, 3.0), ("lag", 1, 3.0)), currents_ms=(3.0, 3.0, 0.0)
+    ),
+    "currents of J2 and J3": Delays(
+        (("lag", 1, 5.0), ("lag", 2, 5.0)), currents_ms=(0.0, 5.0, 5.0)
+    ),
     "position of J1": Delays((("late-position", 0, 3.0),), positions_ms=(3.0, 0.0, 0.0)),
     "position of J2": Delays((("late-position", 1, 3.0),), positions_ms=(0.0, 3.0, 0.0)),
     "position of J3": Delays((("late-position", 2, 3.0),), positions_ms=(0.0, 0.0, 3.0)),
@@ -230,11 +267,17 @@ def _delayed(run: Run, delays: Delays) -> Run:
 
 @pytest.mark.parametrize("name", DELAYS)
 def test_the_check_names_what_is_late_with_its_delay(name: str) -> None:
-    """A late current, a skew of all channels and a late encoder look alike, and each has another remedy."""
+    """A late current, a skew of all channels and a late encoder look alike,
+    and each has another remedy.
+    """
     delays = DELAYS[name]
     runs = tuple(_delayed(run, delays) for run in _runs()[:4])
-    found = check_geometry(gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES).mistakes
-    assert [(one.effect.name, one.axis) for one in found] == [(effect, axis) for effect, axis, _ in delays.said]
+    found = check_geometry(
+        gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES
+    ).mistakes
+    assert [(one.effect.name, one.axis) for one in found] == [
+        (effect, axis) for effect, axis, _ in delays.said
+    ]
     for one, (_, _, delay_ms) in zip(found, delays.said, strict=True):
         assert abs(one.coefficients[0] - 1e-3 * delay_ms) < 3.0 * one.deviations[0] < 1e-3
 
@@ -246,9 +289,14 @@ def test_a_current_behind_a_filter_is_late_once() -> None:
     runs: list[Run] = []
     for run in _runs()[:4]:
         current = run.current_a.copy()
-        current[:, 1] = signal.lfilter([share], [1.0, share - 1.0], current[:, 1] - current[0, 1]) + current[0, 1]
+        current[:, 1] = (
+            signal.lfilter([share], [1.0, share - 1.0], current[:, 1] - current[0, 1])
+            + current[0, 1]
+        )
         runs.append(replace(run, current_a=current))
-    check = check_geometry(gathered(three_axes_truth(), tuple(runs)), np.random.default_rng(0), GATES)
+    check = check_geometry(
+        gathered(three_axes_truth(), tuple(runs)), np.random.default_rng(0), GATES
+    )
     assert [(one.effect.name, one.axis) for one in check.mistakes] == [("lag", 1)]
     assert check.mistakes[0].coefficients[0] == pytest.approx(delay_s, rel=0.1)
 
@@ -285,7 +333,9 @@ def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() ->
 
 
 def test_the_direction_of_gravity_has_the_sigma_of_the_joint_fit() -> None:
-    """Over clean cells, each component of the turn is as far from zero as its σ says: 32 of them tell it to 12 %."""
+    """Over clean cells, each component of the turn is as far from zero as its σ says:
+    32 of them tell it to 12 %.
+    """
     truth = three_axes_truth()
     far: list[FloatArray] = []
     for seed in range(16):
@@ -296,12 +346,16 @@ def test_the_direction_of_gravity_has_the_sigma_of_the_joint_fit() -> None:
         turn = turn_between(gravity.declared_m_s2, gravity.found_m_s2)
         far.append(turn / np.sqrt(np.diag(gravity.covariance_rad2)))
         along = turn / np.linalg.norm(turn)
-        assert gravity.turn_std_rad == pytest.approx(np.sqrt(along @ gravity.covariance_rad2 @ along))
+        assert gravity.turn_std_rad == pytest.approx(
+            np.sqrt(along @ gravity.covariance_rad2 @ along)
+        )
     assert 0.8 < np.sqrt(np.mean(np.square(far))) < 1.2
 
 
 def test_a_slide_between_two_joints_shows_millimetres_of_its_zero() -> None:
-    """What is mounted behind the wrist is weighed, so the slide's zero is a lever that the first joints feel."""
+    """What is mounted behind the wrist is weighed, so the slide's zero is a lever that the first
+    joints feel.
+    """
     moved = np.array([0.0, 0.0, 0.006, 0.0])
     runs = tuple(replace(run, position_rad=run.position_rad + moved) for run in _polar_runs())
     found = check_geometry(gathered(polar_truth(), runs), np.random.default_rng(0), GATES)
@@ -315,7 +369,16 @@ def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> No
     rng = np.random.default_rng(9)
     truth = gantry_truth()
     runs = tuple(
-        record(truth, f"r{number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload)
+        record(
+            truth,
+            f"r{number}",
+            rng,
+            seconds=15.0,
+            rate_hz=500.0,
+            averaged=2,
+            noise_a=NOISE_A,
+            payload=payload,
+        )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
     found = check_geometry(gathered(truth, runs), np.random.default_rng(0), GATES)
@@ -332,7 +395,9 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
     truth = three_axes_truth()
     robot = truth.model.robot
     lean = rotation_by(np.array([0.0, TILT_RAD, 0.0])) @ robot.gravity_m_s2
-    leaning = replace(truth, model=Model(replace(robot, gravity_m_s2=lean), truth.model.drive_train))
+    leaning = replace(
+        truth, model=Model(replace(robot, gravity_m_s2=lean), truth.model.drive_train)
+    )
     rng = np.random.default_rng(8)
     less = np.array([0.06, 1.0, 1.0])
     runs: list[Run] = []
@@ -350,7 +415,8 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
                 bend=lambda q: q * less,
             )
         )
-    fixed = identify(leaning.model, runs, SMALL, fixed_gains=truth.gains)  # the gain of J1 is not seen
+    # The gain of J1 is not seen
+    fixed = identify(leaning.model, runs, SMALL, fixed_gains=truth.gains)
     check = check_geometry(gather(fixed, runs), np.random.default_rng(0), GATES)
     assert len(check.mistakes) == 1
     (alike,) = check.alike
@@ -383,15 +449,20 @@ def test_check_geometry_names_a_small_zero_beside_a_large_spring_of_another_axis
         current = run.current_a.copy()
         current[:, 2] += 2.0 * run.position_rad[:, 2] / truth.gains[2]
         runs.append(replace(_with_mistake(run, mistake), current_a=current))
-    (found,) = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES).mistakes
+    (found,) = check_geometry(
+        gathered(truth, tuple(runs)), np.random.default_rng(0), GATES
+    ).mistakes
     assert (found.effect.name, found.axis) == ("zero-offset", 1)
     assert np.degrees(found.coefficients[0]) == pytest.approx(-1.0, abs=0.3)
 
 
 def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
     mistake = MISTAKES[0]
-    start, steps = _fitted(mistake), _searched(mistake)
-    calibration = calibration_of(start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps)
+    start = _fitted(mistake)
+    steps = _searched(mistake)
+    calibration = calibration_of(
+        start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps
+    )
     (accepted,) = calibration.effects
     assert (accepted.name, accepted.axis, accepted.settings) == ("zero-offset", "J2", {})
     assert accepted.coefficients[0].value == pytest.approx(-ZERO_RAD, abs=0.002)
@@ -407,7 +478,9 @@ def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
     left = (predicted - data.current_a)[moving]
     assert np.sqrt(np.mean(left**2)) < 1.1 * NOISE_A
     # The corrected model predicts the same; the declared one does not.
-    declared = tuple(one for one in calibration.parameters if not one.name.startswith("zero-offset"))
+    declared = tuple(
+        one for one in calibration.parameters if not one.name.startswith("zero-offset")
+    )
     without = replace(calibration, effects=(), parameters=declared)
     bad = (predict_current(without, start.model, data) - data.current_a)[moving]
     assert np.sqrt(np.mean(bad**2)) > 1.05 * np.sqrt(np.mean(left**2))
@@ -416,8 +489,11 @@ def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
 
 def test_a_body_is_weighed_with_the_corrected_geometry() -> None:
     mistake = MISTAKES[2]
-    start, steps = _fitted(mistake), _searched(mistake)
-    calibration = calibration_of(start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps)
+    start = _fitted(mistake)
+    steps = _searched(mistake)
+    calibration = calibration_of(
+        start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps
+    )
     loaded = _with_mistake(_runs()[4], mistake)
     weighed = weigh(calibration, start.model, [loaded], start.conditioning)
     assert abs(weighed.mass_kg - PAYLOAD_TRUTH["m"]) < 3.0 * weighed.mass_std_kg
@@ -425,7 +501,9 @@ def test_a_body_is_weighed_with_the_corrected_geometry() -> None:
     without = replace(
         calibration,
         effects=(),
-        parameters=tuple(one for one in calibration.parameters if not one.name.startswith("gravity-direction")),
+        parameters=tuple(
+            one for one in calibration.parameters if not one.name.startswith("gravity-direction")
+        ),
         covariance_factor=None,
     )
     expected = weigh(without, level, [loaded], start.conditioning)
@@ -434,7 +512,8 @@ def test_a_body_is_weighed_with_the_corrected_geometry() -> None:
 
 def test_before_and_after_are_of_the_same_rows() -> None:
     mistake = MISTAKES[1]
-    start, steps = _fitted(mistake), _searched(mistake)
+    start = _fitted(mistake)
+    steps = _searched(mistake)
     whole = account(start, steps)
     assert whole.holdout_change is not None
     assert whole.holdout_change.rise < -2.0 * whole.holdout_change.std
@@ -446,7 +525,8 @@ def test_before_and_after_are_of_the_same_rows() -> None:
 
 def test_a_correction_that_leaves_is_taken_back() -> None:
     start = _fitted(MISTAKES[0])
-    offset, late = PlacedEffect(ZeroOffset(), 1), PlacedEffect(LatePosition(), 2)
+    offset = PlacedEffect(ZeroOffset(), 1)
+    late = PlacedEffect(LatePosition(), 2)
     both = with_effects(start, (offset, late))
     assert set(both.corrections) == {offset, late}
     alone = with_effects(both, (late,))
@@ -457,23 +537,38 @@ def test_a_correction_that_leaves_is_taken_back() -> None:
 
 def test_a_declared_turn_of_gravity_is_within_twenty_degrees() -> None:
     columns = GravityDirection().coefficients
-    assert [np.degrees(column.largest) for column in columns] == pytest.approx([20.05, 20.05], abs=0.1)
+    assert [np.degrees(column.largest) for column in columns] == pytest.approx(
+        [20.05, 20.05], abs=0.1
+    )
 
 
 def test_a_gantry_that_leans_is_named_and_upright_it_bends_no_gain() -> None:
-    """In an upright gravity the mass of a linear axis, its rotor and the offset of its friction are two numbers; they
-    are three but for a millionth once what is found of a lean is applied.
+    """In an upright gravity the mass of a linear axis, its rotor and the offset of its friction are
+    two numbers; they are three but for a millionth once what is found of a lean is applied.
     """
     truth = gantry_truth()
     robot = truth.model.robot
     lean = np.array([0.03, -0.04, 0.0])
-    leaning = Model(replace(robot, gravity_m_s2=rotation_by(lean) @ robot.gravity_m_s2), truth.model.drive_train)
+    leaning = Model(
+        replace(robot, gravity_m_s2=rotation_by(lean) @ robot.gravity_m_s2), truth.model.drive_train
+    )
     rng = np.random.default_rng(9)
     runs = tuple(
-        record(truth, f"run {number}", rng, seconds=15.0, rate_hz=500.0, averaged=2, noise_a=NOISE_A, payload=payload)
+        record(
+            truth,
+            f"run {number}",
+            rng,
+            seconds=15.0,
+            rate_hz=500.0,
+            averaged=2,
+            noise_a=NOISE_A,
+            payload=payload,
+        )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
-    last = find_effects(gathered(replace(truth, model=leaning), runs), np.random.default_rng(0), GATES, ())[-1].after
+    last = find_effects(
+        gathered(replace(truth, model=leaning), runs), np.random.default_rng(0), GATES, ()
+    )[-1].after
     (placed,) = last.effects
     assert isinstance(placed.effect, GravityDirection)
     found = last.model.robot.gravity_m_s2

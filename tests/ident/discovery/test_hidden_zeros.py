@@ -27,7 +27,9 @@ def leaning(robot: Robot, angle_deg: float) -> Robot:
     return replace(robot, gravity_m_s2=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
 
 
-def test_an_upright_arm_hides_the_first_zero_by_symmetry_and_the_last_one_by_its_link(arm: Robot) -> None:
+def test_an_upright_arm_hides_the_first_zero_by_symmetry_and_the_last_one_by_its_link(
+    arm: Robot,
+) -> None:
     assert causes(arm) == ["symmetry", "moves", "last link"]
 
 
@@ -36,13 +38,23 @@ def test_a_base_that_leans_by_two_degrees_is_upright_still(arm: Robot) -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [20.0, 90.0])
-def test_on_a_wall_the_first_zero_is_hidden_by_the_moves_alone(arm: Robot, angle_deg: float) -> None:
+def test_on_a_wall_the_first_zero_is_hidden_by_the_moves_alone(
+    arm: Robot, angle_deg: float
+) -> None:
     assert zero_hidden_by(leaning(arm, angle_deg), 0) is ZeroHiddenBy.MOVES
 
 
 def test_slides_before_any_turning_joint_shift_the_whole_arm() -> None:
-    """A turn about the vertical behind horizontal slides is none of the whole arm: their torques show it."""
-    assert causes(gantry_truth().model.robot) == ["symmetry", "symmetry", "symmetry", "moves", "last link"]
+    """A turn about the vertical behind horizontal slides is none of the whole arm:
+    their torques show it.
+    """
+    assert causes(gantry_truth().model.robot) == [
+        "symmetry",
+        "symmetry",
+        "symmetry",
+        "moves",
+        "last link",
+    ]
 
 
 def test_axes_before_are_those_of_the_chain(arm: Robot) -> None:

@@ -10,7 +10,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ident.discovery.candidates import CandidateTrial, ColumnCache, FamilyTrials, SearchProblem, score_candidates
+from ident.discovery.candidates import (
+    CandidateTrial,
+    ColumnCache,
+    FamilyTrials,
+    SearchProblem,
+    score_candidates,
+)
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import Gates
 from ident.discovery.search import rank_effects, rank_families
@@ -35,7 +41,9 @@ def search_problem(small: Evidence) -> SearchProblem:
 @pytest.fixture(scope="module")
 def problem(small: Evidence) -> Linearisation:
     estimate = small.estimate
-    return linearise(small.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
+    return linearise(
+        small.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False
+    )
 
 
 def _fold_of_rows(folds: Folds) -> NDArray[np.int64]:
@@ -46,7 +54,9 @@ def _fold_of_rows(folds: Folds) -> NDArray[np.int64]:
 
 
 def _shows_its_own(folds: Folds, other: Folds) -> float:
-    """Effect on the held-out residual of fold 0 of a change of three in all its rows: three, if it has no influence."""
+    """Effect on the held-out residual of fold 0 of a change of three in all its rows:
+    three, if it has no influence.
+    """
     own = _fold_of_rows(folds) == 0
     return float(np.mean((other.residual - folds.residual)[own]))
 
@@ -69,28 +79,35 @@ def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearis
 
 
 def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same figure of merit on a residual of the fit of all rows, and on folds that part the moves."""
+    """The same figure of merit on a residual of the fit of all rows,
+    and on folds that part the moves.
+    """
     folds = cut_into_folds(problem)
     changed = cut_into_folds(_changed(problem, folds))
     assert _shows_its_own(folds, changed) == pytest.approx(3.0)
 
     def of_all_rows(fold: Folds) -> FloatArray:
-        step = linalg.cho_solve(fold.full_factor, fold.linearisation.jacobian.on_columns(fold.linearisation.residual))
+        step = linalg.cho_solve(
+            fold.full_factor, fold.linearisation.jacobian.on_columns(fold.linearisation.residual)
+        )
         return np.asarray(fold.linearisation.residual - fold.linearisation.jacobian @ step)
 
     leaking = [replace(one, residual=of_all_rows(one)) for one in (folds, changed)]
     assert _shows_its_own(*leaking) < 2.9
 
-    # Pieces of one move dealt to different folds: they share its noise. The move's number is what forbids it.
+    # Pieces of one move dealt to different folds: they share its noise. The move's number is what
+    # forbids it.
     pieces = 4 * problem.cluster + np.arange(len(problem.cluster)) % 4
     parted = replace(problem, cluster=pieces)
-    kept, leaked = cut_into_folds(parted, move_of=np.arange(4 * problem.cluster_count) // 4), cut_into_folds(parted)
+    kept = cut_into_folds(parted, move_of=np.arange(4 * problem.cluster_count) // 4)
+    leaked = cut_into_folds(parted)
     assert max(_folds_a_move(kept)) == 1
     assert min(_folds_a_move(leaked)) == 4
 
 
 def _folds_a_move(folds: Folds) -> list[int]:
-    move, fold = folds.linearisation.cluster // 4, _fold_of_rows(folds)
+    move = folds.linearisation.cluster // 4
+    fold = _fold_of_rows(folds)
     return [len(np.unique(fold[move == number])) for number in np.unique(move)]
 
 
@@ -106,13 +123,17 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
 
 
 def test_the_same_seed_gives_the_same_verdict(small: Evidence) -> None:
-    first, second = (rank_effects(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2))
+    first, second = (
+        rank_effects(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2)
+    )
     assert [(f.effect, f.axis, f.probability, f.held_out_fall) for f in first] == [
         (f.effect, f.axis, f.probability, f.held_out_fall) for f in second
     ]
 
 
-def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(search_problem: SearchProblem) -> None:
+def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(
+    search_problem: SearchProblem,
+) -> None:
     """A family is scored on each fold with the setting that the others chose, best on it or not."""
     (tested,) = search_problem.test([tuple(Cogging(order) for order in range(1, 13))], 0)
     scored = tested.nested()
@@ -134,9 +155,14 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
     own = _fold_of_rows(folds) == 0
     columns = rng.normal(size=(len(own), 3))
     changed = cut_into_folds(
-        replace(folds.linearisation, residual=folds.linearisation.residual + 5.0 * own * columns[:, 0])
+        replace(
+            folds.linearisation, residual=folds.linearisation.residual + 5.0 * own * columns[:, 0]
+        )
     )
-    before, after = (score_candidates(one, columns, [slice(i, i + 1) for i in range(3)]) for one in (folds, changed))
+    before, after = (
+        score_candidates(one, columns, [slice(i, i + 1) for i in range(3)])
+        for one in (folds, changed)
+    )
     for one, other in zip(before, after, strict=True):
         assert one is not None
         assert other is not None
@@ -145,15 +171,22 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
 
 
 def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
-    """Twenty times every move's noise gets a random sign, on each motor alone: one false name at most.
+    """Twenty times every move's noise gets a random sign, on each motor alone:
+    one false name at most.
 
-    Nor do families that are known from another axis, which compete among themselves: one more at most.
+    Nor do families that are known from another axis, which compete among themselves: one more at
+    most.
     """
     rng = np.random.default_rng(12)
-    estimate, observed = small.estimate, small.training
+    estimate = small.estimate
+    observed = small.training
     drive_train = small.model.drive_train
-    noise = observed.current - drive_train.to_motor @ estimate.predicted_torque(observed) / estimate.gains[:, None]
-    # A choice of families, settings and axes that competes as the whole dictionary does, at a part of its price.
+    noise = (
+        observed.current
+        - drive_train.to_motor @ estimate.predicted_torque(observed) / estimate.gains[:, None]
+    )
+    # A choice of families, settings and axes that competes as the whole dictionary does, at a part
+    # of its price.
     families = tuple(family[::4] for family in EFFECTS)
     cache: ColumnCache = {}
     false = known = 0
@@ -162,13 +195,17 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
         problem = search_problem_of(with_current(small, (sign - 1.0) * noise), cache)
         false += any(finding.passed for finding in rank_effects(problem, rng, GATES, families))
         alone = tuple(family for family in families if family[0].name in KNOWN)
-        known += any(finding.passed for finding in rank_effects(problem, rng, GATES, alone, known=KNOWN))
+        known += any(
+            finding.passed for finding in rank_effects(problem, rng, GATES, alone, known=KNOWN)
+        )
     assert false <= 1
     assert known <= 2
 
 
 def test_a_family_known_from_another_axis_competes_with_its_own_name(small: Evidence) -> None:
-    """Noise makes one as strong less often among few candidates; the others are judged as before."""
+    """Noise makes one as strong less often among few candidates;
+    the others are judged as before.
+    """
     problem = search_problem_of(small)
     families = tuple(family[::4] for family in EFFECTS)
     plain, related = (
@@ -188,7 +225,9 @@ def test_a_family_known_from_another_axis_competes_with_its_own_name(small: Evid
     assert sum(related[key] for key in plain) < sum(plain.values())
 
 
-def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int = 8) -> CandidateTrial:
+def _noise_trial(
+    rng: np.random.Generator, moves: int, columns: int, rows: int = 8
+) -> CandidateTrial:
     """A candidate on noise alone, in moves of different loudness."""
     x = rng.normal(size=(moves, rows, columns)) * rng.uniform(0.5, 2.0, size=(moves, 1, 1))
     e = rng.normal(size=(moves, rows)) + 0.7 * rng.normal(size=(moves, 1))
@@ -206,8 +245,9 @@ def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int =
     )
 
 
-# Of 400 candidates on noise 20 ± 4.4 have p ≤ 0.05 by chance alone; three deviations on either side. With twelve moves
-# of different loudness the bootstrap is a little too sure (6 to 9 % in 1500 draws): a tenth is the most allowed.
+# Of 400 candidates on noise 20 ± 4.4 have p ≤ 0.05 by chance alone; three deviations on either
+# side. With twelve moves of different loudness the bootstrap is a little too sure (6 to 9 % in 1500
+# draws): a tenth is the most allowed.
 @pytest.mark.parametrize("columns", [1, 2])
 @pytest.mark.parametrize(("moves", "least", "most"), [(12, 7, 40), (60, 7, 33)])
 def test_the_bootstrap_keeps_its_size(
@@ -217,8 +257,12 @@ def test_the_bootstrap_keeps_its_size(
     effect = (Stribeck(0.1), PositionFriction())[columns - 1]
     false = 0
     for _ in range(400):
-        trial = replace(_noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3))
-        (finding,) = rank_families(search_problem, [FamilyTrials(0, ((effect, trial),))], rng, GATES)
+        trial = replace(
+            _noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3)
+        )
+        (finding,) = rank_families(
+            search_problem, [FamilyTrials(0, ((effect, trial),))], rng, GATES
+        )
         assert finding.probability is not None
         false += finding.probability <= 0.05
     assert least <= false <= most

@@ -1,4 +1,6 @@
-"""What instruments from the demanded motion say of an effect that a fit in a position loop has found."""
+"""What instruments from the demanded motion say of an effect that a fit in a position loop has
+found.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ def contradiction(value: float, std: float, fitted: float, placed: PlacedEffect 
     ("value_ms", "said"),
     [
         (0.3, "may all be zero"),  # nothing is left of it by instruments
-        (1.3, "0.0013 s, not 0.0042"),  # a third of it is left: what the fit says is mostly the loop
+        # A third of it is left: what the fit says is mostly the loop
+        (1.3, "0.0013 s, not 0.0042"),
         (3.0, ""),  # nearer to the fit than to zero
         (4.0, ""),
     ],

@@ -31,7 +31,10 @@ def _late(*delays_ms: float) -> Evidence:
     runs = []
     for run in small_recordings(three_axes_truth(), 3, noise_a=0.03):
         columns = zip(run.current_a.T, delays_ms, strict=True)
-        late = [np.interp(run.time_s - 1e-3 * delay_ms, run.time_s, current) for current, delay_ms in columns]
+        late = [
+            np.interp(run.time_s - 1e-3 * delay_ms, run.time_s, current)
+            for current, delay_ms in columns
+        ]
         runs.append(replace(run, current_a=np.stack(late, axis=1)))
     return gathered(three_axes_truth(), tuple(runs))
 
@@ -46,7 +49,8 @@ def _found(*delays_ms: float) -> LateCurrents | None:
 def test_differences_of_rows_are_nearly_the_rate_of_torque() -> None:
     evidence = _late(0.0, 0.0, 0.0)
     use = evidence.training.motor_use
-    rough, exact = rough_torque_rates(evidence)[use], torque_rates(evidence)[use]
+    rough = rough_torque_rates(evidence)[use]
+    exact = torque_rates(evidence)[use]
     cosine = float(rough @ exact) / float(np.linalg.norm(rough) * np.linalg.norm(exact))
     assert cosine > 0.9
 
@@ -79,11 +83,17 @@ def test_delays_are_common_or_those_of_the_late_axes(
 
 
 def test_one_current_that_is_left_to_test_is_no_common_delay() -> None:
-    """The model has a lag of the other two already: nothing says that they are late by the same time."""
+    """The model has a lag of the other two already:
+    nothing says that they are late by the same time.
+    """
     evidence = _late(4.0, 4.0, 4.0)
     problem = search_problem_of(evidence)
     rates = torque_rates(evidence)
-    left = [one for one in try_delays(problem, rates) if one.axis == 2 or isinstance(one.members[0][0], TimeSkew)]
+    left = [
+        one
+        for one in try_delays(problem, rates)
+        if one.axis == 2 or isinstance(one.members[0][0], TimeSkew)
+    ]
     found = find_late_currents(problem, left, rates)
     assert found is None or PlacedEffect(TimeSkew(), 0) not in found.effects
 

@@ -1,4 +1,6 @@
-"""Noise floor: a known noise is recovered at rest and between repeated moves; without data there is no floor."""
+"""Noise floor: a known noise is recovered at rest and between repeated moves;
+without data there is no floor.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,21 @@ NOISE_A = np.array([0.3, 0.1, 0.05, 0.2, 0.4, 0.02])
 SMALL = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
 MOVES = (FloorSource.REPEATED_MOVES,)
 DEVIATIONS = 4.0
-"""Limit in σ of the estimate itself, by its std_percent: one of six motors is outside by chance in 2600 runs."""
+"""Limit in σ of the estimate itself, by its std_percent:
+one of six motors is outside by chance in 2600 runs.
+"""
 
 
 def _resting(truth: Truth, runs: int = 3) -> tuple[Dataset, ...]:
-    """Noiseless runs whose current bends slowly while a motor rests, as that of an integrator does."""
+    """Noiseless runs whose current bends slowly while a motor rests,
+    as that of an integrator does.
+    """
     rng = np.random.default_rng(8)
     made = []
     for number in range(runs):
-        data = differentiate(record(truth, f"run{number}", rng, seconds=22.0), truth.model.drive_train, CONDITIONING)
+        data = differentiate(
+            record(truth, f"run{number}", rng, seconds=22.0), truth.model.drive_train, CONDITIONING
+        )
         current = data.current_a.copy()
         for motor, still in enumerate(~data.motor_moving.T):
             for part in _parts(still):
@@ -49,7 +57,10 @@ def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
     rng = np.random.default_rng(seed)
     noise_a = NOISE_A[: runs[0].current_a.shape[1]]
     return tuple(
-        replace(data, current_a=data.current_a + noise_a * rng.standard_normal(data.current_a.shape)) for data in runs
+        replace(
+            data, current_a=data.current_a + noise_a * rng.standard_normal(data.current_a.shape)
+        )
+        for data in runs
     )
 
 
@@ -67,7 +78,9 @@ def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
             at = np.arange(len(q))
             return np.stack([np.interp(at - 2.4 * number, at, axis) for axis in q.T], axis=1)
 
-        made = record(small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=later)
+        made = record(
+            small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=later
+        )
         return differentiate(made, small_truth.model.drive_train, SMALL)
 
     return tuple(run(number) for number in range(3))
@@ -94,14 +107,19 @@ def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
 
 def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dataset, ...]) -> None:
     drawn = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
-    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(resting[0])
+    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(
+        resting[0]
+    )
     reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
-    # 120 estimates: their mean is known to std_percent/√120, their scatter to 1/√240 of itself; three of those.
+    # 120 estimates: their mean is known to std_percent/√120, their scatter to 1/√240 of itself;
+    # three of those.
     assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
     assert relative.std() == pytest.approx(reported, rel=0.25)
 
 
-def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(resting: tuple[Dataset, ...]) -> None:
+def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(
+    resting: tuple[Dataset, ...],
+) -> None:
     """The estimate itself is no bound: half of the draws are above the noise."""
     above: list[bool] = []
     above_limit: list[bool] = []
@@ -113,12 +131,15 @@ def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(resting: tuple[D
             assert 0.7 * floor.noise_a < floor.least_a < floor.noise_a
     draws = len(above)
     assert 0.35 * draws < sum(above) < 0.65 * draws
-    # Of 240 draws, 12 are expected above a limit of 95 %; 23 and more come in one of a thousand such tests.
+    # Of 240 draws, 12 are expected above a limit of 95 %; 23 and more come in one of a thousand
+    # such tests.
     assert 1 <= sum(above_limit) <= 22
 
 
 def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ...]) -> None:
-    """A quarter of the dwells spoilt moves the median to a higher quantile; a mean would follow the steps' size."""
+    """A quarter of the dwells spoilt moves the median to a higher quantile;
+    a mean would follow the steps' size.
+    """
     slipping = []
     for data in _noisy(resting):
         current = data.current_a.copy()
@@ -126,21 +147,26 @@ def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ..
             for part in _parts(still)[::4]:
                 current[(part.start + part.stop) // 2 : part.stop, motor] += 200.0 * NOISE_A[motor]
         slipping.append(replace(data, current_a=current))
-    for floor, expected in zip(_all(noise_floors(slipping, CONDITIONING)), _expected_a(resting[0]), strict=True):
+    for floor, expected in zip(
+        _all(noise_floors(slipping, CONDITIONING)), _expected_a(resting[0]), strict=True
+    ):
         assert floor.noise_a < 2.0 * expected
 
 
 def test_what_moves_or_is_invalid_has_no_say(resting: tuple[Dataset, ...]) -> None:
     noisy = _noisy(resting)
     elsewhere = [
-        replace(data, current_a=np.where(data.motor_moving, 99.0 * data.current_a, data.current_a)) for data in noisy
+        replace(data, current_a=np.where(data.motor_moving, 99.0 * data.current_a, data.current_a))
+        for data in noisy
     ]
     assert noise_floors(elsewhere, CONDITIONING) == noise_floors(noisy, CONDITIONING)
     unseen = [replace(data, valid=np.zeros_like(data.valid)) for data in noisy]
     assert noise_floors(unseen, CONDITIONING) == (None,) * 6
 
 
-def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(resting: tuple[Dataset, ...]) -> None:
+def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(
+    resting: tuple[Dataset, ...],
+) -> None:
     (first, *_) = _noisy(resting)
     short = slice(0, round(6.0 * first.rate_hz))
     cut = replace(
@@ -153,17 +179,23 @@ def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(resti
     assert noise_floors((cut,), CONDITIONING) == (None,) * 6
     switched_off = [replace(data, current_a=np.zeros_like(data.current_a)) for data in resting]
     assert noise_floors(switched_off, CONDITIONING) == (None,) * 6
-    always_moving = [replace(data, motor_moving=np.ones_like(data.motor_moving)) for data in resting]
+    always_moving = [
+        replace(data, motor_moving=np.ones_like(data.motor_moving)) for data in resting
+    ]
     assert noise_floors(always_moving, CONDITIONING) == (None,) * 6
 
 
-def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(repeated: tuple[Dataset, ...]) -> None:
+def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(
+    repeated: tuple[Dataset, ...],
+) -> None:
     still = replace(
         repeated[0],
         motor_moving=np.zeros_like(repeated[0].motor_moving),
         current_a=np.zeros_like(repeated[0].current_a),
     )
-    for floor, expected in zip(_all(noise_floors(_noisy([still]), SMALL)), _expected_a(still), strict=True):
+    for floor, expected in zip(
+        _all(noise_floors(_noisy([still]), SMALL)), _expected_a(still), strict=True
+    ):
         assert floor.parts == 11
         assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
 
@@ -181,7 +213,9 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
         assert (other.parts, other.freedom) == (one.parts, one.freedom)
 
 
-def test_standstill_alone_is_no_bound(resting: tuple[Dataset, ...], repeated: tuple[Dataset, ...]) -> None:
+def test_standstill_alone_is_no_bound(
+    resting: tuple[Dataset, ...], repeated: tuple[Dataset, ...]
+) -> None:
     at_rest = _all(noise_floors(_noisy(resting), CONDITIONING, (FloorSource.STANDSTILL,)))
     assert not any(floor.is_bound for floor in at_rest)
     in_motion = _all(noise_floors(_noisy(repeated), SMALL, MOVES))
@@ -191,10 +225,16 @@ def test_standstill_alone_is_no_bound(resting: tuple[Dataset, ...], repeated: tu
 
 
 def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> None:
-    """Torques of the motion cancel, ten times larger than the noise in a row; the start of a move is no sample."""
+    """Torques of the motion cancel, ten times larger than the noise in a row;
+    the start of a move is no sample.
+    """
     drawn = [_all(noise_floors(_noisy(repeated, seed), SMALL, MOVES)) for seed in range(20)]
-    assert all(floor.source is FloorSource.REPEATED_MOVES and floor.parts > 30 for floor in drawn[0])
-    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(repeated[0])
+    assert all(
+        floor.source is FloorSource.REPEATED_MOVES and floor.parts > 30 for floor in drawn[0]
+    )
+    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(
+        repeated[0]
+    )
     reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
     assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
     # 60 estimates: their scatter is known to 1/√120 of itself, 9 %; three of those.
@@ -210,42 +250,58 @@ def test_pairs_that_share_a_move_have_less_freedom(repeated: tuple[Dataset, ...]
         assert many.freedom == pytest.approx(1.6 * few.freedom)
 
 
-def test_friction_that_changes_between_repetitions_is_no_noise(repeated: tuple[Dataset, ...]) -> None:
+def test_friction_that_changes_between_repetitions_is_no_noise(
+    repeated: tuple[Dataset, ...],
+) -> None:
     noisy = _noisy(repeated)
     warming = [
         replace(data, current_a=data.current_a + 5.0 * number * np.sign(data.velocity_rad_s))
         for number, data in enumerate(noisy)
     ]
-    for one, other in zip(*(_all(noise_floors(runs, SMALL, MOVES)) for runs in (noisy, warming)), strict=True):
+    for one, other in zip(
+        *(_all(noise_floors(runs, SMALL, MOVES)) for runs in (noisy, warming)), strict=True
+    ):
         assert other.noise_a == pytest.approx(one.noise_a, rel=1e-6)
 
 
 def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> None:
-    """A model explains the inertia's torque of the measured motion; it would make the floor of axis 2 twice as high."""
+    """A model explains the inertia's torque of the measured motion;
+    it would make the floor of axis 2 twice as high.
+    """
 
     def run(number: int) -> Dataset:
         def shaken(q: FloatArray) -> FloatArray:
             phase = np.array([0.0, 1.0, 2.0]) + 2.5 * number
             return np.asarray(q + 1e-3 * np.sin(0.05 * np.arange(len(q))[:, None] + phase))
 
-        made = record(small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=shaken)
+        made = record(
+            small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=shaken
+        )
         return differentiate(made, small_truth.model.drive_train, SMALL)
 
     runs = _noisy([run(0), run(1)])
-    for floor, expected in zip(_all(noise_floors(runs, SMALL, MOVES)), _expected_a(runs[0]), strict=True):
+    for floor, expected in zip(
+        _all(noise_floors(runs, SMALL, MOVES)), _expected_a(runs[0]), strict=True
+    ):
         assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
 
 
 @pytest.mark.parametrize(
-    ("loud_in_motion", "source"), [(False, FloorSource.REPEATED_MOVES), (True, FloorSource.STANDSTILL)]
+    ("loud_in_motion", "source"),
+    [(False, FloorSource.REPEATED_MOVES), (True, FloorSource.STANDSTILL)],
 )
 def test_the_smaller_of_both_estimates_is_taken(
     repeated: tuple[Dataset, ...], loud_in_motion: bool, source: FloorSource
 ) -> None:
     """A robot that hunts at standstill, and one that is disturbed in motion."""
-    rng, runs = np.random.default_rng(2), []
-    for data in _noisy([replace(data, current_a=data.current_a * data.motor_moving) for data in repeated]):
-        loud = 3.0 * rng.standard_normal(data.current_a.shape) * (data.motor_moving == loud_in_motion)
+    rng = np.random.default_rng(2)
+    runs = []
+    for data in _noisy(
+        [replace(data, current_a=data.current_a * data.motor_moving) for data in repeated]
+    ):
+        loud = (
+            3.0 * rng.standard_normal(data.current_a.shape) * (data.motor_moving == loud_in_motion)
+        )
         runs.append(replace(data, current_a=data.current_a + loud))
     for floor, expected in zip(_all(noise_floors(runs, SMALL)), _expected_a(runs[0]), strict=True):
         assert floor.source is source
@@ -255,7 +311,8 @@ def test_the_smaller_of_both_estimates_is_taken(
 def test_other_paths_payloads_and_rates_are_no_repetition(repeated: tuple[Dataset, ...]) -> None:
     first, second, _ = _noisy(repeated)
     others = (
-        replace(second, position_rad=second.position_rad + np.array([0.05, 0.0, 0.0])),  # 1 % of the travel
+        # 1 % of the travel
+        replace(second, position_rad=second.position_rad + np.array([0.05, 0.0, 0.0])),
         replace(second, payload=MOUNTED),
         replace(second, rate_hz=1.01 * second.rate_hz),
         replace(second, valid=np.zeros_like(second.valid)),

@@ -1,4 +1,6 @@
-"""What each check of the library sees of a zero that is some degrees off, as the page on the library says."""
+"""What each check of the library sees of a zero that is some degrees off,
+as the page on the library says.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,19 @@ AXES = ("J1", "J2", "J3")
 OFF_DEG = 5.0
 
 
-def test_a_zero_of_some_degrees_is_seen_by_the_search_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zero_of_some_degrees_is_seen_by_the_search_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
     example = import_module("gains_from_arrays")
     nameplate = example.NAMEPLATE_NM_A
-    model = ident.Model(ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS)))
-    right = [example.record(model, "bare", None, 1), example.record(model, "loaded", example.DISC, 2)]
+    model = ident.Model(
+        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    )
+    right = [
+        example.record(model, "bare", None, 1),
+        example.record(model, "loaded", example.DISC, 2),
+    ]
     off_rad = np.radians([0.0, OFF_DEG, 0.0])
     mistaken = [replace(run, position_rad=np.asarray(run.position_rad) + off_rad) for run in right]
     gains = ident.identify(model, right).estimate.gains

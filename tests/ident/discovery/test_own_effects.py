@@ -1,4 +1,6 @@
-"""Effects of one's own in the search: found where they are, not where they are not, and beside mistakes of geometry."""
+"""Effects of one's own in the search: found where they are, not where they are not,
+and beside mistakes of geometry.
+"""
 
 from __future__ import annotations
 
@@ -56,14 +58,20 @@ def _lobed(data: Dataset) -> FloatArray:
     return acting_on(1, 3, size_nm * np.sign(data.velocity_rad_s[:, 1]))
 
 
-def test_it_is_found_where_it_is_and_its_setting_is_refined(small: Evidence, small_truth: Truth) -> None:
-    steps = find_effects(bent(small, small_truth, _lobed), np.random.default_rng(0), GATES, own_effects=OWN)
+def test_it_is_found_where_it_is_and_its_setting_is_refined(
+    small: Evidence, small_truth: Truth
+) -> None:
+    steps = find_effects(
+        bent(small, small_truth, _lobed), np.random.default_rng(0), GATES, own_effects=OWN
+    )
     (placed,) = steps[-1].after.effects
     assert isinstance(placed.effect, LobedFriction)
     assert placed.axis == 1
     assert placed.effect.lobes == pytest.approx(LOBES, abs=0.1)  # it was among none of those given
     estimate = steps[-1].after.estimate
-    values = dict(zip((column.name for column in estimate.unknowns), estimate.parameters, strict=True))
+    values = dict(
+        zip((column.name for column in estimate.unknowns), estimate.parameters, strict=True)
+    )
     found = [values[column.name] for column in placed.columns]
     assert found == pytest.approx([COSINE_NM, SINE_NM], abs=1.0)
 
@@ -110,10 +118,14 @@ def _rubbing(data: Dataset) -> FloatArray:
     return acting_on(1, 3, SPOT_NM * np.exp(-(distance**2)) * np.sign(data.velocity_rad_s[:, 1]))
 
 
-def test_two_real_settings_are_refined_and_nothing_joins_for_the_rest(small: Evidence, small_truth: Truth) -> None:
+def test_two_real_settings_are_refined_and_nothing_joins_for_the_rest(
+    small: Evidence, small_truth: Truth
+) -> None:
     """At the values that are given, a rest would stay, and be taken for another friction."""
     given = tuple(TightSpot(centre_rad, 0.8) for centre_rad in (-1.0, 0.0, 1.0))
-    steps = find_effects(bent(small, small_truth, _rubbing), np.random.default_rng(0), GATES, own_effects=given)
+    steps = find_effects(
+        bent(small, small_truth, _rubbing), np.random.default_rng(0), GATES, own_effects=given
+    )
     (placed,) = steps[-1].after.effects
     assert isinstance(placed.effect, TightSpot)
     assert placed.axis == 1
@@ -144,17 +156,23 @@ class WritingFriction(LobedFriction):
 def test_one_that_writes_into_the_signals_is_refused(small: Evidence) -> None:
     """Every effect reads the same arrays: the search would go on with other positions."""
     with pytest.raises(
-        ident.EffectRefused, match=r"'writing-friction': found ValueError .*read-only.* copy what it changes"
+        ident.EffectRefused,
+        match=r"'writing-friction': found ValueError .*read-only.* copy what "
+        r"it changes",
     ):
         find_effects(small, np.random.default_rng(0), GATES, own_effects=[WritingFriction(2.0)])
 
 
-def test_mistakes_of_the_description_compete_with_it(small_truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mistakes_of_the_description_compete_with_it(
+    small_truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A zero that is off by 2° is a suspect, which must stand beside every other effect."""
     rng = np.random.default_rng(5)
     runs: list[ident.Run] = []
     for number in range(4):
-        run = record(small_truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=0.03)
+        run = record(
+            small_truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=0.03
+        )
         runs.append(replace(run, position_rad=run.position_rad + np.radians([0.0, 2.0, 0.0])))
     mistaken = gathered(small_truth, tuple(runs))
     tested: set[str] = set()
@@ -165,6 +183,8 @@ def test_mistakes_of_the_description_compete_with_it(small_truth: Truth, monkeyp
         return rank_families(problem, trials, *rest)
 
     monkeypatch.setattr(geometry_check, "rank_families", watched)
-    (found,) = geometry_check.check_geometry(mistaken, np.random.default_rng(0), GATES, OWN).mistakes
+    (found,) = geometry_check.check_geometry(
+        mistaken, np.random.default_rng(0), GATES, OWN
+    ).mistakes
     assert (found.effect.name, found.axis) == ("zero-offset", 1)
     assert {"lobed-friction", "zero-offset", "spring"} <= tested

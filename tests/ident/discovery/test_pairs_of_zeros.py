@@ -24,7 +24,15 @@ GATES = Gates(draws=199)
 def _runs() -> tuple[Run, ...]:
     rng = np.random.default_rng(12)
     return tuple(
-        record(tx40_truth(), f"run {number}", rng, seconds=20.0, rate_hz=200.0, noise_a=0.03, payload=payload)
+        record(
+            tx40_truth(),
+            f"run {number}",
+            rng,
+            seconds=20.0,
+            rate_hz=200.0,
+            noise_a=0.03,
+            payload=payload,
+        )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
 
@@ -33,11 +41,17 @@ def test_two_zeros_that_hide_each_other_are_both_named_with_their_sizes() -> Non
     """None of the two passes alone: only the upper arm is turned."""
     runs = tuple(replace(run, position_rad=run.position_rad + OPPOSITE_RAD) for run in _runs())
     evidence = gathered(tx40_truth(), runs)
-    found = {one.axis: one for one in check_geometry(evidence, np.random.default_rng(0), GATES).mistakes}
+    found = {
+        one.axis: one for one in check_geometry(evidence, np.random.default_rng(0), GATES).mistakes
+    }
     assert set(found) == {1, 2}
     for axis, one in found.items():
         assert isinstance(one.effect, ZeroOffset)
-        assert abs(one.coefficients[0] + OPPOSITE_RAD[axis]) < 3.0 * one.deviations[0] < np.radians(2.0)
+        assert (
+            abs(one.coefficients[0] + OPPOSITE_RAD[axis])
+            < 3.0 * one.deviations[0]
+            < np.radians(2.0)
+        )
 
 
 def test_right_zeros_make_no_pair() -> None:

@@ -1,4 +1,6 @@
-"""Every family, planted with the true load and current: named on its axis, with the right size and sign."""
+"""Every family, planted with the true load and current:
+named on its axis, with the right size and sign.
+"""
 
 from __future__ import annotations
 
@@ -117,8 +119,11 @@ class Planted:
 
 
 def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
-    """z of Dahl's model, sample by sample: dz = (1 − z s) dq/η with the exact solution over one step."""
-    z, out = 0.0, np.empty_like(t.velocity)
+    """z of Dahl's model, sample by sample:
+    dz = (1 − z s) dq/η with the exact solution over one step.
+    """
+    z = 0.0
+    out = np.empty_like(t.velocity)
     for k, step in enumerate(t.velocity / t.rate_hz):
         way = np.sign(step)
         z = way - (way - z) * np.exp(-abs(step) / distance_rad)
@@ -127,13 +132,19 @@ def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
 
 
 def _meshed(t: TrueSignals, efficiency: float) -> FloatArray:
-    """More torque where the motor drives the load, less where the load drives it: what a gear keeps of the power."""
+    """More torque where the motor drives the load, less where the load drives it:
+    what a gear keeps of the power.
+    """
     through = t.load + t.frictions[t.axis]
-    return np.asarray(np.where(through * t.velocity > 0.0, through / efficiency, through * efficiency) - through)
+    return np.asarray(
+        np.where(through * t.velocity > 0.0, through / efficiency, through * efficiency) - through
+    )
 
 
 def _pushed(t: TrueSignals, half_gap_rad: float) -> FloatArray:
-    """Torque of all joints for the joint behind a gap, which follows its motor from flank to flank."""
+    """Torque of all joints for the joint behind a gap,
+    which follows its motor from flank to flank.
+    """
     through = t.load + t.frictions[t.axis]
     width = 0.15 * np.sqrt(np.mean(through**2))
     flank = 1.0 - 2.0 / (1.0 + np.exp(2.0 * through / width))
@@ -167,22 +178,31 @@ def _hose(t: TrueSignals, other: int) -> FloatArray:
 
 
 def _slack_cable(t: TrueSignals, other: int) -> FloatArray:
-    """A cable that pulls where the joint is before the other one, around both at one radius; half of it on each."""
-    force = np.where(t.positions[t.axis] > t.positions[other], t.positions[t.axis] - t.positions[other], 0.0)
+    """A cable that pulls where the joint is before the other one, around both at one radius;
+    half of it on each.
+    """
+    force = np.where(
+        t.positions[t.axis] > t.positions[other], t.positions[t.axis] - t.positions[other], 0.0
+    )
     torque = np.zeros_like(t.positions)
     torque[t.axis], torque[other] = 15.0 * force, -15.0 * force
     return torque
 
 
 def _lengthening(angle: FloatArray, foot_m: float, lever_m: float, force_n: float) -> FloatArray:
-    """A constant force along a balancer: its work F Δs between neighbouring angles, over their difference."""
+    """A constant force along a balancer: its work F Δs between neighbouring angles,
+    over their difference.
+    """
     ends = [np.array([np.cos(angle + way), np.sin(angle + way)]) * lever_m for way in (-1e-6, 1e-6)]
     shorter, longer = (np.hypot(foot_m - x, y) for x, y in ends)
     return np.asarray(force_n * (longer - shorter) / 2e-6)
 
 
 def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
-    return np.asarray(np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity))
+    return np.asarray(
+        np.exp2(-clock_s / (constant_s * np.log(2.0)))
+        * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity)
+    )
 
 
 def _heated(t: TrueSignals) -> FloatArray:
@@ -192,14 +212,20 @@ def _heated(t: TrueSignals) -> FloatArray:
 
 
 def _saturated(torque: FloatArray, gain: float, half_a: float) -> FloatArray:
-    """Gain times the current that a torque needs where half the torque constant is left at half_a: i / (1 + (i/h)²)."""
+    """Gain times the current that a torque needs where half the torque constant is left at half_a:
+    i / (1 + (i/h)²).
+    """
     least_a = torque / gain
     return np.asarray(gain * 2.0 * least_a / (1.0 + np.sqrt(1.0 - 4.0 * (least_a / half_a) ** 2)))
 
 
 def _followed(torque: FloatArray, constant_s: float, rate_hz: float) -> FloatArray:
-    """What a first-order lag makes of it, in ten Euler steps a sample, between which it goes straight."""
-    out, state, steps = np.empty_like(torque), float(torque[0]), 10
+    """What a first-order lag makes of it, in ten Euler steps a sample,
+    between which it goes straight.
+    """
+    out = np.empty_like(torque)
+    state = float(torque[0])
+    steps = 10
     before = state
     for sample, value in enumerate(torque.tolist()):
         for step in range(steps):
@@ -216,18 +242,18 @@ def _late(torques: FloatArray, delay_s: float, rate_hz: float) -> FloatArray:
 
 CASES = (
     Planted("spring", 1, lambda t: 9.0 * t.position, (9.0,)),
-    Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),
-    Planted("ripple", 0, lambda t: 4.0 * np.cos(0.5 * t.motor_angle) + 3.0 * np.sin(0.5 * t.motor_angle), (4.0, 3.0)),
-    Planted("saturation", 1, lambda t: _saturated(t.motor_torque, GAINS[1], 10.0) - t.motor_torque, (0.01, 2e-4)),
-    Planted("lag", 0, lambda t: _followed(t.motor_torque, 0.01, t.rate_hz) - t.motor_torque, (0.01,)),
-    Planted("time-skew", 0, lambda t: _late(t.motor_torques, 0.008, t.rate_hz) - t.motor_torques, (0.008,)),
+    Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),  # noqa: E501
+    Planted("ripple", 0, lambda t: 4.0 * np.cos(0.5 * t.motor_angle) + 3.0 * np.sin(0.5 * t.motor_angle), (4.0, 3.0)),  # noqa: E501
+    Planted("saturation", 1, lambda t: _saturated(t.motor_torque, GAINS[1], 10.0) - t.motor_torque, (0.01, 2e-4)),  # noqa: E501
+    Planted("lag", 0, lambda t: _followed(t.motor_torque, 0.01, t.rate_hz) - t.motor_torque, (0.01,)),  # noqa: E501
+    Planted("time-skew", 0, lambda t: _late(t.motor_torques, 0.008, t.rate_hz) - t.motor_torques, (0.008,)),  # noqa: E501
 )  # fmt: skip
 SMALL_CASES = (
-    Planted("stribeck", 1, lambda t: 6.0 * np.sign(t.velocity) / np.exp(np.abs(t.velocity) / 0.2), (6.0,)),
+    Planted("stribeck", 1, lambda t: 6.0 * np.sign(t.velocity) / np.exp(np.abs(t.velocity) / 0.2), (6.0,)),  # noqa: E501
     Planted("nonlinear-viscous", 2, lambda t: 1.5 * t.velocity * np.abs(t.velocity), (1.5,)),
     Planted("asymmetric-viscous", 2, lambda t: 0.9 * np.maximum(t.velocity, -t.velocity), (0.9,)),
     Planted("load-friction", 2, lambda t: 0.15 * np.abs(t.load) * np.sign(t.velocity), (0.15,)),
-    Planted("position-friction", 2, lambda t: np.sign(t.velocity) * 1.5 * np.cos(t.position + 0.7), (1.147, -0.966)),
+    Planted("position-friction", 2, lambda t: np.sign(t.velocity) * 1.5 * np.cos(t.position + 0.7), (1.147, -0.966)),  # noqa: E501
     Planted("warm-up", 1, lambda t: _cold(t, t.time_s, 20.0), (5.0, 2.0)),
     Planted("warm-up", 2, lambda t: _cold(t, t.started_s + t.time_s, 80.0), (5.0, 2.0)),
     Planted("temperature-friction", 1, _heated, (0.15, -0.1)),
@@ -237,12 +263,12 @@ SMALL_CASES = (
     Planted("efficiency", 1, lambda t: _meshed(t, 0.85), ((1 - 0.85**2) / (1 + 0.85**2),)),
     Planted("coupling", 1, lambda t: _rubbing(t, 2), (2.0, 0.8)),
     Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
-    Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),
+    Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),  # noqa: E501
     Planted("cable", 1, lambda t: _hose(t, 2), (19.2, -14.4, 10.8)),
     Planted("slack-cable", 1, lambda t: _slack_cable(t, 2), (30.0,)),
     Planted("offset-drift", 1, lambda t: 4.0 * np.exp(-(t.started_s + t.time_s) / 60.0), (4.0,)),
-    Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),
-    Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0,)),
+    Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),  # noqa: E501
+    Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0,)),  # noqa: E501
 )  # fmt: skip
 """On the arm of three axes, which needs a third of the time."""
 
@@ -263,20 +289,28 @@ def arm(truth: Truth, noisy: Evidence) -> Arm:
 
 
 def warmth(run: Run, started_s: float) -> FloatArray:
-    """Temperature of each of three drives [°C], shape (k, 3): slow waves between 30 and 50 °C, as loads change."""
-    phase = (started_s + run.time_s[:, None]) / np.array([31.0, 23.0, 41.0]) + np.array([0.3, 2.0, 4.1])
+    """Temperature of each of three drives [°C], shape (k, 3):
+    slow waves between 30 and 50 °C, as loads change.
+    """
+    phase = (started_s + run.time_s[:, None]) / np.array([31.0, 23.0, 41.0]) + np.array(
+        [0.3, 2.0, 4.1]
+    )
     return np.asarray(40.0 + 10.0 * np.sin(phase))
 
 
 @pytest.fixture(scope="module")
 def small_arm(small_truth: Truth, small_runs: tuple[Run, ...]) -> Arm:
-    """In a session in which every run began a while after the one before, with drives that warm up and cool down."""
+    """In a session in which every run began a while after the one before,
+    with drives that warm up and cool down.
+    """
     runs = tuple(
         replace(run, started_s=PAUSE_S * index, temperature_c=warmth(run, PAUSE_S * index))
         for index, run in enumerate(small_runs)
     )
     clean = gathered(small_truth, runs)
-    return Arm(small_truth, clean, {}, {data.name: _true(small_truth, data) for data in clean.datasets})
+    return Arm(
+        small_truth, clean, {}, {data.name: _true(small_truth, data) for data in clean.datasets}
+    )
 
 
 def _true(truth: Truth, data: Dataset) -> TrueSignals:
@@ -294,7 +328,11 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
         one = still.copy()
         one[:, axis] = 1.0
         moved, at_rest = (
-            np.einsum("jck,c->jk", truth.model.regressor(Motion(motion.position_rad, still, a)), parameters * rigid)
+            np.einsum(
+                "jck,c->jk",
+                truth.model.regressor(Motion(motion.position_rad, still, a)),
+                parameters * rigid,
+            )
             for a in (one, still)
         )
         return np.asarray(moved - at_rest)
@@ -307,7 +345,8 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
         motor_angles=truth.model.drive_train.ratio @ motion.position_rad.T,
         loads=np.einsum("jck,c->jk", columns, parameters * rigid),
         frictions=np.einsum("jck,c->jk", columns, parameters * rubbing),
-        motor_torques=truth.model.drive_train.to_motor @ np.einsum("jck,c->jk", columns, parameters),
+        motor_torques=truth.model.drive_train.to_motor
+        @ np.einsum("jck,c->jk", columns, parameters),
         time_s=data.time_s - data.time_s[0],
         started_s=data.started_s or 0.0,
         rate_hz=data.rate_hz,
@@ -319,7 +358,10 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
 def _with(arm: Arm, planted: Planted) -> Evidence:
     def torque(data: Dataset) -> FloatArray:
         made = planted.torque(replace(arm.signals[data.name], axis=planted.axis))
-        on_all = made if made.ndim == 2 else acting_on(planted.axis, len(arm.truth.gains), made)
+        if made.ndim == 2:
+            on_all = made
+        else:
+            on_all = acting_on(planted.axis, len(arm.truth.gains), made)
         if _family(planted.family)[0].side in {GearSide.MOTOR, GearSide.ALL_MOTORS}:
             return np.asarray(arm.truth.model.drive_train.direction.T @ on_all)
         return on_all
@@ -342,7 +384,9 @@ def test_it_is_named_with_its_size_and_sign(arm: Arm, planted: Planted) -> None:
     _is_named(arm, planted)
 
 
-@pytest.mark.parametrize("planted", SMALL_CASES, ids=lambda planted: f"{planted.family}-{planted.axis}")
+@pytest.mark.parametrize(
+    "planted", SMALL_CASES, ids=lambda planted: f"{planted.family}-{planted.axis}"
+)
 def test_so_it_is_on_a_smaller_arm(small_arm: Arm, planted: Planted) -> None:
     _is_named(small_arm, planted)
 
@@ -358,7 +402,9 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     after = with_effects(start, (own.placed,))
     count = len(planted.expected)
     found = after.estimate.parameters[len(after.rows_without_effects.columns) :][:count]
-    assert found == pytest.approx(np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected)))
+    assert found == pytest.approx(
+        np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected))
+    )
     assert training_error(after).axes[planted.axis] < training_error(start).axes[planted.axis]
 
 
@@ -366,37 +412,52 @@ FAST = ("elasticity", "backlash", "presliding", "coupling")
 """Families of torques that change where a motion does, as what is late does."""
 
 
-@pytest.mark.parametrize("planted", [one for one in SMALL_CASES if one.family in FAST], ids=lambda one: one.family)
+@pytest.mark.parametrize(
+    "planted", [one for one in SMALL_CASES if one.family in FAST], ids=lambda one: one.family
+)
 def test_a_fast_effect_is_no_delay_and_no_wrong_zero(small_arm: Arm, planted: Planted) -> None:
-    """The check of the description called a spring in the gear of J1 a position that is early by 3.5 ms."""
+    """The check of the description called a spring in the gear of J1 a position that is early by
+    3.5 ms.
+    """
     check = check_geometry(_with(small_arm, planted), np.random.default_rng(0), GATES)
     assert check.mistakes == ()
 
 
 def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effect, float, float]:
-    """Effect that is found, and errors of its gain by a first-order form of it and by what was found."""
+    """Effect that is found, and errors of its gain by a first-order form of it and by what was
+    found.
+    """
     start = _with(arm, planted)
-    first, last = find_effects(start, np.random.default_rng(0), GATES, (_family(planted.family),), geometry=())
+    first, last = find_effects(
+        start, np.random.default_rng(0), GATES, (_family(planted.family),), geometry=()
+    )
     assert first.accepted is not None
     assert first.accepted.axis == planted.axis
     assert last.accepted is None
     before = with_effects(start, (PlacedEffect(first_order, planted.axis),))
     plain, whole = (
-        float(np.abs(one.estimate.gains / arm.truth.gains - 1.0)[planted.axis]) for one in (before, first.after)
+        float(np.abs(one.estimate.gains / arm.truth.gains - 1.0)[planted.axis])
+        for one in (before, first.after)
     )
     return first.after.effects[0].effect, plain, whole
 
 
 def test_the_filter_of_a_lag_keeps_its_gain(arm: Arm) -> None:
     """What a first-order expansion lacks goes into the gain."""
-    found, plain, whole = _gain_errors(arm, next(case for case in CASES if case.family == "lag"), Lag())
+    found, plain, whole = _gain_errors(
+        arm, next(case for case in CASES if case.family == "lag"), Lag()
+    )
     assert found.settings["filter_s"] == pytest.approx(0.01, rel=0.1)
     assert whole < min(0.5 * plain, 0.01)
 
 
 def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
-    """It rests on few moves, whose random signs test nothing: the first one says whether the effect is there."""
-    planted = Planted("saturation", 2, lambda t: _saturated(t.motor_torque, GAINS[2], 12.0) - t.motor_torque, ())
+    """It rests on few moves, whose random signs test nothing:
+    the first one says whether the effect is there.
+    """
+    planted = Planted(
+        "saturation", 2, lambda t: _saturated(t.motor_torque, GAINS[2], 12.0) - t.motor_torque, ()
+    )
     (family,) = search_problem_of(_with(arm, planted)).test((_family("saturation"),), 2)
     first, both = (moves_behind(trial.gram) for _, trial in family.members)
     assert both < FEWEST_MOVES < first
@@ -409,9 +470,14 @@ def test_a_richer_form_needs_no_possible_simpler_one(small_arm: Arm) -> None:
     problem = search_problem_of(small_arm.clean)
     (family,) = problem.test((_family("saturation"),), 1)
     (plain, one), (whole, both) = family.members
-    trials = replace(one, coefficients=np.array([-1e9])), replace(both, coefficients=np.array([1.0, 1.0]))
+    trials = (
+        replace(one, coefficients=np.array([-1e9])),
+        replace(both, coefficients=np.array([1.0, 1.0])),
+    )
     members = tuple(zip((plain, whole), trials, strict=True))
-    (finding,) = rank_families(problem, (replace(family, members=members),), np.random.default_rng(0), GATES)
+    (finding,) = rank_families(
+        problem, (replace(family, members=members),), np.random.default_rng(0), GATES
+    )
     assert finding.effect == whole
 
 
@@ -430,12 +496,16 @@ def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
     findings = rank_effects(search_problem_of(turned), np.random.default_rng(0), GATES, families)
     assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
-    same = rank_effects(search_problem_of(start, arm.cache), np.random.default_rng(0), GATES, families)
+    same = rank_effects(
+        search_problem_of(start, arm.cache), np.random.default_rng(0), GATES, families
+    )
     assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
 
 
 def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    dead = tuple(replace(run, current_a=run.current_a * np.array([1, 1, 1, 0, 1, 1])) for run in noisy_runs)
+    dead = tuple(
+        replace(run, current_a=run.current_a * np.array([1, 1, 1, 0, 1, 1])) for run in noisy_runs
+    )
     with pytest.raises(CurrentConstant, match="axis J4: found a current that is zero throughout"):
         identify(truth.model, dead, CONDITIONING)
 
@@ -449,7 +519,12 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
     assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
     few = round(5.0 * clean_runs[0].rate_hz)
     short = tuple(
-        replace(run, time_s=run.time_s[:few], position_rad=run.position_rad[:few], current_a=run.current_a[:few])
+        replace(
+            run,
+            time_s=run.time_s[:few],
+            position_rad=run.position_rad[:few],
+            current_a=run.current_a[:few],
+        )
         for run in clean_runs
     )
     with pytest.raises(TooFewMoves, match="record longer"):
@@ -457,12 +532,20 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
 
 
 def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
-    """Lag-one correlation 0.67 in every current: the spread over 24 draws against the σ that each of them claims."""
+    """Lag-one correlation 0.67 in every current:
+    the spread over 24 draws against the σ that each of them claims.
+    """
     rng = np.random.default_rng(5)
     clean = small_arm.clean
-    bare, estimate = clean.rows_without_effects, clean.estimate
-    exact = small_arm.truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
-    gains, claimed = [], []
+    bare = clean.rows_without_effects
+    estimate = clean.estimate
+    exact = (
+        small_arm.truth.model.drive_train.to_motor
+        @ estimate.predicted_torque(bare)
+        / estimate.gains[:, None]
+    )
+    gains = []
+    claimed = []
     for _ in range(24):
         noise = np.empty_like(exact)
         noise[:, 0] = rng.normal(size=len(exact))
@@ -485,11 +568,14 @@ def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
 
 
 def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
-    """Of what grows with the load, a dictionary without it can name only a saturation, which would bend the gain.
+    """Of what grows with the load, a dictionary without it can name only a saturation,
+    which would bend the gain.
 
     Physics refuses that of two terms, because d < 0, but not that of one term.
     """
-    grown = Planted("load-friction", 1, lambda t: 0.3 * np.abs(t.load) * np.sign(t.velocity), (0.3,))
+    grown = Planted(
+        "load-friction", 1, lambda t: 0.3 * np.abs(t.load) * np.sign(t.velocity), (0.3,)
+    )
     start = _with(arm, grown)
     families = _family("saturation"), _family("stribeck"), _family("spring")
     (step,) = find_effects(start, np.random.default_rng(0), GATES, families)
@@ -499,19 +585,28 @@ def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
     assert "the gain of J2 by" in aside["saturation"].reason(("J1", "J2", "J3", "J4", "J5", "J6"))
     assert aside["saturation"].rival == PlacedEffect(aside["smooth-load"].finding.effect, 1)
     # With it the gain would be off by more than three times as much.
-    bent_by_name = with_effects(start, (PlacedEffect(aside["saturation"].finding.effect, 1),)).estimate
-    before, after = (np.abs(one.gains / arm.truth.gains - 1.0)[1] for one in (start.estimate, bent_by_name))
+    bent_by_name = with_effects(
+        start, (PlacedEffect(aside["saturation"].finding.effect, 1),)
+    ).estimate
+    before, after = (
+        np.abs(one.gains / arm.truth.gains - 1.0)[1] for one in (start.estimate, bent_by_name)
+    )
     assert after > 3.0 * before
 
 
-def test_friction_against_temperature_is_named_first_and_the_worst_gain_gets_better(small_arm: Arm) -> None:
-    start = _with(small_arm, next(case for case in SMALL_CASES if case.family == "temperature-friction"))
+def test_friction_against_temperature_is_named_first_and_the_worst_gain_gets_better(
+    small_arm: Arm,
+) -> None:
+    start = _with(
+        small_arm, next(case for case in SMALL_CASES if case.family == "temperature-friction")
+    )
     steps = find_effects(start, np.random.default_rng(1))
     first = steps[0].accepted
     assert first is not None
     assert (first.effect.name, first.axis) == ("temperature-friction", 1)
     before, after = (
-        np.abs(evidence.estimate.gains / small_arm.truth.gains - 1.0).max() for evidence in (start, steps[-1].after)
+        np.abs(evidence.estimate.gains / small_arm.truth.gains - 1.0).max()
+        for evidence in (start, steps[-1].after)
     )
     assert after < before
 

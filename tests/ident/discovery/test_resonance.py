@@ -1,4 +1,6 @@
-"""Flexible gears and gears with a gap whose resonance lies in the band: one effect explains it, and none joins."""
+"""Flexible gears and gears with a gap whose resonance lies in the band:
+one effect explains it, and none joins.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,15 @@ from ident.effects.signals import fitted_signals
 from ident.effects.transmission import Backlash, Elasticity
 from ident.effects.twist import DrivenLink, Gears, spring_torque, twists
 from ident.model.robot import Motion
-from tests.ident.recordings import MOUNTED, Truth, bent, gathered, record, search_problem_of, training_error
+from tests.ident.recordings import (
+    MOUNTED,
+    Truth,
+    bent,
+    gathered,
+    record,
+    search_problem_of,
+    training_error,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -37,16 +47,30 @@ def quick(small_truth: Truth) -> Evidence:
     """Runs at 1 kHz: the flanks of a gap are crossed in some milliseconds."""
     rng = np.random.default_rng(3)
     runs = tuple(
-        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0, averaged=1)
+        record(
+            small_truth,
+            f"run{index}",
+            rng,
+            MOUNTED if index % 2 else None,
+            noise_a=0.3,
+            seconds=22.0,
+            averaged=1,
+        )
         for index in range(4)
     )
     return gathered(small_truth, runs)
 
 
 def _stepped(
-    torque: FloatArray, inertia: FloatArray, rate_hz: float, compliance: float, half_gap: float = 0.0
+    torque: FloatArray,
+    inertia: FloatArray,
+    rate_hz: float,
+    compliance: float,
+    half_gap: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Twist and its acceleration by small explicit steps from the first sample to the last, no windows."""
+    """Twist and its acceleration by small explicit steps from the first sample to the last,
+    no windows.
+    """
     steps = max(8, round(STEPS_HZ / rate_hz))
     twist = torque[0] * compliance + half_gap * np.sign(torque[0])
     rate = 0.0
@@ -77,7 +101,9 @@ def _stepped(
 
 
 def _on_a_spring(small: Evidence, truth: Truth, compliance: float, half_gap: float) -> Evidence:
-    """Recordings of an arm whose joint stands behind its motor by the twist: torques of the arm where it is."""
+    """Recordings of an arm whose joint stands behind its motor by the twist:
+    torques of the arm where it is.
+    """
 
     def torque(data: Dataset) -> FloatArray:
         run = fitted_signals(small.model, data, small.training, small.estimate)
@@ -97,7 +123,9 @@ def _found(start: Evidence) -> Evidence:
     return find_effects(start, np.random.default_rng(0), GATES, families, geometry=())[-1].after
 
 
-def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(small: Evidence, small_truth: Truth) -> None:
+def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(
+    small: Evidence, small_truth: Truth
+) -> None:
     start = _on_a_spring(small, small_truth, COMPLIANCE, 0.0)
     last = _found(start)
     ((effect, axis),) = [(placed.effect, placed.axis) for placed in last.effects]
@@ -112,25 +140,32 @@ def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(small: Evide
     assert last.estimate.gains == pytest.approx(small.estimate.gains, rel=0.01)
 
 
-def test_one_effect_explains_a_gap_with_flanks_that_give_and_none_joins(quick: Evidence, small_truth: Truth) -> None:
+def test_one_effect_explains_a_gap_with_flanks_that_give_and_none_joins(
+    quick: Evidence, small_truth: Truth
+) -> None:
     start = _on_a_spring(quick, small_truth, 2e-4, 4e-3)
     last = _found(start)
     ((effect, axis),) = [(placed.effect, placed.axis) for placed in last.effects]
     assert isinstance(effect, Backlash)
     assert axis == AXIS
-    assert last.estimate.parameters[len(last.rows_without_effects.columns)] == pytest.approx(4e-3, rel=0.15)
+    assert last.estimate.parameters[len(last.rows_without_effects.columns)] == pytest.approx(
+        4e-3, rel=0.15
+    )
     errors = [training_error(evidence).axes[AXIS] for evidence in (start, last, quick)]
     # The gap is refined, the compliance of its flanks is one of the three that were proposed.
     assert errors[1] ** 2 - errors[2] ** 2 < 0.25 * (errors[0] ** 2 - errors[2] ** 2)
 
 
 def test_windows_hold_all_that_a_gap_does() -> None:
-    """The whole time in small steps, of one gap; all gaps at once, in windows around the turns of the torque."""
+    """The whole time in small steps, of one gap;
+    all gaps at once, in windows around the turns of the torque.
+    """
     rate_hz = 500.0
     time = np.arange(2500) / rate_hz
     torque = 12.0 * np.sin(2.0 * np.pi * 0.7 * time) * np.cos(2.0 * np.pi * 0.16 * time) + 3.0
     inertia = 0.5 + 0.2 * np.sin(time)
-    gaps, compliances = np.array([4e-4, 2e-3]), np.array([2e-4, 1e-4])
+    gaps = np.array([4e-4, 2e-3])
+    compliances = np.array([2e-4, 1e-4])
     still = np.zeros_like(torque)
     link = DrivenLink(rate_hz, inertia, torque, still, still)
     made = twists(link, Gears(gaps, compliances, RATIO)).acceleration_rad_s2
@@ -158,7 +193,11 @@ def test_a_spring_passes_a_wave_as_its_transfer_function_says(
     resonance = 2.0 * np.pi * share * rate_hz
     time = np.arange(round(60 + 40.0 / (ratio * share))) / rate_hz
     passed = spring_torque(
-        np.sin(resonance * time), np.full(len(time), inertia), rate_hz, 1.0 / (inertia * resonance**2), ratio
+        np.sin(resonance * time),
+        np.full(len(time), inertia),
+        rate_hz,
+        1.0 / (inertia * resonance**2),
+        ratio,
     )
     settled = slice(len(time) // 2, None)
     expected = np.sin(resonance * time - np.pi / 2.0) / (2.0 * ratio)
@@ -179,7 +218,9 @@ def test_the_first_order_is_the_limit_of_a_stiff_gear(small: Evidence) -> None:
     run = replace(run, inertia_kg_m2=np.ones_like(run.inertia_kg_m2))
     slow = replace(run, load_torque_nm=(1.0 - np.cos(run.time_s)) * np.ones((3, 1)))
     first = Elasticity().columns(slow, AXIS)[..., 100:-100]
-    assert Elasticity(2e-6, 0.3).columns(slow, AXIS)[..., 100:-100] == pytest.approx(first, abs=0.01)
+    assert Elasticity(2e-6, 0.3).columns(slow, AXIS)[..., 100:-100] == pytest.approx(
+        first, abs=0.01
+    )
     assert not np.allclose(Elasticity(0.1, 0.3).columns(slow, AXIS)[..., 100:-100], first, atol=0.1)
 
 

@@ -1,4 +1,6 @@
-"""Ripple of an order that no list holds: found against motor and joint angle, and not found in noise."""
+"""Ripple of an order that no list holds:
+found against motor and joint angle, and not found in noise.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
 from ident.effects.transmission import Ripple
-from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, search_problem_of
+from tests.ident.recordings import (
+    MOUNTED,
+    Truth,
+    acting_on,
+    bent,
+    gathered,
+    record,
+    search_problem_of,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +43,9 @@ def _rippling(small: Evidence, truth: Truth, axis: int, order: float, size_nm: f
     ratio = truth.model.drive_train.ratio[axis, axis]
 
     def torque(data: Dataset) -> FloatArray:
-        return acting_on(axis, 3, size_nm * np.cos(order * ratio * data.position_rad[:, axis] - 0.8))
+        return acting_on(
+            axis, 3, size_nm * np.cos(order * ratio * data.position_rad[:, axis] - 0.8)
+        )
 
     return bent(small, truth, torque)
 
@@ -42,14 +54,18 @@ def _rippling(small: Evidence, truth: Truth, axis: int, order: float, size_nm: f
     ("axis", "order"),
     [(0, 0.37), pytest.param(2, 37.0 / 45.0, id="37-of-the-joint")],
 )
-def test_an_order_between_the_whole_ones_is_named(small: Evidence, small_truth: Truth, axis: int, order: float) -> None:
+def test_an_order_between_the_whole_ones_is_named(
+    small: Evidence, small_truth: Truth, axis: int, order: float
+) -> None:
     start = _rippling(small, small_truth, axis, order, 4.0)
     last = find_effects(start, np.random.default_rng(0), GATES, RIPPLES, geometry=())[-1].after
     ((placed, effect),) = [(placed.axis, placed.effect) for placed in last.effects]
     assert isinstance(effect, Ripple)
     assert placed == axis
     # A line is one period over the range wide; it is found to a tenth of that.
-    range_rev = np.ptp(np.concatenate([data.position_rad[:, axis] for data in small.datasets])) / (2.0 * np.pi)
+    range_rev = np.ptp(np.concatenate([data.position_rad[:, axis] for data in small.datasets])) / (
+        2.0 * np.pi
+    )
     assert abs(effect.order - order) * 40.0 * range_rev < 0.1
     found = last.estimate.parameters[len(last.rows_without_effects.columns) :][:2]
     assert np.hypot(*found) == pytest.approx(4.0, rel=0.1)
@@ -58,7 +74,9 @@ def test_an_order_between_the_whole_ones_is_named(small: Evidence, small_truth: 
 def test_an_order_that_may_not_join_is_tried_once(
     small: Evidence, small_truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is refined before it is refused, and must not be chosen again with the order that it had before."""
+    """It is refined before it is refused, and must not be chosen again with the order that it had
+    before.
+    """
     refused: list[Finding] = []
 
     def refuse(model: object, found: Finding, *_: object) -> SetAside:
@@ -68,7 +86,11 @@ def test_an_order_that_may_not_join_is_tried_once(
 
     monkeypatch.setattr(loop, "join", refuse)
     (step,) = find_effects(
-        _rippling(small, small_truth, 0, 0.37, 4.0), np.random.default_rng(0), GATES, RIPPLES, geometry=()
+        _rippling(small, small_truth, 0, 0.37, 4.0),
+        np.random.default_rng(0),
+        GATES,
+        RIPPLES,
+        geometry=(),
     )
     assert step.accepted is None
     assert len(refused) == len(step.set_aside)
@@ -76,18 +98,26 @@ def test_an_order_that_may_not_join_is_tried_once(
 
 def test_noise_proposes_no_order(small: Evidence) -> None:
     """Correlated noise of a size that differs from move to move; 15 draws of one per cent each."""
-    rng, problem = np.random.default_rng(8), search_problem_of(small)
-    folds, alarms = problem.folds, 0
+    rng = np.random.default_rng(8)
+    problem = search_problem_of(small)
+    folds = problem.folds
+    alarms = 0
     for _ in range(15):
         size = rng.uniform(0.2, 2.0, folds.linearisation.cluster_count)[folds.linearisation.cluster]
         noise = size * np.convolve(rng.normal(size=len(size)), (0.6, 1.0, 0.6), "same")
-        drawn = replace(problem, folds=replace(folds, linearisation=replace(folds.linearisation, residual=noise)))
+        drawn = replace(
+            problem,
+            folds=replace(folds, linearisation=replace(folds.linearisation, residual=noise)),
+        )
         alarms += bool(propose_orders(drawn, (), rng, GATES))
     assert alarms <= 1
 
 
-def test_an_order_in_the_model_or_next_to_one_is_not_proposed_again(small: Evidence, small_truth: Truth) -> None:
-    problem, rng = search_problem_of(_rippling(small, small_truth, 1, 2.6, 4.0)), np.random.default_rng(0)
+def test_an_order_in_the_model_or_next_to_one_is_not_proposed_again(
+    small: Evidence, small_truth: Truth
+) -> None:
+    problem = search_problem_of(_rippling(small, small_truth, 1, 2.6, 4.0))
+    rng = np.random.default_rng(0)
     (family,) = propose_orders(problem, (), rng, GATES)[1]
     nearest: Effect = min(family, key=lambda member: abs(member.settings["order"] - 2.6))
     assert nearest.settings["order"] == pytest.approx(2.6, abs=0.01)
@@ -107,13 +137,18 @@ def test_the_transform_is_the_sum_over_the_rows_of_each_move(small_truth: Truth)
     columns = problem.torque(Ripple(float(made.orders[chosen])), 1)
     folds = problem.folds
     slow = (
-        # Decorrelation of the runs is on the residual's side here; summed over moves it is the same.
-        replace(folds.linearisation, scatter=None).whitened(columns, problem.model.drive_train.to_motor)
+        # Decorrelation of the runs is on the residual's side here; summed over moves it is the
+        # same.
+        replace(folds.linearisation, scatter=None).whitened(
+            columns, problem.model.drive_train.to_motor
+        )
         * folds.linearisation.decorrelated(folds.linearisation.residual)[:, None]
     )
     by_move = np.stack([np.bincount(folds.linearisation.cluster, part) for part in slow.T])
     # The transform counts its angle from another origin.
-    assert np.hypot(*made.scores[:, :, chosen]) == pytest.approx(np.hypot(*by_move), rel=0.02, abs=0.01 * by_move.max())
+    assert np.hypot(*made.scores[:, :, chosen]) == pytest.approx(
+        np.hypot(*by_move), rel=0.02, abs=0.01 * by_move.max()
+    )
 
 
 def test_signs_leave_the_noise_as_it_is() -> None:
@@ -121,7 +156,9 @@ def test_signs_leave_the_noise_as_it_is() -> None:
     made = Periodogram(0, 0, 3.0, np.arange(5.0), rng.normal(size=(2, 40, 5)))
     same = made.statistic(np.ones((1, 40)))
     assert made.statistic(-np.ones((1, 40))) == pytest.approx(same)
-    assert np.mean(made.statistic(rng.choice((-1.0, 1.0), (500, 40)))) == pytest.approx(2.0, rel=0.1)
+    assert np.mean(made.statistic(rng.choice((-1.0, 1.0), (500, 40)))) == pytest.approx(
+        2.0, rel=0.1
+    )
 
 
 @pytest.mark.parametrize(("least", "length"), [(16.0, 16), (1499.5, 1536), (19997.0, 20480)])

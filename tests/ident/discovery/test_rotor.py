@@ -60,19 +60,34 @@ def _clean(truth: Truth) -> Evidence:
     runs = []
     for number in range(4):
         payload = MOUNTED if number % 2 else None
-        runs.append(record(truth, f"run{number}", rng, payload, noise_a=0.02, seconds=16.0, rate_hz=500.0, averaged=2))
+        runs.append(
+            record(
+                truth,
+                f"run{number}",
+                rng,
+                payload,
+                noise_a=0.02,
+                seconds=16.0,
+                rate_hz=500.0,
+                averaged=2,
+            )
+        )
     return gathered(truth, tuple(runs))
 
 
 def _with_load_friction(truth: Truth) -> Evidence:
-    """Recordings with friction that grows with the torque for links and payload, by the regressor's link columns."""
+    """Recordings with friction that grows with the torque for links and payload,
+    by the regressor's link columns.
+    """
 
     def torque(data: Dataset) -> FloatArray:
         parameters = truth.parameters.copy()
         if data.payload is not None:
             parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
         links = np.isin(np.arange(len(parameters)), truth.model.link_columns)
-        load_nm = np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters * links)[AXIS]
+        load_nm = np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters * links)[
+            AXIS
+        ]
         friction_nm = COEFFICIENT * np.abs(load_nm) * np.sign(data.velocity_rad_s[:, AXIS])
         return acting_on(AXIS, len(truth.gains), friction_nm)
 
@@ -124,7 +139,9 @@ def _assert_true(evidence: Evidence, truth: Truth, rotor_kg_m2: float) -> None:
     assert inertia_std < 0.2
 
 
-def test_load_friction_beside_a_heavy_rotor_is_true(found: Evidence, heavy: Evidence, heavy_truth: Truth) -> None:
+def test_load_friction_beside_a_heavy_rotor_is_true(
+    found: Evidence, heavy: Evidence, heavy_truth: Truth
+) -> None:
     _assert_true(found, heavy_truth, ROTORS_KG_M2[AXIS])
     assert abs(_loss(found)[0][1]) < _loss(found)[1][1]
     # What it is for: with the rotor in the load the coefficient is wrong.
@@ -155,7 +172,9 @@ def test_a_calibration_predicts_the_same_load_friction(found: Evidence, heavy_tr
     assert placed_effect(accepted, calibration)[0].effect == _own(found)
     data = found.datasets[1]
     names = {coefficient.name for coefficient in accepted.coefficients}
-    declared = tuple(parameter for parameter in calibration.parameters if parameter.name not in names)
+    declared = tuple(
+        parameter for parameter in calibration.parameters if parameter.name not in names
+    )
     bare = replace(calibration, effects=(), parameters=declared)
     friction_nm = _predicted(calibration, heavy_truth, data) - _predicted(bare, heavy_truth, data)
     parameters = heavy_truth.parameters.copy()
@@ -170,7 +189,9 @@ def test_a_calibration_of_an_earlier_version_has_no_rotor(heavy: Evidence) -> No
     (accepted,) = calibration.effects
     earlier = replace(accepted, settings={"speed_exponent": 0.0})
     assert placed_effect(earlier, calibration)[0].effect == LoadFriction(0)
-    assert [one.name for one in accepted.coefficients] == ["load-friction coefficient 2 (speed_exponent 0)"]
+    assert [one.name for one in accepted.coefficients] == [
+        "load-friction coefficient 2 (speed_exponent 0)"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -178,7 +199,9 @@ def test_a_calibration_of_an_earlier_version_has_no_rotor(heavy: Evidence) -> No
     [(FIVE_BAR, (0, 1)), (PLANAR, (0, 1, 2, 3)), (THREE_LEGS, ())],
     ids=lambda one: getattr(one, "name", None),
 )
-def test_cranks_carry_their_rotors_and_slides_do_not(mechanism: Mechanism, expected: tuple[int, ...]) -> None:
+def test_cranks_carry_their_rotors_and_slides_do_not(
+    mechanism: Mechanism, expected: tuple[int, ...]
+) -> None:
     made = recorded(mechanism, 7, seconds=12.0, noise_a=0.01)
     rows = identify(made.model, made.runs, made.conditioning, keep_rows=True).gathered
     assert rows is not None
@@ -193,9 +216,13 @@ def test_only_the_first_two_axes_of_an_arm_carry_their_rotors(heavy: Evidence) -
 
 
 def test_the_bound_of_a_rotor_holds_for_a_redundant_drive() -> None:
-    """With nothing but one rotor in the mass matrix of torques without preload, the bound is that rotor."""
+    """With nothing but one rotor in the mass matrix of torques without preload,
+    the bound is that rotor.
+    """
     made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01)
-    problem = search_problem_of(gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)))
+    problem = search_problem_of(
+        gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
+    )
     (run, _) = problem.runs
     (data, _) = problem.datasets
     followed = made.model.follow(data.motion())
@@ -226,12 +253,16 @@ def test_a_declared_inertia_is_kept(heavy: Evidence) -> None:
 
 def test_a_declared_inertia_that_is_a_parameter_of_its_own_is_refused(heavy: Evidence) -> None:
     with pytest.raises(EffectRefused, match="J3 is given a rotor"):
-        with_declared(heavy, [PlacedEffect(Efficiency(1.0, 0.1), 2)], np.random.default_rng(0), axes=NAMES)
+        with_declared(
+            heavy, [PlacedEffect(Efficiency(1.0, 0.1), 2)], np.random.default_rng(0), axes=NAMES
+        )
 
 
 @pytest.mark.parametrize("name", [LoadFriction.name, Efficiency.name])
 def test_no_rotor_has_a_negative_inertia(name: str, heavy: Evidence) -> None:
-    """J + d/c is not negative: beside J = 0 its rest is not either, and a rotor that is certainly negative is none."""
+    """J + d/c is not negative: beside J = 0 its rest is not either,
+    and a rotor that is certainly negative is none.
+    """
     dictionary = {family[0].name: family[0] for family in EFFECTS}
     without = dictionary[name].with_settings({"with_rotor": 1, "rotor_inertia_kg_m2": 0.0})
     beside = without.with_settings({"rotor_inertia_kg_m2": 0.2})

@@ -1,4 +1,6 @@
-"""The search: it names what was planted by other formulas than its own, and stays silent on clean data."""
+"""The search: it names what was planted by other formulas than its own,
+and stays silent on clean data.
+"""
 
 from __future__ import annotations
 
@@ -39,24 +41,34 @@ def test_clean_data_get_no_effect(truth: Truth, noisy_runs: tuple[Run, ...]) -> 
     assert steps[0].after.effects == ()
 
 
-# Made by other formulas than the dictionary's: a Gaussian Stribeck bump, friction of the measured load.
-def test_low_speed_friction_is_named_and_the_holdout_run_gets_better(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+# Made by other formulas than the dictionary's: a Gaussian Stribeck bump, friction of the measured
+# load.
+def test_low_speed_friction_is_named_and_the_holdout_run_gets_better(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
     runs = []
     for run in noisy_runs:
         v = _speed(run, 1)
         runs.append(_with_torque(run, 1, 5.0 * np.sign(v) * np.exp(-((v / 0.35) ** 2))))
     start = _identified(truth, tuple(runs))
     steps = find_effects(start, np.random.default_rng(0))
-    assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [("stribeck", 1)]
-    before, after = start.holdout_error, steps[-1].after.holdout_error
+    assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [
+        ("stribeck", 1)
+    ]
+    before = start.holdout_error
+    after = steps[-1].after.holdout_error
     assert before is not None
     assert after is not None
     assert after.axes[1] < 0.95 * before.axes[1]
     assert np.max(np.abs(steps[-1].after.estimate.gains / GAINS - 1.0)) < 0.02
 
 
-def test_a_spring_is_distinguished_from_gravity(small_truth: Truth, small_runs: tuple[Run, ...]) -> None:
-    """And from a hinge that begins where the joint hardly comes: that says the same with two settings more."""
+def test_a_spring_is_distinguished_from_gravity(
+    small_truth: Truth, small_runs: tuple[Run, ...]
+) -> None:
+    """And from a hinge that begins where the joint hardly comes:
+    that says the same with two settings more.
+    """
     torque = [4.0 * run.position_rad[:, 2] / small_truth.gains[2] for run in small_runs]
     runs = tuple(
         replace(run, current_a=run.current_a + np.outer(added, (0.0, 0.0, 1.0)))

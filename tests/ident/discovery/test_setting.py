@@ -1,4 +1,6 @@
-"""Settings between those of the dictionary, parsimony, and effects that a later one has made idle."""
+"""Settings between those of the dictionary, parsimony,
+and effects that a later one has made idle.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def _low_speed(data: Dataset, speed_rad_s: float = 0.17) -> FloatArray:
     return np.asarray(20.0 * np.sign(v) * np.exp(-np.abs(v) / speed_rad_s))
 
 
-def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small_truth: Truth) -> None:
+def test_a_setting_between_two_of_the_dictionary_is_found(
+    small: Evidence, small_truth: Truth
+) -> None:
     search_problem = search_problem_of(_needing(small, small_truth, _low_speed))
     families = (EFFECTS[0],)
     best = rank_effects(search_problem, np.random.default_rng(0), GATES, families)[0]
@@ -47,23 +51,33 @@ def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small
 
 
 @pytest.mark.parametrize(
-    "effect", [Spring(), Cogging(3), Stribeck(0.05), Stribeck(0.5), Stribeck(0.123), WarmUp(20.0, 0)]
+    "effect",
+    [Spring(), Cogging(3), Stribeck(0.05), Stribeck(0.5), Stribeck(0.123), WarmUp(20.0, 0)],
 )
 def test_a_whole_signed_or_outermost_setting_stays(small: Evidence, effect: Effect) -> None:
     assert refine_setting(search_problem_of(small), effect, 1, EFFECTS) == effect
 
 
-def test_an_effect_that_a_later_one_makes_idle_is_taken_out(small: Evidence, small_truth: Truth) -> None:
+def test_an_effect_that_a_later_one_makes_idle_is_taken_out(
+    small: Evidence, small_truth: Truth
+) -> None:
     bare = _needing(small, small_truth, _low_speed)
-    start = with_effects(bare, (PlacedEffect(AsymmetricViscous(), 1), PlacedEffect(AsymmetricViscous(), 2)))
+    start = with_effects(
+        bare, (PlacedEffect(AsymmetricViscous(), 1), PlacedEffect(AsymmetricViscous(), 2))
+    )
     last = find_effects(start, np.random.default_rng(0), GATES)[-1].after
     assert [(placed.effect.name, placed.axis) for placed in last.effects] == [("stribeck", 1)]
 
 
 def test_an_effect_that_is_still_needed_stays(small: Evidence, small_truth: Truth) -> None:
-    start = _needing(small, small_truth, lambda data: _low_speed(data) + 9.0 * data.position_rad[:, 1])
+    start = _needing(
+        small, small_truth, lambda data: _low_speed(data) + 9.0 * data.position_rad[:, 1]
+    )
     last = find_effects(start, np.random.default_rng(0), GATES)[-1].after
-    assert {(placed.effect.name, placed.axis) for placed in last.effects} == {("stribeck", 1), ("spring", 1)}
+    assert {(placed.effect.name, placed.axis) for placed in last.effects} == {
+        ("stribeck", 1),
+        ("spring", 1),
+    }
 
 
 def _finding(effect: Effect, fall: float, axis: int = 1, *, passed: bool = True) -> Finding:
@@ -84,7 +98,8 @@ def _finding(effect: Effect, fall: float, axis: int = 1, *, passed: bool = True)
     )
 
 
-HINGE, SPRING = Hinge(-2.5, 1), Spring()
+HINGE = Hinge(-2.5, 1)
+SPRING = Spring()
 
 
 @pytest.mark.parametrize(
@@ -97,7 +112,9 @@ HINGE, SPRING = Hinge(-2.5, 1), Spring()
         ([_finding(HINGE, 100.0, passed=False), _finding(SPRING, 99.5)], "spring"),
     ],
 )
-def test_of_two_that_explain_alike_the_simpler_is_chosen(findings: list[Finding], name: str) -> None:
+def test_of_two_that_explain_alike_the_simpler_is_chosen(
+    findings: list[Finding], name: str
+) -> None:
     chosen = choose_effect(findings)
     assert chosen is not None
     assert chosen.effect.name == name

@@ -1,4 +1,6 @@
-"""Structure without a name: found as a smooth or periodic term on the right axis and variable; detection limits."""
+"""Structure without a name: found as a smooth or periodic term on the right axis and variable;
+detection limits.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def _loop(start: Evidence, families: tuple[tuple[Effect, ...], ...] = EFFECTS) -
 
 def _low_speed(axis: int) -> Torque:
     return lambda data: (
-        7.0 * np.sign(data.velocity_rad_s[:, axis]) * np.exp(-np.abs(data.velocity_rad_s[:, axis]) / 0.3)
+        7.0
+        * np.sign(data.velocity_rad_s[:, axis])
+        * np.exp(-np.abs(data.velocity_rad_s[:, axis]) / 0.3)
     )
 
 
@@ -76,12 +80,17 @@ NAMELESS = (
     Nameless(2, _bump, (), "smooth-velocity"),
     Nameless(1, _low_speed(1), ("stribeck", "nonlinear-viscous"), "smooth-velocity"),
     Nameless(
-        0, lambda data: 4.0 * np.sin(120.0 * data.position_rad[:, 0]), ("cogging", "ripple"), "periodic-motor-angle"
+        0,
+        lambda data: 4.0 * np.sin(120.0 * data.position_rad[:, 0]),
+        ("cogging", "ripple"),
+        "periodic-motor-angle",
     ),
 )
 
 
-@pytest.mark.parametrize("case", NAMELESS, ids=("ripples", "bump", "stribeck removed", "cogging removed"))
+@pytest.mark.parametrize(
+    "case", NAMELESS, ids=("ripples", "bump", "stribeck removed", "cogging removed")
+)
 def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
     small: Evidence, small_truth: Truth, case: Nameless, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,7 +98,9 @@ def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
     start = _needing(small, small_truth, case.axis, case.torque)
     step = _loop(start, _without(*case.removed))[0]
     found = [step.accepted, *(aside.finding for aside in step.set_aside)]
-    term = next(one for one in found if one and (one.effect.name, one.axis) == (case.name, case.axis))
+    term = next(
+        one for one in found if one and (one.effect.name, one.axis) == (case.name, case.axis)
+    )
     # Most of the excess of that axis' squared error is gone with it.
     joined = with_effects(start, (term.placed,))
     before, after, clean = (training_error(e).axes[case.axis] ** 2 for e in (start, joined, small))
@@ -99,18 +110,26 @@ def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
     assert moved.any() == (term is not step.accepted)
 
 
-def test_a_name_that_is_right_wins_over_a_term_that_fits_anything(small: Evidence, small_truth: Truth) -> None:
+def test_a_name_that_is_right_wins_over_a_term_that_fits_anything(
+    small: Evidence, small_truth: Truth
+) -> None:
     steps = _loop(_needing(small, small_truth, 1, _low_speed(1)))
-    assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [("stribeck", 1)]
+    assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [
+        ("stribeck", 1)
+    ]
     assert any(finding.passed for finding in steps[0].structures)  # it was asked, and had its say
 
 
-@pytest.mark.parametrize("variable", [Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME])
+@pytest.mark.parametrize(
+    "variable", [Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME]
+)
 @pytest.mark.parametrize("signed", [0, 1])
 def test_no_variable_is_lost_because_a_part_of_its_term_is_declared(
     small: Evidence, variable: Abscissa, signed: int
 ) -> None:
-    """Offset and dry friction are a constant times one and times sign(q̇): the rest of the term must still be tried."""
+    """Offset and dry friction are a constant times one and times sign(q̇):
+    the rest of the term must still be tried.
+    """
     search_problem = search_problem_of(small)
     limits = {Abscissa.VELOCITY: (0.0, 3.0), Abscissa.TIME: (0.0, 20.0)}.get(variable, (-1.0, 1.0))
     for at_rows in (False, True):
@@ -122,15 +141,19 @@ def test_the_detection_limit_parts_what_is_found_from_what_is_not(
     small: Evidence, small_truth: Truth, axis: int
 ) -> None:
     limit = detection_limits_nm(search_problem_of(small), GATES)[axis]
-    families = tuple(family for family in EFFECTS if family[0].name in {"cogging", "stribeck", "spring"})
+    families = tuple(
+        family for family in EFFECTS if family[0].name in {"cogging", "stribeck", "spring"}
+    )
 
     def found(times: float) -> tuple[str, int] | None:
         ratio = small_truth.model.drive_train.ratio[axis, axis]
         start = _needing(
             small, small_truth, axis,
-            lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[:, axis]),
+            lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[:, axis]),  # noqa: E501
         )  # fmt: skip
-        best = choose_effect(rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, families))
+        best = choose_effect(
+            rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, families)
+        )
         return None if best is None else (best.effect.name, best.axis)
 
     assert found(3.0) == ("cogging", axis)

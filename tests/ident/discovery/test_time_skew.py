@@ -1,4 +1,6 @@
-"""A time skew counts only where instruments confirm it: least squares find one in recordings without any."""
+"""A time skew counts only where instruments confirm it:
+least squares find one in recordings without any.
+"""
 
 from __future__ import annotations
 

@@ -17,7 +17,9 @@ from tests.ident.recordings import whole
 
 FloatArray = NDArray[np.float64]
 
-MOTORS, MOVES, WIDTH = 3, 16, 5
+MOTORS = 3
+MOVES = 16
+WIDTH = 5
 
 
 def _problem(rng: np.random.Generator) -> Linearisation:
@@ -25,7 +27,12 @@ def _problem(rng: np.random.Generator) -> Linearisation:
 
     The last motor's equation lacks the first two unknowns, as those near the flange do.
     """
-    parts = [(motor, move) for motor in range(MOTORS) for move in range(MOVES) for _ in range(rng.integers(8, 20))]
+    parts = [
+        (motor, move)
+        for motor in range(MOTORS)
+        for move in range(MOVES)
+        for _ in range(rng.integers(8, 20))
+    ]
     motor, cluster = (np.array(part, dtype=np.int64) for part in zip(*parts, strict=True))
     jacobian = rng.normal(size=(len(motor), WIDTH)) * (1.0 + motor[:, None])
     jacobian[motor == MOTORS - 1, :2] = 0.0
@@ -53,7 +60,8 @@ def _fit(columns: FloatArray, target: FloatArray) -> FloatArray:
 
 def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) -> CandidateTrial:
     """The same by projection and by one whole refit a fold."""
-    j, e = whole(problem.jacobian), problem.residual
+    j = whole(problem.jacobian)
+    e = problem.residual
     left = columns - j @ _fit(j, columns)
     coefficients = _fit(left, e)
     after = e - left @ coefficients
@@ -63,7 +71,8 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
 
     everything = np.ones(len(e), dtype=np.bool_)
     both = np.concatenate((j, columns), axis=1)
-    training, held = [], []
+    training = []
+    held = []
     for fold in range(count):
         out = problem.cluster % count == fold
         without = e[~out] - j[~out] @ _fit(j[~out], e[~out])
@@ -163,7 +172,9 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
 def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     rng = np.random.default_rng(5)
     folds = cut_into_folds(_problem(rng))
-    (trial,) = score_candidates(folds, rng.normal(size=(len(folds.linearisation.motor), width)), [slice(0, width)])
+    (trial,) = score_candidates(
+        folds, rng.normal(size=(len(folds.linearisation.motor), width)), [slice(0, width)]
+    )
     assert trial is not None
     signs = rng.choice((-1.0, 1.0), size=(5, MOVES))
     expected = []
@@ -172,5 +183,8 @@ def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
         fitted = np.linalg.solve(trial.gram.sum(axis=0), total)
         left = drawn[:, None] * trial.scatter - trial.gram @ fitted
         expected.append(total @ np.linalg.solve(left.T @ left, total))
-    found = _drawn_wald(trial, signs) if width > 1 else _drawn_numbers(trial.scatter, trial.gram[:, :, 0], signs)
+    if width > 1:
+        found = _drawn_wald(trial, signs)
+    else:
+        found = _drawn_numbers(trial.scatter, trial.gram[:, :, 0], signs)
     assert found == pytest.approx(np.array(expected), rel=1e-9)

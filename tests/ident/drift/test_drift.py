@@ -1,4 +1,6 @@
-"""Changes and drifts: what is noise is called noise as often as is said, and what is none is found."""
+"""Changes and drifts: what is noise is called noise as often as is said,
+and what is none is found.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,15 @@ from ident.drift.change import (
     dispersions,
     pattern,
 )
-from tests.studies.drift_study import AXES, RECALIBRATIONS, delays, draw, false_alarms, most_percent, share_percent
+from tests.studies.drift_study import (
+    AXES,
+    RECALIBRATIONS,
+    delays,
+    draw,
+    false_alarms,
+    most_percent,
+    share_percent,
+)
 
 NAMES = tuple(f"J{number}" for number in range(1, AXES + 1))
 GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
@@ -46,13 +56,16 @@ def test_constants_of_the_normal_distribution_are_those_of_scipy() -> None:
 
 def test_a_history_is_judged_without_importing_scipy() -> None:
     code = (
-        "import sys, ident.drift.change, ident.drift.change; sys.exit(any(m.startswith('scipy') for m in sys.modules))"
+        "import sys, ident.drift.change, ident.drift.change; sys.exit(any(m.startswith('scipy') "
+        "for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_probability_far_in_the_tail_has_no_digits() -> None:
-    certain, likely = (decide(("J1",), [10.0], [0.01], [new], [0.01]).words for new in (12.0, 10.05))
+    certain, likely = (
+        decide(("J1",), [10.0], [0.01], [new], [0.01]).words for new in (12.0, 10.05)
+    )
     assert "p < 1e-6 among 1" in certain
     assert "p = 0.0" in likely
 
@@ -66,7 +79,9 @@ def test_one_change_is_the_two_sided_normal_test() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(_gains, _gains, st.floats(1e-3, 10.0), st.floats(1e-3, 10.0), st.floats(0.5, 2.0))
-def test_a_change_does_not_depend_on_unit_nor_sign(old: float, new: float, a: float, b: float, factor: float) -> None:
+def test_a_change_does_not_depend_on_unit_nor_sign(
+    old: float, new: float, a: float, b: float, factor: float
+) -> None:
     one = change_significance(old, a, new, b)
     other = change_significance(-factor * old, factor * a, -factor * new, factor * b)
     assert other.percent == pytest.approx(one.percent, rel=1e-9, abs=1e-9)
@@ -93,7 +108,9 @@ def test_a_dispersion_that_is_none_is_shown(wrong: float) -> None:
 def test_probabilities_of_no_change_are_uniform() -> None:
     rng = np.random.default_rng(1)
     found = [
-        change_significance(10.0 + 0.04 * a, 0.04, 10.0 + 0.03 * b, 0.03, dispersion=1.0).probability
+        change_significance(
+            10.0 + 0.04 * a, 0.04, 10.0 + 0.03 * b, 0.03, dispersion=1.0
+        ).probability
         for a, b in rng.standard_normal((2000, 2))
     ]
     assert kstest(found, "uniform").pvalue > 0.01
@@ -135,14 +152,18 @@ def test_nothing_to_compare_changes_nothing() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0.1, 10.0), st.integers(0, 30), st.booleans())
-def test_scatter_is_measured_in_any_unit_and_never_below_one(unit: float, count: int, mirrored: bool) -> None:
+def test_scatter_is_measured_in_any_unit_and_never_below_one(
+    unit: float, count: int, mirrored: bool
+) -> None:
     rng = np.random.default_rng(count)
     values, stds = draw(rng, (AXES, count + 1), 1.0)
     found = dispersions(values, stds)
     sign = -1.0 if mirrored else 1.0
     assert found.shape == (AXES,)
     assert (found >= 1.0).all()
-    np.testing.assert_allclose(dispersions(sign * unit * values + 7.0, unit * stds), found, rtol=1e-6)
+    np.testing.assert_allclose(
+        dispersions(sign * unit * values + 7.0, unit * stds), found, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("true", [1.0, 1.5, 3.0])
@@ -157,7 +178,8 @@ def test_neither_a_step_nor_a_slow_drift_is_scatter() -> None:
     rng = np.random.default_rng(4)
     values, stds = draw(rng, (400, AXES, 30), 1.0)
     plain = float(np.median(dispersions(values, stds)[:, 0]))
-    step, slope = values.copy(), values.copy()
+    step = values.copy()
+    slope = values.copy()
     step[:, 0, 15:] += 20.0
     slope[:, 0] += 0.3 * np.arange(30)
     for changed in (step, slope):
@@ -178,7 +200,9 @@ def test_a_quarter_of_the_differences_may_be_of_any_size() -> None:
 
 
 def test_scatter_is_known_better_than_by_the_median() -> None:
-    """A thousand differences outweigh the prior; the median is worth little more than a third of them."""
+    """A thousand differences outweigh the prior;
+    the median is worth little more than a third of them.
+    """
     rng = np.random.default_rng(11)
     values, stds = draw(rng, (300, 1, 1001), 1.5)
     away = np.abs(np.diff(values)) / np.hypot(stds[..., 1:], stds[..., :-1])
@@ -192,7 +216,8 @@ def test_few_calibrations_say_nothing_of_scatter() -> None:
 
 def test_the_sums_are_pages() -> None:
     """By hand: baseline exact, k = 0.5, deviations of 2, 2, -3 σ."""
-    values, stds = np.array([0.0, 2.0, 2.0, -3.0]) + 100.0, np.ones(4)
+    values = np.array([0.0, 2.0, 2.0, -3.0]) + 100.0
+    stds = np.ones(4)
     stds[0] = 1e-9
     found = cusum_paths(values, stds, 1.0, Chart(reference=0.5, baseline=1))
     np.testing.assert_allclose(found[0], [0.0, 2.0, 2.0, -3.0])
@@ -201,7 +226,9 @@ def test_the_sums_are_pages() -> None:
 
 
 def test_deviations_within_the_baseline_are_independent_and_normal() -> None:
-    """Hawkins' recursive residuals: exactly standard normal, with the baseline's uncertainty counted."""
+    """Hawkins' recursive residuals: exactly standard normal,
+    with the baseline's uncertainty counted.
+    """
     rng = np.random.default_rng(5)
     values = rng.standard_normal((20_000, CHART.baseline))
     deviations = cusum_paths(values, np.ones_like(values), 1.0, CHART)[0][:, 1:]
@@ -217,7 +244,9 @@ def test_a_step_is_reported_with_its_size_its_time_and_its_side() -> None:
     assert found.onset == 13
     assert not found.alarms[-1].rose
     assert found.change_percent == pytest.approx(-6.0)
-    assert found.change_sigmas == pytest.approx(-0.6 / (DISPERSION * 0.04 * math.sqrt(1 / 3 + 1 / 12)))
+    assert found.change_sigmas == pytest.approx(
+        -0.6 / (DISPERSION * 0.04 * math.sqrt(1 / 3 + 1 / 12))
+    )
     assert found.baseline == pytest.approx(-10.0)
     assert found.alarms[0].index == 14
     assert found.alarms[0].kind is AlarmKind.DRIFT  # 14 σ at once are beyond both limits
@@ -231,7 +260,9 @@ def test_a_step_has_its_whole_size_from_the_first_day_on(count: int, newest: int
     assert found.alarmed
     assert found.onset == 13
     assert found.change_percent == pytest.approx(-6.0)
-    assert found.change_sigmas == pytest.approx(-0.6 / (DISPERSION * 0.04 * math.sqrt(1 / newest + 1 / 12)))
+    assert found.change_sigmas == pytest.approx(
+        -0.6 / (DISPERSION * 0.04 * math.sqrt(1 / newest + 1 / 12))
+    )
 
 
 def test_a_change_within_the_baseline_is_compared_with_what_was_before() -> None:
@@ -254,7 +285,9 @@ def test_one_calibration_far_off_is_a_jump() -> None:
 
 
 def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
-    """After a jump on the fourth day: twelve calibrations are the baseline again, that one among them."""
+    """After a jump on the fourth day: twelve calibrations are the baseline again,
+    that one among them.
+    """
     values = np.full(20, 10.0)
     values[3] = 10.0 + 0.04 * DISPERSION * 6.5
     assert cusum(values[:4], np.full(4, 0.04)).onset == 2
@@ -284,7 +317,9 @@ def test_an_onset_is_reported_in_alarm_only(values: list[float]) -> None:
     assert found.alarmed == (found.onset is not None) == (found.alarm is not None)
     if not found.alarmed:
         assert not found.steady
-        assert found.baseline == pytest.approx(np.mean(values[: min(len(values) - 1, CHART.baseline)]))
+        assert found.baseline == pytest.approx(
+            np.mean(values[: min(len(values) - 1, CHART.baseline)])
+        )
 
 
 def test_one_calibration_is_its_own_baseline() -> None:
@@ -293,7 +328,8 @@ def test_one_calibration_is_its_own_baseline() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "stds"), [([], []), ([1.0], [1.0, 2.0]), ([1.0], [0.0]), ([math.nan], [1.0]), ([0.0, 0.0], [1.0, 1.0])]
+    ("values", "stds"),
+    [([], []), ([1.0], [1.0, 2.0]), ([1.0], [0.0]), ([math.nan], [1.0]), ([0.0, 0.0], [1.0, 1.0])],
 )
 def test_what_cannot_be_watched_is_refused(values: list[float], stds: list[float]) -> None:
     with pytest.raises(ValueError, match="expected"):
@@ -319,7 +355,9 @@ def test_numbers_of_any_size_are_watched(values: list[float], stds: list[float])
     (factor,) = dispersions([values], [stds])
     found = cusum(values, stds, dispersion=float(factor))
     numbers = [found.baseline, found.change_percent, found.change_sigmas]
-    assert all(map(math.isfinite, [*numbers, *found.deviations, *found.upper, *found.lower, *found.trend]))
+    assert all(
+        map(math.isfinite, [*numbers, *found.deviations, *found.upper, *found.lower, *found.trend])
+    )
     assert len(decide(("J1",), values[:1], stds[:1], values[1:2], stds[1:2]).words) < 120
 
 
@@ -352,7 +390,9 @@ def test_a_drift_does_not_depend_on_unit_nor_sign(
 
 
 def test_a_slope_is_reported_along_its_line() -> None:
-    """0.7 σ a calibration from the first one on: the CUSUM's baseline goes with it, the line does not."""
+    """0.7 σ a calibration from the first one on:
+    the CUSUM's baseline goes with it, the line does not.
+    """
     values = -10.0 * (1.0 - 0.0028 * np.arange(8))
     found = cusum(values, np.full(8, 0.04))
     assert found.steady
@@ -364,11 +404,16 @@ def test_a_slope_is_reported_along_its_line() -> None:
     assert found.change_sigmas == pytest.approx(found.trend[-1])
     middle, spread = 3.5, 42.0  # of 0 … 7: mean, and sum of squares about it
     assert found.trend[-1] == pytest.approx(-0.7 * math.sqrt(spread) / DISPERSION)
-    assert found.baseline_std == pytest.approx(DISPERSION * 0.04 * math.sqrt(1 / 8 + middle**2 / spread))
+    assert found.baseline_std == pytest.approx(
+        DISPERSION * 0.04 * math.sqrt(1 / 8 + middle**2 / spread)
+    )
 
 
 def test_no_alarm_in_24_recalibrations_without_drift() -> None:
-    """1.1 % of the histories of six axes at most; 3000 draws know that to 0.2 %. One draw by itself has none."""
+    """1.1 % of the histories of six axes at most; 3000 draws know that to 0.2 %.
+
+    One draw by itself has none.
+    """
     rng = np.random.default_rng(6)
     shares = false_alarms(rng, 3000, dispersion=1.05)
     assert shares.any <= 1.5
@@ -385,18 +430,24 @@ def test_no_alarm_in_24_recalibrations_without_drift() -> None:
 def test_three_per_cent_over_twelve_recalibrations_is_found_by_the_sums(
     std_percent: float, within_two: float, within_four: float
 ) -> None:
-    """Shares of histories in which it is found at most two, and four, recalibrations after it has reached 3 σ [%]."""
+    """Shares of histories in which it is found at most two, and four,
+    recalibrations after it has reached 3 σ [%].
+    """
     found = delays(np.random.default_rng(8), 800, std_percent=std_percent, before=12)
     assert share_percent(found.cusum, 2) >= within_two
     assert share_percent(found.cusum, 4) >= within_four
     assert (found.any <= found.cusum).all()
 
 
-@pytest.mark.parametrize(("std_percent", "within_two"), [(0.2, 57), (0.3, 36), (0.5, 23), (0.8, 35), (1, 28)])
+@pytest.mark.parametrize(
+    ("std_percent", "within_two"), [(0.2, 57), (0.3, 36), (0.5, 23), (0.8, 35), (1, 28)]
+)
 def test_a_drift_from_the_first_day_is_found_by_the_line_sooner_than_by_the_sums(
     std_percent: float, within_two: float
 ) -> None:
-    """No test can find them all: what the best one finds that knows the day is no more than `most_percent`."""
+    """No test can find them all: what the best one finds that knows the day is no more than
+    `most_percent`.
+    """
     found = delays(np.random.default_rng(9), 800, std_percent=std_percent, before=1)
     share = share_percent(found.any, 2)
     assert share >= within_two

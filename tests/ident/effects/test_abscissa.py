@@ -19,17 +19,27 @@ from tests.ident.effects.test_effects import random_signals
 FloatArray = NDArray[np.float64]
 
 _numbers = st.floats(-100.0, 100.0, allow_subnormal=False)
-_speeds = arrays(np.float64, st.integers(2, 60), elements=st.floats(-3.0, 3.0, allow_subnormal=False))
+_speeds = arrays(
+    np.float64, st.integers(2, 60), elements=st.floats(-3.0, 3.0, allow_subnormal=False)
+)
 
 
-@given(x=arrays(np.float64, st.integers(1, 50), elements=_numbers), lower=_numbers, width=st.floats(1e-3, 200.0))
+@given(
+    x=arrays(np.float64, st.integers(1, 50), elements=_numbers),
+    lower=_numbers,
+    width=st.floats(1e-3, 200.0),
+)
 @settings(deadline=None)
-def test_splines_sum_to_one_and_are_never_negative(x: FloatArray, lower: float, width: float) -> None:
+def test_splines_sum_to_one_and_are_never_negative(
+    x: FloatArray, lower: float, width: float
+) -> None:
     basis = cubic_basis(x, lower, lower + width)
     assert basis.shape == (INTERVALS + 3, len(x))
     assert basis.sum(axis=0) == pytest.approx(np.ones(len(x)))
     assert np.all(basis >= -1e-15)
-    outside = cubic_basis(np.array([lower - 1.0, lower, lower + width, lower + width + 1.0]), lower, lower + width)
+    outside = cubic_basis(
+        np.array([lower - 1.0, lower, lower + width, lower + width + 1.0]), lower, lower + width
+    )
     assert outside[:, 0] == pytest.approx(outside[:, 1])
     assert outside[:, 2] == pytest.approx(outside[:, 3])
 
@@ -71,7 +81,9 @@ def test_the_way_is_the_same_in_the_other_direction(velocity: FloatArray) -> Non
 
 @given(velocity=_speeds, distance_rad=st.floats(1e-3, 1.0))
 @settings(deadline=None)
-def test_a_bristle_lags_at_most_from_one_side_to_the_other(velocity: FloatArray, distance_rad: float) -> None:
+def test_a_bristle_lags_at_most_from_one_side_to_the_other(
+    velocity: FloatArray, distance_rad: float
+) -> None:
     """z stays within ±1, so z − sign is against the motion, and at most two."""
     assume(bool(np.any(np.abs(velocity) > STICKING_RAD_S)))
     signals = replace(random_signals(0), velocity_rad_s=velocity[None])

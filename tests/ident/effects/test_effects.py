@@ -14,7 +14,13 @@ from ident.discovery.structure import VARIABLES
 from ident.effects.dictionary import EFFECTS, GEOMETRY, PAIRED
 from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, at_joints, is_placeable
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
-from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
+from ident.effects.friction import (
+    AsymmetricViscous,
+    Coupling,
+    LoadFriction,
+    PositionFriction,
+    Stribeck,
+)
 from ident.effects.position import Hinge, Spring
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals
@@ -26,7 +32,8 @@ from tests.ident.arms import GANTRY, THREE_AXES
 
 FloatArray = NDArray[np.float64]
 
-JOINTS, SAMPLES = 13, 400
+JOINTS = 13
+SAMPLES = 400
 
 
 def random_signals(seed: int) -> Signals:
@@ -68,11 +75,16 @@ def _scaled(s: Signals, factor: float) -> Signals:
 
 def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
     x = np.abs(random_signals(5).variable(variable, 0, other_axis - 1 if other_axis else None))
-    return Smooth(variable, float(np.quantile(x, 0.05)), float(np.quantile(x, 0.95)), signed, other_axis)
+    return Smooth(
+        variable, float(np.quantile(x, 0.05)), float(np.quantile(x, 0.95)), signed, other_axis
+    )
 
 
 GENERIC: tuple[tuple[Effect, ...], ...] = (
-    *(tuple(_over_its_range(variable, signed) for signed in signs) for variable, signs in VARIABLES),
+    *(
+        tuple(_over_its_range(variable, signed) for signed in signs)
+        for variable, signs in VARIABLES
+    ),
     tuple(_over_its_range(Abscissa.OTHER_VELOCITY, signed, other_axis=4) for signed in (0, 1)),
     (Periodic(0), Periodic(1)),
 )
@@ -92,9 +104,14 @@ def _is_odd(columns: Callable[[Signals], FloatArray], signals: Signals, reversed
     return _same(columns(reversed_), -columns(signals)) and bool(np.any(columns(signals)))
 
 
-def _is_zero_where(columns: Callable[[Signals], FloatArray], signals: Signals, held: Signals) -> bool:
-    """Held over the middle half: a filter, forwards or backwards in time, has forgotten the rest in its middle."""
-    free, middle = columns(signals), columns(held)[..., SAMPLES // 2 - 5 : SAMPLES // 2 + 5]
+def _is_zero_where(
+    columns: Callable[[Signals], FloatArray], signals: Signals, held: Signals
+) -> bool:
+    """Held over the middle half: a filter, forwards or backwards in time,
+    has forgotten the rest in its middle.
+    """
+    free = columns(signals)
+    middle = columns(held)[..., SAMPLES // 2 - 5 : SAMPLES // 2 + 5]
     return bool(np.max(np.abs(middle)) <= 1e-7 * np.max(np.abs(free))) and bool(np.any(free))
 
 
@@ -105,9 +122,12 @@ def _held(value: FloatArray) -> FloatArray:
 
 
 def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
-    """Whether a property can be seen in an effect's columns; what it is said of must have a say in them."""
+    """Whether a property can be seen in an effect's columns;
+    what it is said of must have a say in them.
+    """
     s = random_signals(seed)
-    v, angle = s.velocity_rad_s, s.motor_position_rad
+    v = s.velocity_rad_s
+    angle = s.motor_position_rad
 
     def columns(signals: Signals) -> FloatArray:
         return effect.columns(signals, axis)
@@ -122,21 +142,29 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
             holds = _same(columns(replace(s, velocity_rad_s=3.0 + v**2)), columns(s))
         case Property.PERIODIC_IN_MOTOR_ANGLE:
             has_a_say = not _same(columns(replace(s, motor_position_rad=angle + 0.3)), columns(s))
-            holds = has_a_say and _same(columns(replace(s, motor_position_rad=angle + 2.0 * np.pi)), columns(s))
+            holds = has_a_say and _same(
+                columns(replace(s, motor_position_rad=angle + 2.0 * np.pi)), columns(s)
+            )
         case Property.ODD_IN_CURRENT:
-            holds = _is_odd(columns, s, replace(s, motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a))
+            holds = _is_odd(
+                columns, s, replace(s, motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a)
+            )
         case Property.ODD_IN_LOAD:
-            turned = replace(s, load_torque_nm=-s.load_torque_nm, geared_torque_nm=-s.geared_torque_nm)
+            turned = replace(
+                s, load_torque_nm=-s.load_torque_nm, geared_torque_nm=-s.geared_torque_nm
+            )
             holds = _is_odd(columns, s, turned)
         case Property.RATE_OF_TORQUE:
             holds = _is_zero_where(columns, s, replace(s, motor_torque_nm=_held(s.motor_torque_nm)))
         case Property.RATE_OF_LOAD:
             holds = _is_zero_where(columns, s, replace(s, load_torque_nm=_held(s.load_torque_nm)))
         case Property.SMOOTH:
-            # A uniform cubic spline's slope is less than one an interval, and no variable here is more than a hundred
-            # times its range; a change by a small part of itself turns no sign.
+            # A uniform cubic spline's slope is less than one an interval, and no variable here is
+            # more than a hundred times its range; a change by a small part of itself turns no sign.
             change = columns(_scaled(s, 1.0 + 1e-8)) - columns(s)
-            holds = bool(np.any(change)) and float(np.max(np.abs(change))) <= 1e-8 * 100.0 * INTERVALS
+            holds = (
+                bool(np.any(change)) and float(np.max(np.abs(change))) <= 1e-8 * 100.0 * INTERVALS
+            )
     return holds
 
 
@@ -171,7 +199,8 @@ def test_a_wrong_claim_is_refuted(effect: Effect, claim: Property) -> None:
 
 
 def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
-    # Corrections of the geometry are tested against an arm (test_geometry.py); these signals have none.
+    # Corrections of the geometry are tested against an arm (test_geometry.py); these signals have
+    # none.
     of_signals = set(Property) - {Property.TURNS_THE_ARM}
     assert {claim for _, claim in WRONG} == of_signals
     assert {effect.declares for family in (*EFFECTS, *GENERIC) for effect in family} == of_signals
@@ -180,15 +209,21 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
 
 @pytest.mark.parametrize("effect", MEMBERS)
 def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Effect) -> None:
-    signals, strange = random_signals(5), random_signals(6)
+    signals = random_signals(5)
+    strange = random_signals(6)
     columns = effect.columns(signals, 0)
-    joints = {GearSide.TWO_JOINTS: (2,), GearSide.ALL_JOINTS: (JOINTS,), GearSide.ALL_MOTORS: (JOINTS,)}.get(
-        effect.side, ()
-    )
+    joints = {
+        GearSide.TWO_JOINTS: (2,),
+        GearSide.ALL_JOINTS: (JOINTS,),
+        GearSide.ALL_MOTORS: (JOINTS,),
+    }.get(effect.side, ())
     assert columns.shape == (*joints, len(effect.coefficients), SAMPLES)
     assert np.all(np.isfinite(columns))
     constant = np.array(
-        [column.name == "preload" and effect.name == "passive-spring" for column in effect.coefficients]
+        [
+            column.name == "preload" and effect.name == "passive-spring"
+            for column in effect.coefficients
+        ]
     )
     moving = np.ptp(columns, axis=-1) > 0
     if effect.name == "cable":  # each stiffness of one joint alone acts on that joint
@@ -197,19 +232,28 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
 
     def changed(axes: list[int]) -> Signals:
         arrays = {}
-        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "motor_position_rad", "load_torque_nm",
+        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "motor_position_rad", "load_torque_nm",  # noqa: E501
                      "geared_torque_nm", "motor_torque_nm", "current_a"):  # fmt: skip
             array = getattr(signals, name).copy()
             array[axes] = getattr(strange, name)[axes]
             arrays[name] = array
         return replace(signals, **arrays)
 
-    own = [0, int(effect.settings["other_axis"]) - 1] if effect.settings.get("other_axis") else [0]
-    own = list(range(JOINTS)) if effect.side is GearSide.ALL_MOTORS else own
-    assert np.array_equal(effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns)
+    if effect.settings.get("other_axis"):
+        own = [0, int(effect.settings["other_axis"]) - 1]
+    else:
+        own = [0]
+    if effect.side is GearSide.ALL_MOTORS:
+        own = list(range(JOINTS))
+    assert np.array_equal(
+        effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns
+    )
     # What depends on the clock alone is the same on all axes.
     is_by_time = effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
-    of_the_clock = is_by_time and effect.declares in {Property.SMOOTH, Property.INDEPENDENT_OF_VELOCITY}
+    of_the_clock = is_by_time and effect.declares in {
+        Property.SMOOTH,
+        Property.INDEPENDENT_OF_VELOCITY,
+    }
     if not of_the_clock or effect.settings.get("signed"):
         assert not np.allclose(effect.columns(changed(own), 0), columns)
 
@@ -217,20 +261,28 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
 def test_columns_act_where_the_effect_says() -> None:
     ratio = np.diag([30.0, 40.0, 50.0])
     ratio[2, 1] = 25.0
-    train, rng = DriveTrain(ratio), np.random.default_rng(1)
-    one, two, all_ = rng.normal(size=(2, 7)), rng.normal(size=(2, 2, 7)), rng.normal(size=(3, 1, 7))
+    train = DriveTrain(ratio)
+    rng = np.random.default_rng(1)
+    one = rng.normal(size=(2, 7))
+    two = rng.normal(size=(2, 2, 7))
+    all_ = rng.normal(size=(3, 1, 7))
     at_joint = at_joints(Cogging(1), 2, one, train)
     # Motor 3 turns with joints 2 and 3, the second at half the ratio.
     assert at_joint == pytest.approx(np.stack((0.0 * one, 0.5 * one, one)))
-    assert at_joints(Spring(), 1, one, train) == pytest.approx(np.stack((0.0 * one, one, 0.0 * one)))
-    assert at_joints(Coupling(3, 1), 0, two, train) == pytest.approx(np.stack((two[0], 0.0 * one, two[1])))
+    assert at_joints(Spring(), 1, one, train) == pytest.approx(
+        np.stack((0.0 * one, one, 0.0 * one))
+    )
+    assert at_joints(Coupling(3, 1), 0, two, train) == pytest.approx(
+        np.stack((two[0], 0.0 * one, two[1]))
+    )
     assert np.array_equal(at_joints(Elasticity(), 1, all_, train), all_)
     of_motors = np.stack((all_[0], all_[1] + 0.5 * all_[2], all_[2]))
     assert at_joints(TimeSkew(), 0, all_, train) == pytest.approx(of_motors)
 
 
 def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None:
-    three, gantry = robot_from_urdf(THREE_AXES.urdf), robot_from_urdf(GANTRY.urdf)
+    three = robot_from_urdf(THREE_AXES.urdf)
+    gantry = robot_from_urdf(GANTRY.urdf)
     placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
     assert placed == [0, 1]
     assert not is_placeable(Coupling(4, 1), 0, three)
@@ -260,15 +312,27 @@ class Cubic(AsymmetricViscous):
 
 
 def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str]]:
-    """Pairs of effects of which one's columns span the other's on the robot's joints: they cannot be distinguished."""
-    train, first_run, rest = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS))), random_signals(5), random_signals(6)
+    """Pairs of effects of which one's columns span the other's on the robot's joints:
+    they cannot be distinguished.
+    """
+    train = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS)))
+    first_run = random_signals(5)
+    rest = random_signals(6)
     runs = (first_run, replace(rest, session_s=300.0 + rest.time_s))
     spans: list[tuple[str, FloatArray, bool]] = []
     for effect in (effect for family in families for effect in family):
-        torque = np.concatenate([at_joints(effect, 0, effect.columns(run, 0), train) for run in runs], axis=-1)
+        torque = np.concatenate(
+            [at_joints(effect, 0, effect.columns(run, 0), train) for run in runs], axis=-1
+        )
         columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
         settings = ", ".join(f"{value:g}" for value in effect.settings.values())
-        spans.append((f"{effect.name} ({settings})", np.linalg.svd(columns, full_matrices=False)[2], effect.with_motor))
+        spans.append(
+            (
+                f"{effect.name} ({settings})",
+                np.linalg.svd(columns, full_matrices=False)[2],
+                effect.with_motor,
+            )
+        )
     pairs = []
     for (one, first, driven), (other, second, other_driven) in combinations(spans, 2):
         if driven != other_driven:  # never on the same joint
@@ -290,15 +354,22 @@ def test_no_two_effects_are_the_same_under_two_names() -> None:
 @pytest.mark.parametrize("backwards", [0, 1])
 def test_the_rate_behind_a_filter_is_that_of_its_equation(backwards: int) -> None:
     """T ẏ + y = τ of a ramp that begins at t₀ has ẏ = 1 − exp(−(t − t₀)/T); of a constant, none."""
-    rate_hz, filter_s, start = 500.0, 0.012, 100
+    rate_hz = 500.0
+    filter_s = 0.012
+    start = 100
     time_s = (np.arange(300) - start) / rate_hz
-    ramp, rate = np.maximum(time_s, 0.0), np.where(time_s > 0.0, -np.expm1(-time_s / filter_s), 0.0)
+    ramp = np.maximum(time_s, 0.0)
+    rate = np.where(time_s > 0.0, -np.expm1(-time_s / filter_s), 0.0)
     if backwards:
-        ramp, rate = ramp[::-1], -rate[::-1]
-    effect, signals = Lag(filter_s, backwards), replace(random_signals(1), rate_hz=rate_hz)
+        ramp = ramp[::-1]
+        rate = -rate[::-1]
+    effect = Lag(filter_s, backwards)
+    signals = replace(random_signals(1), rate_hz=rate_hz)
     found = effect.columns(replace(signals, motor_torque_nm=np.stack((ramp, np.full(300, 7.0)))), 0)
     assert found[0] == pytest.approx(-rate, abs=1e-9)
-    assert effect.columns(replace(signals, motor_torque_nm=np.full((1, 300), 7.0)), 0) == pytest.approx(0.0, abs=1e-9)
+    assert effect.columns(
+        replace(signals, motor_torque_nm=np.full((1, 300), 7.0)), 0
+    ) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_with_no_filter_it_is_the_central_difference() -> None:
@@ -309,10 +380,14 @@ def test_with_no_filter_it_is_the_central_difference() -> None:
 
 
 @pytest.mark.parametrize(
-    "effect", [LoadFriction(0, 0.4, 1), LoadFriction(1, 0.4, 1), Efficiency(0.5, 0.4, 1)], ids=lambda one: one.name
+    "effect",
+    [LoadFriction(0, 0.4, 1), LoadFriction(1, 0.4, 1), Efficiency(0.5, 0.4, 1)],
+    ids=lambda one: one.name,
 )
 def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | Efficiency) -> None:
-    s, axis, step = random_signals(3), 2, 1e-7
+    s = random_signals(3)
+    axis = 2
+    step = 1e-7
     loss, rest = effect.columns(s, axis)
     (before,) = replace(effect, rotor_inertia_kg_m2=0.4 - step, with_rotor=0).columns(s, axis)
     (after,) = replace(effect, rotor_inertia_kg_m2=0.4 + step, with_rotor=0).columns(s, axis)
@@ -324,16 +399,21 @@ def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | 
 
 
 def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
-    s, axis = random_signals(4), 2
+    s = random_signals(4)
+    axis = 2
     loss = PlacedEffect(LoadFriction(0, 0.3, 1), axis)
     known = beside_rotors(s, (PlacedEffect(Elasticity(), 1), loss))
     turning_nm = 0.3 * s.acceleration_rad_s2[axis]
     np.testing.assert_allclose(known.link_torque(axis), s.load_torque_nm[axis] - turning_nm)
     np.testing.assert_allclose(known.gear_torque(axis), s.geared_torque_nm[axis] - turning_nm)
-    np.testing.assert_allclose(known.variable(Abscissa.LOAD, axis), s.load_torque_nm[axis] - turning_nm)
+    np.testing.assert_allclose(
+        known.variable(Abscissa.LOAD, axis), s.load_torque_nm[axis] - turning_nm
+    )
     np.testing.assert_allclose(known.link_torque(1), s.load_torque_nm[1])
     own = np.arange(JOINTS)[:, None] == axis
-    np.testing.assert_allclose(known.inertia(slice(None), axis), s.inertia(slice(None), axis) - 0.3 * own)
+    np.testing.assert_allclose(
+        known.inertia(slice(None), axis), s.inertia(slice(None), axis) - 0.3 * own
+    )
     np.testing.assert_allclose(known.inertia(axis, axis), s.inertia(axis, axis) - 0.3)
     np.testing.assert_array_equal(known.inertia(slice(None), 1), s.inertia(slice(None), 1))
     np.testing.assert_array_equal(loss.effect.columns(known, axis), loss.effect.columns(s, axis))

@@ -1,4 +1,6 @@
-"""Corrections of the geometry: each column is the derivative of the torque of a corrected arm, built another way."""
+"""Corrections of the geometry: each column is the derivative of the torque of a corrected arm,
+built another way.
+"""
 
 from __future__ import annotations
 
@@ -44,9 +46,13 @@ def _run() -> Dataset:
 
 
 def _smooth_torque(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
-    """Torque of all joints without dry friction, by the regressor: none of it is used by the effects."""
+    """Torque of all joints without dry friction, by the regressor:
+    none of it is used by the effects.
+    """
     dry = np.array([column.name.startswith("fs") for column in model.columns])
-    return np.asarray(np.einsum("jck,c->jk", model.regressor(data.motion()), np.where(dry, 0.0, standard)))
+    return np.asarray(
+        np.einsum("jck,c->jk", model.regressor(data.motion()), np.where(dry, 0.0, standard))
+    )
 
 
 @pytest.mark.parametrize(
@@ -63,18 +69,26 @@ def _smooth_torque(model: Model, data: Dataset, standard: FloatArray) -> FloatAr
 def test_a_column_is_the_change_of_the_torque_of_a_corrected_arm(
     effect: GeometryEffect, axis: int, coefficient: int
 ) -> None:
-    truth, data = tx40_truth(), _run()
-    step = STEP if not isinstance(effect, LatePosition) else 1.0 / data.rate_hz
+    truth = tx40_truth()
+    data = _run()
+    if not isinstance(effect, LatePosition):
+        step = STEP
+    else:
+        step = 1.0 / data.rate_hz
 
     def torque(change: float) -> FloatArray:
         values = list(effect.applied)
         values[coefficient] += change
         placed = (PlacedEffect(effect.with_applied(values), axis),)
-        return _smooth_torque(corrected_model(truth.model, placed), corrected_dataset(data, placed), truth.parameters)
+        return _smooth_torque(
+            corrected_model(truth.model, placed), corrected_dataset(data, placed), truth.parameters
+        )
 
     expected = (torque(step) - torque(-step)) / (2.0 * step)
     around = (PlacedEffect(effect, axis),)
-    signals = declared_signals(corrected_model(truth.model, around), data, truth.parameters, truth.gains)
+    signals = declared_signals(
+        corrected_model(truth.model, around), data, truth.parameters, truth.gains
+    )
     found = effect.columns(signals, axis)[:, coefficient]
     inner = slice(20, -20)  # the ends of a run that was shifted stay constant
     size = float(np.max(np.abs(expected)))
@@ -86,7 +100,9 @@ def test_a_column_is_the_change_of_the_torque_of_a_corrected_arm(
 def test_the_zero_of_an_axis_along_gravity_changes_no_torque() -> None:
     truth = tx40_truth()
     signals = declared_signals(truth.model, _run(), truth.parameters, truth.gains)
-    assert np.max(np.abs(ZeroOffset().columns(signals, 0))) < 1e-6 * np.max(np.abs(ZeroOffset().columns(signals, 1)))
+    assert np.max(np.abs(ZeroOffset().columns(signals, 0))) < 1e-6 * np.max(
+        np.abs(ZeroOffset().columns(signals, 1))
+    )
 
 
 def test_a_corrected_zero_moves_the_arm_as_the_offset_does() -> None:
@@ -95,7 +111,8 @@ def test_a_corrected_zero_moves_the_arm_as_the_offset_does() -> None:
     turned = position.copy()
     turned[:, 3] += 0.1
     model = corrected_model(truth.model, (PlacedEffect(ZeroOffset(applied_rad=0.1), 3),))
-    found, expected = poses(model.robot, position), poses(truth.model.robot, turned)
+    found = poses(model.robot, position)
+    expected = poses(truth.model.robot, turned)
     # Behind the joint; the joint's own frame turns with it in both.
     assert found.origin_m == pytest.approx(expected.origin_m)
     assert found.rotation[4:] == pytest.approx(expected.rotation[4:])
@@ -112,7 +129,9 @@ def test_gravity_keeps_its_length_and_is_found_again(
     declared = 9.81 * np.array(direction) / np.linalg.norm(direction)
     first, second = across(declared)
     assert [first @ first, second @ second] == pytest.approx([1.0, 1.0])
-    assert [first @ second, first @ declared, second @ declared] == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+    assert [first @ second, first @ declared, second @ declared] == pytest.approx(
+        [0.0, 0.0, 0.0], abs=1e-12
+    )
     turned = turned_gravity(declared, turn)
     assert np.linalg.norm(turned) == pytest.approx(9.81)
     angle = np.arccos(np.clip(turned @ declared / 9.81**2, -1.0, 1.0))
@@ -128,7 +147,10 @@ def test_components_of_gravity_scatter_as_their_deviations_say(
     direction: tuple[float, float, float], deviations: tuple[float, float]
 ) -> None:
     declared = 9.81 * np.array(direction) / np.linalg.norm(direction)
-    ends = [turned_gravity(declared, [deviations[0], 0.0]), turned_gravity(declared, [0.0, deviations[1]])]
+    ends = [
+        turned_gravity(declared, [deviations[0], 0.0]),
+        turned_gravity(declared, [0.0, deviations[1]]),
+    ]
     moved = np.linalg.norm([end - declared for end in ends], axis=0)
     assert turned_gravity_std(declared, declared, deviations) == pytest.approx(moved, abs=1e-3)
 
@@ -153,7 +175,8 @@ def test_a_planned_motion_has_no_late_position() -> None:
 
 
 def test_an_effect_is_the_same_one_after_each_correction() -> None:
-    one, other = PlacedEffect(ZeroOffset(), 2), PlacedEffect(ZeroOffset(applied_rad=0.03), 2)
+    one = PlacedEffect(ZeroOffset(), 2)
+    other = PlacedEffect(ZeroOffset(applied_rad=0.03), 2)
     assert one == other
     assert [column.name for column in one.columns] == [column.name for column in other.columns]
     assert [column.about for column in other.columns] == [0.03]
@@ -167,7 +190,9 @@ def test_the_mounting_is_one_for_all_axes_and_a_zero_one_for_each() -> None:
 
 
 def test_rotations_are_right_handed() -> None:
-    assert rotation_by(np.array([0.0, 0.0, np.pi / 2])) @ [1.0, 0.0, 0.0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
+    assert rotation_by(np.array([0.0, 0.0, np.pi / 2])) @ [1.0, 0.0, 0.0] == pytest.approx(
+        [0.0, 1.0, 0.0], abs=1e-12
+    )
     assert np.array_equal(rotation_by(np.zeros(3)), np.eye(3))
 
 

@@ -16,7 +16,16 @@ from ident.arrays import FloatArray
 from ident.discovery.search import effect_key
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, check_settings, columns_at, fits_data
-from ident.effects.own import SHIPPED, families_of, installed_families, known_effect, package_of, search_families
+from ident.effects.own import (
+    SHIPPED,
+    families_of,
+    installed_families,
+    installed_version,
+    is_of_package,
+    known_effect,
+    package_of,
+    search_families,
+)
 from ident.effects.rotor import known_rotors
 from ident.effects.signals import Signals
 
@@ -119,24 +128,68 @@ class Misspelled(SquareDrag):
 @pytest.mark.parametrize(
     ("effects", "words"),
     [
-        (SquareDrag(), r"SquareDrag\(exponent=1.0\); expected a list of effects; put brackets around it"),
+        (
+            SquareDrag(),
+            r"SquareDrag\(exponent=1.0\); expected a list of effects; put brackets "
+            r"around it",
+        ),
         (None, r"None; expected a list of effects"),
-        ([SquareDrag(7.0)], r"exponent = 7 in effect 'square-drag'; expected a value from 0.5 to 3"),
+        (
+            [SquareDrag(7.0)],
+            r"exponent = 7 in effect 'square-drag'; expected a value "
+            r"from 0.5 to 3",
+        ),
         ([SquareDrag(float("nan"))], r"exponent = nan in effect 'square-drag'; expected a value"),
-        ([SquareDrag(1)], r"exponent = 1 in effect 'square-drag'; expected a value of type float.*write float\(1\)"),
-        ([Lonely()], r"effect 'lonely-drag' on two joints without a setting `other_axis`; expected the number"),
-        ([SHIPPED["spring"]], r"drivegain's own effect 'spring'; expected others: it is tried without this"),
-        ([Twice()], r"coefficients \['drag', 'drag'\] of effect 'twice-drag'; expected a name for each"),
-        ([Misspelled()], r"exponents in `refined` of effect 'misspelled-drag'; expected names among its .*: exponent"),
-        ([Rotor()], r"rotor_inertia_kg_m2, with_rotor in `has_rotor_form` of effect 'rotor-drag'; expected names"),
-        ([OneWave()], r"1 coefficients of effect 'wave-drag', which reports give as one amplitude; expected two"),
+        (
+            [SquareDrag(1)],
+            r"exponent = 1 in effect 'square-drag'; expected a value of type "
+            r"float.*write float\(1\)",
+        ),
+        (
+            [Lonely()],
+            r"effect 'lonely-drag' on two joints without a setting `other_axis`; expected "
+            r"the number",
+        ),
+        (
+            [SHIPPED["spring"]],
+            r"drivegain's own effect 'spring'; expected others: it is tried "
+            r"without this",
+        ),
+        (
+            [Twice()],
+            r"coefficients \['drag', 'drag'\] of effect 'twice-drag'; expected a "
+            r"name for each",
+        ),
+        (
+            [Misspelled()],
+            r"exponents in `refined` of effect 'misspelled-drag'; expected names "
+            r"among its .*: exponent",
+        ),
+        (
+            [Rotor()],
+            r"rotor_inertia_kg_m2, with_rotor in `has_rotor_form` of effect 'rotor-drag'; "
+            r"expected names",
+        ),
+        (
+            [OneWave()],
+            r"1 coefficients of effect 'wave-drag', which reports give as one amplitude; "
+            r"expected two",
+        ),
         ([SquareDrag], r"the class SquareDrag; expected objects of subclasses of `ident.Effect`"),
         (["spring"], r"'spring'; expected objects"),
         ([Named()], r"the name 'Square Drag'; expected lowercase words joined by hyphens"),
         ([Spring()], r"the name 'spring', which drivegain has; give it another"),
         ([SquareDrag(), SecondDrag()], r"two classes of effects with the name 'square-drag'"),
-        ([Unranged()], r"fields of effect 'unranged-drag' without a range: scale; expected each as `Annotated"),
-        ([Colon()], r"coefficients \['drag:disc'\] of effect 'colon-drag'; expected at least one, with a name"),
+        (
+            [Unranged()],
+            r"fields of effect 'unranged-drag' without a range: scale; expected each as "
+            r"`Annotated",
+        ),
+        (
+            [Colon()],
+            r"coefficients \['drag:disc'\] of effect 'colon-drag'; expected at least one, "
+            r"with a name",
+        ),
     ],
 )
 def test_what_is_no_usable_effect_is_refused(effects: Any, words: str) -> None:
@@ -176,9 +229,17 @@ class Given(SquareDrag):
 def test_columns_of_an_effect_of_ones_own_are_checked() -> None:
     stub = SimpleNamespace(current_a=np.zeros((AXES, SAMPLES)), time_s=np.zeros(SAMPLES))
     signals = cast(Signals, stub)
-    with pytest.raises(ident.EffectRefused, match=r"'given': found columns of shape \(5,\); expected \(1, 5\)"):
+    with pytest.raises(
+        ident.EffectRefused,
+        match=r"'given': found columns of shape \(5,\); "
+        r"expected \(1, 5\)",
+    ):
         columns_at(Given(given=0), signals, 0)
-    with pytest.raises(ident.EffectRefused, match=r"'given': found columns with numbers that are not finite"):
+    with pytest.raises(
+        ident.EffectRefused,
+        match=r"'given': found columns with numbers that are "
+        r"not finite",
+    ):
         columns_at(Given(given=1), signals, 0)
     assert np.array_equal(columns_at(Given(given=2), signals, 0), np.ones((1, SAMPLES)))
 
@@ -217,7 +278,9 @@ class Hesitating(SquareDrag):
 def test_an_effect_that_cannot_say_whether_it_fits_is_refused_by_name() -> None:
     assert fits_data(SquareDrag(), (), 0)
     with pytest.raises(
-        ident.EffectRefused, match=r"'hesitating': found IndexError \(0 runs, axis 1\) in its .*fits_in"
+        ident.EffectRefused,
+        match=r"'hesitating': found IndexError \(0 runs, axis 1\) in its "
+        r".*fits_in",
     ):
         fits_data(Hesitating(), (), 1)
 
@@ -230,15 +293,18 @@ class Site:
         self.folder = folder
 
     def install(self, package: str, code: str, effects: str = "EFFECTS") -> None:
-        """Write module and metadata of a package."""
+        """Write module and metadata of a package; without names of effects it registers none."""
         module = package.replace("-", "_")
         (self.folder / f"{module}.py").write_text(code, encoding="utf-8")
         metadata = self.folder / f"{module}-0.3.dist-info"
         metadata.mkdir()
-        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.3\n", encoding="utf-8")
-        (metadata / "entry_points.txt").write_text(
-            f"[drivegain.effects]\ndrag = {module}:{effects}\n", encoding="utf-8"
+        (metadata / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.3\n", encoding="utf-8"
         )
+        if effects:
+            (metadata / "entry_points.txt").write_text(
+                f"[drivegain.effects]\ndrag = {module}:{effects}\n", encoding="utf-8"
+            )
 
 
 @pytest.fixture
@@ -286,7 +352,8 @@ def test_two_packages_with_one_effect_are_refused(site: Site) -> None:
     site.install("drag-second", _code("drag-second"))
     with pytest.raises(
         ident.EffectRefused,
-        match=r"package 'drag-second 0.3': found effect 'square-drag', which package 'drag-first 0.3' has, too",
+        match=r"package 'drag-second 0.3': found effect 'square-drag', which package 'drag-first "
+        r"0.3' has, too",
     ):
         search_families()
 
@@ -294,16 +361,37 @@ def test_two_packages_with_one_effect_are_refused(site: Site) -> None:
 @pytest.mark.parametrize(
     ("package", "code", "words"),
     [
-        ("drag-alone", "import nothing_of_this_name", r"cannot be loaded \(ModuleNotFoundError: No module named"),
+        (
+            "drag-alone",
+            "import nothing_of_this_name",
+            r"cannot be loaded \(ModuleNotFoundError: No "
+            r"module named",
+        ),
         ("drag-raising", "raise KeyError('x')", r"cannot be loaded \(KeyError: 'x'\)"),
-        ("drag-empty", "WRONG = 1", r"cannot be loaded \(AttributeError: module 'drag_empty' has no attribute"),
+        (
+            "drag-empty",
+            "WRONG = 1",
+            r"cannot be loaded \(AttributeError: module 'drag_empty' has "
+            r"no attribute",
+        ),
         ("drag-exiting", "raise SystemExit(0)", r"cannot be loaded \(SystemExit: 0\)"),
-        ("drag-number", "EFFECTS = 3", r"found 3; expected objects of subclasses of `ident.Effect`"),
+        (
+            "drag-number",
+            "EFFECTS = 3",
+            r"found 3; expected objects of subclasses of "
+            r"`ident.Effect`",
+        ),
     ],
 )
-def test_a_broken_package_stops_a_search_and_no_prediction(site: Site, package: str, code: str, words: str) -> None:
+def test_a_broken_package_stops_a_search_and_no_prediction(
+    site: Site, package: str, code: str, words: str
+) -> None:
     site.install(package, code)
-    with pytest.raises(ident.EffectRefused, match=rf"^entry point 'drag' of package '{package} 0.3': .*{words}"):
+    with pytest.raises(
+        ident.EffectRefused,
+        match=rf"^entry point 'drag' of package '{package} "
+        rf"0.3': .*{words}",
+    ):
         search_families()
     spring = known_effect("spring")
     assert spring is not None
@@ -319,6 +407,42 @@ def test_a_package_that_is_not_there_is_named() -> None:
     assert "own_effects" in str(ident.EffectNotInstalled("square-drag", "J2", "module drags"))
 
 
+def test_an_effect_of_the_package_that_a_calibration_names_is_used_in_any_version(
+    site: Site,
+) -> None:
+    site.install("drag-one", _code("drag-one"))
+    known = known_effect("square-drag")
+    assert known is not None
+    assert is_of_package(known, "drag-one 0.1")
+    assert is_of_package(known, "module drag_one")
+    assert not is_of_package(known, "drag-other 0.3")
+    assert not is_of_package(known, "module drags")
+
+
+def test_an_effect_of_the_same_name_of_another_package_is_not_used(site: Site) -> None:
+    site.install("drag-foreign", _code("drag-foreign"))
+    known = known_effect("square-drag")
+    assert known is not None
+    error = ident.EffectNotInstalled(
+        "square-drag", "J2", "drag-one 0.2", other=package_of(known) or ""
+    )
+    assert "found an effect of this name of drag-foreign 0.3" in str(error)
+    assert "expected drag-one 0.2" in str(error)
+    assert "own_effects" in str(error)
+
+
+def test_a_package_that_does_not_register_its_effect_is_not_to_be_installed(site: Site) -> None:
+    site.install("drag-hidden", _code("drag-hidden"), "")
+    assert known_effect("square-drag") is None
+    assert installed_version("drag-hidden 0.2") == "0.3"
+    assert installed_version("drag-missing 0.2") == ""
+    assert installed_version("module drags") == ""
+    error = ident.EffectNotInstalled("square-drag", "J2", "drag-hidden 0.2", installed="0.3")
+    assert "found version 0.3 of its package, which does not register it" in str(error)
+    assert "entry points of the group drivegain.effects" in str(error)
+    assert "install this package" not in str(error)
+
+
 def test_settings_of_an_effect_of_ones_own_are_those_with_a_range() -> None:
     effect = SquareDrag(2.0)
     assert effect.settings == {"exponent": 2.0}
@@ -326,8 +450,26 @@ def test_settings_of_an_effect_of_ones_own_are_those_with_a_range() -> None:
 
 
 NAMES_OF_THE_DICTIONARY = (
-    *("lower", "upper", "sense", "other_axis", "order", "exponent", "with_rotor", "rotor_inertia_kg_m2"),
-    *("held", "sags", "two_terms", "backwards", "half_gap_rad", "resonant_rad_nm", "damping_ratio", "filter_s"),
+    *(
+        "lower",
+        "upper",
+        "sense",
+        "other_axis",
+        "order",
+        "exponent",
+        "with_rotor",
+        "rotor_inertia_kg_m2",
+    ),
+    *(
+        "held",
+        "sags",
+        "two_terms",
+        "backwards",
+        "half_gap_rad",
+        "resonant_rad_nm",
+        "damping_ratio",
+        "filter_s",
+    ),
 )
 """Names that settings of the dictionary have, where they mean something."""
 
@@ -399,7 +541,9 @@ class Declaring(SquareDrag):
     @property
     def settings_fault(self) -> str:
         """An exponent of one in the second form."""
-        return "exponent = 1 in its second form; expected another" if self.form and self.exponent == 1.0 else ""
+        if self.form and self.exponent == 1.0:
+            return "exponent = 1 in its second form; expected another"
+        return ""
 
 
 def test_a_meaning_that_a_class_declares_is_used() -> None:
@@ -411,7 +555,15 @@ def test_a_meaning_that_a_class_declares_is_used() -> None:
     assert "form" not in column.name
     assert effect_key(effect, 0) == effect_key(effect.with_settings({"form": 1}), 0)
     assert effect_key(effect, 0) != effect_key(effect.with_settings({"exponent": 2.0}), 0)
-    with pytest.raises(ident.EffectRefused, match=r"on axis 2 is given driver = 2; it is the number of another of"):
+    with pytest.raises(
+        ident.EffectRefused,
+        match=r"on axis 2 is given driver = 2; it is the "
+        r"number of another of",
+    ):
         check_settings(effect, effect.settings, 1, AXES)
-    with pytest.raises(ident.EffectRefused, match=r"'declaring-drag' is given exponent = 1 in its second form"):
+    with pytest.raises(
+        ident.EffectRefused,
+        match=r"'declaring-drag' is given exponent = 1 in its "
+        r"second form",
+    ):
         check_settings(effect, {**effect.settings, "form": 1}, 0, AXES)

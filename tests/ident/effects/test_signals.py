@@ -46,8 +46,11 @@ def _made(truth: Truth, data: Dataset, began_s: float | None = None) -> Signals:
     return declared_signals(truth.model, data, _loaded(truth), truth.gains, began_s)
 
 
-def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(small_truth: Truth, data: Dataset) -> None:
-    made, columns = _made(small_truth, data), small_truth.model.regressor(data.motion())
+def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(
+    small_truth: Truth, data: Dataset
+) -> None:
+    made = _made(small_truth, data)
+    columns = small_truth.model.regressor(data.motion())
     load, geared, whole = (
         np.einsum("jck,c->jk", columns, parameters)
         for parameters in (
@@ -60,21 +63,33 @@ def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(small_truth: 
     assert made.geared_torque_nm == pytest.approx(geared)
     assert made.motor_torque_nm == pytest.approx(small_truth.model.drive_train.to_motor @ whole)
     assert made.current_a * small_truth.gains[:, None] == pytest.approx(made.motor_torque_nm)
-    assert made.motor_position_rad == pytest.approx(np.diag([40.0, 50.0, -45.0]) @ data.position_rad.T)
+    assert made.motor_position_rad == pytest.approx(
+        np.diag([40.0, 50.0, -45.0]) @ data.position_rad.T
+    )
 
 
 def _inertia(signals: Signals) -> FloatArray:
-    return np.stack([signals.inertia(slice(None), axis) for axis in range(len(signals.position_rad))], axis=1)
+    return np.stack(
+        [signals.inertia(slice(None), axis) for axis in range(len(signals.position_rad))], axis=1
+    )
 
 
-def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, data: Dataset) -> None:
-    """Mass matrix of links and payload; interpolated between postures, so it follows to a hundredth."""
+def test_inertia_is_torque_per_acceleration_at_every_sample(
+    small_truth: Truth, data: Dataset
+) -> None:
+    """Mass matrix of links and payload;
+    interpolated between postures, so it follows to a hundredth.
+    """
     parameters = _without(small_truth, "Ia", "fv", "fs", "off")
     still = np.zeros_like(data.position_rad)
     rng = np.random.default_rng(1)
     acceleration = rng.normal(size=data.position_rad.shape)
     moved, held = (
-        np.einsum("jck,c->jk", small_truth.model.regressor(Motion(data.position_rad, still, a)), parameters)
+        np.einsum(
+            "jck,c->jk",
+            small_truth.model.regressor(Motion(data.position_rad, still, a)),
+            parameters,
+        )
         for a in (acceleration, still)
     )
     inertia = _inertia(_made(small_truth, data))
@@ -88,7 +103,9 @@ def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, 
 def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
     small: Evidence, small_truth: Truth, data: Dataset
 ) -> None:
-    """Ia of joints 1 and 2 cannot be distinguished from their links; that of joint 3 is a parameter of its own."""
+    """Ia of joints 1 and 2 cannot be distinguished from their links;
+    that of joint 3 is a parameter of its own.
+    """
     found = _inertia(fitted_signals(small.model, data, small.training, small.estimate))
     true = _inertia(_made(small_truth, data))
     rotors = np.array([0.03, 0.03, 0.0])
@@ -122,9 +139,13 @@ def test_the_session_clock_counts_from_the_first_run(small_truth: Truth, data: D
 def test_runs_that_overlap_have_no_common_clock(
     data: Dataset, starts_s: tuple[float, ...], began_s: float | None
 ) -> None:
-    """Stamps from each file's own start say nothing of the session; by the time of day a simulated cell may overlap."""
+    """Stamps from each file's own start say nothing of the session;
+    by the time of day a simulated cell may overlap.
+    """
     assert data.time_s[-1] - data.time_s[0] > 0.9
-    assert session_began_s([replace(data, started_s=started_s) for started_s in starts_s]) == began_s
+    assert (
+        session_began_s([replace(data, started_s=started_s) for started_s in starts_s]) == began_s
+    )
 
 
 def test_without_a_clock_the_session_is_the_run(small_truth: Truth, data: Dataset) -> None:

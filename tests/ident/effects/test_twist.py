@@ -1,4 +1,6 @@
-"""A link behind a gear that is not rigid: what friction holds, what the twist changes, and what the gear passes."""
+"""A link behind a gear that is not rigid:
+what friction holds, what the twist changes, and what the gear passes.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +49,12 @@ def _back_and_forth(weight_nm: float) -> DrivenLink:
     )
 
 
-def _stepped(link: DrivenLink, gap_rad: float, compliance_rad_nm: float, twist_rad: float) -> NDArray[np.float64]:
-    """What the gear passes, step by step from the first sample to the last: two masses with friction, no windows."""
+def _stepped(
+    link: DrivenLink, gap_rad: float, compliance_rad_nm: float, twist_rad: float
+) -> NDArray[np.float64]:
+    """What the gear passes, step by step from the first sample to the last:
+    two masses with friction, no windows.
+    """
     damping = 2.0 * RATIO * np.sqrt(INERTIA_KG_M2 / compliance_rad_nm)
     step_s = 1.0 / (STEPS * link.rate_hz)
     lag_rate = 0.0
@@ -60,9 +66,16 @@ def _stepped(link: DrivenLink, gap_rad: float, compliance_rad_nm: float, twist_r
             pressed = twist_rad - np.clip(twist_rad, -gap_rad, gap_rad)
             force = pressed / compliance_rad_nm + damping * lag_rate
             if gap_rad > 0.0:
-                force = 0.0 if pressed == 0.0 else max(force, 0.0) if pressed > 0.0 else min(force, 0.0)
+                if pressed == 0.0:
+                    force = 0.0
+                elif pressed > 0.0:
+                    force = max(force, 0.0)
+                else:
+                    force = min(force, 0.0)
             moving_nm = (1.0 - share) * link.torque_nm[sample] + share * link.torque_nm[sample + 1]
-            motor_rad_s = (1.0 - share) * link.speed_rad_s[sample] + share * link.speed_rad_s[sample + 1]
+            motor_rad_s = (1.0 - share) * link.speed_rad_s[sample] + share * link.speed_rad_s[
+                sample + 1
+            ]
             link_rad_s = motor_rad_s - lag_rate - step_s * (moving_nm - force) / INERTIA_KG_M2
             most = step_s * DRY_NM / INERTIA_KG_M2
             link_rad_s = np.sign(link_rad_s) * max(abs(link_rad_s) - most, 0.0)
@@ -79,7 +92,9 @@ def _stepped(link: DrivenLink, gap_rad: float, compliance_rad_nm: float, twist_r
 @pytest.mark.parametrize("weight_nm", [0.0, 2.0, -1.0])
 @pytest.mark.parametrize("gap_rad", [0.0, HALF_GAP_RAD])
 def test_windows_hold_all_that_a_held_link_does(weight_nm: float, gap_rad: float) -> None:
-    """The whole time in small steps; in windows around turns and rests, with a spring between them."""
+    """The whole time in small steps; in windows around turns and rests,
+    with a spring between them.
+    """
     link = _back_and_forth(weight_nm)
     gears = Gears(np.array([gap_rad]), np.array([COMPLIANCE_RAD_NM]), RATIO)
     found = twists(link, gears)
@@ -91,11 +106,15 @@ def test_windows_hold_all_that_a_held_link_does(weight_nm: float, gap_rad: float
 
 
 def test_a_motor_that_turns_back_crosses_the_gap_without_its_link() -> None:
-    """Friction of 4 Nm holds a weight of 2 Nm until the motor has crossed the gap, of whichever size."""
+    """Friction of 4 Nm holds a weight of 2 Nm until the motor has crossed the gap,
+    of whichever size.
+    """
     link = _back_and_forth(2.0)
     way_rad = np.cumsum(link.speed_rad_s) / RATE_HZ
     turned = 1200
-    gears = Gears(np.array([HALF_GAP_RAD, 2.0 * HALF_GAP_RAD]), np.full(2, COMPLIANCE_RAD_NM), RATIO)
+    gears = Gears(
+        np.array([HALF_GAP_RAD, 2.0 * HALF_GAP_RAD]), np.full(2, COMPLIANCE_RAD_NM), RATIO
+    )
     passed = twists(link, gears).passed_nm
     back_rad = way_rad[turned] - way_rad[turned:]
     unwound_rad = 10.0 * COMPLIANCE_RAD_NM
@@ -109,12 +128,16 @@ def test_a_motor_that_turns_back_crosses_the_gap_without_its_link() -> None:
 
 @given(dry_nm=st.floats(0.0, 20.0), weight_nm=st.floats(-5.0, 5.0))
 @settings(max_examples=25, deadline=None)
-def test_a_stiff_gear_without_a_gap_passes_what_a_rigid_one_does_in_motion(dry_nm: float, weight_nm: float) -> None:
+def test_a_stiff_gear_without_a_gap_passes_what_a_rigid_one_does_in_motion(
+    dry_nm: float, weight_nm: float
+) -> None:
     link = replace(_back_and_forth(weight_nm), dry_nm=np.full(2400, dry_nm))
     stiff = Gears(np.zeros(1), np.array([1e-7]), 1.0)
     found = twists(link, stiff)
     is_fast = np.abs(link.speed_rad_s) > 0.3
-    assert found.passed_nm[0][is_fast] == pytest.approx(link.pushed_nm[is_fast], abs=0.05 * (1.0 + dry_nm))
+    assert found.passed_nm[0][is_fast] == pytest.approx(
+        link.pushed_nm[is_fast], abs=0.05 * (1.0 + dry_nm)
+    )
     assert np.abs(found.twist_rad).max() < 1e-5
 
 
@@ -124,8 +147,12 @@ def run(small: Evidence) -> Signals:
 
 
 @pytest.mark.parametrize("size_rad", [1e-4, 2e-3])
-def test_a_twist_changes_the_torque_as_the_model_of_the_twisted_arm_says(run: Signals, size_rad: float) -> None:
-    """D(δ) − M δ̈ is the torque of links and payload at q − δ, less that at q; the mass matrix is exact here."""
+def test_a_twist_changes_the_torque_as_the_model_of_the_twisted_arm_says(
+    run: Signals, size_rad: float
+) -> None:
+    """D(δ) − M δ̈ is the torque of links and payload at q − δ, less that at q;
+    the mass matrix is exact here.
+    """
     assert run.arm is not None
     time_s = np.arange(len(run.time_s)) / run.rate_hz
     twist = size_rad * np.sin(2.0 * np.pi * 0.9 * time_s + 0.4)
@@ -169,7 +196,9 @@ def test_without_friction_a_held_link_is_one_that_is_not(run: Signals) -> None:
     moves_with_motor = Backlash(0.0, HALF_GAP_RAD, COMPLIANCE_RAD_NM, RATIO)
     held = moves_with_motor.with_settings({"held": 1})
     other = AXIS + 1
-    assert held.columns(free, AXIS)[other] == pytest.approx(moves_with_motor.columns(free, AXIS)[other], abs=1e-6)
+    assert held.columns(free, AXIS)[other] == pytest.approx(
+        moves_with_motor.columns(free, AXIS)[other], abs=1e-6
+    )
     assert not np.any(link_of(free, AXIS, held=True).dry_nm)
 
 
@@ -179,7 +208,10 @@ def test_a_rotor_in_the_load_does_not_move_behind_the_gear(run: Signals) -> None
     known = [0.0] * len(run.current_a)
     known[AXIS] = inertia_kg_m2
     beside = replace(run, rotor_inertia_kg_m2=tuple(known))
-    for effect in (Backlash(0.0, HALF_GAP_RAD, COMPLIANCE_RAD_NM, RATIO, 1), Elasticity(COMPLIANCE_RAD_NM, RATIO, 1)):
+    for effect in (
+        Backlash(0.0, HALF_GAP_RAD, COMPLIANCE_RAD_NM, RATIO, 1),
+        Elasticity(COMPLIANCE_RAD_NM, RATIO, 1),
+    ):
         with_rotor = effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
         assert with_rotor.columns(run, AXIS) == pytest.approx(effect.columns(beside, AXIS))
         assert not np.allclose(with_rotor.columns(run, AXIS), effect.columns(run, AXIS))

@@ -41,7 +41,11 @@ def test_an_inertia_that_is_none_counts_as_a_small_one_and_a_real_one_as_it_is()
     negative[300] = -0.1
     smallest = inertia.copy()
     smallest[300] = LEAST_SHARE * float(np.mean(negative))
-    assert_allclose(twists(_link(negative), GEARS).passed_nm, twists(_link(smallest), GEARS).passed_nm, rtol=1e-6)
+    assert_allclose(
+        twists(_link(negative), GEARS).passed_nm,
+        twists(_link(smallest), GEARS).passed_nm,
+        rtol=1e-6,
+    )
     heavier = twists(_link(2.0 * inertia), GEARS).twist_rad
     assert np.isfinite(heavier).all()
     assert np.abs(heavier - twists(_link(inertia), GEARS).twist_rad).max() > 0.0

@@ -1,4 +1,6 @@
-"""The whitened equations of the motors' currents, against their definition and against finite differences."""
+"""The whitened equations of the motors' currents,
+against their definition and against finite differences.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ident.arrays import FloatArray
-from ident.equations.currents import ROWS_FOR_TRIANGLE, Currents, PreloadedCurrents, whitening_transform
+from ident.equations.currents import (
+    ROWS_FOR_TRIANGLE,
+    Currents,
+    PreloadedCurrents,
+    whitening_transform,
+)
 from ident.equations.triangles import Triangles
 
 GAINS = np.array([12.0, -5.0, 3.0])
@@ -17,7 +24,9 @@ ROWS = 60
 
 
 class Recording:
-    """Currents of three motors, each with an equation of its own: g_i v_i = (W χ + k)_i + g_i e_i."""
+    """Currents of three motors, each with an equation of its own:
+    g_i v_i = (W χ + k)_i + g_i e_i.
+    """
 
     def __init__(self, rows: int = ROWS, noise: FloatArray = NOISE) -> None:
         rng = np.random.default_rng(4)
@@ -43,7 +52,9 @@ def recording() -> Recording:
     return Recording()
 
 
-def test_the_residual_is_the_torque_of_the_currents_less_that_of_the_model(recording: Recording) -> None:
+def test_the_residual_is_the_torque_of_the_currents_less_that_of_the_model(
+    recording: Recording,
+) -> None:
     residual = recording.currents().residual(GAINS, PARAMETERS)
     expected = GAINS[:, None] * recording.current - recording.torque
     assert_allclose(residual, expected.ravel(), atol=1e-12)
@@ -64,7 +75,9 @@ def test_whitened_rows_have_the_noise_of_one(recording: Recording) -> None:
     assert_allclose(residual.std(axis=1), 1.0, atol=0.045)
 
 
-def test_the_noise_of_each_current_is_found_with_its_degrees_of_freedom(recording: Recording) -> None:
+def test_the_noise_of_each_current_is_found_with_its_degrees_of_freedom(
+    recording: Recording,
+) -> None:
     currents = recording.currents()
     errors = recording.current - recording.torque / GAINS[:, None]
     expected = np.linalg.norm(errors, axis=1) / np.sqrt(ROWS - 5 / 3)
@@ -161,7 +174,9 @@ def test_preload_of_any_size_leaves_no_trace(
     assert_allclose(np.trace(projection, axis1=1, axis2=2), 2.0)
 
 
-def test_corrected_currents_give_the_slope_of_the_cost_with_preload(preloaded: PreloadedCurrents) -> None:
+def test_corrected_currents_give_the_slope_of_the_cost_with_preload(
+    preloaded: PreloadedCurrents,
+) -> None:
     whitened = preloaded.whitened(GAINS, NOISE)
     residual = whitened.residual(GAINS, PARAMETERS)
     gradient = preloaded.corrected(GAINS, NOISE, whitened, residual).T @ residual
@@ -171,7 +186,9 @@ def test_corrected_currents_give_the_slope_of_the_cost_with_preload(preloaded: P
         more = preloaded.cost(GAINS + step, PARAMETERS, NOISE)
         less = preloaded.cost(GAINS - step, PARAMETERS, NOISE)
         expected = (more - less) / (2.0 * step[motor])
-        assert gradient[motor] == pytest.approx(expected, rel=1e-5, abs=1e-4 * np.abs(gradient).max())
+        assert gradient[motor] == pytest.approx(
+            expected, rel=1e-5, abs=1e-4 * np.abs(gradient).max()
+        )
 
 
 def test_the_cost_with_preload_is_half_the_squares(preloaded: PreloadedCurrents) -> None:
@@ -192,5 +209,6 @@ def test_the_noise_beside_a_preload_is_found_from_what_is_visible_of_it() -> Non
         of_motors.append(np.column_stack((drive, many.linear[motor], many.known[motor])))
     currents = PreloadedCurrents.of_rows(of_motors, directions)
     noise = currents.noise(GAINS, PARAMETERS)
-    # A third of the noise is hidden by the preload; of 6000 rows some 4000 are seen: four standard errors.
+    # A third of the noise is hidden by the preload; of 6000 rows some 4000 are seen: four standard
+    # errors.
     assert_allclose(noise, NOISE, rtol=0.07)

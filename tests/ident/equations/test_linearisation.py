@@ -22,12 +22,20 @@ from ident.estimators.estimate import Identification
 from tests.ident.recordings import Truth
 
 
-def test_jacobian_is_the_slope_of_the_residual(clean_found: Identification, clean_runs: tuple[Run, ...]) -> None:
+def test_jacobian_is_the_slope_of_the_residual(
+    clean_found: Identification, clean_runs: tuple[Run, ...]
+) -> None:
     start = gather(clean_found, clean_runs)
-    gains, parameters, noise = start.estimate.gains, start.estimate.parameters, np.full(6, 0.1)
+    gains = start.estimate.gains
+    parameters = start.estimate.parameters
+    noise = np.full(6, 0.1)
 
-    def problem(step: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        return linearise(start.training, gains + step[:6], parameters + step[6:], noise, gains_fixed=False).residual
+    def problem(
+        step: np.ndarray[tuple[int], np.dtype[np.float64]],
+    ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        return linearise(
+            start.training, gains + step[:6], parameters + step[6:], noise, gains_fixed=False
+        ).residual
 
     around = linearise(start.training, gains, parameters, noise, gains_fixed=False)
     rng = np.random.default_rng(0)
@@ -36,18 +44,23 @@ def test_jacobian_is_the_slope_of_the_residual(clean_found: Identification, clea
         step = np.zeros(6 + len(parameters))
         step[around.free] = scaled * around.scale
         slope = (problem(step) - problem(-step)) / 2.0
-        assert_allclose(-slope, around.jacobian @ scaled, rtol=0.0, atol=1e-4 * np.max(np.abs(slope)))
+        assert_allclose(
+            -slope, around.jacobian @ scaled, rtol=0.0, atol=1e-4 * np.max(np.abs(slope))
+        )
 
 
 def test_a_jacobian_in_parts_is_the_whole_one() -> None:
     """Products, some of its columns, and all of them; each motor holds unknowns of its own."""
     rng = np.random.default_rng(7)
     seen = (np.array([0, 2, 3, 4]), np.array([1, 4]), np.array([], dtype=np.int64))
-    parts = tuple(rng.normal(size=(len(held), rows)) for held, rows in zip(seen, (6, 9, 3), strict=True))
+    parts = tuple(
+        rng.normal(size=(len(held), rows)) for held, rows in zip(seen, (6, 9, 3), strict=True)
+    )
     jacobian = Jacobian(parts, seen, 5)
     whole = np.zeros((18, 5))
     whole[:6, seen[0]], whole[6:15, seen[1]] = parts[0].T, parts[1].T
-    step, columns = rng.normal(size=5), rng.normal(size=(18, 2))
+    step = rng.normal(size=5)
+    columns = rng.normal(size=(18, 2))
     assert jacobian @ step == pytest.approx(whole @ step)
     assert jacobian.on_columns(columns) == pytest.approx(whole.T @ columns)
     assert jacobian.on_columns(columns[:, 0]) == pytest.approx(whole.T @ columns[:, 0])
@@ -61,15 +74,20 @@ def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:
     rng = np.random.default_rng(3)
     jacobian = rng.normal(size=(10, 12, 4)) * np.array([1e-3, 1.0, 30.0, 1e3])
     residual = rng.normal(size=(10, 12))
-    rows, whole = jacobian.reshape(-1, 4), residual.ravel()
+    rows = jacobian.reshape(-1, 4)
+    whole = residual.ravel()
     estimate = np.linalg.lstsq(rows, whole, rcond=None)[0]
     around = residual - jacobian @ estimate
     grams = np.einsum("mri,mrj->mij", jacobian, jacobian)
     shifts = left_out_shifts(grams, np.einsum("mri,mr->mi", jacobian, around))
     for cluster, shift in enumerate(shifts):
         kept = np.arange(10) != cluster
-        without = np.linalg.lstsq(jacobian[kept].reshape(-1, 4), residual[kept].ravel(), rcond=None)[0]
-        assert shift == pytest.approx(without - estimate, rel=1e-6, abs=1e-9 * np.abs(estimate).max())
+        without = np.linalg.lstsq(
+            jacobian[kept].reshape(-1, 4), residual[kept].ravel(), rcond=None
+        )[0]
+        assert shift == pytest.approx(
+            without - estimate, rel=1e-6, abs=1e-9 * np.abs(estimate).max()
+        )
 
 
 def test_a_direction_that_one_cluster_alone_has_seen_stays() -> None:
@@ -80,7 +98,9 @@ def test_a_direction_that_one_cluster_alone_has_seen_stays() -> None:
 
 def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
     rng = np.random.default_rng(5)
-    rows, parameters, noise = rng.normal(size=(40, 7)), rng.normal(size=5), rng.uniform(0.1, 1.0, 6)
+    rows = rng.normal(size=(40, 7))
+    parameters = rng.normal(size=5)
+    noise = rng.uniform(0.1, 1.0, 6)
     products = []
     for part in (rows, np.asarray(np.linalg.qr(rows, mode="r"))):
         jacobian, residual = motor_jacobian(part, 2, truth.gains, parameters, noise)
@@ -91,25 +111,37 @@ def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
 FloatArray = NDArray[np.float64]
 
 
-def _slow_line(rng: np.random.Generator, correlation_rows: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Six slow columns fitted to noise alone: the estimate, and G and s of 120 clusters of 50 rows."""
+def _slow_line(
+    rng: np.random.Generator, correlation_rows: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Six slow columns fitted to noise alone:
+    the estimate, and G and s of 120 clusters of 50 rows.
+    """
     rows = np.arange(6000)
-    turns, phase = rng.uniform(1e-3, 2.5e-2, 5), rng.uniform(0.0, 6.0, 5)
+    turns = rng.uniform(1e-3, 2.5e-2, 5)
+    phase = rng.uniform(0.0, 6.0, 5)
     jacobian = np.column_stack((np.ones(len(rows)), np.sin(np.outer(rows, turns) + phase)))
     keep = np.exp(-1.0 / correlation_rows) if correlation_rows else 0.0
-    noise = signal.lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(len(rows) + 1000))[1000:]
+    noise = signal.lfilter(
+        [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(len(rows) + 1000)
+    )[1000:]
     estimate = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
-    parts, left = jacobian.reshape(-1, 50, 6), (noise - jacobian @ estimate).reshape(-1, 50)
+    parts = jacobian.reshape(-1, 50, 6)
+    left = (noise - jacobian @ estimate).reshape(-1, 50)
     return estimate, np.einsum("mri,mrj->mij", parts, parts), np.einsum("mri,mr->mi", parts, left)
 
 
 def _std(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    shifts, blocks = left_out_shifts(grams, scores), len(grams)
-    return np.asarray(np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0)))
+    shifts = left_out_shifts(grams, scores)
+    blocks = len(grams)
+    return np.asarray(
+        np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    )
 
 
 def test_clusters_with_independent_noise_stay_as_they_are() -> None:
-    runs, kept = np.repeat([0, 1, 2], 40), 0
+    runs = np.repeat([0, 1, 2], 40)
+    kept = 0
     for seed in range(20):
         _, grams, scores = _slow_line(np.random.default_rng(seed), 0.0)
         kept += len(independent_blocks(grams, scores, runs)) == len(grams)
@@ -117,15 +149,21 @@ def test_clusters_with_independent_noise_stay_as_they_are() -> None:
 
 
 def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -> None:
-    """A misfit that outlives three clusters: plain clusters claim half of the scatter, blocks nearly all of it."""
-    runs, plain, joined = np.repeat([0, 1], 60), [], []
+    """A misfit that outlives three clusters:
+    plain clusters claim half of the scatter, blocks nearly all of it.
+    """
+    runs = np.repeat([0, 1], 60)
+    plain = []
+    joined = []
     for seed in range(60):
         estimate, grams, scores = _slow_line(np.random.default_rng(seed), 150.0)
         starts = independent_blocks(grams, scores, runs)
         assert len(starts) >= MIN_MOVES_TO_LEAVE_OUT
         assert {0, 60} <= set(starts)
         plain.append(estimate / _std(grams, scores))
-        joined.append(estimate / _std(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts)))
+        joined.append(
+            estimate / _std(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
+        )
     assert np.sqrt(np.mean(np.square(plain))) > 1.6
     assert np.sqrt(np.mean(np.square(joined))) < 1.3
 

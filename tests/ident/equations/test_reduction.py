@@ -46,7 +46,9 @@ def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> 
 
 @pytest.fixture(scope="module")
 def small_estimate(small_truth: Truth, small_runs: tuple[Run, ...]) -> Estimate:
-    """Estimate from a run of the three-axis arm without load and one with it, in pieces of the usual length."""
+    """Estimate from a run of the three-axis arm without load and one with it,
+    in pieces of the usual length.
+    """
     return ml(regrouped(reduce_runs(small_truth.model, small_runs[:2], SMALL)))
 
 
@@ -83,15 +85,21 @@ def test_runs_are_read_one_after_the_other(small_truth: Truth, small_runs: tuple
     assert found.runs == tuple(run.name for run in small_runs)
 
 
-def test_rows_kept_by_a_fit_are_those_built_of_its_runs(small_truth: Truth, small_runs: tuple[Run, ...]) -> None:
-    given, unseen = small_runs[:2], small_runs[2:3]
+def test_rows_kept_by_a_fit_are_those_built_of_its_runs(
+    small_truth: Truth, small_runs: tuple[Run, ...]
+) -> None:
+    given = small_runs[:2]
+    unseen = small_runs[2:3]
     found = identify(small_truth.model, given, SMALL, holdout=unseen, keep_rows=True)
-    kept, built = gather(found), gather(replace(found, gathered=None), given, unseen)
+    kept = gather(found)
+    built = gather(replace(found, gathered=None), given, unseen)
     assert kept.rows_without_effects.runs == tuple(run.name for run in (*given, *unseen))
     for one, other in ((kept.training, built.training), (kept.holdout, built.holdout)):
         assert one is not None
         assert other is not None
-        assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in OBSERVATION_ROWS)
+        assert all(
+            np.array_equal(getattr(one, name), getattr(other, name)) for name in OBSERVATION_ROWS
+        )
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)])
@@ -108,11 +116,15 @@ def test_the_support_leaves_nothing_out(truth: Truth, order: tuple[int, ...]) ->
 
 @given(st.integers(0, 40), st.integers(1, 12), st.integers(0, 2**32 - 1))
 @settings(deadline=None)
-def test_a_triangle_of_pieces_has_the_norms_of_the_whole(rows: int, columns: int, seed: int) -> None:
+def test_a_triangle_of_pieces_has_the_norms_of_the_whole(
+    rows: int, columns: int, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     matrix = rng.normal(size=(rows, columns))
     cut = int(rng.integers(0, rows + 1))
     found = triangle((triangle((matrix[:cut],), columns), matrix[cut:]), columns)
     x = rng.normal(size=columns)
-    assert np.linalg.norm(found @ x) == pytest.approx(np.linalg.norm(matrix @ x), rel=1e-12, abs=1e-12)
+    assert np.linalg.norm(found @ x) == pytest.approx(
+        np.linalg.norm(matrix @ x), rel=1e-12, abs=1e-12
+    )
     assert len(found) <= max(columns, rows)

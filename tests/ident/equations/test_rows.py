@@ -26,7 +26,9 @@ def data(small_truth: Truth, small_runs: tuple[Run, ...]) -> Dataset:
 
 
 def _windows(data: Dataset) -> tuple[FloatArray, list[slice]]:
-    """Weight of each sample of a window, positive and summing to one, and the samples of each row."""
+    """Weight of each sample of a window, positive and summing to one,
+    and the samples of each row.
+    """
     filter_ = decimator(data.rate_hz, SMALL.decimation_cutoff_hz)
     size = np.abs(filter_.taps)
     starts = filter_.factor * np.arange(filter_.rows(len(data.time_s)))
@@ -38,7 +40,9 @@ def _share(weights: FloatArray, windows: list[slice], flags: BoolArray) -> Float
     return np.array([float(weights @ flags[window]) for window in windows])
 
 
-def test_a_row_counts_where_standstill_has_a_small_share_of_its_window(small_truth: Truth, data: Dataset) -> None:
+def test_a_row_counts_where_standstill_has_a_small_share_of_its_window(
+    small_truth: Truth, data: Dataset
+) -> None:
     use, _ = row_masks(small_truth.model, data, SMALL)
     weights, windows = _windows(data)
     for axis in range(3):
@@ -51,7 +55,9 @@ def test_a_row_counts_where_standstill_has_a_small_share_of_its_window(small_tru
         assert np.array_equal(use[axis], expected)
 
 
-def test_one_invalid_sample_takes_every_row_whose_window_has_it(small_truth: Truth, data: Dataset) -> None:
+def test_one_invalid_sample_takes_every_row_whose_window_has_it(
+    small_truth: Truth, data: Dataset
+) -> None:
     usable, _ = row_masks(small_truth.model, data, SMALL)
     weights, windows = _windows(data)
     sample = windows[int(np.flatnonzero(usable[1])[5])].start + len(weights) // 2
@@ -67,7 +73,9 @@ def test_one_invalid_sample_takes_every_row_whose_window_has_it(small_truth: Tru
     assert not motor_use[1][seen].any()
 
 
-def test_a_motor_at_rest_has_no_row_while_its_joint_moves(small_truth: Truth, data: Dataset) -> None:
+def test_a_motor_at_rest_has_no_row_while_its_joint_moves(
+    small_truth: Truth, data: Dataset
+) -> None:
     motor_moving = data.motor_moving.copy()
     motor_moving[:, 2] = False
     use, motor_use = row_masks(small_truth.model, replace(data, motor_moving=motor_moving), SMALL)

@@ -1,4 +1,7 @@
-"""The equations of eq. (17): unknowns that get a value, the condition number, and what is refused."""
+"""The equations of eq.
+
+(17): unknowns that get a value, the condition number, and what is refused.
+"""
 
 from __future__ import annotations
 
@@ -52,10 +55,14 @@ def test_a_system_with_given_unknowns_has_the_residual_of_the_whole_one(
     less = reduced.joints.square_sum(np.concatenate((gains, kept, [1.0])))
     assert_allclose(less, whole, rtol=1e-8)
     of_motors = reduced.currents.cost(gains, kept, np.ones(len(gains)))
-    assert of_motors == pytest.approx(system.currents.cost(gains, parameters, np.ones(len(gains))), rel=1e-9)
+    assert of_motors == pytest.approx(
+        system.currents.cost(gains, parameters, np.ones(len(gains))), rel=1e-9
+    )
 
 
-def test_the_condition_does_not_depend_on_the_unit_of_an_effect(system: System, noisy_found: Identification) -> None:
+def test_the_condition_does_not_depend_on_the_unit_of_an_effect(
+    system: System, noisy_found: Identification
+) -> None:
     estimate = noisy_found.estimate
     solution = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
     name = system.columns[0].name
@@ -73,20 +80,28 @@ def test_the_condition_does_not_depend_on_the_unit_of_an_effect(system: System, 
         scaled_solution = solution.copy()
         scaled_solution[first] /= unit
         changed = replace(system, base=base, joints=joints)
-        values.append(changed.weighted_singular_values(scaled_solution, len(solution) - 1, gains=True))
+        values.append(
+            changed.weighted_singular_values(scaled_solution, len(solution) - 1, gains=True)
+        )
     assert_allclose(values[0], values[1], rtol=1e-9)
     assert values[0][0] / values[0][-1] > 10.0
 
 
-def test_singular_values_are_of_the_weighted_unknowns(system: System, noisy_found: Identification) -> None:
+def test_singular_values_are_of_the_weighted_unknowns(
+    system: System, noisy_found: Identification
+) -> None:
     estimate = noisy_found.estimate
     solution = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
     free = len(solution) - 1
     weighted = system.joints.stacked(1.0 / system.joints.residual_std(solution, free))
     with_gains = np.linalg.svd(weighted[:, :-1], compute_uv=False)
     without = np.linalg.svd(weighted[:, system.axis_count : -1], compute_uv=False)
-    assert_allclose(system.weighted_singular_values(solution, free, gains=True), with_gains, rtol=1e-9)
-    assert_allclose(system.weighted_singular_values(solution, free, gains=False), without, rtol=1e-9)
+    assert_allclose(
+        system.weighted_singular_values(solution, free, gains=True), with_gains, rtol=1e-9
+    )
+    assert_allclose(
+        system.weighted_singular_values(solution, free, gains=False), without, rtol=1e-9
+    )
 
 
 def test_as_many_rows_as_unknowns_are_too_few(system: System) -> None:

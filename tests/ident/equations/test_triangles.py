@@ -1,4 +1,6 @@
-"""What is read off triangles: norms, deviations, least squares, against the rows that they stand for."""
+"""What is read off triangles: norms, deviations, least squares,
+against the rows that they stand for.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def triangles(rows: tuple[FloatArray, ...]) -> Triangles:
     return Triangles(factors, np.array(ROWS))
 
 
-def test_the_squares_of_each_axis_are_those_of_its_rows(rows: tuple[FloatArray, ...], triangles: Triangles) -> None:
+def test_the_squares_of_each_axis_are_those_of_its_rows(
+    rows: tuple[FloatArray, ...], triangles: Triangles
+) -> None:
     vector = np.array([1.0, -2.0, 0.5, 3.0])
     expected = [np.sum((own @ vector) ** 2) for own in rows]
     assert_allclose(triangles.square_sum(vector), expected, rtol=1e-12)

@@ -17,10 +17,13 @@ FloatArray = NDArray[np.float64]
 
 
 def _gram_error(triangle: FloatArray, matrix: FloatArray) -> float:
-    """max |(RᵀR − AᵀA)_ij| / (‖a_i‖ ‖a_j‖): relative to the columns, however differently they are scaled."""
+    """max |(RᵀR − AᵀA)_ij| / (‖a_i‖ ‖a_j‖):
+    relative to the columns, however differently they are scaled.
+    """
     norms = np.linalg.norm(matrix, axis=0)
     norms[norms == 0.0] = 1.0
-    unit, found = matrix / norms, triangle / norms
+    unit = matrix / norms
+    found = triangle / norms
     return float(np.max(np.abs(found.T @ found - unit.T @ unit), initial=0.0))
 
 
@@ -35,7 +38,8 @@ def _streamed(matrix: FloatArray, cuts: list[int]) -> FloatArray:
 @st.composite
 def _matrices(draw: st.DrawFn) -> FloatArray:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    rows, count = draw(st.integers(0, 120)), draw(st.integers(1, 30))
+    rows = draw(st.integers(0, 120))
+    count = draw(st.integers(1, 30))
     matrix = rng.normal(size=(rows, count)) * 10.0 ** rng.integers(-6, 7, count)
     for column in draw(st.lists(st.integers(0, count - 1), max_size=3)):
         matrix[:, column] = 0.0
@@ -46,7 +50,9 @@ def _matrices(draw: st.DrawFn) -> FloatArray:
 
 @settings(deadline=None, max_examples=150)
 @given(_matrices(), st.data())
-def test_any_cutting_gives_the_triangle_of_the_whole(matrix: FloatArray, data: st.DataObject) -> None:
+def test_any_cutting_gives_the_triangle_of_the_whole(
+    matrix: FloatArray, data: st.DataObject
+) -> None:
     cuts = data.draw(st.lists(st.integers(0, len(matrix)), max_size=6))
     triangle = _streamed(matrix, cuts)
     count = matrix.shape[1]
@@ -92,7 +98,8 @@ def test_leaves_its_arguments_alone() -> None:
     rng = np.random.default_rng(3)
     columns = rng.normal(size=(4, 10))
     triangle = qr_update(None, columns)
-    kept, kept_triangle = columns.copy(), triangle.copy()
+    kept = columns.copy()
+    kept_triangle = triangle.copy()
     qr_update(triangle, columns)
     assert np.array_equal(columns, kept)
     assert np.array_equal(triangle, kept_triangle)
@@ -111,7 +118,8 @@ def test_no_rows_are_a_zero_triangle() -> None:
 def test_joints_meet_in_one_triangle() -> None:
     rng = np.random.default_rng(4)
     places = ((0, 1, 2, 3, 4), (4, 2), (3,))
-    whole, parts = [], []
+    whole = []
+    parts = []
     for chosen in places:
         rows = np.zeros((30, 5))
         rows[:, chosen] = rng.normal(size=(30, len(chosen)))

@@ -58,22 +58,29 @@ def test_parameters_are_those_of_the_base_grouping(mechanism: Mechanism) -> None
 
 
 def test_five_bar_has_the_base_parameters_of_the_paper_and_pencil() -> None:
-    """A plane needs 3 of each link (Izz, mx, my); one of a closed loop's mx is regrouped; 3 of each drive."""
+    """A plane needs 3 of each link (Izz, mx, my); one of a closed loop's mx is regrouped;
+    3 of each drive.
+    """
     names = _fitted(FIVE_BAR.name).system.base.names
     assert len(names) == 4 * 3 - 1 + 2 * 3
     assert sum(name.startswith(("Izz", "mx", "my")) for name in names) == 11
 
 
 def test_noise_does_not_bend_the_gains_of_a_preloaded_drive() -> None:
-    """Least squares loses a share of every gain to the noise of its own columns; corrected currents do not."""
-    errors, deviations, noises = [], [], []
+    """Least squares loses a share of every gain to the noise of its own columns;
+    corrected currents do not.
+    """
+    errors = []
+    deviations = []
+    noises = []
     for seed in SEEDS:
         made = recorded(PLANAR, seed, seconds=12.0, noise_a=NOISE_A)
         found = identify(made.model, made.runs, made.conditioning).estimate
         errors.append(found.gains / PLANAR.gains - 1.0)
         deviations.append(found.gains_std / np.abs(PLANAR.gains))
         noises.append(found.axis_noise)
-    mean, expected = np.mean(errors, axis=0), np.mean(deviations, axis=0)
+    mean = np.mean(errors, axis=0)
+    expected = np.mean(deviations, axis=0)
     assert np.all(np.abs(mean) < 3.5 * expected / np.sqrt(len(SEEDS)))
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(deviations))) < 1.5
     # White noise behind the decimation: each motor shows the same share of it.
@@ -90,7 +97,8 @@ def test_tls_of_a_redundant_robot_has_residual_weights() -> None:
 def test_what_the_preload_hides_is_taken_out_exactly() -> None:
     rng = np.random.default_rng(1)
     preload, _ = np.linalg.qr(rng.normal(size=(30, 4, 1)))
-    gains, noise = np.array([2.0, -1.5, 1.8, 2.2]), np.array([0.02, 0.05, 0.01, 0.03])
+    gains = np.array([2.0, -1.5, 1.8, 2.2])
+    noise = np.array([0.02, 0.05, 0.01, 0.03])
     transform = whitening_transform(preload, gains, noise)
     assert np.max(np.abs(transform @ preload)) < 1e-10
     # ‖T y‖² is yᵀA (AᵀD²A)⁻¹ Aᵀy, with A the complement of N.
@@ -107,23 +115,27 @@ def test_the_gain_columns_are_derivatives() -> None:
     made = recorded(PLANAR, noise_a=NOISE_A)
     currents = identify(made.model, made.runs, made.conditioning).system.currents
     assert isinstance(currents, PreloadedCurrents)
-    noise, gains = np.array([0.01, 0.02, 0.012, 0.015]), PLANAR.gains * np.array([1.01, 0.98, 1.0, 1.02])
+    noise = np.array([0.01, 0.02, 0.012, 0.015])
+    gains = PLANAR.gains * np.array([1.01, 0.98, 1.0, 1.02])
     parameters = currents.whitened(gains, noise).parameters(gains)
     whitened = currents.whitened(gains, noise)
     residual = whitened.residual(gains, parameters)
     slope = 2.0 * currents.corrected(gains, noise, whitened, residual).T @ residual
     for motor in range(4):
         step = 1e-6 * np.eye(4)[motor]
-        ahead, behind = (2.0 * currents.cost(gains + sign * step, parameters, noise) for sign in (1, -1))
+        ahead, behind = (
+            2.0 * currents.cost(gains + sign * step, parameters, noise) for sign in (1, -1)
+        )
         assert slope[motor] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-3)
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_rows_and_triangles_are_the_same_equations(mechanism: Mechanism) -> None:
-    found, made = _fitted(mechanism.name), _made(mechanism.name)
+    found = _fitted(mechanism.name)
+    made = _made(mechanism.name)
     assert found.gathered is not None
     datasets, rows = found.gathered
-    again = observe(made.model, [differentiate(run, made.model.drive_train, made.conditioning) for run in made.runs],
+    again = observe(made.model, [differentiate(run, made.model.drive_train, made.conditioning) for run in made.runs],  # noqa: E501
                     made.conditioning, found.system)  # fmt: skip
     assert again.regressor == pytest.approx(rows.regressor)
     system = rows.system()
@@ -138,22 +150,35 @@ def test_rows_and_triangles_are_the_same_equations(mechanism: Mechanism) -> None
     seen = problem.whitened(torque, made.model.drive_train.to_motor)
     first = found.system.axis_count
     direct = np.zeros((problem.jacobian.width, len(problem.residual)))
-    for motor, (part, held) in enumerate(zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)):
+    for motor, (part, held) in enumerate(
+        zip(problem.jacobian.parts, problem.jacobian.seen, strict=True)
+    ):
         direct[held, problem.rows_of(motor)] = part
-    assert seen == pytest.approx((direct[first : first + 2] / problem.scale[first : first + 2, None]).T, abs=1e-9)
+    assert seen == pytest.approx(
+        (direct[first : first + 2] / problem.scale[first : first + 2, None]).T, abs=1e-9
+    )
     assert len(datasets) == 2
 
 
 def test_what_preload_hides_of_an_effect_is_in_no_row() -> None:
-    """A torque of one motor alone is seen at all of them: the part that works against the others is not."""
-    found, made = _fitted(PLANAR.name), _made(PLANAR.name)
+    """A torque of one motor alone is seen at all of them:
+    the part that works against the others is not.
+    """
+    found = _fitted(PLANAR.name)
+    made = _made(PLANAR.name)
     assert found.gathered is not None
     data, _ = found.gathered
-    per_unit = [decimate_rows(one, made.conditioning, np.abs(one.velocity_rad_s[:, 1])) for one in data]
+    per_unit = [
+        decimate_rows(one, made.conditioning, np.abs(one.velocity_rad_s[:, 1])) for one in data
+    ]
     alone = np.zeros((4, 1, sum(map(len, per_unit))))
     alone[1, 0] = np.concatenate(per_unit)
     with_effect = [
-        replace(run, current_a=run.current_a + _padded(np.abs(one.velocity_rad_s) * [0, 1, 0, 0] / PLANAR.gains))
+        replace(
+            run,
+            current_a=run.current_a
+            + _padded(np.abs(one.velocity_rad_s) * [0, 1, 0, 0] / PLANAR.gains),
+        )
         for run, one in zip(made.runs, data, strict=True)
     ]
     again = [differentiate(run, made.model.drive_train, made.conditioning) for run in with_effect]

@@ -1,4 +1,6 @@
-"""Estimators side by side: the same answer without noise, and only `ml` keeps it under other filters with noise."""
+"""Estimators side by side: the same answer without noise,
+and only `ml` keeps it under other filters with noise.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.estimators.comparison import CUTOFF_FACTORS, ESTIMATORS, EstimatorComparison, try_estimators
+from ident.estimators.comparison import (
+    CUTOFF_FACTORS,
+    ESTIMATORS,
+    EstimatorComparison,
+    try_estimators,
+)
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
 pytestmark = pytest.mark.slow
@@ -26,19 +33,29 @@ def _of(comparison: EstimatorComparison, estimator: str) -> FloatArray:
     return spread
 
 
-def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(noisy: EstimatorComparison) -> None:
+def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(
+    noisy: EstimatorComparison,
+) -> None:
     assert len(noisy.trials) == len(ESTIMATORS) * len(CUTOFF_FACTORS)
-    assert {trial.position_cutoff_hz for trial in noisy.declared} == {CONDITIONING.position_cutoff_hz}
+    assert {trial.position_cutoff_hz for trial in noisy.declared} == {
+        CONDITIONING.position_cutoff_hz
+    }
     assert [trial.estimator for trial in noisy.declared] == list(ESTIMATORS)
 
 
-def test_gains_of_ml_depend_less_on_the_filters_than_those_of_tls(noisy: EstimatorComparison) -> None:
+def test_gains_of_ml_depend_less_on_the_filters_than_those_of_tls(
+    noisy: EstimatorComparison,
+) -> None:
     assert np.mean(_of(noisy, "ml")) < 0.5 * np.mean(_of(noisy, "tls, rows (paper)"))
     assert np.mean(_of(noisy, "tls, rows (paper)")) < 0.2 * np.mean(_of(noisy, "tls, residuals"))
 
 
 def test_gains_of_tls_depend_on_the_weights_of_the_rows(noisy: EstimatorComparison) -> None:
-    errors = {trial.estimator: trial.gains / GAINS - 1.0 for trial in noisy.declared if trial.gains is not None}
+    errors = {
+        trial.estimator: trial.gains / GAINS - 1.0
+        for trial in noisy.declared
+        if trial.gains is not None
+    }
     assert np.max(np.abs(errors["tls, rows (paper)"])) < 0.01
     assert np.max(np.abs(errors["tls, residuals"])) > 0.05
 

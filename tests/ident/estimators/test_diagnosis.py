@@ -1,4 +1,6 @@
-"""Each mistake of a recording is named, by run or axis, and it alone; none is named in clean recordings."""
+"""Each mistake of a recording is named, by run or axis, and it alone;
+none is named in clean recordings.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,14 @@ from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.data.unsigned_current import unsigned_currents
 from ident.discovery.evidence import gather
-from ident.errors import GAIN_UNSEEN, CurrentReversed, CurrentUnsigned, ModelContradicted, PayloadDiffers, UnitsMistaken
+from ident.errors import (
+    GAIN_UNSEEN,
+    CurrentReversed,
+    CurrentUnsigned,
+    ModelContradicted,
+    PayloadDiffers,
+    UnitsMistaken,
+)
 from ident.estimators.diagnosis import (
     axis_error_diagnoses,
     channel_errors,
@@ -35,7 +44,15 @@ from ident.estimators.refusals import idle_joints, require_plausible, require_un
 from ident.model.model import Column, DriveTrain, Model
 from ident.model.robot import Joint, JointKind, Robot
 from ident.plausible import UNIT_RATIO, WEIGHT_RATIO
-from tests.ident.mistaken import AXES, BODY, SMALL, diagnosed, small_recordings, turned, with_currents
+from tests.ident.mistaken import (
+    AXES,
+    BODY,
+    SMALL,
+    diagnosed,
+    small_recordings,
+    turned,
+    with_currents,
+)
 from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
 
 pytestmark = pytest.mark.slow
@@ -51,7 +68,12 @@ def test_nothing_is_named_in_clean_recordings(small_truth: Truth, seed: int) -> 
     runs = small_recordings(small_truth, seed, count=3, noise_a=(0.02, 0.1, 0.15)[seed % 3])
     limit = np.full(3, 99.0)
     assert diagnosed(small_truth, runs[:2], runs[2:], effort_limit=limit) == ()
-    assert diagnosed(small_truth, runs[1:], runs[:1], fixed=True, method=Method.WLS, effort_limit=limit) == ()
+    assert (
+        diagnosed(
+            small_truth, runs[1:], runs[:1], fixed=True, method=Method.WLS, effort_limit=limit
+        )
+        == ()
+    )
     assert exchanged_channels(small_truth.model, runs[:2], SMALL, AXES) is None
 
 
@@ -75,7 +97,9 @@ def test_a_payload_turned_in_the_held_out_run(small_truth: Truth) -> None:
 
 
 @pytest.mark.parametrize("left_on", [False, True])
-def test_a_payload_left_off_or_on_in_one_run_leaves_no_numbers(small_truth: Truth, left_on: bool) -> None:
+def test_a_payload_left_off_or_on_in_one_run_leaves_no_numbers(
+    small_truth: Truth, left_on: bool
+) -> None:
     run, body = (2, BODY) if left_on else (3, 0.0 * BODY)
     runs = small_recordings(small_truth, 0, count=6, bodies={run: body})
     with pytest.raises(PayloadDiffers, match=rf"run r{run}: .*was it mounted in this run"):
@@ -83,7 +107,9 @@ def test_a_payload_left_off_or_on_in_one_run_leaves_no_numbers(small_truth: Trut
 
 
 def test_the_only_loaded_run_without_its_payload(small_truth: Truth) -> None:
-    """Fixed gains that are off by 10 to 20 % say nothing of a payload; a weight of nearly nothing does."""
+    """Fixed gains that are off by 10 to 20 % say nothing of a payload;
+    a weight of nearly nothing does.
+    """
     runs = small_recordings(small_truth, 0, count=2)
     off = np.array([1.2, 0.85, 1.1])
     assert diagnosed(small_truth, with_currents(runs, off), fixed=True) == ()
@@ -96,7 +122,9 @@ def test_the_difference_is_estimated_as_planted(small_truth: Truth) -> None:
     """Twice the mass, at the same centre."""
     heavier = BODY * np.r_[np.ones(6), np.full(4, 2.0)]
     runs = small_recordings(small_truth, 4, bodies={3: heavier}, noise_a=0.02)
-    known = identify(small_truth.model, runs[:2], SMALL, holdout=runs[3:], fixed_gains=small_truth.gains)
+    known = identify(
+        small_truth.model, runs[:2], SMALL, holdout=runs[3:], fixed_gains=small_truth.gains
+    )
     assert known.holdout is not None
     (found,) = payload_differences(known.holdout, known.estimate.gains, known.estimate.parameters)
     seen = [6, 8, 9]  # my lies along the last axis, which is horizontal
@@ -105,14 +133,22 @@ def test_the_difference_is_estimated_as_planted(small_truth: Truth) -> None:
 
 
 @pytest.mark.parametrize("order", [*map(list, itertools.permutations(range(3)))][1:], ids=str)
-def test_exchanged_currents_are_named(small_truth: Truth, clean: list[Run], order: list[int]) -> None:
+def test_exchanged_currents_are_named(
+    small_truth: Truth, clean: list[Run], order: list[int]
+) -> None:
     found = exchanged_channels(small_truth.model, with_currents(clean[:2], 1.0, order), SMALL, AXES)
     assert found is not None
-    assert found.axes == tuple(name for name, place in zip(AXES, order, strict=True) if AXES[place] != name)
+    assert found.axes == tuple(
+        name for name, place in zip(AXES, order, strict=True) if AXES[place] != name
+    )
 
 
-def test_one_motor_that_explains_another_current_better_is_no_exchange(small_truth: Truth, clean: list[Run]) -> None:
-    """Both equations of a pair must ask for the exchange, not their sum: here only that of J2 does."""
+def test_one_motor_that_explains_another_current_better_is_no_exchange(
+    small_truth: Truth, clean: list[Run]
+) -> None:
+    """Both equations of a pair must ask for the exchange, not their sum:
+    here only that of J2 does.
+    """
     mixed = []
     for run in clean[:2]:
         current = run.current_a.copy()
@@ -129,22 +165,42 @@ def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: li
     assert (found.name, found.axes) == ("current-reversed", ("J2",))
 
 
-@pytest.mark.parametrize("signs", [s for s in itertools.product((1.0, -1.0), repeat=3) if 0 < s.count(-1.0) < 3])
-def test_a_reversed_current_with_fixed_gains(small_truth: Truth, clean: list[Run], signs: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    "signs", [s for s in itertools.product((1.0, -1.0), repeat=3) if 0 < s.count(-1.0) < 3]
+)
+def test_a_reversed_current_with_fixed_gains(
+    small_truth: Truth, clean: list[Run], signs: tuple[float, ...]
+) -> None:
     axes = ("base", "arm", "wrist")  # not the joints' names in the URDF
     names = [axis for axis, sign in zip(axes, signs, strict=True) if sign < 0.0]
     runs = with_currents(clean[:1], np.array(signs))
     with pytest.raises(CurrentReversed, match=f"axis {', '.join(names)}: "):
-        identify(small_truth.model, runs, SMALL, fixed_gains=small_truth.gains, method=Method.WLS, axes=axes)
+        identify(
+            small_truth.model,
+            runs,
+            SMALL,
+            fixed_gains=small_truth.gains,
+            method=Method.WLS,
+            axes=axes,
+        )
 
 
 @pytest.mark.parametrize("fixed", [False, True])
 @pytest.mark.parametrize(("current", "mass"), [(1000.0, 1.0), (1.0, 1000.0)], ids=["mA", "grams"])
-def test_a_unit_is_named(small_truth: Truth, clean: list[Run], current: float, mass: float, fixed: bool) -> None:
+def test_a_unit_is_named(
+    small_truth: Truth, clean: list[Run], current: float, mass: float, fixed: bool
+) -> None:
     heavy = replace(MOUNTED, known={"m": mass * MOUNTED.known["m"]})
-    runs = [replace(run, payload=run.payload and heavy) for run in with_currents(clean[:2], current)]
-    subject = "the weight of the payload" if fixed else "all drive gains"
-    with pytest.raises(UnitsMistaken, match=f"{subject}.*{'mA' if fixed or current > 1.0 else 'g and read as kg'}"):
+    runs = [
+        replace(run, payload=run.payload and heavy) for run in with_currents(clean[:2], current)
+    ]
+    if fixed:
+        subject = "the weight of the payload"
+    else:
+        subject = "all drive gains"
+    with pytest.raises(
+        UnitsMistaken, match=f"{subject}.*{'mA' if fixed or current > 1.0 else 'g and read as kg'}"
+    ):
         diagnosed(small_truth, runs, fixed=fixed)
 
 
@@ -165,7 +221,8 @@ def test_one_gain_off_its_nameplate(small_truth: Truth, clean: list[Run]) -> Non
 
 def test_torques_above_the_limits_of_the_urdf(small_truth: Truth, clean: list[Run]) -> None:
     """Without a payload nothing else speaks of mA."""
-    runs, limit = with_currents(clean[:1], 1000.0), np.array([99.0, np.inf, 99.0])
+    runs = with_currents(clean[:1], 1000.0)
+    limit = np.array([99.0, np.inf, 99.0])
     (found,) = diagnosed(small_truth, runs, fixed=True, effort_limit=limit)
     assert found.name == "torque-above-limit"
     assert diagnosed(small_truth, runs, fixed=True, effort_limit=np.full(3, np.inf)) == ()
@@ -174,29 +231,41 @@ def test_torques_above_the_limits_of_the_urdf(small_truth: Truth, clean: list[Ru
 def test_an_error_on_one_axis(small_truth: Truth, clean: list[Run]) -> None:
     rng = np.random.default_rng(0)
     noise = [rng.standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0]) for run in clean]
-    noisy = [replace(run, current_a=run.current_a + one) for run, one in zip(clean, noise, strict=True)]
+    noisy = [
+        replace(run, current_a=run.current_a + one) for run, one in zip(clean, noise, strict=True)
+    ]
     (found,) = diagnosed(small_truth, noisy[:2], fixed=True)
     assert (found.name, found.runs, found.axes) == ("axis-error", (), ("J3",))
 
 
-def test_an_error_of_a_held_out_run_is_that_runs_alone(small_truth: Truth, clean: list[Run]) -> None:
+def test_an_error_of_a_held_out_run_is_that_runs_alone(
+    small_truth: Truth, clean: list[Run]
+) -> None:
     """The rows of a search for effects name all runs, those of the fit first."""
-    noise = np.random.default_rng(0).standard_normal(clean[2].current_a.shape) * np.array([0.0, 0.0, 1.0])
+    noise = np.random.default_rng(0).standard_normal(clean[2].current_a.shape) * np.array(
+        [0.0, 0.0, 1.0]
+    )
     noisy = replace(clean[2], current_a=clean[2].current_a + noise)
     gains = small_truth.gains
-    found = identify(small_truth.model, clean[:2], SMALL, holdout=[noisy], fixed_gains=gains, keep_rows=True)
+    found = identify(
+        small_truth.model, clean[:2], SMALL, holdout=[noisy], fixed_gains=gains, keep_rows=True
+    )
     for identified in (found, gather(found).identification):
         (one,) = diagnose(identified, AXES, gains)
         assert (one.name, one.runs, one.axes) == ("axis-error", ("r2",), ("J3",))
 
 
 def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
-    size, left = np.array([30.0, 20.0, 0.01]), np.array([1.0, 1.0, 0.09])
+    size = np.array([30.0, 20.0, 0.01])
+    left = np.array([1.0, 1.0, 0.09])
     idle = idle_joints(small_truth.model, size, left)
     (found,) = axis_error_diagnoses(size, left, idle, AXES, ())
     assert (found.name, found.axes) == ("axis-idle", ("J3",))
     estimate = identify(
-        small_truth.model, small_recordings(small_truth, 5, count=1), SMALL, fixed_gains=small_truth.gains
+        small_truth.model,
+        small_recordings(small_truth, 5, count=1),
+        SMALL,
+        fixed_gains=small_truth.gains,
     ).estimate
     error = RelativeError((3.3, 5.0, 900.0), 4.0)
     require_plausible(estimate, error, AXES, idle)
@@ -208,13 +277,23 @@ def test_axes_that_never_move_apart_leave_no_parameters(small_truth: Truth) -> N
     def tied(q: FloatArray) -> FloatArray:
         return np.column_stack((q[:, 0], q[:, 1], 0.5 * q[:, 1] + 1e-6 * q[:, 2]))
 
-    run = record(small_truth, "tied", np.random.default_rng(0), seconds=16.0, noise_a=0.05, rate_hz=200.0, bend=tied)
+    run = record(
+        small_truth,
+        "tied",
+        np.random.default_rng(0),
+        seconds=16.0,
+        noise_a=0.05,
+        rate_hz=200.0,
+        bend=tied,
+    )
     (found,) = diagnosed(small_truth, [run], fixed=True, method=Method.WLS)
     assert found.name == "ill-conditioned"
 
 
 def test_the_unit_of_an_effect_is_no_bad_condition(small_truth: Truth) -> None:
-    """A coefficient in rad/Nm is some 1e-5, and its column some 1e5 times as large as those of masses."""
+    """A coefficient in rad/Nm is some 1e-5, and its column some 1e5 times as large as those of
+    masses.
+    """
     runs = small_recordings(small_truth, 0, count=2)
     found = identify(small_truth.model, runs, SMALL, fixed_gains=small_truth.gains, keep_rows=True)
     assert found.gathered is not None
@@ -222,7 +301,9 @@ def test_the_unit_of_an_effect_is_no_bad_condition(small_truth: Truth) -> None:
     effect = np.zeros((3, 1, rows.current.shape[1]))
     effect[1, 0] = np.random.default_rng(0).standard_normal(rows.current.shape[1])
     conditions = [
-        wls(rows.extended((Column("effect", "1"),), unit * effect).system(), small_truth.gains).condition
+        wls(
+            rows.extended((Column("effect", "1"),), unit * effect).system(), small_truth.gains
+        ).condition
         for unit in (1.0, 1e6)
     ]
     assert conditions == pytest.approx([found.estimate.condition] * 2, rel=0.1)
@@ -241,7 +322,9 @@ def test_another_estimator_far_from_ml(small_truth: Truth, clean: list[Run]) -> 
 def test_the_instruments_need_not_agree_with_ml(small_truth: Truth, clean: list[Run]) -> None:
     """Where a disturbance moves the arm, ml is the one that is off."""
     found = identify(small_truth.model, clean, SMALL)
-    off = replace(found, estimate=replace(found.estimate, method=Method.IV, gains=1.3 * found.estimate.gains))
+    off = replace(
+        found, estimate=replace(found.estimate, method=Method.IV, gains=1.3 * found.estimate.gains)
+    )
     assert "estimators-disagree" not in {one.name for one in diagnose(off, AXES)}
     other = replace(off, estimate=replace(off.estimate, method=Method.TLS))
     apart = [one for one in diagnose(other, AXES) if one.name == "estimators-disagree"]
@@ -256,11 +339,17 @@ def limits_in(text: str) -> tuple[float, float]:
     return float(found[1]), float(found[2])
 
 
-@given(scale=st.floats(0.01, 0.69) | st.floats(0.71, 1.29) | st.floats(1.31, 100.0), sign=st.sampled_from([1.0, -1.0]))
+@given(
+    scale=st.floats(0.01, 0.69) | st.floats(0.71, 1.29) | st.floats(1.31, 100.0),
+    sign=st.sampled_from([1.0, -1.0]),
+)
 def test_the_scale_of_a_current_beside_a_calibration(scale: float, sign: float) -> None:
     predicted = np.random.default_rng(0).standard_normal((2, 200))
     measured = predicted * np.array([[1.0], [sign * scale]])
-    found = {one.name: one for one in scale_diagnoses(measured, predicted, np.ones((2, 200), dtype=bool), "ab", ("r",))}
+    found = {
+        one.name: one
+        for one in scale_diagnoses(measured, predicted, np.ones((2, 200), dtype=bool), "ab", ("r",))
+    }
     assert ("current-reversed" in found) == (sign < 0.0)
     assert ("current-off-scale" in found) == (not 0.7 <= scale <= 1.3)
     if "current-off-scale" in found:
@@ -269,11 +358,15 @@ def test_the_scale_of_a_current_beside_a_calibration(scale: float, sign: float) 
 
 
 def test_noise_makes_no_scale(small_truth: Truth) -> None:
-    """Twenty times the same torque, at 1.3 of the prediction, with noise of a seventh of its size."""
+    """Twenty times the same torque, at 1.3 of the prediction,
+    with noise of a seventh of its size.
+    """
     predicted = np.random.default_rng(0).standard_normal((1, 400))
     for seed in range(1, 21):
         measured = 1.3 * predicted + 0.15 * np.random.default_rng(seed).standard_normal((1, 400))
-        assert not list(scale_diagnoses(measured, predicted, np.ones((1, 400), dtype=bool), "a", ("r",)))
+        assert not list(
+            scale_diagnoses(measured, predicted, np.ones((1, 400), dtype=bool), "a", ("r",))
+        )
 
 
 @given(
@@ -285,7 +378,11 @@ def test_a_gain_is_named_where_the_text_says(ratio: float, std: float, sign: flo
     """Outside the range that the text has, by more than the σ that it has."""
     nameplate = np.array([sign * 20.0])
     estimate = an_estimate(ratio * nameplate, std * np.abs(nameplate))
-    found = [one for one in gain_diagnoses(estimate, nameplate, ("J1",)) if one.name == "gain-off-nameplate"]
+    found = [
+        one
+        for one in gain_diagnoses(estimate, nameplate, ("J1",))
+        if one.name == "gain-off-nameplate"
+    ]
     is_off = ratio + 3.0 * std < 0.7 or ratio - 3.0 * std > 1.3
     assert bool(found) == is_off
     for one in found:
@@ -309,7 +406,11 @@ def test_a_gain_that_the_moves_hardly_show_is_named_where_its_number_is_absurd(
     gain: float, std: float, is_named: bool
 ) -> None:
     estimate = an_estimate(np.array([gain]), np.array([std]))
-    found = [one for one in gain_diagnoses(estimate, np.array([38.0]), ("J1",)) if one.name == GAIN_UNSEEN]
+    found = [
+        one
+        for one in gain_diagnoses(estimate, np.array([38.0]), ("J1",))
+        if one.name == GAIN_UNSEEN
+    ]
     assert bool(found) == is_named
     for one in found:
         assert one.axes == ("J1",)
@@ -342,7 +443,11 @@ def an_estimate(gains: FloatArray, std: FloatArray) -> Estimate:
 
 def test_ranges_in_texts_are_those_that_are_tested(small_truth: Truth, clean: list[Run]) -> None:
     """A factor that a refusal names is the one that it tests."""
-    with pytest.raises(UnitsMistaken, match=rf"0\.7 to 1\.3, and within a factor of {UNIT_RATIO:g} on one axis"):
+    with pytest.raises(
+        UnitsMistaken,
+        match=rf"0\.7 to 1\.3, and within a factor of {UNIT_RATIO:g} "
+        r"on one axis",
+    ):
         require_units(np.full(3, 1.01 * UNIT_RATIO), np.ones(3))
     forgotten = [clean[0], small_recordings(small_truth, 0, count=2, bodies={1: 0.0 * BODY})[1]]
     (found,) = diagnosed(small_truth, forgotten, fixed=True)
@@ -350,7 +455,9 @@ def test_ranges_in_texts_are_those_that_are_tested(small_truth: Truth, clean: li
 
 
 @pytest.mark.parametrize("factor", [0.51, 2.0])
-def test_a_current_in_another_ampere_is_named(small_truth: Truth, clean: list[Run], factor: float) -> None:
+def test_a_current_in_another_ampere_is_named(
+    small_truth: Truth, clean: list[Run], factor: float
+) -> None:
     """A torque constant that is applied twice, or an ampere that is a peak value of two."""
     (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, factor, 1.0])))
     assert (found.name, found.axes) == ("gain-off-nameplate", ("J2",))
@@ -359,13 +466,17 @@ def test_a_current_in_another_ampere_is_named(small_truth: Truth, clean: list[Ru
     assert float(ratio[1]) == pytest.approx(1.0 / factor, rel=0.05)
 
 
-def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(small_truth: Truth) -> None:
+def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(
+    small_truth: Truth,
+) -> None:
     """Without noise, and at 200 Hz, the current of J3 is near zero in two samples of 16 s."""
     runs = small_recordings(small_truth, 3, count=1, noise_a=0.0)
     assert unsigned_channels(small_truth.model, runs, SMALL, AXES) is None
     size = np.abs(runs[0].current_a[:, 2])
     sized = [replace(runs[0], current_a=np.column_stack((runs[0].current_a[:, :2], size)))]
-    assert not any(unsigned_currents(run, small_truth.model.drive_train.ratio).any() for run in sized)
+    assert not any(
+        unsigned_currents(run, small_truth.model.drive_train.ratio).any() for run in sized
+    )
     found = unsigned_channels(small_truth.model, sized, SMALL, AXES)
     assert found is not None
     assert found.axes == ("J3",)
@@ -375,9 +486,11 @@ def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(sma
 
 
 def _pendulum_run() -> Run:
-    """An arm that hangs, is lifted and let down again, with hardly any friction: its current has one sign, almost.
+    """An arm that hangs, is lifted and let down again, with hardly any friction:
+    its current has one sign, almost.
 
-    From rest at zero torque the current rises as a line, as the size of a current does where it turns.
+    From rest at zero torque the current rises as a line, as the size of a current does where it
+    turns.
     """
     rate_hz = 500.0
     ramp = np.clip(np.arange(0.0, 0.6, 1.0 / rate_hz) / 0.6, 0.0, 1.0)
@@ -414,7 +527,9 @@ def test_a_size_is_refused_whatever_its_load(small_truth: Truth) -> None:
 
 
 @pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS, Method.ML])
-def test_a_recording_is_judged_alike_whatever_the_method(small_truth: Truth, clean: list[Run], method: Method) -> None:
+def test_a_recording_is_judged_alike_whatever_the_method(
+    small_truth: Truth, clean: list[Run], method: Method
+) -> None:
     """The estimator is named for what it makes of the noise, the recording for its mistake."""
     found = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])), method=method)
     by_ml = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])))

@@ -33,7 +33,9 @@ def _noise(rng: np.random.Generator, correlation_s: float) -> FloatArray:
 
 @pytest.mark.parametrize("correlation_s", [1e-6, 0.1, 0.5])
 def test_an_estimate_with_white_rows_has_its_own_deviation(correlation_s: float) -> None:
-    slow_columns = np.stack([np.sin(0.7 * TIME_S), np.cos(0.7 * TIME_S), np.sin(2.0 * TIME_S)], axis=1)
+    slow_columns = np.stack(
+        [np.sin(0.7 * TIME_S), np.cos(0.7 * TIME_S), np.sin(2.0 * TIME_S)], axis=1
+    )
     jacobian = np.concatenate((slow_columns, slow_columns))
     rng = np.random.default_rng(3)
     scaled: list[FloatArray] = []

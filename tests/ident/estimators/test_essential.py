@@ -48,7 +48,8 @@ def test_the_spread_of_what_stays_is_below_the_ratio(
 
 def test_each_step_takes_the_worst_of_a_new_estimate(system: System) -> None:
     found = essential(system, wls, 20.0)
-    current, names = system, [column.name for column in system.columns]
+    current = system
+    names = [column.name for column in system.columns]
     for step in found.removed[:5]:
         estimate = wls(current)
         relative = relative_std_percent(estimate.parameters, estimate.parameters_std)[: len(names)]
@@ -61,11 +62,13 @@ def test_each_step_takes_the_worst_of_a_new_estimate(system: System) -> None:
 
 
 def test_gains_hardly_change_and_the_error_hardly_grows(system: System) -> None:
-    whole, found = ml(system), essential(system, ml, 30.0)
+    whole = ml(system)
+    found = essential(system, ml, 30.0)
     assert len(found.removed) > 10
     assert found.estimate.gains == pytest.approx(whole.gains, rel=0.02)
     assert found.estimate.gains == pytest.approx(GAINS, rel=0.03)
-    before, after = whole.relative_error(system).total, found.estimate.relative_error(found.system).total
+    before = whole.relative_error(system).total
+    after = found.estimate.relative_error(found.system).total
     assert before <= after < 1.05 * before
 
 
@@ -76,22 +79,33 @@ def test_the_whole_estimate_holds_zeros_and_predicts_the_same(system: System) ->
         found.whole.unknowns, found.whole.parameters, found.whole.parameters_std, strict=True
     ):
         assert (value == 0.0 and std == 0.0) == (column.name in removed)
-    assert found.whole.relative_error(system).axes == pytest.approx(found.estimate.relative_error(found.system).axes)
+    assert found.whole.relative_error(system).axes == pytest.approx(
+        found.estimate.relative_error(found.system).axes
+    )
 
 
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=8, unique=True), st.integers(0, 2**32 - 1))
 @settings(max_examples=15, deadline=None)
-def test_parameters_held_where_they_were_found_change_nothing(system: System, held: list[int], seed: int) -> None:
+def test_parameters_held_where_they_were_found_change_nothing(
+    system: System, held: list[int], seed: int
+) -> None:
     """W χ with some of χ given is the same torque, at joints, motors and moves alike."""
     rng = np.random.default_rng(seed)
-    values, gains = rng.normal(size=len(system.unknowns)), rng.normal(size=6)
+    values = rng.normal(size=len(system.unknowns))
+    gains = rng.normal(size=6)
     rest = system.holding({index: float(values[index]) for index in held})
     left = np.delete(values, held)
-    assert [c.name for c in rest.unknowns] == [c.name for i, c in enumerate(system.unknowns) if i not in held]
+    assert [c.name for c in rest.unknowns] == [
+        c.name for i, c in enumerate(system.unknowns) if i not in held
+    ]
     one = system.joints.square_sum(np.concatenate((gains, values, [1.0])))
-    assert rest.joints.square_sum(np.concatenate((gains, left, [1.0]))) == pytest.approx(one, rel=1e-8)
+    assert rest.joints.square_sum(np.concatenate((gains, left, [1.0]))) == pytest.approx(
+        one, rel=1e-8
+    )
     one = system.motors.square_sum(np.concatenate(([1.0], values, [1.0])))
-    assert rest.motors.square_sum(np.concatenate(([1.0], left, [1.0]))) == pytest.approx(one, rel=1e-8)
+    assert rest.motors.square_sum(np.concatenate(([1.0], left, [1.0]))) == pytest.approx(
+        one, rel=1e-8
+    )
     for before, after in zip(system.clusters[:3], rest.clusters[:3], strict=True):
         for rows, others in zip(before, after, strict=True):
             assert others @ np.concatenate(([1.0], left, [1.0])) == pytest.approx(
@@ -105,4 +119,8 @@ def test_a_ratio_that_leaves_nothing_is_refused(system: System) -> None:
 
 
 def test_a_parameter_of_zero_is_infinitely_uncertain() -> None:
-    assert relative_std_percent(np.array([0.0, 2.0, -2.0]), np.array([1.0, 1.0, 1.0])).tolist() == [np.inf, 50.0, 50.0]
+    assert relative_std_percent(np.array([0.0, 2.0, -2.0]), np.array([1.0, 1.0, 1.0])).tolist() == [
+        np.inf,
+        50.0,
+        50.0,
+    ]

@@ -28,7 +28,9 @@ def _fit(truth: Truth, runs: tuple[Run, ...]) -> Estimate:
 
 
 @pytest.mark.parametrize("method", Method)
-def test_without_noise_every_method_finds_every_gain(truth: Truth, clean_runs: tuple[Run, ...], method: Method) -> None:
+def test_without_noise_every_method_finds_every_gain(
+    truth: Truth, clean_runs: tuple[Run, ...], method: Method
+) -> None:
     estimate = identify(truth.model, clean_runs, CONDITIONING, method=method).estimate
     assert estimate.gains == pytest.approx(GAINS, rel=2e-4)
     names = [column.name for column in estimate.unknowns]
@@ -37,7 +39,9 @@ def test_without_noise_every_method_finds_every_gain(truth: Truth, clean_runs: t
         assert found == pytest.approx(PAYLOAD_TRUTH[name], rel=5e-3, abs=1e-3)
 
 
-def test_fixed_gains_give_the_classical_identification(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+def test_fixed_gains_give_the_classical_identification(
+    truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
     system = identify(truth.model, clean_runs[:1], CONDITIONING, fixed_gains=GAINS).system
     expected = system.base.grouping @ truth.parameters
     for method in (Method.LS, Method.WLS, Method.ML):
@@ -48,7 +52,10 @@ def test_fixed_gains_give_the_classical_identification(truth: Truth, clean_runs:
 
 def test_ml_and_the_papers_tls_beat_wls(noisy_found: Identification) -> None:
     methods = (Method.LS, Method.WLS, Method.TLS, Method.ML)
-    errors = {m: float(np.mean(np.abs(estimate_with(m, noisy_found.system).gains / GAINS - 1.0))) for m in methods}
+    errors = {
+        m: float(np.mean(np.abs(estimate_with(m, noisy_found.system).gains / GAINS - 1.0)))
+        for m in methods
+    }
     assert errors[Method.ML] < 0.012
     assert errors[Method.TLS] < 0.012
     assert errors[Method.WLS] > 0.1
@@ -78,7 +85,8 @@ def test_a_change_of_current_unit_scales_exactly_that_gain(
 def test_the_order_of_runs_does_not_matter(
     truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification
 ) -> None:
-    before, after = noisy_found.estimate, _fit(truth, noisy_runs[::-1])
+    before = noisy_found.estimate
+    after = _fit(truth, noisy_runs[::-1])
     assert after.gains == pytest.approx(before.gains, rel=1e-9)
     assert after.gains_std == pytest.approx(before.gains_std, rel=1e-6)
 
@@ -103,7 +111,8 @@ def test_the_covariance_covers_the_error(noisy_found: Identification) -> None:
 
 def test_ml_solves_the_instrumental_variable_equations(noisy_found: Identification) -> None:
     """Its instruments are the columns of W and the predicted currents (decision 0010)."""
-    system, estimate = noisy_found.system, noisy_found.estimate
+    system = noisy_found.system
+    estimate = noisy_found.estimate
     gamma = 1.0 / estimate.gains
     columns = np.zeros(len(estimate.parameters))
     size = np.zeros_like(columns)
@@ -121,7 +130,9 @@ def test_tls_scalings_agree_without_noise(clean_found: Identification, scaling: 
     assert tls(clean_found.system, scaling).gains == pytest.approx(GAINS, rel=2e-4)
 
 
-def test_without_a_known_payload_there_is_no_scale(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+def test_without_a_known_payload_there_is_no_scale(
+    truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
     with pytest.raises(PayloadMissing, match="payload of known mass"):
         _fit(truth, clean_runs[:1])
     system = identify(truth.model, clean_runs[:1], CONDITIONING, fixed_gains=GAINS).system
@@ -158,14 +169,21 @@ def test_more_runs_of_one_mounting_share_its_unknowns(noisy_found: Identificatio
     assert noisy_found.estimate.rows == int(system.motors.rows.sum())
 
 
-def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(clean_found: Identification) -> None:
-    """Joint 6 rests while joint 5 moves: no row of the coupled motors is free of an undetermined dry friction."""
+def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(
+    clean_found: Identification,
+) -> None:
+    """Joint 6 rests while joint 5 moves: no row of the coupled motors is free of an undetermined
+    dry friction.
+    """
     system = clean_found.system
     apart = replace(
         system,
         motors=replace(
             system.motors,
-            factors=tuple(f if m < 4 else np.zeros((0, f.shape[1])) for m, f in enumerate(system.motors.factors)),
+            factors=tuple(
+                f if m < 4 else np.zeros((0, f.shape[1]))
+                for m, f in enumerate(system.motors.factors)
+            ),
             rows=np.where(np.arange(6) < 4, system.motors.rows, 0),
         ),
     )

@@ -1,4 +1,6 @@
-"""Friction that is another one with a payload: it does not become gain, and a calibration predicts with both."""
+"""Friction that is another one with a payload:
+it does not become gain, and a calibration predicts with both.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,14 @@ from ident.model.model import Model
 from ident.model.robot import Motion
 from ident.prediction import fitted_model, predict_torque, standard_parameters
 from ident.weighing import weigh
-from tests.ident.recordings import MOUNTED, PAYLOAD_TRUTH, Truth, record, three_axes_truth, tx40_truth
+from tests.ident.recordings import (
+    MOUNTED,
+    PAYLOAD_TRUTH,
+    Truth,
+    record,
+    three_axes_truth,
+    tx40_truth,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -44,10 +53,14 @@ def truth() -> Truth:
 def runs(truth: Truth) -> tuple[Run, ...]:
     """Two runs without load, then two with it, when the arm is warm."""
     rng = np.random.default_rng(7)
-    bare = [record(truth, f"bare{number}", rng, noise_a=NOISE_A, rate_hz=500.0, averaged=2) for number in range(2)]
+    bare = [
+        record(truth, f"bare{number}", rng, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
+        for number in range(2)
+    ]
     warm = _warmer(truth)
     loaded = [
-        record(warm, f"loaded{number}", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0, averaged=2) for number in range(2)
+        record(warm, f"loaded{number}", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
+        for number in range(2)
     ]
     return (*bare, *loaded)
 
@@ -75,13 +88,18 @@ def test_friction_that_falls_before_the_payload_is_mounted_does_not_become_gain(
     assert worst > 5.0 * np.max(np.abs(found.estimate.gains / truth.gains - 1.0))
 
 
-def test_what_the_payload_adds_to_friction_is_that_of_the_truth(truth: Truth, found: Identification) -> None:
+def test_what_the_payload_adds_to_friction_is_that_of_the_truth(
+    truth: Truth, found: Identification
+) -> None:
     names = [column.name for column in found.estimate.unknowns]
     for place in truth.model.friction_columns:
         name = f"{truth.model.columns[place].name}_loaded"
         index = names.index(name)
         added = (WARMER - 1.0) * truth.parameters[place]
-        assert abs(found.estimate.parameters[index] - added) < 4.0 * found.estimate.parameters_std[index]
+        assert (
+            abs(found.estimate.parameters[index] - added)
+            < 4.0 * found.estimate.parameters_std[index]
+        )
 
 
 def test_it_costs_little_where_friction_stays(truth: Truth) -> None:
@@ -102,9 +120,14 @@ def test_a_calibration_predicts_with_the_friction_of_what_is_mounted(
 ) -> None:
     mounted = MOUNTED if payload is not None else None
     arm = truth if mounted is None else _warmer(truth)
-    run = record(arm, "new", np.random.default_rng(9), mounted, seconds=6.0, rate_hz=500.0, averaged=2)
+    run = record(
+        arm, "new", np.random.default_rng(9), mounted, seconds=6.0, rate_hz=500.0, averaged=2
+    )
     data = differentiate(run, truth.model.drive_train, CONDITIONING)
-    body = None if mounted is None else np.array(list(PAYLOAD_TRUTH.values()))
+    if mounted is None:
+        body = None
+    else:
+        body = np.array(list(PAYLOAD_TRUTH.values()))
     # The model of a cell: that the calibration has friction by payload is read from its parameters.
     predicted = predict_torque(calibration, truth.model, data)
     expected = arm.model.torques(data.motion(), arm.model.with_payload(arm.parameters, body))[2].T
@@ -112,11 +135,17 @@ def test_a_calibration_predicts_with_the_friction_of_what_is_mounted(
     left = np.sqrt(np.mean((predicted - expected)[moving] ** 2) / np.mean(expected[moving] ** 2))
     assert left < 0.01
     other = _warmer(truth) if mounted is None else truth
-    wrong = other.model.torques(data.motion(), other.model.with_payload(other.parameters, body))[2].T
-    assert np.sqrt(np.mean((predicted - wrong)[moving] ** 2) / np.mean(expected[moving] ** 2)) > 0.02
+    wrong = other.model.torques(data.motion(), other.model.with_payload(other.parameters, body))[
+        2
+    ].T
+    assert (
+        np.sqrt(np.mean((predicted - wrong)[moving] ** 2) / np.mean(expected[moving] ** 2)) > 0.02
+    )
 
 
-def test_a_model_without_it_takes_the_friction_without_load(truth: Truth, calibration: Calibration) -> None:
+def test_a_model_without_it_takes_the_friction_without_load(
+    truth: Truth, calibration: Calibration
+) -> None:
     model = fitted_model(calibration, truth.model)
     assert model.friction_by_payload
     whole = standard_parameters(calibration, model)
@@ -126,7 +155,9 @@ def test_a_model_without_it_takes_the_friction_without_load(truth: Truth, calibr
 
 
 @pytest.mark.parametrize("make", [three_axes_truth, tx40_truth])
-def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(make: object) -> None:
+def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
+    make: object,
+) -> None:
     assert callable(make)
     declared: Model = make().model
     model = replace(declared, friction_by_payload=True)
@@ -139,7 +170,9 @@ def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
     np.testing.assert_array_equal(bare[:, :count], declared.regressor(motion))
     np.testing.assert_array_equal(loaded[:, :count], bare[:, :count])
     assert not bare[:, count:].any()
-    np.testing.assert_array_equal(loaded[:, model.loaded_friction_columns], loaded[:, model.friction_columns])
+    np.testing.assert_array_equal(
+        loaded[:, model.loaded_friction_columns], loaded[:, model.friction_columns]
+    )
     assert not loaded[~model.support].any()
     parameters = rng.normal(size=len(model.columns))
     body = rng.normal(size=10)
@@ -148,7 +181,10 @@ def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
         if mounted is not None:
             by_columns += np.einsum("mck,c->mk", regressor[:, model.flange], body)
         np.testing.assert_allclose(
-            model.torques(motion, model.with_payload(parameters, mounted))[2], by_columns, rtol=1e-9, atol=1e-9
+            model.torques(motion, model.with_payload(parameters, mounted))[2],
+            by_columns,
+            rtol=1e-9,
+            atol=1e-9,
         )
 
 
@@ -165,7 +201,9 @@ def test_where_every_run_is_loaded_there_is_one_friction(truth: Truth) -> None:
     shared = identify(truth.model, runs, CONDITIONING, fixed_gains=gains, judge=False)
     found = identify(by_payload, runs, CONDITIONING, fixed_gains=gains, judge=False)
     assert found.estimate.unknowns == shared.estimate.unknowns
-    np.testing.assert_allclose(found.estimate.parameters, shared.estimate.parameters, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        found.estimate.parameters, shared.estimate.parameters, rtol=1e-9, atol=1e-9
+    )
 
 
 def test_a_mounting_of_any_name_is_no_friction() -> None:
@@ -174,11 +212,15 @@ def test_a_mounting_of_any_name_is_no_friction() -> None:
     assert not Parameter("fs1", 0.1, 0.1, "Nm").is_payload_friction
 
 
-def test_a_body_is_weighed_beside_bare_runs_of_another_friction(truth: Truth, calibration: Calibration) -> None:
+def test_a_body_is_weighed_beside_bare_runs_of_another_friction(
+    truth: Truth, calibration: Calibration
+) -> None:
     rng = np.random.default_rng(13)
     model = replace(truth.model, friction_by_payload=True)
     bare = record(truth, "bare", rng, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
-    loaded = record(_warmer(truth), "loaded", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
+    loaded = record(
+        _warmer(truth), "loaded", rng, MOUNTED, noise_a=NOISE_A, rate_hz=500.0, averaged=2
+    )
     mass = list(LINK_PARAMETERS).index("m")
     weighed = weigh(calibration, model, (loaded,), CONDITIONING, bare=(bare,))
     one_friction = weigh(calibration, truth.model, (loaded,), CONDITIONING, bare=(bare,))

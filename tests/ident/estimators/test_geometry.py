@@ -1,4 +1,6 @@
-"""Geometry from redundant encoders: one wrong number is named, and nothing else is corrected for it."""
+"""Geometry from redundant encoders: one wrong number is named,
+and nothing else is corrected for it.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from tests.ident.mechanisms import FIVE_BAR, PLANAR
 pytestmark = pytest.mark.slow
 
 FloatArray = NDArray[np.float64]
-NOISE_RAD = 5e-6  #: of a count of 2⁻¹⁶ turns of a motor behind a gear of 5, as of the shipped redundant robot
+#: of a count of 2⁻¹⁶ turns of a motor behind a gear of 5, as of the shipped redundant robot
+NOISE_RAD = 5e-6
 PARAMETERS = geometry_parameters(PLANAR.robot)
 X_OF_FIRST = GeometryParameter(GeometryKind.PLACE, "motor-0", "x")
 Y_OF_SECOND = GeometryParameter(GeometryKind.PLACE, "motor-1", "y")
@@ -61,12 +64,16 @@ def _noise(seed: int, shape: tuple[int, ...], correlation_s: float = 0.0) -> Flo
 def _found(
     *wrong: tuple[GeometryParameter, float], position_rad: FloatArray | None = None, seed: int = 1
 ) -> GeometryFinding:
-    """Finding with a description in which numbers are off; what has to be added is the negative of it."""
+    """Finding with a description in which numbers are off;
+    what has to be added is the negative of it.
+    """
     changes = [GeometryChange(parameter, change) for parameter, change in wrong]
     if position_rad is None:
         exact = _exact(seed)
         position_rad = exact + NOISE_RAD * _noise(seed, exact.shape)
-    found = estimate_geometry(model_with_geometry(PLANAR.model, changes), (thinned(_run(position_rad)),))
+    found = estimate_geometry(
+        model_with_geometry(PLANAR.model, changes), (thinned(_run(position_rad)),)
+    )
     assert found is not None
     return found
 
@@ -106,7 +113,9 @@ def test_two_wrong_numbers_are_named_together() -> None:
 
 
 @pytest.mark.parametrize("parameter", [X_OF_FIRST, Y_OF_SECOND])
-def test_a_motor_that_sits_elsewhere_on_the_base_is_no_zero_and_no_rod(parameter: GeometryParameter) -> None:
+def test_a_motor_that_sits_elsewhere_on_the_base_is_no_zero_and_no_rod(
+    parameter: GeometryParameter,
+) -> None:
     found = _found((parameter, 3e-4))
     assert _is_named(found, parameter, -3e-4)
     assert found.corrections == found.causes
@@ -125,9 +134,13 @@ def test_a_late_encoder_is_named_and_nothing_is_corrected_for_it(delay_s: float)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("axes", [(1.0, 0.0, -1.0, 0.5), (1.0, 0.0, 0.0, 0.0), (0.7, -0.4, 1.0, 0.2)])
+@pytest.mark.parametrize(
+    "axes", [(1.0, 0.0, -1.0, 0.5), (1.0, 0.0, 0.0, 0.0), (0.7, -0.4, 1.0, 0.2)]
+)
 def test_arms_that_bend_are_no_wrong_numbers(seed: int, axes: tuple[float, ...]) -> None:
-    """A misfit that turns with the pose is explained by some numbers to a part, but not down to the noise."""
+    """A misfit that turns with the pose is explained by some numbers to a part,
+    but not down to the noise.
+    """
     exact = _exact(seed)
     bend_rad = 2e-4 * np.sin(3.0 * exact[:, [0]]) * np.array(axes)
     found = _found(position_rad=exact + bend_rad + NOISE_RAD * _noise(seed, exact.shape), seed=seed)
@@ -157,10 +170,11 @@ def test_a_right_description_says_nothing() -> None:
 
 @pytest.mark.parametrize("correlation_s", [0.02, 0.1, 0.5])
 def test_deviations_are_those_of_the_noise(correlation_s: float) -> None:
-    """All numbers together: what weakly seen directions scatter is in σ, and so is what slow noise does.
+    """All numbers together: what weakly seen directions scatter is in σ,
+    and so is what slow noise does.
 
-    Twelve draws of some ten numbers, of which a half are independent, know the root mean square to 9 %; without what
-    slow noise does it would be twice as large.
+    Twelve draws of some ten numbers, of which a half are independent, know the root mean square to
+    9 %; without what slow noise does it would be twice as large.
     """
     scaled: list[float] = []
     for draw in range(DRAWS):
@@ -231,5 +245,8 @@ def test_a_place_on_the_base_is_one_of_its_coordinates() -> None:
     moved = model_with_geometry(PLANAR.model, [GeometryChange(Y_OF_SECOND, 0.002)]).robot
     before = {joint.name: joint.translation_m for joint in PLANAR.robot.joints}
     for joint in moved.joints:
-        shift = [0.0, 0.002, 0.0] if joint.name == "motor-1" else [0.0, 0.0, 0.0]
+        if joint.name == "motor-1":
+            shift = [0.0, 0.002, 0.0]
+        else:
+            shift = [0.0, 0.0, 0.0]
         assert np.allclose(joint.translation_m - before[joint.name], shift, atol=1e-15)

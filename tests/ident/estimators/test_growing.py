@@ -1,4 +1,6 @@
-"""A fit that grows: the same as one of all rows at once, in any order, and honest about what nothing fixes yet."""
+"""A fit that grows: the same as one of all rows at once, in any order,
+and honest about what nothing fixes yet.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def whole(small_truth: Truth, long_runs: tuple[Run, ...]) -> GrowingFit:
 
 @pytest.fixture(scope="module")
 def labelled(long_runs: tuple[Run, ...]) -> tuple[Run, ...]:
-    """Both, with the number of the move of each sample: targets change every MOVE_SAMPLES, joints rest halfway."""
+    """Both, with the number of the move of each sample:
+    targets change every MOVE_SAMPLES, joints rest halfway.
+    """
     move = (np.arange(LONG_SAMPLES) + MOVE_SAMPLES // 2) // MOVE_SAMPLES
     return tuple(replace(run, move=move) for run in long_runs)
 
@@ -90,7 +94,11 @@ def _std(found: QuickGains) -> FloatArray:
 
 
 def _is_unknown(found: QuickGains, reason: Unknown, axes: tuple[int, ...] = ()) -> bool:
-    return found.gains is None and found.gains_std is None and (found.unknown, found.axes) == (reason, axes)
+    return (
+        found.gains is None
+        and found.gains_std is None
+        and (found.unknown, found.axes) == (reason, axes)
+    )
 
 
 # The same as all rows at once
@@ -112,7 +120,9 @@ def test_pieces_in_any_order_give_the_gains_of_all_rows_at_once(
 def test_runs_that_were_folded_in_while_they_grew_are_the_whole_runs(
     small_truth: Truth, long_runs: tuple[Run, ...], whole: GrowingFit, lengths: list[int]
 ) -> None:
-    """At any moments: borders change nothing of the size of σ, and no row is lost or counted twice."""
+    """At any moments: borders change nothing of the size of σ,
+    and no row is lost or counted twice.
+    """
     fit = _empty(small_truth)
     for run in long_runs:
         for length in sorted(lengths):
@@ -156,13 +166,18 @@ def test_rows_near_the_border_wait_and_are_then_those_of_the_whole_run(
     ended = so_far.with_run(run)
     assert ended.runs[0].rows == whole.runs[0].rows
     assert ended.standard is not None
-    for one, other in zip(ended.standard.joints.factors, whole.standard.joints.factors, strict=True):
+    for one, other in zip(
+        ended.standard.joints.factors, whole.standard.joints.factors, strict=True
+    ):
         scale = np.abs(other).max()
         assert one.T @ one / scale**2 == pytest.approx(other.T @ other / scale**2, abs=1e-8)
 
 
 def test_clusters_of_very_many_moves_are_joined_and_say_the_same(
-    small_truth: Truth, pieces: tuple[Run, ...], at_once: QuickGains, monkeypatch: pytest.MonkeyPatch
+    small_truth: Truth,
+    pieces: tuple[Run, ...],
+    at_once: QuickGains,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(joined_module, "MAX_CLUSTERS", 8)
     fit = _grown(small_truth, pieces)
@@ -171,7 +186,9 @@ def test_clusters_of_very_many_moves_are_joined_and_say_the_same(
     assert _std(fit.gains()) == pytest.approx(_std(at_once), rel=0.6)
 
 
-def test_the_grown_equations_serve_maximum_likelihood(small_truth: Truth, pieces: tuple[Run, ...]) -> None:
+def test_the_grown_equations_serve_maximum_likelihood(
+    small_truth: Truth, pieces: tuple[Run, ...]
+) -> None:
     grown = ml(_grown(small_truth, pieces).system())
     whole = ml(regrouped(reduce_runs(small_truth.model, pieces, SMALL)))
     assert grown.gains == pytest.approx(whole.gains, rel=1e-9)
@@ -203,7 +220,9 @@ def test_without_a_payload_the_gains_are_unknown_however_much_is_recorded(
     assert found.std_percent is None
 
 
-def test_with_a_payload_alone_the_gains_are_unknown(small_truth: Truth, pieces: tuple[Run, ...]) -> None:
+def test_with_a_payload_alone_the_gains_are_unknown(
+    small_truth: Truth, pieces: tuple[Run, ...]
+) -> None:
     found = _grown(small_truth, pieces[1:3]).gains()
     assert _is_unknown(found, Unknown.NOT_DISTINGUISHED)
 
@@ -234,9 +253,13 @@ def test_a_few_moves_are_too_few_for_an_error_bar(small_truth: Truth) -> None:
     assert _is_unknown(fit.gains(), Unknown.FEW_MOVES)
 
 
-def test_a_payload_that_was_not_mounted_does_not_show(small_truth: Truth, pieces: tuple[Run, ...]) -> None:
+def test_a_payload_that_was_not_mounted_does_not_show(
+    small_truth: Truth, pieces: tuple[Run, ...]
+) -> None:
     bare = tuple(pieces[index] for index in (0, 3, 4, 7))
-    said_to_be_loaded = tuple(replace(run, name=f"{run.name}, again", payload=MOUNTED) for run in bare[:2])
+    said_to_be_loaded = tuple(
+        replace(run, name=f"{run.name}, again", payload=MOUNTED) for run in bare[:2]
+    )
     found = _grown(small_truth, (*bare[2:], *said_to_be_loaded)).gains()
     assert _is_unknown(found, Unknown.PAYLOAD_UNSEEN)
 
@@ -252,7 +275,9 @@ def test_a_run_is_in_the_fit_once(small_truth: Truth, pieces: tuple[Run, ...]) -
         fit.with_run_so_far(pieces[0])
 
 
-def test_a_payload_that_was_not_announced_is_refused(small_truth: Truth, pieces: tuple[Run, ...]) -> None:
+def test_a_payload_that_was_not_announced_is_refused(
+    small_truth: Truth, pieces: tuple[Run, ...]
+) -> None:
     other = replace(pieces[1], payload=Payload("plate", "b", {"m": 2.0}))
     with pytest.raises(DataUnfit, match="name all payloads"):
         _empty(small_truth).with_run(other)
@@ -269,7 +294,9 @@ def test_a_run_that_is_too_short_waits_and_is_refused_when_it_ends(
         assert _empty(small_truth).with_run_so_far(short).standard is None
 
 
-def test_systems_of_other_payloads_are_not_joined(small_truth: Truth, pieces: tuple[Run, ...]) -> None:
+def test_systems_of_other_payloads_are_not_joined(
+    small_truth: Truth, pieces: tuple[Run, ...]
+) -> None:
     bare = reduce_runs(small_truth.model, pieces[:1], SMALL)
     loaded = reduce_runs(small_truth.model, pieces[1:2], SMALL)
     with pytest.raises(ValueError, match="expected the same in both"):

@@ -20,7 +20,9 @@ from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record
 THREE = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
 SEEDS = 3
 BENT = ("fs1", "fs2", "fs3")
-"""A disturbance that opposes the motion slows the arm down, so that friction looks smaller than it is."""
+"""A disturbance that opposes the motion slows the arm down,
+so that friction looks smaller than it is.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +39,17 @@ def disturbed(small_truth: Truth) -> tuple[Identification, ...]:
 def test_iv_solves_the_equations_of_its_instruments(disturbed: tuple[Identification, ...]) -> None:
     """Σ_i (T L̂_i)ᵀ e_i γ_i/σ_i² = 0 and v̂_iᵀ e_i = 0 with the residual of the recorded motion."""
     found = disturbed[1]
-    estimate, system = found.estimate, found.system
+    estimate = found.estimate
+    system = found.system
     projected = system.on_instruments()
-    columns, size = np.zeros(len(estimate.parameters)), np.zeros(len(estimate.parameters))
-    sums, sizes = [], []
+    columns = np.zeros(len(estimate.parameters))
+    size = np.zeros(len(estimate.parameters))
+    sums = []
+    sizes = []
     for motor, gain in enumerate(estimate.gains):
         recorded, instrument = (
-            np.concatenate([cluster[motor] for cluster in one.clusters]) for one in (system, projected)
+            np.concatenate([cluster[motor] for cluster in one.clusters])
+            for one in (system, projected)
         )
         error = recorded[:, 0] - (recorded[:, 1:-1] @ estimate.parameters + recorded[:, -1]) / gain
         predicted = (instrument[:, 1:-1] @ estimate.parameters + instrument[:, -1]) / gain
@@ -51,8 +57,11 @@ def test_iv_solves_the_equations_of_its_instruments(disturbed: tuple[Identificat
         residual = recorded[:, 0] - predicted
         weight = len(error) / (gain * float(residual @ residual))
         sums.append(weight * (instrument[:, 1:-1].T @ error))
-        sizes.append(abs(weight) * np.linalg.norm(instrument[:, 1:-1], axis=0) * np.linalg.norm(error))
-    columns, size = np.sum(sums, axis=0), np.sum(sizes, axis=0)
+        sizes.append(
+            abs(weight) * np.linalg.norm(instrument[:, 1:-1], axis=0) * np.linalg.norm(error)
+        )
+    columns = np.sum(sums, axis=0)
+    size = np.sum(sizes, axis=0)
     # σ counts the free unknowns of all motors alike, hence the hundredth.
     assert np.all(np.abs(columns) < 1e-2 * size)
 
@@ -71,7 +80,9 @@ def test_the_loop_bends_ml_and_not_iv(small_truth: Truth) -> None:
             names = [column.name for column in estimate.unknowns]
             at = [names.index(name) for name in BENT]
             true = [
-                small_truth.parameters[[column.name for column in small_truth.model.columns].index(name)]
+                small_truth.parameters[
+                    [column.name for column in small_truth.model.columns].index(name)
+                ]
                 for name in BENT
             ]
             scores.append(((estimate.parameters[at] - true) / estimate.parameters_std[at]).tolist())
@@ -82,7 +93,9 @@ def test_the_loop_bends_ml_and_not_iv(small_truth: Truth) -> None:
 
 
 def test_instruments_of_rows_are_those_of_the_reduction(small_truth: Truth) -> None:
-    """The search builds its rows whole, the fit as triangles: both give the same estimate, with and without effects."""
+    """The search builds its rows whole, the fit as triangles:
+    both give the same estimate, with and without effects.
+    """
     rng = np.random.default_rng(5)
     runs = [
         record_in_loop(small_truth, name, rng, payload, disturbance_nm=2.0, seconds=8.0)
@@ -102,7 +115,10 @@ def test_instruments_of_rows_are_those_of_the_reduction(small_truth: Truth) -> N
 
 def test_continuous_motion_has_no_instruments(small_truth: Truth) -> None:
     rng = np.random.default_rng(1)
-    runs = [record(small_truth, "bare", rng, seconds=6.0), record(small_truth, "loaded", rng, MOUNTED, seconds=6.0)]
+    runs = [
+        record(small_truth, "bare", rng, seconds=6.0),
+        record(small_truth, "loaded", rng, MOUNTED, seconds=6.0),
+    ]
     time = runs[0].time_s[:, None]
     motion = np.sin(2.0 * time + np.arange(3)) + 0.5 * np.cos(3.3 * time) + 0.3 * np.sin(5.1 * time)
     waving = [replace(run, position_rad=motion) for run in runs]

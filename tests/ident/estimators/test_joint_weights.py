@@ -14,7 +14,15 @@ from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System
 from ident.equations.triangles import Triangles, triangle
 from ident.estimators.estimate import Identification
-from ident.estimators.least_squares import Scaling, joint_data_std, joint_error_std, ls, misjudged_joints, tls, wls
+from ident.estimators.least_squares import (
+    Scaling,
+    joint_data_std,
+    joint_error_std,
+    ls,
+    misjudged_joints,
+    tls,
+    wls,
+)
 from ident.estimators.maximum_likelihood import ml
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
@@ -50,7 +58,14 @@ def _small_system(truth: Truth, seed: int, noise_a: float) -> System:
     """Two runs without load and two with the disc, with this noise in the currents."""
     rng = np.random.default_rng(seed)
     runs = [
-        record(truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=noise_a, seconds=22.0)
+        record(
+            truth,
+            f"run{number}",
+            rng,
+            MOUNTED if number % 2 else None,
+            noise_a=noise_a,
+            seconds=22.0,
+        )
         for number in range(4)
     ]
     conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
@@ -95,9 +110,12 @@ def test_joint_data_std_without_rows_is_infinite_so_that_the_joint_has_no_weight
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_joint_data_std_follows_the_noise_of_the_current_and_not_the_gain(small_truth: Truth, axis: int) -> None:
+def test_joint_data_std_follows_the_noise_of_the_current_and_not_the_gain(
+    small_truth: Truth, axis: int
+) -> None:
     quiet = joint_data_std(_small_system(small_truth, 1, NOISE_A).joints)
-    assert quiet == pytest.approx(quiet.mean(), rel=0.1)  # the same noise on three axes whose gains are different
+    # The same noise on three axes whose gains are different
+    assert quiet == pytest.approx(quiet.mean(), rel=0.1)
     other_gains = small_truth.gains.copy()
     other_gains[axis] *= 2.0
     stronger = replace(small_truth, gains=other_gains)
@@ -129,7 +147,9 @@ def test_joint_error_std_is_that_of_the_joint_alone(noisy: Evidence) -> None:
         assert found[joint] == pytest.approx(error / np.sqrt(len(rows) - own.shape[1]), rel=1e-6)
 
 
-def test_wls_of_fixed_gains_weights_by_the_error_of_the_joint_alone(noisy_found: Identification) -> None:
+def test_wls_of_fixed_gains_weights_by_the_error_of_the_joint_alone(
+    noisy_found: Identification,
+) -> None:
     system = noisy_found.system
     weight = 1.0 / joint_error_std(system.joints, GAINS)
     matrix = system.joints.stacked(weight)
@@ -150,7 +170,9 @@ def test_a_wrist_has_no_torque_of_the_known_mass_so_free_gains_take_the_global_e
     assert wls(system).gains == pytest.approx(expected[:6], rel=1e-6)
 
 
-def test_tls_of_runs_in_another_order_is_the_same(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_tls_of_runs_in_another_order_is_the_same(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
     def gains(runs: tuple[Run, ...]) -> FloatArray:
         return tls(regrouped(reduce_runs(truth.model, runs, CONDITIONING))).gains
 
@@ -158,7 +180,9 @@ def test_tls_of_runs_in_another_order_is_the_same(truth: Truth, noisy_runs: tupl
 
 
 def _with_twin_column(system: System, difference: float) -> System:
-    """J1 has one column twice, but for a share of its norm; the parameter of the second one is zero."""
+    """J1 has one column twice, but for a share of its norm;
+    the parameter of the second one is zero.
+    """
     count = system.axis_count
     factors = []
     for joint, factor in enumerate(system.joints.factors):
@@ -182,13 +206,20 @@ def test_misjudged_joints_with_a_parameter_that_hardly_shows_names_its_joint(
     assert misjudged_joints(system) == expected
 
 
-def test_misjudged_joints_of_usual_recordings_is_empty(small_truth: Truth, noisy_found: Identification) -> None:
+def test_misjudged_joints_of_usual_recordings_is_empty(
+    small_truth: Truth, noisy_found: Identification
+) -> None:
     assert misjudged_joints(_small_system(small_truth, 1, NOISE_A)) == ()
     assert misjudged_joints(noisy_found.system) == ()
 
 
-def test_misjudged_joints_with_currents_in_milliampere_names_a_joint_whose_gain_is_bent(small_truth: Truth) -> None:
-    """Eq. (21) takes the noise for one of every column, and parameters are then larger numbers than gains."""
+def test_misjudged_joints_with_currents_in_milliampere_names_a_joint_whose_gain_is_bent(
+    small_truth: Truth,
+) -> None:
+    """Eq.
+
+    (21) takes the noise for one of every column, and parameters are then larger numbers than gains.
+    """
     system = _small_system(small_truth, 1, NOISE_A)
     scale = np.ones(system.joints.factors[0].shape[1])
     scale[: system.axis_count] = 1000.0

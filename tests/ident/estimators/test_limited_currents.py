@@ -1,4 +1,6 @@
-"""Drives that give less current than their reference asks for are found by the torque; what is no such drive is not."""
+"""Drives that give less current than their reference asks for are found by the torque;
+what is no such drive is not.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,11 @@ from tests.ident.recordings import three_axes_truth
 TRUTH = three_axes_truth()
 AXIS = 1
 GIVEN = 0.9
-"""Share of the largest current of a run from which on the reference asks for more. The motion is that of a recording
-without a limit, so the current that it needs beyond this share differs by a tenth."""
+"""Share of the largest current of a run from which on the reference asks for more.
+
+The motion is that of a recording without a limit, so the current that it needs beyond this share
+differs by a tenth.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +34,9 @@ def runs() -> list[Run]:
 
 
 def winding_up(run: Run, limit_a: float) -> Run:
-    """The run with a reference of J2 that winds up wherever the motor needs what its drive gives at most."""
+    """The run with a reference of J2 that winds up wherever the motor needs what its drive gives at
+    most.
+    """
     current = run.current_a.copy()
     own = current[:, AXIS]
     times = 2.5 + np.sin(11.0 * run.time_s)
@@ -57,7 +64,9 @@ def test_a_drive_that_gives_less_is_named_and_its_samples_are_left_out(runs: lis
     assert {axis for one in named for axis in one.axes} == {AXES[AXIS]}
     assert found.channels[-1].torque_limits[AXIS] == pytest.approx(limit_a, rel=0.12)
     with_all = fitted(used, keep_rows=False)
-    error, before = (abs(one.estimate.gains[AXIS] / TRUTH.gains[AXIS] - 1.0) for one in (found, with_all))
+    error, before = (
+        abs(one.estimate.gains[AXIS] / TRUTH.gains[AXIS] - 1.0) for one in (found, with_all)
+    )
     assert before > 0.02
     assert error < 0.5 * before
     z = (found.estimate.gains - TRUTH.gains) / found.estimate.gains_std
@@ -77,7 +86,9 @@ def test_a_blow_is_no_limit(runs: list[Run]) -> None:
     for run in runs:
         current = run.current_a.copy()
         for start in rng.integers(500, len(current) - 500, 6).tolist():
-            current[start : start + 60, AXIS] += np.sign(current[start, AXIS]) * 0.8 * largest_a(runs)
+            current[start : start + 60, AXIS] += (
+                np.sign(current[start, AXIS]) * 0.8 * largest_a(runs)
+            )
         struck.append(replace(run, current_a=current))
     assert limits_named(fitted(struck)) == []
 

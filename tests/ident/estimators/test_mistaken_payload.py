@@ -1,4 +1,6 @@
-"""A payload that was not where the runs say it was: no residual need show it, but the scatter of the gains does."""
+"""A payload that was not where the runs say it was:
+no residual need show it, but the scatter of the gains does.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 def undeclared(truth: Truth) -> tuple[Run, ...]:
     """Runs with the payload mounted that say they went without."""
     rng = np.random.default_rng(5)
-    runs = (record(truth, f"undeclared{i}", rng, MOUNTED, noise_a=0.3, seconds=22.0) for i in range(2))
+    runs = (
+        record(truth, f"undeclared{i}", rng, MOUNTED, noise_a=0.3, seconds=22.0) for i in range(2)
+    )
     return tuple(replace(run, payload=None) for run in runs)
 
 
@@ -45,27 +49,46 @@ def test_mounted_in_one_of_two_runs_declared_unloaded(
 
 def test_forgotten_in_a_run_declared_loaded(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     with pytest.raises(PayloadUnseen):
-        identify(truth.model, (replace(noisy_runs[0], payload=MOUNTED), *noisy_runs[1:3]), CONDITIONING)
+        identify(
+            truth.model, (replace(noisy_runs[0], payload=MOUNTED), *noisy_runs[1:3]), CONDITIONING
+        )
 
 
-def test_exchanged_roles_turn_every_sign_and_friction_shows_it(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    """They are no contradiction: the robot is taken to be lighter by the payload. But friction then adds energy."""
+def test_exchanged_roles_turn_every_sign_and_friction_shows_it(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
+    """They are no contradiction: the robot is taken to be lighter by the payload.
+
+    But friction then adds energy.
+    """
     exchanged = tuple(replace(run, payload=None if run.payload else MOUNTED) for run in noisy_runs)
-    with pytest.raises(RolesExchanged, match=r"fs1 = -5\..*; expected above 0.*payload's run .* exchanged"):
+    with pytest.raises(
+        RolesExchanged,
+        match=r"fs1 = -5\..*; expected above 0.*payload's run .* "
+        r"exchanged",
+    ):
         identify(truth.model, exchanged, CONDITIONING)
     estimate = ml(regrouped(reduce_runs(truth.model, exchanged, CONDITIONING)))
     assert estimate.gains == pytest.approx(-GAINS, rel=0.05)
 
 
-def test_currents_of_another_sign_are_no_exchanged_roles(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    """A drive may count its current the other way: its gain is negative, and friction still takes energy."""
+def test_currents_of_another_sign_are_no_exchanged_roles(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
+    """A drive may count its current the other way:
+    its gain is negative, and friction still takes energy.
+    """
     signs = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
     for turned in (-np.ones(6), signs):
         runs = tuple(replace(run, current_a=run.current_a * turned) for run in noisy_runs[:2])
-        assert identify(truth.model, runs, CONDITIONING).estimate.gains == pytest.approx(GAINS * turned, rel=0.05)
+        assert identify(truth.model, runs, CONDITIONING).estimate.gains == pytest.approx(
+            GAINS * turned, rel=0.05
+        )
 
 
-def test_fixed_gains_of_the_wrong_sign_are_refused(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_fixed_gains_of_the_wrong_sign_are_refused(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
     for method in (Method.WLS, Method.ML):
         with pytest.raises(RolesExchanged, match="fixed gains"):
             identify(truth.model, noisy_runs[:1], CONDITIONING, method=method, fixed_gains=-GAINS)
@@ -73,27 +96,40 @@ def test_fixed_gains_of_the_wrong_sign_are_refused(truth: Truth, noisy_runs: tup
 
 def test_a_robot_without_dry_friction_is_not_refused(truth: Truth) -> None:
     """Its friction is identified as zero, above or below by chance."""
-    rng, slippery = np.random.default_rng(4), truth.parameters.copy()
+    rng = np.random.default_rng(4)
+    slippery = truth.parameters.copy()
     slippery[[14 * joint + 12 for joint in range(6)]] = 0.0
     runs = tuple(
-        record(replace(truth, parameters=slippery), f"r{i}", rng, MOUNTED if i else None, noise_a=0.3) for i in (0, 1)
+        record(
+            replace(truth, parameters=slippery), f"r{i}", rng, MOUNTED if i else None, noise_a=0.3
+        )
+        for i in (0, 1)
     )
-    assert identify(truth.model, runs, CONDITIONING).estimate.gains == pytest.approx(GAINS, rel=0.05)
+    assert identify(truth.model, runs, CONDITIONING).estimate.gains == pytest.approx(
+        GAINS, rel=0.05
+    )
     known = identify(truth.model, runs[:1], CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
     friction = [
-        v for c, v in zip(known.estimate.unknowns, known.estimate.parameters, strict=True) if c.name[:2] == "fs"
+        v
+        for c, v in zip(known.estimate.unknowns, known.estimate.parameters, strict=True)
+        if c.name[:2] == "fs"
     ]
     assert min(friction) < 0.0
 
 
-def test_gains_beside_which_the_payload_weighs_nothing_have_no_scale(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_gains_beside_which_the_payload_weighs_nothing_have_no_scale(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
     """As of exchanged channels: an optimum at infinity, with a small σ."""
     found = identify(truth.model, noisy_runs[:2], CONDITIONING)
     require_seen_payload(found.estimate, found.system)
     one = found.estimate
     scale = np.concatenate((np.full(6, 1e8), np.full(len(one.parameters), 1e8)))
     away = replace(
-        one, gains=1e8 * one.gains, parameters=1e8 * one.parameters, covariance=one.covariance * np.outer(scale, scale)
+        one,
+        gains=1e8 * one.gains,
+        parameters=1e8 * one.parameters,
+        covariance=one.covariance * np.outer(scale, scale),
     )
     with pytest.raises(PayloadUnseen, match="not in rad, or columns in another order"):
         require_seen_payload(away, found.system)
@@ -145,6 +181,9 @@ def test_what_is_refused_is_what_the_limits_say(total: float, axis: float, unkno
 def test_few_but_honest_data_pass(truth: Truth) -> None:
     """A gate must not refuse what is merely short: twelve seconds a run at six per cent noise."""
     rng = np.random.default_rng(8)
-    runs = [record(truth, f"r{i}", rng, MOUNTED if i % 2 else None, noise_a=0.3, seconds=12.0) for i in range(2)]
+    runs = [
+        record(truth, f"r{i}", rng, MOUNTED if i % 2 else None, noise_a=0.3, seconds=12.0)
+        for i in range(2)
+    ]
     found = identify(truth.model, runs, CONDITIONING, method=Method.ML)
     assert np.max(found.estimate.gains_std / np.abs(found.estimate.gains)) < 0.1

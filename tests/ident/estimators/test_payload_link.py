@@ -1,4 +1,6 @@
-"""A payload on another link than the last one: gains and payload come back, and a wrong link does not pass."""
+"""A payload on another link than the last one:
+gains and payload come back, and a wrong link does not pass.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,10 @@ def truth() -> Truth:
 def test_gains_and_payload_come_back(truth: Truth) -> None:
     rng = np.random.default_rng(5)
     drawn = replace(MOUNTED, known={name: PAYLOAD_TRUTH[name] for name in ("mx", "my", "mz", "m")})
-    runs = (record(truth, "bare", rng, noise_a=0.01), record(truth, "loaded", rng, drawn, noise_a=0.01))
+    runs = (
+        record(truth, "bare", rng, noise_a=0.01),
+        record(truth, "loaded", rng, drawn, noise_a=0.01),
+    )
     found = identify(truth.model, runs, CONDITIONING, method=Method.ML)
     error_percent = 100.0 * (found.estimate.gains / truth.gains - 1.0)
     assert np.abs(error_percent).max() < 1.0
@@ -41,6 +46,9 @@ def test_gains_and_payload_come_back(truth: Truth) -> None:
 
 def test_a_mass_that_does_not_show_behind_so_few_joints_asks_for_the_centre(truth: Truth) -> None:
     rng = np.random.default_rng(6)
-    runs = (record(truth, "bare", rng, noise_a=0.01), record(truth, "loaded", rng, MOUNTED, noise_a=0.01))
+    runs = (
+        record(truth, "bare", rng, noise_a=0.01),
+        record(truth, "loaded", rng, MOUNTED, noise_a=0.01),
+    )
     with pytest.raises(RankDeficient, match=r"does not show behind so few joints: .*`centre_m`"):
         identify(truth.model, runs, CONDITIONING, method=Method.ML)

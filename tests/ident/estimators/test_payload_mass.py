@@ -24,17 +24,28 @@ pytestmark = pytest.mark.slow
 STEP = 0.01  #: Share of the mass between the refits and the fit
 DRAWING = {name: PAYLOAD_TRUTH[name] for name in ("m", "mx", "my", "mz")}
 METHODS = [("ml", 0.005), ("iv", 0.005), ("ls", 0.02), ("wls", 0.02), ("tls", 0.02)]
-"""Those of the joints' equations are differentiated in the motors', which coupled axes weight a little otherwise."""
+"""Those of the joints' equations are differentiated in the motors',
+which coupled axes weight a little otherwise.
+"""
 KNOWN = {"mass": {"m": PAYLOAD_TRUTH["m"]}, "centre": DRAWING, "all": PAYLOAD_TRUTH}
 CASES = [(*METHODS[0], known) for known in KNOWN] + [(*method, "all") for method in METHODS[1:]]
-"""What is known of the payload is a matter of the equations, not of the method: one method tries all three."""
+"""What is known of the payload is a matter of the equations, not of the method:
+one method tries all three.
+"""
 
 
 @pytest.fixture(scope="module")
 def runs(truth: Truth) -> tuple[Run, ...]:
     """Two runs without and two with load, with noise."""
     return tuple(
-        record(truth, f"r{seed}", np.random.default_rng(seed), MOUNTED if seed % 2 else None, noise_a=0.1, seconds=22.0)
+        record(
+            truth,
+            f"r{seed}",
+            np.random.default_rng(seed),
+            MOUNTED if seed % 2 else None,
+            noise_a=0.1,
+            seconds=22.0,
+        )
         for seed in range(4)
     )
 
@@ -54,7 +65,9 @@ def _refitted(
     above = _fitted(truth, runs, known, 1.0 + STEP, method).estimate
     below = _fitted(truth, runs, known, 1.0 - STEP, method).estimate
     between_kg = 2.0 * STEP * known["m"]
-    return (above.gains - below.gains) / between_kg, (above.parameters - below.parameters) / between_kg
+    return (above.gains - below.gains) / between_kg, (
+        above.parameters - below.parameters
+    ) / between_kg
 
 
 @pytest.mark.parametrize(("method", "tolerance", "known"), CASES)
@@ -93,7 +106,8 @@ def test_effects_in_the_model_are_differentiated_too(truth: Truth, runs: tuple[R
     change = with_effect(1.0 + STEP).estimate.gains - with_effect(1.0 - STEP).estimate.gains
     gains = found.estimate.gains
     expected = change / (2.0 * STEP * gains)
-    # The column of the effect is the load that the model predicts, which answers to the mass as well.
+    # The column of the effect is the load that the model predicts, which answers to the mass as
+    # well.
     assert response.gain_per_kg * DRAWING["m"] / gains == pytest.approx(expected, abs=0.02)
 
 
@@ -112,10 +126,16 @@ def test_two_bodies_have_a_derivative_each_and_two_mountings_of_one_body_one(
     two = mass_responses(*_parts(with_payloads(MOUNTED, replace(turned, name="plate"))))
     assert [response.payload for response in two] == ["disc", "plate"]
     assert sum(response.gain_per_kg for response in two) == pytest.approx(one.gain_per_kg, rel=1e-6)
-    heavier = with_payloads(replace(MOUNTED, known={"m": mass * (1.0 + STEP)}), replace(turned, name="plate"))
-    lighter = with_payloads(replace(MOUNTED, known={"m": mass * (1.0 - STEP)}), replace(turned, name="plate"))
+    heavier = with_payloads(
+        replace(MOUNTED, known={"m": mass * (1.0 + STEP)}), replace(turned, name="plate")
+    )
+    lighter = with_payloads(
+        replace(MOUNTED, known={"m": mass * (1.0 - STEP)}), replace(turned, name="plate")
+    )
     expected = (heavier.estimate.gains - lighter.estimate.gains) / (2.0 * STEP * mass)
-    assert two[0].gain_per_kg / heavier.estimate.gains == pytest.approx(expected / heavier.estimate.gains, abs=0.003)
+    assert two[0].gain_per_kg / heavier.estimate.gains == pytest.approx(
+        expected / heavier.estimate.gains, abs=0.003
+    )
 
 
 def _parts(found: Identification) -> tuple[System, Estimate]:

@@ -1,4 +1,6 @@
-"""Masses of several payloads that contradict each other are named together, and no run is blamed for them."""
+"""Masses of several payloads that contradict each other are named together,
+and no run is blamed for them.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,11 @@ def recordings(plate_kg: float, *, count: int = 4) -> list[Run]:
 
 def of_payloads(runs: list[Run]) -> list[Diagnosis]:
     """What is said of the payloads."""
-    return [one for one in diagnosed(TRUTH, runs) if one.name in {"masses-contradict", "payload-differs"}]
+    return [
+        one
+        for one in diagnosed(TRUTH, runs)
+        if one.name in {"masses-contradict", "payload-differs"}
+    ]
 
 
 def test_masses_that_agree_are_not_named() -> None:
@@ -46,13 +52,19 @@ def test_masses_that_contradict_each_other_are_named_together(times: float, firs
 
 
 def test_masses_that_leave_no_scale_are_refused_by_the_same_name() -> None:
-    with pytest.raises(MassesContradict, match=r"by the torques plate is 2\.9\d ± .* times as heavy beside disc"):
+    with pytest.raises(
+        MassesContradict,
+        match=r"by the torques plate is 2\.9\d ± .* times as "
+        r"heavy beside disc",
+    ):
         diagnosed(TRUTH, recordings(3.0 * DECLARED_KG))
 
 
 def test_another_body_in_one_run_is_no_contradiction_of_masses() -> None:
     """Two runs carry the disc, and the moves of one of them deny it."""
-    runs = small_recordings(TRUTH, 0, count=8, bodies={3: 0.7 * BODY, 7: BODY * (DECLARED_KG / BODY[-1])})
+    runs = small_recordings(
+        TRUTH, 0, count=8, bodies={3: 0.7 * BODY, 7: BODY * (DECLARED_KG / BODY[-1])}
+    )
     used = [*runs[:7], replace(runs[7], payload=PLATE)]
     (found,) = of_payloads(used)
     assert (found.name, found.runs) == ("payload-differs", ("r3",))

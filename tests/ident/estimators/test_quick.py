@@ -1,4 +1,6 @@
-"""The quick linear estimate: exact without noise, that of maximum likelihood with it, in any unit."""
+"""The quick linear estimate: exact without noise, that of maximum likelihood with it,
+in any unit.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def standard(truth: Truth, pieces: tuple[Run, ...]) -> System:
     return reduce_runs(truth.model, pieces, CONDITIONING)
 
 
-def test_recordings_without_noise_give_gains_and_parameters_back(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+def test_recordings_without_noise_give_gains_and_parameters_back(
+    truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
     system = regrouped(reduce_runs(truth.model, clean_runs, CONDITIONING))
     gains, parameters = mixed_tls(system)
     assert gains == pytest.approx(GAINS, rel=2e-4)
@@ -83,9 +87,15 @@ def small_gains(small_truth: Truth, small_pieces: tuple[Run, ...]) -> QuickGains
 @settings(deadline=None, max_examples=10)
 @given(exponents=st.lists(st.integers(-4, 4), min_size=3, max_size=3), heavier=st.floats(0.1, 10.0))
 def test_gains_are_in_the_units_of_currents_and_payload(
-    small_truth: Truth, small_pieces: tuple[Run, ...], small_gains: QuickGains, exponents: list[int], heavier: float
+    small_truth: Truth,
+    small_pieces: tuple[Run, ...],
+    small_gains: QuickGains,
+    exponents: list[int],
+    heavier: float,
 ) -> None:
-    """A current in other units divides its gain; a payload of other weight multiplies all of them."""
+    """A current in other units divides its gain;
+    a payload of other weight multiplies all of them.
+    """
     unit = 10.0 ** np.array(exponents)
     before = small_gains
     changed = []

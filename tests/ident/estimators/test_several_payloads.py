@@ -17,19 +17,37 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record
 
 OTHER_MOUNTING = dict(
-    zip(LINK_PARAMETERS, (0.06, 0.004, -0.01, 0.07, 0.012, 0.04, 0.21, -0.11, 0.30, 4.59), strict=True)
+    zip(
+        LINK_PARAMETERS,
+        (0.06, 0.004, -0.01, 0.07, 0.012, 0.04, 0.21, -0.11, 0.30, 4.59),
+        strict=True,
+    )
 )
 """The same disc, turned and put elsewhere."""
-PLATE = dict(zip(LINK_PARAMETERS, (0.013, -0.001, 0.003, 0.014, 0.002, 0.01, 0.05, 0.03, 0.1, 1.686), strict=True))
+PLATE = dict(
+    zip(
+        LINK_PARAMETERS,
+        (0.013, -0.001, 0.003, 0.014, 0.002, 0.01, 0.05, 0.03, 0.1, 1.686),
+        strict=True,
+    )
+)
 
 
 def _record(
-    truth: Truth, name: str, rng: np.random.Generator, payload: Payload | None, body: dict[str, float] | None
+    truth: Truth,
+    name: str,
+    rng: np.random.Generator,
+    payload: Payload | None,
+    body: dict[str, float] | None,
 ) -> Run:
-    """A run with any body: `record` mounts the one of PAYLOAD_TRUTH, so the last link makes up the difference."""
+    """A run with any body: `record` mounts the one of PAYLOAD_TRUTH,
+    so the last link makes up the difference.
+    """
     parameters = truth.parameters.copy()
     if body is not None:
-        parameters[truth.model.flange] += [body[name] - PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS]
+        parameters[truth.model.flange] += [
+            body[name] - PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS
+        ]
     return record(replace(truth, parameters=parameters), name, rng, payload, noise_a=0.1)
 
 
@@ -57,7 +75,9 @@ def identified(truth: Truth, mixed: tuple[Run, ...]) -> Identification:
 
 
 def test_each_mounting_has_its_own_unknowns(identified: Identification) -> None:
-    """Disc twice, plate once, runs of each in any order; the plate's mass is unknown and is found."""
+    """Disc twice, plate once, runs of each in any order;
+    the plate's mass is unknown and is found.
+    """
     found = identified.estimate
     assert found.gains == pytest.approx(GAINS, rel=0.01)
     values = dict(zip((column.name for column in found.unknowns), found.parameters, strict=True))
@@ -69,7 +89,9 @@ def test_each_mounting_has_its_own_unknowns(identified: Identification) -> None:
     assert "m:a" not in values
 
 
-def test_one_unknown_vector_for_two_mountings_ruins_the_gains(truth: Truth, mixed: tuple[Run, ...]) -> None:
+def test_one_unknown_vector_for_two_mountings_ruins_the_gains(
+    truth: Truth, mixed: tuple[Run, ...]
+) -> None:
     """Why a mounting has a name: the disc turned, and declared as if it had not been."""
     runs = [run for run in mixed if run.payload is None or run.payload.name == "disc"]
     confused = [replace(run, payload=MOUNTED) if run.payload else run for run in runs]
@@ -82,8 +104,13 @@ def test_one_unknown_vector_for_two_mountings_ruins_the_gains(truth: Truth, mixe
 
 
 @pytest.mark.parametrize("names", [("m",), ("m", "mx", "my", "mz"), LINK_PARAMETERS], ids=len)
-def test_more_knowledge_is_used(truth: Truth, clean_runs: tuple[Run, ...], names: tuple[str, ...]) -> None:
-    """n_kL of eq. (5) from one to ten: what is known is not estimated, and all of it is consistent."""
+def test_more_knowledge_is_used(
+    truth: Truth, clean_runs: tuple[Run, ...], names: tuple[str, ...]
+) -> None:
+    """n_kL of eq.
+
+    (5) from one to ten: what is known is not estimated, and all of it is consistent.
+    """
     payload = Payload("disc", "a", {name: PAYLOAD_TRUTH[name] for name in names})
     runs = (clean_runs[0], replace(clean_runs[1], payload=payload))
     system = identify(truth.model, runs, CONDITIONING).system

@@ -1,4 +1,8 @@
-"""Eqs. (7)-(11) and (17)-(23): against the formulas written out on all rows, and against the scatter they predict."""
+"""Eqs.
+
+(7)-(11) and (17)-(23): against the formulas written out on all rows, and against the scatter they
+predict.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,11 @@ SOLUTION = np.array([3.0, -2.0, 0.7, 0.2, -0.5, 1.1, 1.0])
 """Two gains, three parameters of the robot, one of the payload, and eq. (17)'s one."""
 ROWS = 400
 TWO_AXES = Model(
-    Robot((Joint("J", JointKind.REVOLUTE, -1, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0])),) * 2, np.zeros(3)),
+    Robot(
+        (Joint("J", JointKind.REVOLUTE, -1, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0])),)
+        * 2,
+        np.zeros(3),
+    ),
     DriveTrain(np.eye(2)),
 )
 
@@ -53,7 +61,8 @@ def _exact(rng: np.random.Generator) -> FloatArray:
 
 
 def _scatter(
-    estimate: Callable[[System], Estimate], disturb: Callable[[FloatArray, np.random.Generator], FloatArray]
+    estimate: Callable[[System], Estimate],
+    disturb: Callable[[FloatArray, np.random.Generator], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean and covariance of 400 estimates, and the mean of the covariances that they claim."""
     rng = np.random.default_rng(4)
@@ -83,7 +92,9 @@ def test_least_squares_scatters_as_equation_10_says() -> None:
 
 
 def test_weighting_rows_by_joint_gains_what_it_says() -> None:
-    """The second joint four times as noisy: WLS knows, LS claims one σ for both and scatters more."""
+    """The second joint four times as noisy:
+    WLS knows, LS claims one σ for both and scatters more.
+    """
 
     def disturb(exact: FloatArray, rng: np.random.Generator) -> FloatArray:
         noisy = exact.copy()
@@ -98,7 +109,10 @@ def test_weighting_rows_by_joint_gains_what_it_says() -> None:
 
 @pytest.mark.parametrize("scaling", [Scaling.NONE, Scaling.ROWS])
 def test_total_least_squares_scatters_as_equation_23_says(scaling: Scaling) -> None:
-    """Equal, independent errors in every entry of W_tot: what eq. (21) assumes. LS is biased there."""
+    """Equal, independent errors in every entry of W_tot: what eq.
+
+    (21) assumes. LS is biased there.
+    """
 
     def disturb(exact: FloatArray, rng: np.random.Generator) -> FloatArray:
         return exact + 0.05 * rng.normal(size=exact.shape)
@@ -111,7 +125,9 @@ def test_total_least_squares_scatters_as_equation_23_says(scaling: Scaling) -> N
     def much(exact: FloatArray, rng: np.random.Generator) -> FloatArray:
         return exact + 0.2 * rng.normal(size=exact.shape)
 
-    of_tls, of_ls = (np.abs(_scatter(e, much)[0] / SOLUTION[:-1] - 1.0) for e in (lambda s: tls(s, scaling), ls))
+    of_tls, of_ls = (
+        np.abs(_scatter(e, much)[0] / SOLUTION[:-1] - 1.0) for e in (lambda s: tls(s, scaling), ls)
+    )
     assert np.max(of_tls) < 0.1 * np.max(of_ls)
 
 
@@ -130,20 +146,27 @@ def test_the_triangles_give_the_formulas_of_all_rows(noisy: Evidence) -> None:
             for joint, used in enumerate(rows.use)
         ]
     )
-    regressor, right = matrix[:, :-1], -matrix[:, -1]
+    regressor = matrix[:, :-1]
+    right = -matrix[:, -1]
     count, unknowns = regressor.shape
     solution = np.linalg.lstsq(regressor, right, rcond=None)[0]
     variance = np.sum((right - regressor @ solution) ** 2) / (count - unknowns)
     covariance = variance * np.linalg.inv(regressor.T @ regressor)
     found = ls(rows.system())
-    assert np.concatenate((found.gains, found.parameters)) == pytest.approx(solution, rel=1e-6, abs=1e-8)
-    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-5)
+    assert np.concatenate((found.gains, found.parameters)) == pytest.approx(
+        solution, rel=1e-6, abs=1e-8
+    )
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(
+        np.sqrt(np.diag(covariance)), rel=1e-5
+    )
     _, s, vt = np.linalg.svd(matrix, full_matrices=False)
     vector = vt[-1] / vt[-1, -1]
     compatible = (matrix - np.outer(matrix @ vt[-1], vt[-1]))[:, :-1]
     noise = s[-1] ** 2 / (count - matrix.shape[1])
     size = 1.0 + np.sum(vector[:-1] ** 2)
     total = tls(rows.system(), Scaling.NONE)
-    assert np.concatenate((total.gains, total.parameters)) == pytest.approx(vector[:-1], rel=1e-5, abs=1e-7)
+    assert np.concatenate((total.gains, total.parameters)) == pytest.approx(
+        vector[:-1], rel=1e-5, abs=1e-7
+    )
     claimed = np.sqrt(np.diag(noise * size * np.linalg.inv(compatible.T @ compatible)))
     assert np.sqrt(np.diag(total.covariance)) == pytest.approx(claimed, rel=1e-4)

@@ -1,4 +1,6 @@
-"""Gravity that points elsewhere than declared, positions that count the other way, and zeros a quarter turn away."""
+"""Gravity that points elsewhere than declared, positions that count the other way,
+and zeros a quarter turn away.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def clean(truth: Truth) -> list[Run]:
     return small_recordings(truth, 0, seconds=12.0)
 
 
-def found_in(truth: Truth, runs: list[Run], gains: FloatArray | None = None) -> TurnedGeometry | None:
+def found_in(
+    truth: Truth, runs: list[Run], gains: FloatArray | None = None
+) -> TurnedGeometry | None:
     """The geometry that is found in runs under the model of an arm."""
     instants = read_instants(truth.model, runs, SMALL)
     return find_turned_geometry(truth.model, instants, truth.gains if gains is None else gains)
@@ -54,8 +58,12 @@ def test_nothing_is_found_in_clean_recordings(truth: Truth, seed: int) -> None:
     assert found_in(truth, small_recordings(truth, seed, noise_a=0.15)) is None
 
 
-@pytest.mark.parametrize("declared", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 1, 1), (2, -1, 1)])
-def test_gravity_is_found_within_a_degree(truth: Truth, clean: list[Run], declared: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    "declared", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (1, 1, 1), (2, -1, 1)]
+)
+def test_gravity_is_found_within_a_degree(
+    truth: Truth, clean: list[Run], declared: tuple[int, ...]
+) -> None:
     gravity = 9.81 * np.array(declared) / np.linalg.norm(declared)
     found = found_in(replace(truth, model=with_gravity(truth.model, gravity)), clean)
     assert found is not None
@@ -75,7 +83,9 @@ def test_a_small_turn_of_gravity_is_no_gross_mistake(truth: Truth, clean: list[R
 
 @pytest.mark.parametrize("current_sign", [1.0, -1.0])
 @pytest.mark.parametrize("axis", [1, 2])
-def test_a_reversed_position_is_found(truth: Truth, clean: list[Run], axis: int, current_sign: float) -> None:
+def test_a_reversed_position_is_found(
+    truth: Truth, clean: list[Run], axis: int, current_sign: float
+) -> None:
     signs = np.ones(3)
     signs[axis] = -1.0
     currents = np.ones(3)
@@ -85,14 +95,17 @@ def test_a_reversed_position_is_found(truth: Truth, clean: list[Run], axis: int,
     said = found.diagnosis(AXES)
     assert (said.name, said.axes) == (POSITION_REVERSED, (AXES[axis],))
     assert found.reversed_currents == ((axis,) if current_sign < 0.0 else ())
-    # A current that counts the other way, too, asks for the axis in the URDF, or both signs in the cell file.
+    # A current that counts the other way, too, asks for the axis in the URDF, or both signs in the
+    # cell file.
     assert ("the <axis> of the joint" in said.remedy) == (current_sign < 0.0)
     assert "`drive_train.ratio`" in said.remedy
     assert found.corrected_positions(np.ones((1, 3))).tolist() == [signs.tolist()]
 
 
 @pytest.mark.parametrize("offset_deg", [40.0, -45.0, 60.0, 90.0, -90.0, 135.0, 160.0, 180.0])
-def test_a_zero_that_is_far_off_is_found_with_its_size(truth: Truth, clean: list[Run], offset_deg: float) -> None:
+def test_a_zero_that_is_far_off_is_found_with_its_size(
+    truth: Truth, clean: list[Run], offset_deg: float
+) -> None:
     """It was silent below 45°, and called a payload that was not there above."""
     offset = np.array([0.0, np.deg2rad(offset_deg), 0.0])
     found = found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean])
@@ -108,7 +121,9 @@ def test_a_zero_that_is_far_off_is_found_with_its_size(truth: Truth, clean: list
 
 
 def test_find_turned_geometry_with_a_leaning_base_blames_no_zero(truth: Truth) -> None:
-    """A zero of J1 that is off by 116° turns a lean by 8° away from the arm; the lean itself explains all of it."""
+    """A zero of J1 that is off by 116° turns a lean by 8° away from the arm;
+    the lean itself explains all of it.
+    """
     easy = truth.parameters.copy()
     easy[10:14] *= 0.05  # friction of J1 would hide the torque of the lean
     runs = runs_with_less_of_j1(replace(truth, parameters=easy), share=0.6, noise_a=0.03)
@@ -116,7 +131,7 @@ def test_find_turned_geometry_with_a_leaning_base_blames_no_zero(truth: Truth) -
     assert found_in(replace(truth, model=leaning), runs) is None
 
 
-def test_find_turned_geometry_where_j1_hardly_moves_names_gravity_and_the_zero_that_explains_the_same(
+def test_find_turned_geometry_where_j1_hardly_moves_names_gravity_and_the_zero_that_explains_the_same(  # noqa: E501
     truth: Truth,
 ) -> None:
     runs = runs_with_less_of_j1(truth, share=0.1, noise_a=0.1)
@@ -162,11 +177,16 @@ def tilted_gravity(angle_deg: float, azimuth_deg: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("axis", [0, 2])
-def test_a_zero_that_no_torque_shows_is_not_found(truth: Truth, clean: list[Run], axis: int) -> None:
+def test_a_zero_that_no_torque_shows_is_not_found(
+    truth: Truth, clean: list[Run], axis: int
+) -> None:
     """About a vertical axis and behind the last joint another zero makes the same torques."""
     offset = np.zeros(3)
     offset[axis] = np.deg2rad(90.0)
-    assert found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean]) is None
+    assert (
+        found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean])
+        is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -186,7 +206,9 @@ def test_mistakes_of_currents_are_no_geometry(
     assert found_in(truth, with_currents(clean, factor, order)) is None
 
 
-def test_a_reversed_current_beside_a_wrong_gravity_does_not_hide_it(truth: Truth, clean: list[Run]) -> None:
+def test_a_reversed_current_beside_a_wrong_gravity_does_not_hide_it(
+    truth: Truth, clean: list[Run]
+) -> None:
     wall = replace(truth, model=with_gravity(truth.model, np.array([9.81, 0.0, 0.0])))
     found = found_in(wall, with_currents(clean, np.array([1.0, -1.0, 1.0])))
     assert found is not None
@@ -202,7 +224,13 @@ def test_a_fit_of_all_rows_confirms_it(truth: Truth, clean: list[Run], gains_fix
 
     def confirmed(before_percent: float | None) -> bool:
         return is_confirmed(
-            found, wall.model, clean, SMALL, truth.gains, gains_fixed=gains_fixed, before_percent=before_percent
+            found,
+            wall.model,
+            clean,
+            SMALL,
+            truth.gains,
+            gains_fixed=gains_fixed,
+            before_percent=before_percent,
         )
 
     assert confirmed(None)
@@ -220,7 +248,9 @@ def test_products_serve_every_direction(truth: Truth, clean: list[Run]) -> None:
     columns = with_gravity(truth.model, gravity).regressor(instants[0].motion)[1]
     first = square_of(columns, instants[0], 1)
     bare = gravity_products(truth.model, instants[:1]).directed(gravity).square.sum(axis=1)[1]
-    np.testing.assert_allclose(bare[:-1, :-1], first * truth.model.drive_train.to_motor[1, 1] ** 2, atol=1e-9)
+    np.testing.assert_allclose(
+        bare[:-1, :-1], first * truth.model.drive_train.to_motor[1, 1] ** 2, atol=1e-9
+    )
     assert square.shape[-1] == len(truth.model.columns) + 10 + 1
 
 

@@ -91,13 +91,17 @@ HEAVY = (
     # An in-line wrist: motor 5 also turns with joint 4, motor 6 with joints 4 and 5.
     Kind(
         "kr270.urdf",
-        _with([256.857, 267.429, 252.333, 221, 239.619, 154.323], {(4, 3): -59.905, (5, 3): 38.581, (5, 4): -51.441}),
+        _with(
+            [256.857, 267.429, 252.333, 221, 239.619, 154.323],
+            {(4, 3): -59.905, (5, 3): 38.581, (5, 4): -51.441},
+        ),
         np.array([353.2, 344.5, 320.4, 196.1, 195.3, 137.6]),
         np.array([2.0, 1.1, 2.2, 3.0, 2.0, 3.0]),
     ),
 )
-"""Beside these: in a chain of couplings a motor in another's place belongs to another joint, so that other rows count;
-and a heavy arm that leans is refused, not only fitted badly."""
+"""Beside these: in a chain of couplings a motor in another's place belongs to another joint,
+so that other rows count; and a heavy arm that leans is refused, not only fitted badly.
+"""
 CASES = [(kind, gravity) for kind in (*KINDS, *HEAVY) for gravity in (UPRIGHT, LEANING)]
 
 
@@ -109,9 +113,13 @@ def _name(value: object) -> str:
 
 @cache
 def _truth(urdf: str, gravity: Gravity) -> tuple[Model, FloatArray, FloatArray]:
-    """Model, standard parameters, and the inertial ones of a payload of 5 kg about the last joint's frame."""
+    """Model, standard parameters, and the inertial ones of a payload of 5 kg about the last joint's
+    frame.
+    """
     kind = next(kind for kind in (*KINDS, *HEAVY) if kind.urdf == urdf)
-    model = Model(robot_from_urdf((CONFIGS / "robots" / urdf).read_text(), gravity), DriveTrain(kind.ratio))
+    model = Model(
+        robot_from_urdf((CONFIGS / "robots" / urdf).read_text(), gravity), DriveTrain(kind.ratio)
+    )
     rng = np.random.default_rng(len(urdf))
     parameters = np.zeros(len(model.columns))
     for joint in range(model.robot.joint_count):
@@ -134,20 +142,30 @@ def _body(rng: np.random.Generator, mass: float) -> FloatArray:
 
 
 def _conditioning(model: Model) -> Conditioning:
-    still = tuple(0.005 if joint.kind is JointKind.PRISMATIC else 0.03 for joint in model.robot.joints)
+    still = tuple(
+        0.005 if joint.kind is JointKind.PRISMATIC else 0.03 for joint in model.robot.joints
+    )
     return Conditioning(standstill_rad_s=still)
 
 
 @cache
 def _runs(urdf: str, gravity: Gravity) -> tuple[Run, Run]:
-    """Without and with the payload; the current is exactly what the model needs for the filtered motion."""
+    """Without and with the payload; the current is exactly what the model needs for the filtered
+    motion.
+    """
     kind = next(kind for kind in (*KINDS, *HEAVY) if kind.urdf == urdf)
     model, parameters, payload = _truth(urdf, gravity)
     rng = np.random.default_rng(4)
     made = []
     for mounted in (None, Payload("body", "a", {"m": 5.0})):
         q = positions(rng, 22.0, RATE_HZ, kind.reach)
-        bare = Run("loaded" if mounted else "bare", np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), mounted)
+        bare = Run(
+            "loaded" if mounted else "bare",
+            np.arange(len(q)) / RATE_HZ,
+            q,
+            np.zeros_like(q),
+            mounted,
+        )
         data = differentiate(bare, model.drive_train, _conditioning(model))
         total = parameters.copy()
         if mounted is not None:
@@ -161,7 +179,9 @@ def _runs(urdf: str, gravity: Gravity) -> tuple[Run, Run]:
 
 def _fit(model: Model, runs: tuple[Run, ...], still: tuple[float, ...] | None = None) -> Estimate:
     conditioning = _conditioning(model)
-    return identify(model, runs, conditioning if still is None else Conditioning(standstill_rad_s=still)).estimate
+    return identify(
+        model, runs, conditioning if still is None else Conditioning(standstill_rad_s=still)
+    ).estimate
 
 
 @pytest.mark.parametrize(("kind", "gravity"), CASES, ids=_name)
@@ -178,12 +198,19 @@ def test_without_noise_the_gains_are_exact(kind: Kind, gravity: Gravity) -> None
 @pytest.mark.parametrize("kind", KINDS, ids=_name)
 @settings(deadline=None, max_examples=3)
 @given(data=st.data())
-def test_permuting_the_motors_permutes_the_gains_and_nothing_else(kind: Kind, data: st.DataObject) -> None:
-    """Motor constants g/N, motor torque for a unit of current. N is that of the joint of the motor's number."""
+def test_permuting_the_motors_permutes_the_gains_and_nothing_else(
+    kind: Kind, data: st.DataObject
+) -> None:
+    """Motor constants g/N, motor torque for a unit of current.
+
+    N is that of the joint of the motor's number.
+    """
     model, _, _ = _truth(kind.urdf, UPRIGHT)
     rng = np.random.default_rng(9)
     runs = tuple(
-        replace(run, current_a=run.current_a * (1 + 0.02 * rng.standard_normal(run.current_a.shape)))
+        replace(
+            run, current_a=run.current_a * (1 + 0.02 * rng.standard_normal(run.current_a.shape))
+        )
         for run in _runs(kind.urdf, UPRIGHT)
     )
     order = np.array(data.draw(st.permutations(range(len(kind.gains)))))
@@ -191,14 +218,19 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(kind: Kind, da
     shuffled = tuple(replace(run, current_a=run.current_a[:, order]) for run in runs)
     # One speed for all: which rows count must not depend on the order either.
     still = (0.02,) * len(order)
-    before, after = _fit(model, runs, still), _fit(Model(model.robot, train), shuffled, still)
+    before = _fit(model, runs, still)
+    after = _fit(Model(model.robot, train), shuffled, still)
     per_motor = before.gains / model.drive_train.reduction
     assert after.gains / train.reduction == pytest.approx(per_motor[order], rel=1e-6)
     spread = before.gains_std / np.abs(model.drive_train.reduction)
     assert after.gains_std / np.abs(train.reduction) == pytest.approx(spread[order], rel=1e-4)
     known = dict(zip((c.name for c in before.unknowns), before.parameters, strict=True))
     found = dict(zip((c.name for c in after.unknowns), after.parameters, strict=True))
-    links = {name for name in known.keys() & found.keys() if name.startswith(("I", "m")) and "Iam" not in name}
+    links = {
+        name
+        for name in known.keys() & found.keys()
+        if name.startswith(("I", "m")) and "Iam" not in name
+    }
     assert len(links) > 0.6 * sum(name.startswith(("I", "m")) for name in known)
     for name in links:
         assert found[name] == pytest.approx(known[name], rel=1e-5, abs=1e-6), name
@@ -211,11 +243,14 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
     upright, _, _ = _truth(kind.urdf, UPRIGHT)
     bare = _runs(kind.urdf, LEANING)[:1]
     right, wrong = (
-        identify(model, bare, _conditioning(model), method=Method.LS, fixed_gains=kind.gains).training_error.total
+        identify(
+            model, bare, _conditioning(model), method=Method.LS, fixed_gains=kind.gains
+        ).training_error.total
         for model in (leaning, upright)
     )
     assert right < 1e-4
-    # The offsets of prismatic axes take most of a wrong weight: 1.1 % on the gantry, above 40 % on the arms.
+    # The offsets of prismatic axes take most of a wrong weight: 1.1 % on the gantry, above 40 % on
+    # the arms.
     assert wrong > 0.5
 
 
@@ -223,4 +258,9 @@ def test_prismatic_joints_have_newton_for_their_friction() -> None:
     model, _, _ = _truth("gantry.urdf", UPRIGHT)
     units = {column.name: column.unit for column in model.columns}
     assert (units["Ia1"], units["fv1"], units["fs1"], units["off1"]) == ("kg", "N/(m/s)", "N", "N")
-    assert (units["Ia4"], units["fv4"], units["fs4"], units["off4"]) == ("kg m²", "Nm/(rad/s)", "Nm", "Nm")
+    assert (units["Ia4"], units["fv4"], units["fs4"], units["off4"]) == (
+        "kg m²",
+        "Nm/(rad/s)",
+        "Nm",
+        "Nm",
+    )

@@ -14,13 +14,16 @@ from tests.ident.recordings import CONDITIONING, Truth, record
 
 
 def test_the_tx40_has_61(truth: Truth) -> None:
-    run = record(truth, "bare", np.random.default_rng(11), averaged=1)  # where dry friction turns within a millisecond
+    # Where dry friction turns within a millisecond
+    run = record(truth, "bare", np.random.default_rng(11), averaged=1)
     data = differentiate(run, truth.model.drive_train, CONDITIONING)
     system = regrouped(reduce_runs(truth.model, (run,), CONDITIONING))
     observation = observe(truth.model, [data], CONDITIONING, system)
     assert len(observation.columns) == 61
     assert observation.columns[0].name.startswith("Izz1 + 1.0*Ia1 + 1.0*Iyy2")
-    torque = np.einsum("jcr,c->jr", observation.regressor, observation.base.grouping @ truth.parameters)
+    torque = np.einsum(
+        "jcr,c->jr", observation.regressor, observation.base.grouping @ truth.parameters
+    )
     # The currents of this run were made from the standard parameters, without noise.
     measured = observation.torque(truth.gains)
     size = np.max(np.abs(measured[:, observation.use.any(axis=0)]))
@@ -34,7 +37,9 @@ def test_columns_of_the_links_and_of_dry_friction_are_those_of_their_names(truth
         [f"{name}{number}" for name in LINK_PARAMETERS] for number in numbers
     ]
     assert names[truth.model.dry_friction_columns].tolist() == [f"fs{number}" for number in numbers]
-    assert np.arange(len(names))[truth.model.flange].tolist() == truth.model.link_columns[-1].tolist()
+    assert (
+        np.arange(len(names))[truth.model.flange].tolist() == truth.model.link_columns[-1].tolist()
+    )
 
 
 def test_a_tiny_column_is_zero_and_not_a_parameter() -> None:
@@ -55,11 +60,15 @@ def test_regrouping_keeps_the_product() -> None:
     assert found.names[0] == "a + 2.0*c"
     assert found.names[1] == "b - 0.5*c"
     parameters = rng.normal(size=5)
-    assert matrix[:, [0, 1, 3, 4]] @ (found.grouping @ parameters) == pytest.approx(matrix @ parameters)
+    assert matrix[:, [0, 1, 3, 4]] @ (found.grouping @ parameters) == pytest.approx(
+        matrix @ parameters
+    )
 
 
 def test_columns_that_differ_by_a_millionth_of_another_give_no_weights_of_a_million() -> None:
-    """A carriage in a gravity that leans by a millionth: mass, rotor, and the offset of the friction."""
+    """A carriage in a gravity that leans by a millionth:
+    mass, rotor, and the offset of the friction.
+    """
     acceleration = np.random.default_rng(2).normal(size=50)
     force = np.ones(50)
     mass = acceleration + 1e-6 * force

@@ -21,8 +21,16 @@ IMPOSSIBLE: list[tuple[str, dict[str, Any], str]] = [
     ("no centre", {"m": 1.0, "mx": np.nan}, "has mx = nan; expected finite numbers"),
     ("endless", {"m": 1.0, "Ixx": np.inf}, "has Ixx = inf; expected finite numbers"),
     ("an array", {"m": 1.0, "Ixx": np.eye(3)}, r"known\['Ixx'\] is of type ndarray; expected Real"),
-    ("one negative moment", {"m": 1.0, "Izz": -0.1}, "has Izz = -0.1 kg m²; expected moments of inertia of zero"),
-    ("triangle inequality", {"m": 1.0, **MOMENTS, "Izz": 0.05}, "has an inertia that no body has: .*Izz = 0.05.*expec"),
+    (
+        "one negative moment",
+        {"m": 1.0, "Izz": -0.1},
+        "has Izz = -0.1 kg m²; expected moments of inertia of zero",
+    ),
+    (
+        "triangle inequality",
+        {"m": 1.0, **MOMENTS, "Izz": 0.05},
+        "has an inertia that no body has: .*Izz = 0.05.*expec",
+    ),
     ("not positive", {"m": 1.0, **MOMENTS, "Ixy": 0.03}, "has an inertia that no body has"),
     (
         "about the centre of mass",
@@ -32,7 +40,9 @@ IMPOSSIBLE: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("known", "words"), [case[1:] for case in IMPOSSIBLE], ids=[case[0] for case in IMPOSSIBLE])
+@pytest.mark.parametrize(
+    ("known", "words"), [case[1:] for case in IMPOSSIBLE], ids=[case[0] for case in IMPOSSIBLE]
+)
 def test_a_payload_that_no_body_is_is_refused(known: dict[str, Any], words: str) -> None:
     with pytest.raises(ident.ModelError, match=words):
         ident.Payload("disc", "flange", known)

@@ -1,4 +1,6 @@
-"""Closed chains: how passive joints follow, against differences, Pinocchio, and equations derived by hand."""
+"""Closed chains: how passive joints follow, against differences, Pinocchio,
+and equations derived by hand.
+"""
 
 from __future__ import annotations
 
@@ -48,19 +50,24 @@ def _axes_motion(mechanism: Mechanism, samples: int = 400, size: float = 1.0) ->
     t = np.arange(samples) * STEP_S
     phase = np.arange(3)[:, None]
     wave = 2.0 * np.pi * (0.6 + 0.35 * phase)
-    x, v, a = (
-        size * np.sin(wave * t + phase),
-        size * wave * np.cos(wave * t + phase),
-        -size * wave**2 * np.sin(wave * t + phase),
-    )
+    x = size * np.sin(wave * t + phase)
+    v = size * wave * np.cos(wave * t + phase)
+    a = -size * wave**2 * np.sin(wave * t + phase)
     robot = mechanism.robot
     assembly = assemble(robot)
     home = assembly.position_rad[list(robot.axis_joints)]
     if mechanism is not PLANAR:
         reach = 0.4 if mechanism is FIVE_BAR else 0.06
         part = slice(len(home))
-        return Motion(*(np.asarray(start + reach * one[part].T) for start, one in ((home, x), (0.0, v), (0.0, a))))
-    pose, rate, change = (np.asarray((np.array([[0.05], [0.05], [0.3]]) * part).T) for part in (x, v, a))
+        return Motion(
+            *(
+                np.asarray(start + reach * one[part].T)
+                for start, one in ((home, x), (0.0, v), (0.0, a))
+            )
+        )
+    pose, rate, change = (
+        np.asarray((np.array([[0.05], [0.05], [0.3]]) * part).T) for part in (x, v, a)
+    )
     h = 1e-4
     steps = [pose + k * h * rate + 0.5 * (k * h) ** 2 * change for k in (-2, -1, 0, 1, 2)]
     at = [np.stack([leg_angles(one, leg)[0] for leg in range(4)], axis=1) for one in steps]
@@ -72,33 +79,44 @@ def _axes_motion(mechanism: Mechanism, samples: int = 400, size: float = 1.0) ->
 
 @settings(max_examples=40, deadline=None)
 @given(
-    seed=st.integers(0, 10_000), directions=st.lists(st.sampled_from(DIRECTIONS), min_size=1, max_size=6, unique=True)
+    seed=st.integers(0, 10_000),
+    directions=st.lists(st.sampled_from(DIRECTIONS), min_size=1, max_size=6, unique=True),
 )
 def test_derivatives_of_any_closure(seed: int, directions: list[str]) -> None:
     rng = np.random.default_rng(seed)
     tree = robot_from_urdf(SEVEN_AXES.urdf)
     joints = tuple(replace(joint, parent=index // 2 - 1) for index, joint in enumerate(tree.joints))
     ends = [Place(joint, _turn(rng), rng.uniform(-0.3, 0.3, 3)) for joint in (6, 5)]
-    robot = Robot(joints, tree.gravity_m_s2, (Closure("any", ends[0], ends[1], tuple(directions)),), (0,))
+    robot = Robot(
+        joints, tree.gravity_m_s2, (Closure("any", ends[0], ends[1], tuple(directions)),), (0,)
+    )
     q, v = rng.uniform(-1, 1, (2, 1, 7))
     h = 1e-6
     here = loops(robot, q, velocity=v)
     ahead, behind = (loops(robot, q + sign * h * v) for sign in (1, -1))
-    assert here.jacobian[0] @ v[0] == pytest.approx((ahead.residual - behind.residual)[0] / (2 * h), abs=1e-7)
-    assert here.bias[0] == pytest.approx((ahead.jacobian - behind.jacobian)[0] @ v[0] / (2 * h), abs=1e-6)
+    assert here.jacobian[0] @ v[0] == pytest.approx(
+        (ahead.residual - behind.residual)[0] / (2 * h), abs=1e-7
+    )
+    assert here.bias[0] == pytest.approx(
+        (ahead.jacobian - behind.jacobian)[0] @ v[0] / (2 * h), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_joints_follow_with_their_derivatives(mechanism: Mechanism) -> None:
-    robot, motion = mechanism.robot, _axes_motion(mechanism)
+    robot = mechanism.robot
+    motion = _axes_motion(mechanism)
     assembly = assemble(robot, mechanism.mobility)
     found = follow(robot, assembly, motion)
-    q, v, a = found.joints.position_rad, found.joints.velocity_rad_s, found.joints.acceleration_rad_s2
+    q = found.joints.position_rad
+    v = found.joints.velocity_rad_s
+    a = found.joints.acceleration_rad_s2
     assert np.max(np.abs(loops(robot, q).residual)) < 1e-11
     motors = list(robot.axis_joints)
     assert np.max(np.abs(q[:, motors] - motion.position_rad)) < 1e-11
     closing = loops(robot, q, velocity=v)
-    jacobian, bias = closing.jacobian, closing.bias
+    jacobian = closing.jacobian
+    bias = closing.bias
     assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, v))) < 1e-10
     assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, a) + bias)) < 1e-9
     differences = (q[2:] - q[:-2]) / (2 * STEP_S)
@@ -113,17 +131,23 @@ def test_a_pose_does_not_depend_on_what_was_asked_before() -> None:
     assembly = assemble(robot)
     whole = follow(robot, assembly, motion).joints.position_rad
     part = Motion(
-        *(array[77:201] for array in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2))
+        *(
+            array[77:201]
+            for array in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
+        )
     )
     assert np.max(np.abs(follow(robot, assembly, part).joints.position_rad - whole[77:201])) < 1e-11
 
 
 def test_a_model_keeps_a_motion_as_long_as_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, motion = FIVE_BAR.model, _axes_motion(FIVE_BAR, 50)
+    model = FIVE_BAR.model
+    motion = _axes_motion(FIVE_BAR, 50)
     first = model.follow(motion)
     assert model.follow(replace(motion)) is first
     faster = Motion(motion.position_rad, 2.0 * motion.velocity_rad_s, motion.acceleration_rad_s2)
-    assert model.follow(faster).joints.velocity_rad_s == pytest.approx(2.0 * first.joints.velocity_rad_s)
+    assert model.follow(faster).joints.velocity_rad_s == pytest.approx(
+        2.0 * first.joints.velocity_rad_s
+    )
     assert model.follow(motion) is first
     with pytest.raises(ValueError, match="read-only"):
         first.to_joints[0] = 0.0
@@ -136,19 +160,25 @@ def test_a_model_keeps_a_motion_as_long_as_there_is_room(monkeypatch: pytest.Mon
 
 
 def test_five_bar_against_the_circles_that_its_rods_describe() -> None:
-    found = follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), _axes_motion(FIVE_BAR)).joints.position_rad
+    found = follow(
+        FIVE_BAR.robot, assemble(FIVE_BAR.robot), _axes_motion(FIVE_BAR)
+    ).joints.position_rad
     index = {joint.name: number for number, joint in enumerate(FIVE_BAR.robot.joints)}
-    left, right = found[:, index["left-crank"]], found[:, index["right-crank"]]
+    left = found[:, index["left-crank"]]
+    right = found[:, index["right-crank"]]
     ends = [
         np.stack([side * 0.5 * BASE_M + CRANK_M * np.cos(q), CRANK_M * np.sin(q)], axis=1)
         for side, q in ((-1, left), (1, right))
     ]
-    middle, apart = 0.5 * (ends[0] + ends[1]), ends[1] - ends[0]
+    middle = 0.5 * (ends[0] + ends[1])
+    apart = ends[1] - ends[0]
     half = 0.5 * np.linalg.norm(apart, axis=1)
     across = np.stack([-apart[:, 1], apart[:, 0]], axis=1) / (2.0 * half)[:, None]
     tip = middle + np.sqrt(ROD_M**2 - half**2)[:, None] * across
     angle = found[:, index["left-rod"]] + left
-    assert ends[0] + ROD_M * np.stack([np.cos(angle), np.sin(angle)], axis=1) == pytest.approx(tip, abs=1e-12)
+    assert ends[0] + ROD_M * np.stack([np.cos(angle), np.sin(angle)], axis=1) == pytest.approx(
+        tip, abs=1e-12
+    )
 
 
 def test_three_legs_carry_a_platform_that_only_translates() -> None:
@@ -156,11 +186,15 @@ def test_three_legs_carry_a_platform_that_only_translates() -> None:
     motion = _axes_motion(THREE_LEGS)
     placed = poses(robot, follow(robot, assemble(robot), motion).joints.position_rad)
     hand = next(number for number, joint in enumerate(robot.joints) if joint.name == "hand-0") + 1
-    assert placed.rotation[hand] == pytest.approx(np.broadcast_to(placed.rotation[hand, 0], (400, 3, 3)), abs=1e-11)
+    assert placed.rotation[hand] == pytest.approx(
+        np.broadcast_to(placed.rotation[hand, 0], (400, 3, 3)), abs=1e-11
+    )
     # Each rod keeps its length: from its slide to the platform.
     for leg in range(3):
         at = motion.position_rad[:, leg, None] * np.eye(3)[leg] - SLIDE_M * np.eye(3)[leg]
-        assert np.linalg.norm(placed.origin_m[hand] - at, axis=1) == pytest.approx(SLIDE_M, abs=1e-11)
+        assert np.linalg.norm(placed.origin_m[hand] - at, axis=1) == pytest.approx(
+            SLIDE_M, abs=1e-11
+        )
 
 
 def _torque_of_tree(mechanism: Mechanism, joints: Motion) -> FloatArray:
@@ -168,7 +202,9 @@ def _torque_of_tree(mechanism: Mechanism, joints: Motion) -> FloatArray:
     model = pin.buildModelFromXML(mechanism.urdf)
     model.gravity.linear = np.array(mechanism.gravity_m_s2)
     data = model.createData()
-    states = zip(joints.position_rad, joints.velocity_rad_s, joints.acceleration_rad_s2, strict=True)
+    states = zip(
+        joints.position_rad, joints.velocity_rad_s, joints.acceleration_rad_s2, strict=True
+    )
     return np.stack([pin.rnea(model, data, q, v, a) for q, v, a in states])
 
 
@@ -182,7 +218,8 @@ def _standard(mechanism: Mechanism, model: Model) -> FloatArray:
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_virtual_power_of_the_motors_is_that_of_all_joints(mechanism: Mechanism) -> None:
-    model, motion = mechanism.model, _axes_motion(mechanism, 60)
+    model = mechanism.model
+    motion = _axes_motion(mechanism, 60)
     torque = np.einsum("mck,c->mk", model.regressor(motion), _standard(mechanism, model))
     followed = model.follow(motion)
     tree = _torque_of_tree(mechanism, followed.joints)
@@ -193,18 +230,28 @@ def test_virtual_power_of_the_motors_is_that_of_all_joints(mechanism: Mechanism)
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_constrained_forward_dynamics_returns_the_acceleration(mechanism: Mechanism) -> None:
-    """The torques of the regressor, put into Pinocchio's forward dynamics with constraints of its own."""
-    model, motion = mechanism.model, _axes_motion(mechanism, 40)
+    """The torques of the regressor, put into Pinocchio's forward dynamics with constraints of its
+    own.
+    """
+    model = mechanism.model
+    motion = _axes_motion(mechanism, 40)
     torque = np.einsum("mck,c->km", model.regressor(motion), _standard(mechanism, model))
     joints = model.follow(motion).joints
     tree = pin.buildModelFromXML(mechanism.urdf)
     tree.gravity.linear = np.array(mechanism.gravity_m_s2)
     data = tree.createData()
-    constraints, datas = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+    constraints = pin.StdVec_RigidConstraintModel()
+    datas = pin.StdVec_RigidConstraintData()
     for closure in mechanism.closures:
         # In a plane, the third translation holds by itself.
-        kind = pin.ContactType.CONTACT_6D if len(closure.directions) == 6 else pin.ContactType.CONTACT_3D
-        ends = [tree.frames[tree.getFrameId(link, pin.FrameType.BODY)] for link in (closure.first, closure.second)]
+        if len(closure.directions) == 6:
+            kind = pin.ContactType.CONTACT_6D
+        else:
+            kind = pin.ContactType.CONTACT_3D
+        ends = [
+            tree.frames[tree.getFrameId(link, pin.FrameType.BODY)]
+            for link in (closure.first, closure.second)
+        ]
         places = [part for end in ends for part in (end.parentJoint, end.placement)]
         constraints.append(pin.RigidConstraintModel(kind, tree, *places, pin.ReferenceFrame.LOCAL))
     for constraint in constraints:
@@ -213,7 +260,8 @@ def test_constrained_forward_dynamics_returns_the_acceleration(mechanism: Mechan
     settings = pin.ProximalSettings(1e-13, 1e-10, 200)
     names = [joint.name for joint in model.robot.axes]
     for k in range(40):
-        q, v = joints.position_rad[k], joints.velocity_rad_s[k]
+        q = joints.position_rad[k]
+        v = joints.velocity_rad_s[k]
         applied = np.zeros(tree.nv)
         for name, one in zip(names, torque[k], strict=True):
             applied[tree.joints[tree.getJointId(name)].idx_v] = one
@@ -224,13 +272,15 @@ def test_constrained_forward_dynamics_returns_the_acceleration(mechanism: Mechan
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_short_cuts_agree_with_the_regressor(mechanism: Mechanism) -> None:
-    model, motion = mechanism.model, _axes_motion(mechanism, 30)
+    model = mechanism.model
+    motion = _axes_motion(mechanism, 30)
     standard = _standard(mechanism, model)
     load, _, whole = model.torques(motion, standard)
     torque = np.einsum("mck,c->mk", model.regressor(motion), standard)
     assert load == pytest.approx(torque, rel=1e-9, abs=1e-9)
     assert whole == pytest.approx(torque, rel=1e-9, abs=1e-9)
-    # Of a redundant drive not all motors at will, which would tear the platform apart, but as its coordinates move.
+    # Of a redundant drive not all motors at will, which would tear the platform apart, but as its
+    # coordinates move.
     per_x = model.follow(motion).to_motors.sum(axis=2)
     faster = Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2 + per_x)
     change = np.einsum("mck,c->mk", model.regressor(faster), standard) - torque
@@ -254,9 +304,15 @@ def _wrong(mechanism: Mechanism, **changes: Any) -> Robot:
 
 
 def test_bad_descriptions_are_refused_by_name() -> None:
-    with pytest.raises(ModelError, match=r"closure 'tip' cannot close at the assembly pose: x .* mm"):
+    with pytest.raises(
+        ModelError,
+        match=r"closure 'tip' cannot close at the assembly "
+        r"pose: x .* mm",
+    ):
         assemble(_wrong(FIVE_BAR, assembly_rad={"left-crank": 3.1, "right-crank": 0.0}))
-    with pytest.raises(ModelError, match="leave 2 degrees of freedom at the assembly pose; expected 3"):
+    with pytest.raises(
+        ModelError, match="leave 2 degrees of freedom at the assembly pose; expected 3"
+    ):
         assemble(FIVE_BAR.robot, 3)
     with pytest.raises(ModelError, match="left-crank do not move all 2 degrees of freedom"):
         assemble(_wrong(FIVE_BAR, motors=("left-crank",)))
@@ -270,29 +326,43 @@ def test_bad_descriptions_are_refused_by_name() -> None:
         _wrong(FIVE_BAR, closures=(LinkPair("tip", "nowhere", "right-tip", ("x",)),))
     with pytest.raises(ModelError, match="the list of motors names joint 'left'"):
         _wrong(FIVE_BAR, motors=("left", "right-crank"))
-    with pytest.raises(ModelError, match="two motors drive left-crank; expected a joint of its own for each"):
+    with pytest.raises(
+        ModelError, match="two motors drive left-crank; expected a joint of its own for each"
+    ):
         assemble(_wrong(FIVE_BAR, motors=("left-crank", "right-crank", "left-crank")))
     with pytest.raises(ModelError, match=r"left-crank at 3.6e\+09°; expected -360° to 360°"):
-        assemble(_wrong(FIVE_BAR, assembly_rad={"left-crank": np.radians(3.6e9), "right-crank": 0.0}))
+        assemble(
+            _wrong(FIVE_BAR, assembly_rad={"left-crank": np.radians(3.6e9), "right-crank": 0.0})
+        )
     with pytest.raises(ModelError, match="directions q; expected some of x, y, z, rx, ry, rz"):
         _wrong(FIVE_BAR, closures=(LinkPair("tip", "left-tip", "right-tip", ("q",)),))
 
 
 def test_motors_of_a_redundant_drive_that_do_not_fit_each_other_are_named() -> None:
     motion = _axes_motion(PLANAR, 30)
-    robot, assembly = PLANAR.robot, assemble(PLANAR.robot)
+    robot = PLANAR.robot
+    assembly = assemble(PLANAR.robot)
     turned = motion.position_rad.copy()
     turned[:, 1] += 0.15  # a wrong zero
-    with pytest.raises(ModelError, match=r"motors do not fit each other at .*: .* away from where the others hold it"):
+    with pytest.raises(
+        ModelError,
+        match=r"motors do not fit each other at .*: .* away from where "
+        r"the others hold it",
+    ):
         follow(robot, assembly, replace(motion, position_rad=turned))
     # What an encoder or a bent arm makes is no wrong zero.
     shaken = motion.position_rad + np.random.default_rng(0).normal(0.0, 1e-3, turned.shape)
-    assert follow(robot, assembly, replace(motion, position_rad=shaken)).to_motors.shape == (30, 4, 3)
+    assert follow(robot, assembly, replace(motion, position_rad=shaken)).to_motors.shape == (
+        30,
+        4,
+        3,
+    )
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_the_assembly_pose_has_the_condition_of_a_motion_there(mechanism: Mechanism) -> None:
-    robot, assembly = mechanism.robot, assemble(mechanism.robot)
+    robot = mechanism.robot
+    assembly = assemble(mechanism.robot)
     home = assembly.position_rad[None, list(robot.axis_joints)]
     found = follow(robot, assembly, Motion(home, 0.0 * home, 0.0 * home))
     assert found.condition == pytest.approx(assembly.condition)
@@ -306,7 +376,11 @@ def test_a_redundant_drive_train_is_diagonal() -> None:
 
 def test_a_position_out_of_reach_is_named() -> None:
     motion = Motion(*(np.array([[3.1, 0.0]]) for _ in range(3)))
-    with pytest.raises(ModelError, match=r"the loops cannot be closed at left-crank .*, right-crank "):
+    with pytest.raises(
+        ModelError,
+        match=r"the loops cannot be closed at left-crank .*, "
+        r"right-crank ",
+    ):
         follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), motion)
 
 
@@ -315,7 +389,11 @@ def test_a_motion_through_a_singularity_is_refused_with_the_pose() -> None:
     home = assemble(FIVE_BAR.robot).position_rad[list(FIVE_BAR.robot.axis_joints)]
     way = np.linspace(0.0, 1.0, 200)[:, None]
     motion = home + way * (np.array([np.pi - low, low]) - home)
-    with pytest.raises(ModelError, match=r"close to a singularity at left-crank 2.73, right-crank 0.41"):
+    with pytest.raises(
+        ModelError,
+        match=r"close to a singularity at left-crank 2.73, "
+        r"right-crank 0.41",
+    ):
         follow(FIVE_BAR.robot, assemble(FIVE_BAR.robot), Motion(motion, 0.0 * motion, 0.0 * motion))
 
 
@@ -324,7 +402,9 @@ def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
     motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
     home = assemble(PLANAR.robot).position_rad[list(PLANAR.robot.axis_joints)]
     motors += 2.0 * np.pi * np.round((home - motors) / (2.0 * np.pi))
-    found = follow(PLANAR.robot, assemble(PLANAR.robot), Motion(motors, 0 * motors, 0 * motors)).joints.position_rad
+    found = follow(
+        PLANAR.robot, assemble(PLANAR.robot), Motion(motors, 0 * motors, 0 * motors)
+    ).joints.position_rad
     turned = {joint.name: value for joint, value in zip(PLANAR.robot.joints, found[0], strict=True)}
     assert turned["motor-0"] + turned["elbow-0"] + turned["platform"] == pytest.approx(0.2)
 
@@ -332,7 +412,8 @@ def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_every_pose_of_a_recording_is_reached_from_the_assembly_pose(mechanism: Mechanism) -> None:
     """Also when they are asked one by one, far from each other, as a planner does."""
-    robot, assembly = mechanism.robot, assemble(mechanism.robot)
+    robot = mechanism.robot
+    assembly = assemble(mechanism.robot)
     motion = axis_positions(mechanism, np.random.default_rng(7), 40.0)
     smooth = reach(robot, assembly, motion)
     apart = reach(robot, assembly, motion[::97])
@@ -351,11 +432,13 @@ PARALLELOGRAM = """<robot name="lifter">
     <axis xyz="0 1 0"/><limit velocity="1" effort="1"/></joint>
   <joint name="J4" type="revolute"><parent link="forearm"/><child link="hand"/><origin xyz="0 0 0.3"/>
     <axis xyz="1 0 0"/><limit velocity="1" effort="1"/></joint>
-</robot>"""
+</robot>"""  # noqa: E501
 
 
 def test_a_follower_is_described_by_one_closure_of_a_direction() -> None:
-    """What the refusal of <mimic> proposes: the forearm keeps its direction, so its joint turns back as J2 turns."""
+    """What the refusal of <mimic> proposes: the forearm keeps its direction,
+    so its joint turns back as J2 turns.
+    """
     keeps = LinkPair("parallelogram", "column", "forearm", ("ry",))
     robot = robot_from_urdf(PARALLELOGRAM, closures=(keeps,), motors=("J1", "J2", "J4"))
     rng = np.random.default_rng(5)

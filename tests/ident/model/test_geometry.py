@@ -1,4 +1,6 @@
-"""Zeros and lengths of a description, and what they do to torques, against the simulator's mechanics."""
+"""Zeros and lengths of a description, and what they do to torques,
+against the simulator's mechanics.
+"""
 
 from __future__ import annotations
 
@@ -67,9 +69,14 @@ def test_a_length_moves_the_other_end_of_its_link_along_itself() -> None:
             longer = with_geometry(PLANAR.robot, (GeometryChange(parameter, 3e-4),))
             assert described_length(longer, parameter) == pytest.approx(before + 3e-4)
             others = [
-                one for one in geometry_parameters(PLANAR.robot) if one.kind is parameter.kind and one != parameter
+                one
+                for one in geometry_parameters(PLANAR.robot)
+                if one.kind is parameter.kind and one != parameter
             ]
-            assert all(described_length(longer, one) == described_length(PLANAR.robot, one) for one in others)
+            assert all(
+                described_length(longer, one) == described_length(PLANAR.robot, one)
+                for one in others
+            )
 
 
 def test_an_unknown_length_is_refused_with_those_that_there_are() -> None:
@@ -97,11 +104,15 @@ def _model(spec: CellSpec) -> Model:
 
 
 def _standard(model: Model, spec: CellSpec) -> FloatArray:
-    """Parameters of the links as Pinocchio reads them: m, m c and the inertia about the joint's origin."""
+    """Parameters of the links as Pinocchio reads them:
+    m, m c and the inertia about the joint's origin.
+    """
     tree = link_model(replace(spec, payload=None))
     standard = np.zeros(len(model.columns))
     for joint, columns in zip(model.robot.joints, model.link_columns, strict=True):
-        m, mx, my, mz, xx, xy, yy, xz, yz, zz = tree.inertias[tree.getJointId(joint.name)].toDynamicParameters()
+        m, mx, my, mz, xx, xy, yy, xz, yz, zz = tree.inertias[
+            tree.getJointId(joint.name)
+        ].toDynamicParameters()
         standard[columns] = xx, xy, xz, yy, yz, zz, mx, my, mz, m
     return standard
 
@@ -112,12 +123,16 @@ def _axes_motion(model: Model, samples: int) -> Motion:
     wave = 2.0 * np.pi * np.array([0.7, 1.1])
     position = home + 0.25 * np.sin(wave * t + [0.0, 1.0])
     return Motion(
-        position, 0.25 * wave * np.cos(wave * t + [0.0, 1.0]), -0.25 * wave**2 * np.sin(wave * t + [0.0, 1.0])
+        position,
+        0.25 * wave * np.cos(wave * t + [0.0, 1.0]),
+        -0.25 * wave**2 * np.sin(wave * t + [0.0, 1.0]),
     )
 
 
 def _simulated_torque(spec: CellSpec, motion: Motion, zero_rad: FloatArray) -> FloatArray:
-    """Torque of the motors, shape (m, k): the simulator's closures, differences in time, and Pinocchio's RNEA."""
+    """Torque of the motors, shape (m, k): the simulator's closures, differences in time,
+    and Pinocchio's RNEA.
+    """
     tree = link_model(replace(spec, payload=None))
     mechanism = SimulatedMechanism(tree, spec)
     data = tree.createData()
@@ -155,7 +170,9 @@ def test_the_derivative_of_the_torques_is_that_of_the_simulated_five_bar() -> No
     motion = _axes_motion(model, 12)
     no_zero = np.zeros(2)
     whole = model.torques(motion, standard)[2]
-    assert_allclose(whole, _simulated_torque(spec, motion, no_zero), atol=1e-4 * np.abs(whole).max())
+    assert_allclose(
+        whole, _simulated_torque(spec, motion, no_zero), atol=1e-4 * np.abs(whole).max()
+    )
     step = 1e-3
     crank = next(joint for joint in model.robot.joints if joint.parent >= 0)
     driven = model.robot.joints[crank.parent].name
@@ -164,12 +181,18 @@ def test_the_derivative_of_the_torques_is_that_of_the_simulated_five_bar() -> No
     before, _, after = spec.urdf.partition(f'name="{crank.name}"')
     assert described in after
     longer = replace(
-        spec, urdf=f'{before}name="{crank.name}"' + after.replace(described, f'xyz="{length_m + step!r} 0 0"', 1)
+        spec,
+        urdf=f'{before}name="{crank.name}"'
+        + after.replace(described, f'xyz="{length_m + step!r} 0 0"', 1),
     )
     shorter = replace(
-        spec, urdf=f'{before}name="{crank.name}"' + after.replace(described, f'xyz="{length_m - step!r} 0 0"', 1)
+        spec,
+        urdf=f'{before}name="{crank.name}"'
+        + after.replace(described, f'xyz="{length_m - step!r} 0 0"', 1),
     )
-    by_length = _simulated_torque(longer, motion, no_zero) - _simulated_torque(shorter, motion, no_zero)
+    by_length = _simulated_torque(longer, motion, no_zero) - _simulated_torque(
+        shorter, motion, no_zero
+    )
     turned = np.array([step, 0.0])
     by_zero = _simulated_torque(spec, motion, turned) - _simulated_torque(spec, motion, -turned)
     for parameter, change in (
@@ -195,5 +218,7 @@ def test_the_torque_beside_a_redundant_robot_is_the_derivative_times_the_change(
         left = []
         for change in (2e-3, 1e-3):
             beside = model_with_geometry(model, (GeometryChange(parameter, change),))
-            left.append(np.linalg.norm(beside.torques(motion, standard)[2] - described - change * slope))
+            left.append(
+                np.linalg.norm(beside.torques(motion, standard)[2] - described - change * slope)
+            )
         assert 3.5 < left[0] / left[1] < 4.5

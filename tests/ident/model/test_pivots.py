@@ -1,4 +1,6 @@
-"""Pivots that a closed chain is cut at: their motion, and what friction in them asks of the motors."""
+"""Pivots that a closed chain is cut at:
+their motion, and what friction in them asks of the motors.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,13 @@ def test_a_pivot_turns_by_the_angle_between_its_two_rods() -> None:
     followed = model.follow(_five_bar_motion(model))
     placed = model.at_places(followed)
     names = [joint.name for joint in model.robot.joints]
-    assert [joint.name for joint in model.robot.places] == ["crank-1", "crank-2", "elbow-1", "elbow-2", "pivot tip"]
+    assert [joint.name for joint in model.robot.places] == [
+        "crank-1",
+        "crank-2",
+        "elbow-1",
+        "elbow-2",
+        "pivot tip",
+    ]
     sign = np.array([{"1": -1.0, "2": 1.0}[name[-1]] for name in names])
     for ours, of_joints in (
         (placed.velocity_rad_s, followed.joints.velocity_rad_s),
@@ -59,7 +67,8 @@ def test_motion_of_every_pivot_is_the_derivative_of_its_angle() -> None:
 
 def test_motors_supply_the_power_that_a_pivot_loses() -> None:
     model = _model("dualv")
-    # Motors of a redundant drive must fit each other: their positions and speeds are those of the followed joints.
+    # Motors of a redundant drive must fit each other: their positions and speeds are those of the
+    # followed joints.
     still = np.zeros((1, 4))
     home = Motion(model.assembly.position_rad[None, list(model.robot.axis_joints)], still, still)
     at_home = model.follow(home)
@@ -73,5 +82,7 @@ def test_motors_supply_the_power_that_a_pivot_loses() -> None:
     assert_allclose(np.einsum("umk,km->u", leverage, speed), undriven, atol=1e-9)
 
 
-def test_pivots_of_a_parallelogram_turn_as_joints_of_the_tree_and_are_no_places_of_their_own() -> None:
+def test_pivots_of_a_parallelogram_turn_as_joints_of_the_tree_and_are_no_places_of_their_own() -> (
+    None
+):
     assert _model("orthoglide").robot.pivots == ()

@@ -23,7 +23,9 @@ def _pinocchio_parameters(model: pin.Model) -> np.ndarray[tuple[int], np.dtype[n
     return np.array(parameters)
 
 
-def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
+def rigid_regressor(
+    robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray
+) -> FloatArray:
     """Columns of the rigid links, shape (n, 10 n, k)."""
     count, samples = position.shape
     out = np.zeros((count, count, 10, samples))
@@ -40,9 +42,13 @@ def test_agrees_with_inverse_dynamics_to_1e9(arm: Arm, gravity: tuple[float, flo
     rng = np.random.default_rng(7)
     q, v, a = rng.uniform(-3, 3, (3, model.nv, 40))
     torque = np.einsum(
-        "jck,c->jk", rigid_regressor(robot_from_urdf(arm.urdf, gravity), q, v, a), _pinocchio_parameters(model)
+        "jck,c->jk",
+        rigid_regressor(robot_from_urdf(arm.urdf, gravity), q, v, a),
+        _pinocchio_parameters(model),
     )
-    expected = np.stack([pin.rnea(model, data, q[:, k], v[:, k], a[:, k]) for k in range(40)], axis=1)
+    expected = np.stack(
+        [pin.rnea(model, data, q[:, k], v[:, k], a[:, k]) for k in range(40)], axis=1
+    )
     assert np.max(np.abs(torque - expected)) < 1e-9 * max(1.0, np.max(np.abs(expected)))
 
 
@@ -77,11 +83,12 @@ def test_in_a_tree_a_joint_moves_its_own_branch_alone() -> None:
     urdf = (
         '<robot name="two"><link name="base"/>'
         + "".join(
-            f'<joint name="q{name}" type="{kind}"><origin xyz="0.1 {y} 0.3" rpy="0.3 0.1 {y}"/>'
-            f'<parent link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/>'
-            '<limit lower="-3" upper="3" velocity="3" effort="9"/></joint>'
-            f'<link name="{name}"><inertial><origin xyz="0.01 0.02 0.03"/><mass value="2"/>'
-            '<inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" izz="0.02"/></inertial></link>'
+            f'<joint name="q{name}" type="{kind}"><origin xyz="0.1 {y} 0.3" rpy="0.3 0.1 '
+            f'{y}"/><parent link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/><limit '
+            'lower="-3" upper="3" velocity="3" effort="9"/></joint><link '
+            f'name="{name}"><inertial><origin xyz="0.01 0.02 0.03"/><mass value="2"/><inertia '
+            'ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" '
+            'izz="0.02"/></inertial></link>'
             for name, kind, parent, y, axis in (
                 ("torso", "revolute", "base", "0", "0 0 1"),
                 ("a1", "revolute", "torso", "0.2", "0 1 0"),
@@ -98,7 +105,9 @@ def test_in_a_tree_a_joint_moves_its_own_branch_alone() -> None:
     data = model.createData()
     q, v, a = np.random.default_rng(10).uniform(-2, 2, (3, 5, 20))
     torque = np.einsum("jck,c->jk", rigid_regressor(robot, q, v, a), _pinocchio_parameters(model))
-    expected = np.stack([pin.rnea(model, data, q[:, k], v[:, k], a[:, k]) for k in range(20)], axis=1)
+    expected = np.stack(
+        [pin.rnea(model, data, q[:, k], v[:, k], a[:, k]) for k in range(20)], axis=1
+    )
     assert np.max(np.abs(torque - expected)) < 1e-9 * np.max(np.abs(expected))
 
 

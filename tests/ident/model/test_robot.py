@@ -1,4 +1,6 @@
-"""Requirements on a URDF for its joints to be a robot's, and that it is read as Pinocchio reads it."""
+"""Requirements on a URDF for its joints to be a robot's,
+and that it is read as Pinocchio reads it.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,10 @@ SHIPPED = sorted((*CONFIGS.glob("robots/*.urdf"), *CONFIGS.glob("simulation/*.ur
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 BODY = '<mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
 TWO_LINKS = (
-    '<robot name="r"><link name="a"/><link name="b"><inertial>' + BODY + '</inertial></link><joint name="j" '
-    'type="revolute"><origin xyz="0 0 1"/><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>' + LIMIT + "</joint>"
-    "</robot>"
+    '<robot name="r"><link name="a"/><link '
+    'name="b"><inertial>' + BODY + '</inertial></link><joint name="j" '
+    'type="revolute"><origin xyz="0 0 1"/><parent link="a"/><child link="b"/><axis '
+    'xyz="0 0 1"/>' + LIMIT + "</joint></robot>"
 )
 
 
@@ -36,16 +39,22 @@ def _assert_same(found: UrdfRobot, model: pin.Model, tolerance: float) -> None:
     assert [joint.name for joint in found.joints] == list(model.names)[1:]
     assert found.effort_limit.tolist() == list(model.upperEffortLimit)
     for number, (joint, body) in enumerate(zip(found.joints, found.bodies, strict=True), start=1):
-        placement, inertia = model.jointPlacements[number], model.inertias[number]
+        placement = model.jointPlacements[number]
+        inertia = model.inertias[number]
         prismatic = joint.kind is JointKind.PRISMATIC
         assert joint.parent == model.parents[number] - 1
         assert _far(joint.rotation, placement.rotation) < 1e-14
         assert _far(joint.translation_m, placement.translation) < 1e-14
-        assert _far(joint.axis, _screw(model, number)[slice(0, 3) if prismatic else slice(3, 6)]) < 1e-14
+        assert (
+            _far(joint.axis, _screw(model, number)[slice(0, 3) if prismatic else slice(3, 6)])
+            < 1e-14
+        )
         assert body.mass_kg == pytest.approx(inertia.mass, rel=1e-14)
         if body.mass_kg > 0.0:
             assert _far(body.centre_m, inertia.lever) < 1e-14
-        assert _far(body.inertia_kg_m2, inertia.inertia) < 1e-14 * max(1.0, float(np.abs(inertia.inertia).max()))
+        assert _far(body.inertia_kg_m2, inertia.inertia) < 1e-14 * max(
+            1.0, float(np.abs(inertia.inertia).max())
+        )
 
 
 def _screw(model: pin.Model, number: int) -> FloatArray:
@@ -79,23 +88,34 @@ def test_any_tree_is_read_as_pinocchio_reads_it(seed: int, count: int) -> None:
 @settings(deadline=None, max_examples=60, derandomize=True)
 @given(seed=st.integers(0, 1_000_000), count=st.integers(3, 10))
 def test_held_joints_are_those_that_pinocchio_locks(seed: int, count: int) -> None:
-    """Any joints but one, at any position; the bodies behind them are carried by the joint before them."""
+    """Any joints but one, at any position;
+    the bodies behind them are carried by the joint before them.
+    """
     urdf = _any_tree(seed, count)
-    model, rng = pin.buildModelFromXML(urdf), np.random.default_rng(seed)
+    model = pin.buildModelFromXML(urdf)
+    rng = np.random.default_rng(seed)
     position = rng.choice([0.0, np.pi / 2, -0.7, 2.5], model.nv)
-    held = [int(number) for number in rng.permutation(np.arange(1, model.njoints))[: rng.integers(0, model.nv)]]
+    held = [
+        int(number)
+        for number in rng.permutation(np.arange(1, model.njoints))[: rng.integers(0, model.nv)]
+    ]
     locked = pin.buildReducedModel(model, held, pin.integrate(model, pin.neutral(model), position))
-    found = hold_joints(urdf, {model.names[number]: position[model.joints[number].idx_v] for number in held})
+    found = hold_joints(
+        urdf, {model.names[number]: position[model.joints[number].idx_v] for number in held}
+    )
     _assert_same(read_urdf(found), locked, 1e-12)
 
 
 def _with_gripper(finger: str, thumb: str) -> str:
-    """The two links with a gripper on the second; the arguments are type and content of its joints."""
+    """The two links with a gripper on the second;
+    the arguments are type and content of its joints.
+    """
     return TWO_LINKS.replace(
         "</robot>",
-        f'<link name="f"><inertial>{BODY}</inertial></link><link name="t"><inertial>{BODY}</inertial></link>'
-        f'<joint name="finger" {finger}<parent link="b"/><child link="f"/></joint>'
-        f'<joint name="thumb" {thumb}<parent link="b"/><child link="t"/></joint></robot>',
+        f'<link name="f"><inertial>{BODY}</inertial></link><link '
+        f'name="t"><inertial>{BODY}</inertial></link><joint name="finger" {finger}<parent '
+        f'link="b"/><child link="f"/></joint><joint name="thumb" {thumb}<parent link="b"/><child '
+        'link="t"/></joint></robot>',
     )
 
 
@@ -115,7 +135,10 @@ def test_a_held_gripper_is_the_one_whose_joints_are_fixed_by_hand(angle: float) 
             f'type="fixed"><origin xyz="0.1 0 {0.1 - 2.0 * angle}"/>',
         ),
     )
-    _assert_same_robot(held, hold_joints(_with_gripper(TURNING, SLIDING), {"finger": angle, "thumb": 0.1 - 2 * angle}))
+    _assert_same_robot(
+        held,
+        hold_joints(_with_gripper(TURNING, SLIDING), {"finger": angle, "thumb": 0.1 - 2 * angle}),
+    )
 
 
 def _assert_same_robot(urdf: str, other: str) -> None:
@@ -128,10 +151,26 @@ def _assert_same_robot(urdf: str, other: str) -> None:
 @pytest.mark.parametrize(
     ("urdf", "held", "message"),
     [
-        (_with_gripper(TURNING, SLIDING), {"wrist": 0.0}, "no movable joint 'wrist'.*one of j, finger, thumb"),
-        (_with_gripper(TURNING, 'type="fixed">'), {"thumb": 0.0}, "no movable joint 'thumb'.*one of j, finger"),
-        (_with_gripper('type="floating">', SLIDING), {"finger": 0.1}, "'finger' is of type 'floating' and held at 0.1"),
-        (_with_gripper(TURNING, SLIDING + FOLLOWING.replace("-2", "x")), {"finger": 0.1}, "'thumb'.*no number"),
+        (
+            _with_gripper(TURNING, SLIDING),
+            {"wrist": 0.0},
+            "no movable joint 'wrist'.*one of j, finger, thumb",
+        ),
+        (
+            _with_gripper(TURNING, 'type="fixed">'),
+            {"thumb": 0.0},
+            "no movable joint 'thumb'.*one of j, finger",
+        ),
+        (
+            _with_gripper('type="floating">', SLIDING),
+            {"finger": 0.1},
+            "'finger' is of type 'floating' and held at 0.1",
+        ),
+        (
+            _with_gripper(TURNING, SLIDING + FOLLOWING.replace("-2", "x")),
+            {"finger": 0.1},
+            "'thumb'.*no number",
+        ),
     ],
 )
 def test_what_cannot_be_held_is_refused(urdf: str, held: dict[str, float], message: str) -> None:
@@ -141,9 +180,8 @@ def test_what_cannot_be_held_is_refused(urdf: str, held: dict[str, float], messa
 
 CHAINED = _with_gripper(TURNING, TURNING + '<mimic joint="finger" multiplier="2"/>').replace(
     "</robot>",
-    '<link name="u"/><joint name="tip" type="revolute"><parent link="t"/><child link="u"/><axis xyz="0 0 1"/>'
-    + LIMIT
-    + '<mimic joint="thumb" multiplier="-3" offset="0.5"/></joint></robot>',
+    '<link name="u"/><joint name="tip" type="revolute"><parent link="t"/><child link="u"/><axis '
+    'xyz="0 0 1"/>' + LIMIT + '<mimic joint="thumb" multiplier="-3" offset="0.5"/></joint></robot>',
 )
 """A finger, a thumb that follows it, and a tip that follows the thumb."""
 
@@ -158,19 +196,39 @@ def test_a_follower_of_a_follower_is_where_the_chain_puts_it() -> None:
 @pytest.mark.parametrize(
     ("mimic", "held", "message"),
     [
-        ('<mimic joint="j" multiplier="-1"/>', {"finger": 0.0}, "joint 'finger' mimics joint 'j' .* which moves"),
-        ('<mimic joint="thumb"/>', {"finger": 0.0}, "'finger' mimics joint 'thumb' .multiplier 1., which moves"),
-        ('<mimic joint="thumb"/>', {"finger": 0.2, "thumb": 0.1}, "held at 0.2 and mimics joint 'thumb', by which"),
-        ('<mimic joint="j" multiplier="0" offset="0.3"/>', {"finger": 0.0}, "held at 0 .*by which it is at 0.3"),
+        (
+            '<mimic joint="j" multiplier="-1"/>',
+            {"finger": 0.0},
+            "joint 'finger' mimics joint 'j' .* which moves",
+        ),
+        (
+            '<mimic joint="thumb"/>',
+            {"finger": 0.0},
+            "'finger' mimics joint 'thumb' .multiplier 1., which moves",
+        ),
+        (
+            '<mimic joint="thumb"/>',
+            {"finger": 0.2, "thumb": 0.1},
+            "held at 0.2 and mimics joint 'thumb', by which",
+        ),
+        (
+            '<mimic joint="j" multiplier="0" offset="0.3"/>',
+            {"finger": 0.0},
+            "held at 0 .*by which it is at 0.3",
+        ),
     ],
 )
-def test_a_follower_is_held_only_where_it_is(mimic: str, held: dict[str, float], message: str) -> None:
+def test_a_follower_is_held_only_where_it_is(
+    mimic: str, held: dict[str, float], message: str
+) -> None:
     with pytest.raises(ModelError, match=message):
         hold_joints(_with_gripper(TURNING + mimic, TURNING), held)
 
 
 def test_a_follower_is_held_where_its_leader_puts_it() -> None:
-    same = hold_joints(_with_gripper(TURNING + '<mimic joint="thumb"/>', TURNING), {"finger": 0.1, "thumb": 0.1})
+    same = hold_joints(
+        _with_gripper(TURNING + '<mimic joint="thumb"/>', TURNING), {"finger": 0.1, "thumb": 0.1}
+    )
     assert [joint.name for joint in read_urdf(same).joints] == ["j"]
     still = _with_gripper(TURNING + '<mimic joint="j" multiplier="0" offset="0.3"/>', TURNING)
     assert len(read_urdf(hold_joints(still, {"finger": 0.3, "thumb": 0.0})).joints) == 1
@@ -179,10 +237,34 @@ def test_a_follower_is_held_where_its_leader_puts_it() -> None:
     assert len(read_urdf(hold_joints(of_another, {"finger": 0.3, "thumb": 0.0})).joints) == 1
 
 
-def test_a_robot_whose_joint_mimics_another_is_refused() -> None:
-    """The equations would give it a motion of its own."""
-    with pytest.raises(ModelError, match=r"joint 'j' \(multiplier 2\); expected no <mimic>.*`closures`"):
-        robot_from_urdf(_with_gripper(TURNING + '<mimic joint="j" multiplier="2"/>', TURNING))
+@pytest.mark.parametrize(
+    ("mimic", "message"),
+    [
+        (
+            '<mimic joint="elsewhere"/>',
+            "'finger' mimics 'elsewhere', which is no joint .* that moves; expected one of j",
+        ),
+        (
+            '<mimic joint="finger"/>',
+            "'finger' mimics 'finger', which follows it in turn; expected a joint at the head",
+        ),
+    ],
+    ids=["of nothing", "of itself"],
+)
+def test_a_joint_that_follows_no_joint_is_refused(mimic: str, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        robot_from_urdf(_with_gripper(TURNING + mimic, TURNING))
+
+
+def test_a_follower_of_a_follower_follows_the_first_joint() -> None:
+    robot = robot_from_urdf(CHAINED)
+    names = [joint.name for joint in robot.joints]
+    assert [joint.name for joint in robot.axes] == ["j", "finger"]
+    ratios = {
+        names[one.follower]: (names[one.leader], one.multiplier, round(one.offset, 12))
+        for one in robot.couplings
+    }
+    assert ratios == {"thumb": ("finger", 2.0, 0.0), "tip": ("finger", -6.0, 0.5)}
 
 
 def test_a_floating_base_is_held_where_it_is() -> None:
@@ -192,20 +274,30 @@ def test_a_floating_base_is_held_where_it_is() -> None:
 
 
 def _any_tree(seed: int, count: int) -> str:
-    """Random trees: branches, fixed joints, all kinds of joint, bodies anywhere or nowhere, names in any order."""
+    """Random trees: branches, fixed joints, all kinds of joint, bodies anywhere or nowhere,
+    names in any order.
+    """
     rng = np.random.default_rng(seed)
     names = [f"{letter}{number}" for number, letter in enumerate(rng.choice(list("zyABé_"), count))]
     kinds = rng.choice(["revolute", "continuous", "prismatic", "fixed"], count)
     kinds[0] = "revolute"
     elements = [f'<link name="base">{_inertial(rng)}</link>']
     for number, (name, kind) in enumerate(zip(names, kinds, strict=True)):
-        parent = "base" if number == 0 or rng.random() < 0.1 else f"l{rng.integers(max(0, number - 3), number)}"
-        axis = "" if rng.random() < 0.2 else f'<axis xyz="{_three(rng.choice(np.array([-1.0, 0.3, 1.0, 2.0]), 3))}"/>'
-        limit = (
-            "" if kind in ("continuous", "fixed") and rng.random() < 0.5 else f'<limit velocity="1" effort="{number}"/>'
-        )
+        if number == 0 or rng.random() < 0.1:
+            parent = "base"
+        else:
+            parent = f"l{rng.integers(max(0, number - 3), number)}"
+        if rng.random() < 0.2:
+            axis = ""
+        else:
+            axis = f'<axis xyz="{_three(rng.choice(np.array([-1.0, 0.3, 1.0, 2.0]), 3))}"/>'
+        if kind in ("continuous", "fixed") and rng.random() < 0.5:
+            limit = ""
+        else:
+            limit = f'<limit velocity="1" effort="{number}"/>'
         elements += [
-            f'<joint name="{name}" type="{kind}">{_origin(rng)}<parent link="{parent}"/><child link="l{number}"/>'
+            f'<joint name="{name}" type="{kind}">{_origin(rng)}<parent link="{parent}"/><child '
+            f'link="l{number}"/>'
             f"{axis}{limit}</joint>",
             f'<link name="l{number}"><visual/>{_inertial(rng)}</link>',
         ]
@@ -218,7 +310,10 @@ def _three(numbers: FloatArray) -> str:
 
 
 def _origin(rng: np.random.Generator) -> str:
-    xyz = f'xyz="{_three(rng.uniform(-2, 2, 3))}"' if rng.random() < 0.8 else ""
+    if rng.random() < 0.8:
+        xyz = f'xyz="{_three(rng.uniform(-2, 2, 3))}"'
+    else:
+        xyz = ""
     turned = rng.choice(np.array([0.0, np.pi / 2, np.pi, -1.2, 0.3]), 3)
     rpy = f'rpy="{_three(turned)}"' if rng.random() < 0.8 else ""
     return f"<origin {xyz} {rpy}/>" if rng.random() < 0.9 else ""
@@ -230,7 +325,10 @@ def _inertial(rng: np.random.Generator) -> str:
     xx, xy, xz, yy, yz, zz = rng.uniform(0.0, 1.0, 6)
     mass = rng.choice([0.0, 0.7, 12.5])
     inertia = f'<inertia ixx="{xx}" ixy="{xy}" ixz="{xz}" iyy="{yy}" iyz="{yz}" izz="{zz}"/>'
-    return f'<inertial>{_origin(rng)}<mass value="{mass}"/>{inertia if rng.random() < 0.9 else ""}</inertial>'
+    return (
+        f"<inertial>{_origin(rng)}<mass "
+        f'value="{mass}"/>{inertia if rng.random() < 0.9 else ""}</inertial>'
+    )
 
 
 @pytest.mark.parametrize(
@@ -251,14 +349,26 @@ def test_no_geometry_that_cannot_be(wrong: tuple[str, str], message: str) -> Non
     [
         (('name="j"', ""), "has no name"),
         (('<child link="b"/>', ""), "'j' in the URDF has no <child>"),
-        (('<child link="b"/>', '<child link="c"/>'), "connects link 'c', which the URDF does not have"),
-        (('<parent link="a"/>', '<parent link="c"/>'), "connects link 'c', which the URDF does not have"),
+        (
+            ('<child link="b"/>', '<child link="c"/>'),
+            "connects link 'c', which the URDF does not have",
+        ),
+        (
+            ('<parent link="a"/>', '<parent link="c"/>'),
+            "connects link 'c', which the URDF does not have",
+        ),
         (
             ('<parent link="a"/>', '<parent link="b"/>'),
             "no moving joint",
         ),
-        (('<link name="a"/>', '<link name="a"/><link name="c"/>'), r"2 links without a parent \(a, c\)"),
-        (('<link name="a"/>', '<link name="a"/><link name="a"/>'), "two links of the URDF have the same name"),
+        (
+            ('<link name="a"/>', '<link name="a"/><link name="c"/>'),
+            r"2 links without a parent \(a, c\)",
+        ),
+        (
+            ('<link name="a"/>', '<link name="a"/><link name="a"/>'),
+            "two links of the URDF have the same name",
+        ),
         (('type="revolute"', 'type="floating"'), "type 'floating'; expected revolute"),
         (('type="revolute"', ""), "type None; expected revolute"),
         (('type="revolute"', 'type="fixed"'), "no moving joint"),
@@ -287,10 +397,18 @@ def test_xacro_that_is_not_expanded_is_named(space: str) -> None:
     declared = TWO_LINKS.replace('name="r"', f'name="r" xmlns:xacro="{space}"', 1)
     assert [joint.name for joint in read_urdf(declared).joints] == ["j"]
     macro = declared.replace("</robot>", '<xacro:arm prefix=""/></robot>')
-    with pytest.raises(ModelError, match=r"xacro that is not expanded \(it has <xacro:arm>\); .*`xacro robot"):
+    with pytest.raises(
+        ModelError,
+        match=r"xacro that is not expanded \(it has <xacro:arm>\); "
+        r".*`xacro robot",
+    ):
         read_urdf(macro)
     expression = declared.replace('name="j"', 'name="${prefix}j"', 1)
-    with pytest.raises(ModelError, match=r"xacro that is not expanded \(it has \$\{\.\.\.\} in <joint>\)"):
+    with pytest.raises(
+        ModelError,
+        match=r"xacro that is not expanded \(it has \$\{\.\.\.\} in "
+        r"<joint>\)",
+    ):
         read_urdf(expression)
 
 
@@ -300,7 +418,9 @@ def test_xacro_that_is_not_expanded_is_named(space: str) -> None:
         ('<robot name="r"/>', "has no <link>; expected the links of an arm"),
         (
             TWO_LINKS.replace(
-                "</robot>", '<joint name="back" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
+                "</robot>",
+                '<joint name="back" type="fixed"><parent link="b"/><child '
+                'link="a"/></joint></robot>',
             ),
             "every link of the URDF is behind a joint; expected a tree",
         ),

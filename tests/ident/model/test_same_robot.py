@@ -1,4 +1,6 @@
-"""Base parameters of a robot are taken for its own, also from poor data; those of another robot are not."""
+"""Base parameters of a robot are taken for its own, also from poor data;
+those of another robot are not.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from tests.ident.recordings import RATIO
 SAMPLES = 200
 
 
-def _model(arm: Arm, urdf: str | None = None, gravity: tuple[float, float, float] = GRAVITIES[0]) -> Model:
+def _model(
+    arm: Arm, urdf: str | None = None, gravity: tuple[float, float, float] = GRAVITIES[0]
+) -> Model:
     robot = robot_from_urdf(urdf or arm.urdf, gravity)
     ratio = RATIO if arm is TX40 else np.eye(robot.joint_count)
     return Model(robot, DriveTrain(ratio))

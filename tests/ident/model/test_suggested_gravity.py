@@ -21,7 +21,9 @@ from ident.model.suggested_gravity import suggested_gravity
         ([0.1, 0.2, -9.8], 0.0, [0.1, 0.2, -9.8]),
     ],
 )
-def test_digits_of_noise_are_left_out(found: list[float], std_deg: float, expected: list[float]) -> None:
+def test_digits_of_noise_are_left_out(
+    found: list[float], std_deg: float, expected: list[float]
+) -> None:
     std_m_s2 = float(np.linalg.norm(found) * np.radians(std_deg))
     suggested = suggested_gravity(np.array(found), np.full(3, std_m_s2))
     assert suggested.tolist() == pytest.approx(expected, abs=1.5e-4)

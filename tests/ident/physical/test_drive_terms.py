@@ -1,4 +1,6 @@
-"""Rotors and friction as terms of joints and motors: the same torque, none negative, what does not fit named."""
+"""Rotors and friction as terms of joints and motors:
+the same torque, none negative, what does not fit named.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +37,22 @@ def _torque(terms: DriveTerms, motion: Motion) -> FloatArray:
     directions = MODEL.drive_train.direction
     acceleration = motion.acceleration_rad_s2.T
     velocity = motion.velocity_rad_s.T
-    torque = terms.inertia.of_axes[:, None] * acceleration + terms.damping.of_axes[:, None] * velocity
+    torque = (
+        terms.inertia.of_axes[:, None] * acceleration + terms.damping.of_axes[:, None] * velocity
+    )
     torque += terms.dry_friction.of_axes[:, None] * np.sign(velocity)
     for motor, r in enumerate(directions):
-        along = terms.inertia.of_motors[motor] * (r @ acceleration) + terms.damping.of_motors[motor] * (r @ velocity)
+        along = terms.inertia.of_motors[motor] * (r @ acceleration) + terms.damping.of_motors[
+            motor
+        ] * (r @ velocity)
         along += terms.dry_friction.of_motors[motor] * np.sign(r @ velocity)
         torque += np.outer(r, along)
     return np.asarray(torque)
 
 
-DRIVE = [column.name for column in MODEL.columns if column.name[0] in "Ifo" and column.name[1] in "avsf"]
+DRIVE = [
+    column.name for column in MODEL.columns if column.name[0] in "Ifo" and column.name[1] in "avsf"
+]
 
 
 @given(st.lists(st.floats(-2.0, 5.0), min_size=len(DRIVE), max_size=len(DRIVE)))
@@ -82,7 +90,9 @@ def test_possible_rotors_leave_nothing_over() -> None:
 def test_what_both_motors_of_a_differential_have_in_common_is_not_seen_and_leaves_nothing_over(
     both: float, difference: float
 ) -> None:
-    """Their couplings are 1 and −0.5: Iam6 = x and Iam7 = 2 x make no torque, and a solver may choose any x."""
+    """Their couplings are 1 and −0.5: Iam6 = x and Iam7 = 2 x make no torque,
+    and a solver may choose any x.
+    """
     values = {f"Ia{axis}": 1.0 for axis in range(1, 8)}
     values |= {"Iam6": both + difference, "Iam7": 2.0 * both}
     terms = drive_terms(MODEL, _standard(values))

@@ -1,4 +1,6 @@
-"""Full parameters under a prior: unbiased, with true σ and flags, and possible; a wrong prior is noticed."""
+"""Full parameters under a prior: unbiased, with true σ and flags, and possible;
+a wrong prior is noticed.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,9 @@ def test_the_prior_is_the_same_in_another_frame() -> None:
     assert there @ there.T == pytest.approx(expected @ expected.T, abs=1e-12)
 
 
-def test_data_and_a_prior_without_errors_give_the_robot(small: Evidence, small_truth: Truth) -> None:
+def test_data_and_a_prior_without_errors_give_the_robot(
+    small: Evidence, small_truth: Truth
+) -> None:
     found = small.identification
     prior = LinkPrior(_links(small_truth), 0.1)
     full = full_parameters(found.system, _with_truth(found, small_truth), prior)
@@ -118,7 +122,9 @@ def test_sigma_is_true_and_nothing_is_bent(small: Evidence, small_truth: Truth) 
 
 
 @pytest.mark.parametrize("scale", [0.7, 1.3])
-def test_masses_that_are_thirty_percent_off_are_noticed(small: Evidence, small_truth: Truth, scale: float) -> None:
+def test_masses_that_are_thirty_percent_off_are_noticed(
+    small: Evidence, small_truth: Truth, scale: float
+) -> None:
     found = small.identification
     exact = _with_truth(found, small_truth)
     full = full_parameters(found.system, exact, LinkPrior(scale * _links(small_truth), 0.1))
@@ -155,7 +161,9 @@ def test_each_parameter_says_what_it_rests_on(noisy_found: Identification, truth
 def test_a_rotor_that_is_known_with_its_link_alone_rests_on_the_prior_of_the_link(
     clean_found: Identification, truth: Truth
 ) -> None:
-    """Izz1 + Ia1 + … is known; the rotor has no prior, and the ratio of its σ after and before is zero."""
+    """Izz1 + Ia1 + … is known; the rotor has no prior,
+    and the ratio of its σ after and before is zero.
+    """
     full = full_parameters(clean_found.system, clean_found.estimate, LinkPrior(_links(truth), 0.1))
     rotor = _index(full, "Ia1")
     assert np.isinf(full.prior_std[rotor])
@@ -211,7 +219,9 @@ def test_rotors_of_which_the_data_show_the_difference_alone() -> None:
     truth = Truth(model, standard, np.array([33.9, 32.4, -24.2]))
     rng = np.random.default_rng(5)
     runs = [
-        record(truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=0.3, seconds=16.0)
+        record(
+            truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=0.3, seconds=16.0
+        )
         for number in range(2)
     ]
     found = identify(model, runs, replace(CONDITIONING, standstill_rad_s=(0.03,) * 3))
@@ -225,7 +235,9 @@ def test_rotors_of_which_the_data_show_the_difference_alone() -> None:
     assert full.basis[other] is RestsOn.PRIOR
 
 
-def test_fixed_gains_stay(small: Evidence, small_truth: Truth, small_runs: tuple[object, ...]) -> None:
+def test_fixed_gains_stay(
+    small: Evidence, small_truth: Truth, small_runs: tuple[object, ...]
+) -> None:
     found = small.identification
     fixed = replace(
         _with_truth(found, small_truth),

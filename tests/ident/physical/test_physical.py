@@ -1,4 +1,6 @@
-"""Physical parameters: the same torque where that is possible, the nearest possible one where it is not."""
+"""Physical parameters: the same torque where that is possible,
+the nearest possible one where it is not.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ from tests.ident.recordings import RATIO
 FloatArray = NDArray[np.float64]
 
 
-def _model(arm: Arm, gravity: tuple[float, float, float] = GRAVITIES[0], *, coupled: bool = True) -> Model:
+def _model(
+    arm: Arm, gravity: tuple[float, float, float] = GRAVITIES[0], *, coupled: bool = True
+) -> Model:
     robot = robot_from_urdf(arm.urdf, gravity)
     ratio = np.eye(robot.joint_count)
     if coupled:
@@ -48,9 +52,14 @@ def _motion(model: Model, seed: int, samples: int = 200) -> Motion:
 
 def _link(rng: np.random.Generator, size_m: float = 0.1) -> FloatArray:
     """Twelve points of mass."""
-    masses, points = rng.uniform(0.05, 0.4, 12), rng.uniform(-size_m, size_m, (12, 3))
-    inertia = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, points, strict=True))
-    return np.concatenate((np.asarray(inertia)[np.triu_indices(3)], masses @ points, [masses.sum()]))
+    masses = rng.uniform(0.05, 0.4, 12)
+    points = rng.uniform(-size_m, size_m, (12, 3))
+    inertia = sum(
+        m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, points, strict=True)
+    )
+    return np.concatenate(
+        (np.asarray(inertia)[np.triu_indices(3)], masses @ points, [masses.sum()])
+    )
 
 
 def _truth(model: Model, seed: int) -> FloatArray:
@@ -61,7 +70,10 @@ def _truth(model: Model, seed: int) -> FloatArray:
     out = np.zeros(len(values))
     for joint in range(count):
         out[14 * joint : 14 * joint + 10] = _link(rng)
-        out[14 * joint + 10 : 14 * joint + 14] = (*rng.uniform(0.01, 0.3, 3), rng.uniform(-0.3, 0.3))
+        out[14 * joint + 10 : 14 * joint + 14] = (
+            *rng.uniform(0.01, 0.3, 3),
+            rng.uniform(-0.3, 0.3),
+        )
     for index, motor in enumerate(model.drive_train.coupled):
         own = rng.uniform(0.01, 0.2, 3)
         out[14 * count + 3 * index :][:3] = own
@@ -90,7 +102,9 @@ def _check_possible(found: PhysicalParameters) -> None:
         assert moments[0] + moments[1] > moments[2]
     model = found.model
     values = dict(zip((column.name for column in model.columns), found.standard, strict=True))
-    assert all(value >= 0.0 for name, value in values.items() if name.startswith(("fs", "Iam", "fvm")))
+    assert all(
+        value >= 0.0 for name, value in values.items() if name.startswith(("fs", "Iam", "fvm"))
+    )
     rng = np.random.default_rng(0)
     for velocity in rng.normal(size=(50, model.robot.joint_count)):
         for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
@@ -104,12 +118,16 @@ def _check_possible(found: PhysicalParameters) -> None:
 @settings(deadline=None, max_examples=4, derandomize=True)
 @given(seed=st.integers(0, 10**6), gravity=st.sampled_from(GRAVITIES))
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
-def test_a_possible_robot_keeps_its_torque(arm: Arm, seed: int, gravity: tuple[float, float, float]) -> None:
+def test_a_possible_robot_keeps_its_torque(
+    arm: Arm, seed: int, gravity: tuple[float, float, float]
+) -> None:
     model = _model(arm, gravity)
     truth = _truth(model, seed)
     columns = model.regressor(_motion(model, 1))
     base = _base(model, columns)
-    found = physical_parameters(model, base, base.grouping @ truth, columns, inertia_prior(arm.urdf))
+    found = physical_parameters(
+        model, base, base.grouping @ truth, columns, inertia_prior(arm.urdf)
+    )
     assert found.exact
     _check_possible(found)
     assert np.all(found.eigenvalues >= 0.5 * MARGIN)
@@ -128,7 +146,9 @@ def test_noise_is_projected_and_the_distance_reported(arm: Arm, seed: int) -> No
     columns = model.regressor(_motion(model, 1))
     base = _base(model, columns)
     true_values = base.grouping @ truth
-    noise = 0.1 * np.random.default_rng(seed).normal(size=len(true_values)) * np.abs(true_values).mean()
+    noise = (
+        0.1 * np.random.default_rng(seed).normal(size=len(true_values)) * np.abs(true_values).mean()
+    )
     noisy = true_values + noise
     found = physical_parameters(model, base, noisy, columns, inertia_prior(arm.urdf))
     _check_possible(found)
@@ -141,7 +161,8 @@ def test_noise_is_projected_and_the_distance_reported(arm: Arm, seed: int) -> No
     change = np.linalg.norm(found_torque - given_torque, axis=1) / size
     assert found.torque_change_percent.axes == pytest.approx(100.0 * change, abs=1e-9)
     assert found.exact == bool(np.max(change) <= 1e-6)
-    # The robot without the noise is possible: nothing that is farther away than it may be called the nearest.
+    # The robot without the noise is possible: nothing that is farther away than it may be called
+    # the nearest.
     true_change = np.linalg.norm(true_torque - given_torque, axis=1) / size
     assert np.linalg.norm(change) <= (1.0 + SLACK) * np.linalg.norm(true_change) + 1e-6
 
@@ -169,13 +190,17 @@ def test_no_other_body_of_the_same_torque_is_nearer_to_the_prior() -> None:
     def distance(standard: FloatArray) -> float:
         total = 0.0
         for joint, link in enumerate(prior.links):
-            seen = np.linalg.solve(pseudo_inertia(link), pseudo_inertia(standard[14 * joint : 14 * joint + 10]))
+            seen = np.linalg.solve(
+                pseudo_inertia(link), pseudo_inertia(standard[14 * joint : 14 * joint + 10])
+            )
             total += np.trace(seen) - np.linalg.slogdet(seen)[1] - 4.0
         return total
 
     _, _, right = np.linalg.svd(base.grouping)
     scalars = [14 * joint + place for joint in range(6) for place in range(10, 14)] + [84, 85, 86]
-    inertial = np.array([row for row in right[len(base.names) :] if np.all(np.abs(row[scalars]) < 1e-9)])
+    inertial = np.array(
+        [row for row in right[len(base.names) :] if np.all(np.abs(row[scalars]) < 1e-9)]
+    )
     least = distance(found.standard)
     for direction in np.random.default_rng(0).normal(size=(100, len(inertial))) @ inertial:
         assert distance(found.standard + 1e-3 * direction) >= least - 1e-7
@@ -205,7 +230,9 @@ def test_a_coupled_rotor_cannot_give_energy() -> None:
     index = {column.name: number for number, column in enumerate(model.columns)}
     truth = _truth(model, 7)
     truth[index["Iam6"]] = 3.0 * np.sqrt(truth[index["Ia5"]] * truth[index["Ia6"]])
-    found = physical_parameters(model, base, base.grouping @ truth, columns, inertia_prior(TX40.urdf))
+    found = physical_parameters(
+        model, base, base.grouping @ truth, columns, inertia_prior(TX40.urdf)
+    )
     assert not found.exact
     _check_possible(found)
 
@@ -252,7 +279,9 @@ def test_the_prior_is_the_urdf_or_a_ball() -> None:
 def test_the_grouping_comes_back_from_the_names(arm: Arm) -> None:
     model = _model(arm)
     columns = model.regressor(_motion(model, 1))
-    base = base_parameters(np.asarray(np.linalg.qr(_rows(columns), mode="r")), tuple(c.name for c in model.columns))
+    base = base_parameters(
+        np.asarray(np.linalg.qr(_rows(columns), mode="r")), tuple(c.name for c in model.columns)
+    )
     shuffled = np.random.default_rng(0).permutation(base.names)
     found = regroup(model, tuple(map(str, shuffled)), _rows(model.regressor(_motion(model, 2))))
     assert found.independent == base.independent
@@ -270,13 +299,17 @@ def test_names_of_another_robot_are_refused() -> None:
         regroup(model, tuple(name for name in names if name != "fv2"), rows)
     with pytest.raises(ModelError, match=f"this robot only {len(names)}"):
         regroup(model, (*names, "Iyy3"), rows)
-    longer = Model(robot_from_urdf(TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")), model.drive_train)
+    longer = Model(
+        robot_from_urdf(TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")), model.drive_train
+    )
     with pytest.raises(ModelError, match="geometry"):
         regroup(longer, names, _rows(longer.regressor(_motion(longer, 1))))
 
 
 def test_links_of_the_prior_are_those_that_pinocchio_moves() -> None:
-    """Pinocchio's own inverse dynamics with the URDF's inertias against the regressor with the prior's."""
+    """Pinocchio's own inverse dynamics with the URDF's inertias against the regressor with the
+    prior's.
+    """
     model = _model(GANTRY, coupled=False)
     motion = _motion(model, 3, samples=20)
     standard = np.zeros(len(model.columns))
@@ -287,6 +320,10 @@ def test_links_of_the_prior_are_those_that_pinocchio_moves() -> None:
     data = robot.createData()
     for k in range(20):
         expected = pin.rnea(
-            robot, data, motion.position_rad[k], motion.velocity_rad_s[k], motion.acceleration_rad_s2[k]
+            robot,
+            data,
+            motion.position_rad[k],
+            motion.velocity_rad_s[k],
+            motion.acceleration_rad_s2[k],
         )
         assert torque[:, k] == pytest.approx(expected, abs=1e-9)

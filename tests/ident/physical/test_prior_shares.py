@@ -1,4 +1,6 @@
-"""What the numbers of chosen bodies rest on, compared with a covariance that has numbers in place of limits."""
+"""What the numbers of chosen bodies rest on, compared with a covariance that has numbers in place
+of limits.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,8 @@ def test_shares_are_those_of_the_choice_written_out() -> None:
     sizes = np.linalg.norm(grouping[:, MODEL.link_columns.ravel()] * _link_std(), axis=1) + 1e-3
     factor = 0.01 * sizes[:, None] * rng.standard_normal((len(grouping), len(grouping)))
     covariance = factor @ factor.T
-    # The choice written out, χ = χ₀ + K (β̂ − G χ₀) with K = S Gᵀ (G S Gᵀ)⁻¹: S has numbers in place of limits.
+    # The choice written out, χ = χ₀ + K (β̂ − G χ₀) with K = S Gᵀ (G S Gᵀ)⁻¹: S has numbers in
+    # place of limits.
     prior = _prior_covariance()
     gain = prior @ grouping.T @ np.linalg.inv(grouping @ prior @ grouping.T)
     by_data = np.diag(gain @ covariance @ gain.T)
@@ -60,7 +63,9 @@ def test_shares_are_those_of_the_choice_written_out() -> None:
 
 def test_a_parameter_of_its_own_rests_on_data_and_a_sum_with_a_link_on_the_prior() -> None:
     grouping = _grouping()
-    found = dict(zip(NAMES, prior_shares(MODEL, grouping, 1e-12 * np.eye(len(grouping)), PRIOR), strict=True))
+    found = dict(
+        zip(NAMES, prior_shares(MODEL, grouping, 1e-12 * np.eye(len(grouping)), PRIOR), strict=True)
+    )
     # Only the sum Izz1 + Ia1 is seen; the prior of the link decides on both.
     assert found["Ia1"] > 0.99
     assert found["Izz1"] > 0.99

@@ -1,4 +1,6 @@
-"""A way around what is in the way: every leg of it is clear, and none is found where there is none."""
+"""A way around what is in the way: every leg of it is clear,
+and none is found where there is none.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ pytestmark = pytest.mark.slow
 
 LIMIT = np.array([2.5, 1.5, 1.5, 1.0, 1.0, 1.0])
 STRETCHED = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
-"""The wrist is 0.45 m in front of the arm and 0.34 m high; the first joint turns it to the left or right."""
+"""The wrist is 0.45 m in front of the arm and 0.34 m high;
+the first joint turns it to the left or right.
+"""
 NOTHING = Scene((), (), (), None, (), 0.0)
 
 
@@ -32,13 +36,17 @@ def behind_a_wall() -> Checker:
     return Checker(robot_from_urdf(TX40.urdf), Scene((wrist,), (), (wall,), None, (), 0.01))
 
 
-def _legs(start: FloatArray, way: tuple[FloatArray, ...], end: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def _legs(
+    start: FloatArray, way: tuple[FloatArray, ...], end: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
     return list(pairwise((start, *way, end)))
 
 
 @given(st.integers(0, 1000))
 @settings(max_examples=10, deadline=None, derandomize=True)
-def test_the_way_around_a_wall_is_clear_and_stays_within_the_limits(behind_a_wall: Checker, seed: int) -> None:
+def test_the_way_around_a_wall_is_clear_and_stays_within_the_limits(
+    behind_a_wall: Checker, seed: int
+) -> None:
     start, end = (STRETCHED + np.array([side, 0.0, 0.0, 0.0, 0.0, 0.0]) for side in (-0.8, 0.8))
     assert behind_a_wall.obstruction(start, end) is not None
     way = clear_way(behind_a_wall, start, end, -LIMIT, LIMIT, np.random.default_rng(seed))
@@ -49,14 +57,17 @@ def test_the_way_around_a_wall_is_clear_and_stays_within_the_limits(behind_a_wal
 
 
 def test_a_clear_straight_way_has_no_turns(behind_a_wall: Checker) -> None:
-    start, end = STRETCHED - 0.8 * np.eye(6)[0], STRETCHED - 1.2 * np.eye(6)[0]
+    start = STRETCHED - 0.8 * np.eye(6)[0]
+    end = STRETCHED - 1.2 * np.eye(6)[0]
     assert clear_way(behind_a_wall, start, end, -LIMIT, LIMIT, np.random.default_rng(0)) == ()
 
 
 def test_no_way_is_found_where_the_room_has_none(behind_a_wall: Checker) -> None:
     """Only the first joint may move: it cannot lift the arm over the wall."""
-    start, end = STRETCHED - 0.8 * np.eye(6)[0], STRETCHED + 0.8 * np.eye(6)[0]
-    lower, upper = np.minimum(start, end), np.maximum(start, end)
+    start = STRETCHED - 0.8 * np.eye(6)[0]
+    end = STRETCHED + 0.8 * np.eye(6)[0]
+    lower = np.minimum(start, end)
+    upper = np.maximum(start, end)
     assert clear_way(behind_a_wall, start, end, lower, upper, np.random.default_rng(0)) is None
 
 
@@ -78,6 +89,8 @@ def _walked(checker: Checker, limit: FloatArray, rng: np.random.Generator) -> Fl
     here = checker.home
     for _ in range(4):
         target = checker.home + rng.uniform(-limit, limit)
-        reached = farthest_towards(checker, here, target, checker.home - limit, checker.home + limit)
+        reached = farthest_towards(
+            checker, here, target, checker.home - limit, checker.home + limit
+        )
         here = here if reached is None else reached
     return here

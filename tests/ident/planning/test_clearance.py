@@ -31,15 +31,20 @@ def _scene(last: int, minimum_m: float = 0.01) -> Scene:
 
 @pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
 def test_poses_are_those_of_pinocchio(arm: Arm) -> None:
-    robot, model = robot_from_urdf(arm.urdf), pin.buildModelFromXML(arm.urdf)
+    robot = robot_from_urdf(arm.urdf)
+    model = pin.buildModelFromXML(arm.urdf)
     data = model.createData()
     positions = np.random.default_rng(0).uniform(-2.0, 2.0, (model.nq, 5))
     found = poses(robot, positions.T)
     for sample in range(5):
         pin.forwardKinematics(model, data, positions[:, sample])
         for joint in range(model.nq):
-            assert found.origin_m[joint + 1, sample] == pytest.approx(data.oMi[joint + 1].translation, abs=1e-12)
-            assert found.rotation[joint + 1, sample] == pytest.approx(data.oMi[joint + 1].rotation, abs=1e-12)
+            assert found.origin_m[joint + 1, sample] == pytest.approx(
+                data.oMi[joint + 1].translation, abs=1e-12
+            )
+            assert found.rotation[joint + 1, sample] == pytest.approx(
+                data.oMi[joint + 1].rotation, abs=1e-12
+            )
 
 
 def _segment_distance(a0: FloatArray, a1: FloatArray, b0: FloatArray, b1: FloatArray) -> float:
@@ -97,9 +102,12 @@ def test_a_way_that_is_called_clear_is_clear_everywhere(arm: Arm) -> None:
 def test_a_thin_wall_between_two_free_postures_is_found() -> None:
     robot = robot_from_urdf(TX40.urdf)
     wall = Box("wall", (0.1, -0.002, 0.0), (1.5, 0.002, 1.0))
-    scene = Scene((Capsule("tool", 5, (0.0, 0.0, 0.02), (0.0, 0.0, 0.05), 0.01),), (), (wall,), None, (), 0.0)
+    scene = Scene(
+        (Capsule("tool", 5, (0.0, 0.0, 0.02), (0.0, 0.0, 0.05), 0.01),), (), (wall,), None, (), 0.0
+    )
     checker = Checker(robot, scene)
-    start, end = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    start = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    end = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert (checker.margins(np.stack((start, end))) > 0.05).all()
     found = checker.obstruction(start, end)
     assert found is not None
@@ -113,7 +121,8 @@ def test_what_leaves_the_workspace_is_named() -> None:
     tool = Capsule("tool", 5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 0.02)
     low = Box("workspace", (-2.0, -2.0, 0.3), (2.0, 2.0, 2.0))
     checker = Checker(robot, Scene((tool,), (), (), low, (0,), 0.0))
-    up, down = np.zeros(6), np.array([0.0, 2.0, 0.5, 0.0, 0.0, 0.0])
+    up = np.zeros(6)
+    down = np.array([0.0, 2.0, 0.5, 0.0, 0.0, 0.0])
     assert float(checker.margins(up[None])[0]) > 0.0
     found = checker.obstruction(up, down)
     assert found is not None

@@ -1,4 +1,6 @@
-"""Plans of closed chains: what is reached, which gains a motion shows, and which of them internal preload hides."""
+"""Plans of closed chains: what is reached, which gains a motion shows,
+and which of them internal preload hides.
+"""
 
 from __future__ import annotations
 
@@ -61,15 +63,19 @@ def test_moves_show_every_gain_of_a_redundant_drive_and_rest_shows_none() -> Non
     data = differentiate(made.runs[1], made.model.drive_train, made.conditioning)
     moves = recorded(made.model, data, made.conditioning)
     still = np.repeat(data.position_rad[:1], 60, axis=0)
-    rest = Excitation(Motion(still, np.zeros_like(still), np.zeros_like(still)), np.ones((4, 60), dtype=np.bool_))
+    rest = Excitation(
+        Motion(still, np.zeros_like(still), np.zeros_like(still)), np.ones((4, 60), dtype=np.bool_)
+    )
     runs: tuple[int | None, ...] = (None, 0)
     assert np.all(design.std_percent(design.information(moves, runs)) < UNSEEN_PERCENT)
     assert not np.any(design.std_percent(design.information(rest, runs)) < UNSEEN_PERCENT)
-    shown, unmoved = verdicts(design, [(moves, runs)]), verdicts(design, [(rest, runs)])
+    shown = verdicts(design, [(moves, runs)])
+    unmoved = verdicts(design, [(rest, runs)])
     assert not shown.sentences("ABCD")
     assert shown.rank == shown.known_preload_rank == 4
     assert unmoved.hidden(Hidden.MOTION) == (0, 1, 2, 3)
-    # At rest, currents whose preload is known still give one ratio of the gains: in the null space of Aᵀ they are zero.
+    # At rest, currents whose preload is known still give one ratio of the gains: in the null space
+    # of Aᵀ they are zero.
     assert (unmoved.rank, unmoved.known_preload_rank) == (0, 1)
     assert "nor would they if internal preload were known" in unmoved.sentences("ABCD")[0]
 
@@ -83,19 +89,25 @@ def _judged(made: Made, design: Design) -> Identifiability:
 
 
 def _spread_with_known_preload(rows: Observation, noise_a: FloatArray) -> FloatArray:
-    """Scatter of the gains [%] of least squares in which each motor's own current drives its axis: V g = τ.
+    """Scatter of the gains [%] of least squares in which each motor's own current drives its axis:
+    V g = τ.
 
     The preload of these rows is zero, and the equations know it. The unknowns are those of the fit.
     """
-    rng, count = np.random.default_rng(0), len(noise_a)
-    use, known, found = rows.use[0], rows.known(), []
+    rng = np.random.default_rng(0)
+    count = len(noise_a)
+    use = rows.use[0]
+    known = rows.known()
+    found = []
     weight = 1.0 / (PLANAR.gains * noise_a)
     linear = [-rows.of_joint(axis, use).T * weight[axis] for axis in range(count)]
     for _ in range(40):
         drive = []
         for axis in range(count):
             columns = np.zeros((int(use.sum()), count))
-            columns[:, axis] = weight[axis] * (rows.current[axis, use] + noise_a[axis] * rng.standard_normal(use.sum()))
+            columns[:, axis] = weight[axis] * (
+                rows.current[axis, use] + noise_a[axis] * rng.standard_normal(use.sum())
+            )
             drive.append(columns)
         matrix = np.hstack((np.concatenate(drive), np.concatenate(linear)))
         scale = np.linalg.norm(matrix, axis=0)
@@ -105,7 +117,9 @@ def _spread_with_known_preload(rows: Observation, noise_a: FloatArray) -> FloatA
 
 
 def test_preload_hides_gains_while_the_pose_hardly_changes() -> None:
-    """A tenth of the workspace: fits with and without knowledge of the preload differ as the verdict says."""
+    """A tenth of the workspace: fits with and without knowledge of the preload differ as the
+    verdict says.
+    """
     noise_a = 0.002
     made = made_of(PLANAR, 3, seconds=18.0, noise_a=noise_a, preload_nm=0.0, share=0.1)
     identified = identify(made.model, made.runs, made.conditioning, keep_rows=True)
@@ -130,7 +144,8 @@ def test_preload_hides_gains_while_the_pose_hardly_changes() -> None:
 def test_a_five_bar_goes_where_its_rods_reach() -> None:
     checker = Checker(FIVE_BAR.robot, NOTHING)
     far = float(np.arccos((2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M)))
-    home, stretched = checker.home, np.array([np.pi - far, far])
+    home = checker.home
+    stretched = np.array([np.pi - far, far])
     assert checker.margins(np.array([home]))[0] == np.inf
     apart = np.array([0.1, -0.1])
     assert (checker.margins(stretched + np.array([[0.0], [1.0]]) * apart) == -np.inf).all()
@@ -165,7 +180,9 @@ def test_motors_of_a_redundant_drive_are_made_to_fit() -> None:
 
 
 def test_bodies_of_a_closed_chain_keep_apart() -> None:
-    tip = next(index for index, joint in enumerate(FIVE_BAR.robot.joints) if joint.name == "left-rod")
+    tip = next(
+        index for index, joint in enumerate(FIVE_BAR.robot.joints) if joint.name == "left-rod"
+    )
     post = Capsule("post", -1, (0.0, 0.66, 0.0), (0.0, 0.66, 0.3), 0.02)
     own = Capsule("tip", tip, (ROD_M, 0.0, 0.0), (ROD_M, 0.0, 0.01), 0.02)
     scene = Scene((own, post), ((0, 1),), (), None, (), 0.01)

@@ -18,12 +18,16 @@ ITERATED_M = 5e-6
 
 
 def _segments(seed: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pairs of segments in general position, without length, parallel, and with ends on a coarse grid."""
+    """Pairs of segments in general position, without length, parallel,
+    and with ends on a coarse grid.
+    """
     rng = np.random.default_rng(seed)
     start, end, other_start, other_end = rng.uniform(-1.0, 1.0, (4, COUNT, 3))
     end[:400] = start[:400]
     other_end[200:600] = other_start[200:600]
-    other_end[600:1000] = other_start[600:1000] + rng.uniform(-1.0, 1.0, (400, 1)) * (end - start)[600:1000]
+    other_end[600:1000] = (
+        other_start[600:1000] + rng.uniform(-1.0, 1.0, (400, 1)) * (end - start)[600:1000]
+    )
     for ends in (start, end, other_start, other_end):
         ends[1000:2000] = 0.3 * rng.integers(-1, 2, (1000, 3))
     return start, end, other_start, other_end
@@ -41,7 +45,8 @@ def _capsule(start: FloatArray, end: FloatArray) -> tuple[coal.CollisionGeometry
 
 
 def _distance(
-    first: tuple[coal.CollisionGeometry, coal.Transform3s], second: tuple[coal.CollisionGeometry, coal.Transform3s]
+    first: tuple[coal.CollisionGeometry, coal.Transform3s],
+    second: tuple[coal.CollisionGeometry, coal.Transform3s],
 ) -> float:
     return float(coal.distance(*first, *second, coal.DistanceRequest(), coal.DistanceResult()))
 
@@ -56,9 +61,12 @@ def test_distances_of_capsules_are_those_of_coal() -> None:
 
 def test_distances_to_boxes_and_depths_inside_are_those_of_coal() -> None:
     start, end, corner, size = _segments(1)
-    lower, upper = 0.5 * corner, 0.5 * corner + np.maximum(np.abs(size), 0.001)
+    lower = 0.5 * corner
+    upper = 0.5 * corner + np.maximum(np.abs(size), 0.001)
     expected = [
-        _distance(_capsule(a, b), (coal.Box(*(high - low)), coal.Transform3s(np.eye(3), (low + high) / 2)))
+        _distance(
+            _capsule(a, b), (coal.Box(*(high - low)), coal.Transform3s(np.eye(3), (low + high) / 2))
+        )
         for a, b, low, high in zip(start, end, lower, upper, strict=True)
     ]
     found = segment_to_box(start, end, lower, upper)
@@ -69,7 +77,8 @@ def test_distances_to_boxes_and_depths_inside_are_those_of_coal() -> None:
 @pytest.mark.parametrize("reach", [1e-9, 1e-6, 1e-3, 1.0])
 def test_nearly_parallel_segments_lose_no_precision(reach: float) -> None:
     """Two of length one, 0.1 m apart, crossed by less and less."""
-    start, end = np.array([[-0.5, 0.0, 0.0]]), np.array([[0.5, 0.0, 0.0]])
+    start = np.array([[-0.5, 0.0, 0.0]])
+    end = np.array([[0.5, 0.0, 0.0]])
     other = np.array([[-0.5, -reach, 0.1]]), np.array([[0.5, reach, 0.1]])
     assert segment_to_segment(start, end, *other)[0] == pytest.approx(0.1, abs=1e-12)
     assert segment_to_segment(*other, end, start)[0] == pytest.approx(0.1, abs=1e-12)

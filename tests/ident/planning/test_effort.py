@@ -1,4 +1,6 @@
-"""Expected torque of a motion, beside a pendulum that is computed by hand, and efforts that cannot be true."""
+"""Expected torque of a motion, beside a pendulum that is computed by hand,
+and efforts that cannot be true.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,12 @@ from ident.model.model import DriveTrain, Model
 from ident.model.robot import Motion
 from ident.model.urdf import robot_from_urdf
 from ident.planning.effort import axis_torques, believable_efforts, effort_shares
-from ident.planning.excitation import Expectation, ExpectedPayload, declared_efforts, nominal_parameters
+from ident.planning.excitation import (
+    Expectation,
+    ExpectedPayload,
+    declared_efforts,
+    nominal_parameters,
+)
 
 MASS_KG = 3.0
 LEVER_M = 0.4
@@ -63,7 +70,11 @@ def test_torque_of_a_pendulum_is_that_by_hand(
     friction_nm = 0.05 * EFFORT_NM * np.sign(velocity) + 0.10 * EFFORT_NM / 2.0 * velocity
     bare_nm = inertia_kg_m2 * acceleration + gravity_nm + friction_nm
     assert axis_torques(expectation, motion, None)[0, 0] == pytest.approx(bare_nm)
-    added_nm = PAYLOAD_KG * PAYLOAD_LEVER_M * (PAYLOAD_LEVER_M * acceleration - GRAVITY_M_S2 * np.cos(position))
+    added_nm = (
+        PAYLOAD_KG
+        * PAYLOAD_LEVER_M
+        * (PAYLOAD_LEVER_M * acceleration - GRAVITY_M_S2 * np.cos(position))
+    )
     assert axis_torques(expectation, motion, 0)[0, 0] == pytest.approx(bare_nm + added_nm)
     effort = declared_efforts(expectation.model, URDF)
     share = effort_shares(expectation, effort, motion, (None, 0))[0, 0]
@@ -82,6 +93,8 @@ def test_an_effort_that_gravity_exceeds_is_no_limit(expectation: Expectation) ->
 
 
 @pytest.mark.parametrize("effort", ["0", "1e9"])
-def test_an_effort_that_exporters_write_for_nothing_is_not_known(expectation: Expectation, effort: str) -> None:
+def test_an_effort_that_exporters_write_for_nothing_is_not_known(
+    expectation: Expectation, effort: str
+) -> None:
     urdf = URDF.replace(f'effort="{EFFORT_NM}"', f'effort="{effort}"')
     assert declared_efforts(expectation.model, urdf) == np.inf

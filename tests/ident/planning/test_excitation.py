@@ -1,4 +1,6 @@
-"""Predicted standard deviations against what the estimator does, and the verdicts drawn from them."""
+"""Predicted standard deviations against what the estimator does,
+and the verdicts drawn from them.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,15 @@ from ident.planning.excitation import (
 from ident.planning.gain_verdict import ExtraMoves, GainSource, Visibility, verdicts
 from ident.planning.target import recorded_information
 from tests.ident.arms import TX40
-from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record, tx40_truth
+from tests.ident.recordings import (
+    CONDITIONING,
+    GAINS,
+    MOUNTED,
+    PAYLOAD_TRUTH,
+    Truth,
+    record,
+    tx40_truth,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -42,18 +52,27 @@ PAYLOAD = np.array([PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS])
 
 
 def _design(
-    truth: Truth, known: frozenset[str] = frozenset({"m"}), gravity: tuple[float, ...] = (0, 0, -9.81)
+    truth: Truth,
+    known: frozenset[str] = frozenset({"m"}),
+    gravity: tuple[float, ...] = (0, 0, -9.81),
 ) -> Design:
     robot = replace(truth.model.robot, gravity_m_s2=np.array(gravity, dtype=np.float64))
     model = replace(truth.model, robot=robot)
-    # White noise at 250 Hz, of which rows at 50 a second keep the band below 20 Hz: s²/5 for what is slower.
-    noise = np.full(6, NOISE_A / np.sqrt(decimator(RATE_HZ, CONDITIONING.decimation_cutoff_hz).factor))
-    expectation = Expectation(model, truth.gains, truth.parameters, (ExpectedPayload(known, PAYLOAD),), noise)
+    # White noise at 250 Hz, of which rows at 50 a second keep the band below 20 Hz: s²/5 for what
+    # is slower.
+    noise = np.full(
+        6, NOISE_A / np.sqrt(decimator(RATE_HZ, CONDITIONING.decimation_cutoff_hz).factor)
+    )
+    expectation = Expectation(
+        model, truth.gains, truth.parameters, (ExpectedPayload(known, PAYLOAD),), noise
+    )
     return Design(expectation, visible_base(model, _motion(np.random.default_rng(5), 900)))
 
 
 def _motion(rng: np.random.Generator, rows: int, still: int | None = None) -> Motion:
-    position, velocity, acceleration = (scale * rng.uniform(-1.0, 1.0, (6, rows)).T for scale in (2.0, 3.0, 12.0))
+    position, velocity, acceleration = (
+        scale * rng.uniform(-1.0, 1.0, (6, rows)).T for scale in (2.0, 3.0, 12.0)
+    )
     if still is not None:
         position[:, still], velocity[:, still], acceleration[:, still] = 0.3, 0.0, 0.0
     return Motion(position, velocity, acceleration)
@@ -76,17 +95,23 @@ def test_predicted_deviations_are_those_of_the_estimator(truth: Truth) -> None:
     )
     design = _design(truth)
     excitations = [recorded(truth.model, data, CONDITIONING) for data in _data(truth, clean)]
-    informations = [design.information(e, (p,)) for e, p in zip(excitations, (None, 0), strict=True)]
+    informations = [
+        design.information(e, (p,)) for e, p in zip(excitations, (None, 0), strict=True)
+    ]
     predicted = design.std_percent(np.sum(informations, axis=0))
     errors = []
     for _ in range(SEEDS):
         noisy = [
-            replace(run, current_a=run.current_a + NOISE_A * rng.standard_normal(run.current_a.shape)) for run in clean
+            replace(
+                run, current_a=run.current_a + NOISE_A * rng.standard_normal(run.current_a.shape)
+            )
+            for run in clean
         ]
         gains = identify(truth.model, noisy, CONDITIONING).estimate.gains
         errors.append(100.0 * (gains / GAINS - 1.0))
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / predicted
-    # 12 draws know a deviation to 20 %, all six together (the wrist gains go together) to some 12 %.
+    # 12 draws know a deviation to 20 %, all six together (the wrist gains go together) to some 12
+    # %.
     assert 0.7 < float(np.sqrt(np.mean(ratio**2))) < 1.3
     assert ratio.min() > 0.45
     assert ratio.max() < 1.6
@@ -94,7 +119,8 @@ def test_predicted_deviations_are_those_of_the_estimator(truth: Truth) -> None:
 
 def test_the_information_is_that_of_the_fits_own_equation() -> None:
     """J by finite differences of v = T τ(χ, χ_u)/g, in every unknown."""
-    truth, rng = tx40_truth(), np.random.default_rng(2)
+    truth = tx40_truth()
+    rng = np.random.default_rng(2)
     design = _design(truth)
     excitation = _excitation(rng, 40)
     regressor = truth.model.regressor(excitation.motion)
@@ -110,18 +136,28 @@ def test_the_information_is_that_of_the_fits_own_equation() -> None:
         if loaded:
             torque += np.einsum("jck,c->jk", regressor[:, truth.model.flange], payload)
         gains = GAINS * np.exp(values[-6:])
-        weighted = truth.model.drive_train.to_motor @ torque / gains[:, None] / design.expectation.noise_a[:, None]
+        weighted = (
+            truth.model.drive_train.to_motor
+            @ torque
+            / gains[:, None]
+            / design.expectation.noise_a[:, None]
+        )
         return np.asarray(weighted.ravel())
 
     jacobian = np.zeros((2 * 6 * 40, len(start)))
     for column in range(len(start)):
         step = np.zeros(len(start))
         step[column] = 1e-5
-        both = [currents(start + step, loaded) - currents(start - step, loaded) for loaded in (False, True)]
+        both = [
+            currents(start + step, loaded) - currents(start - step, loaded)
+            for loaded in (False, True)
+        ]
         jacobian[:, column] = np.concatenate(both) / 2e-5
     found = design.information(excitation, (None, 0))
     scale = np.sqrt(np.diag(found))
-    assert jacobian.T @ jacobian / np.outer(scale, scale) == pytest.approx(found / np.outer(scale, scale), abs=1e-6)
+    assert jacobian.T @ jacobian / np.outer(scale, scale) == pytest.approx(
+        found / np.outer(scale, scale), abs=1e-6
+    )
 
 
 @settings(deadline=None, max_examples=15)
@@ -129,7 +165,9 @@ def test_the_information_is_that_of_the_fits_own_equation() -> None:
 def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, times: int) -> None:
     truth = tx40_truth()
     design = _design(truth)
-    louder = Design(replace(design.expectation, noise_a=factor * design.expectation.noise_a), design.base)
+    louder = Design(
+        replace(design.expectation, noise_a=factor * design.expectation.noise_a), design.base
+    )
     excitation = _excitation(np.random.default_rng(seed))
     once = design.std_percent(design.information(excitation, (None, 0)))
     noisy = louder.std_percent(louder.information(excitation, (None, 0)))
@@ -160,7 +198,8 @@ def test_recorded_information_is_the_sum_of_the_runs() -> None:
 
 def test_correlated_rows_say_less() -> None:
     assert effective_noise(np.ones(2), 0.0) == pytest.approx([1.0, 1.0])
-    # The mean of a long first-order autoregression, by its definition: Σ_k ρ^|k| times the variance.
+    # The mean of a long first-order autoregression, by its definition: Σ_k ρ^|k| times the
+    # variance.
     rho = 0.67
     summed = 1.0 + 2.0 * sum(rho**k for k in range(1, 200))
     assert effective_noise(np.ones(1), rho)[0] ** 2 == pytest.approx(summed)
@@ -187,7 +226,9 @@ def test_a_gain_whose_axis_never_moves_is_not_seen() -> None:
     assert "not identifiable" in judged[3].words("J4")
 
 
-def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_through_gravity() -> None:
+def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_through_gravity() -> (
+    None
+):
     truth = tx40_truth()
     excitation = _excitation(np.random.default_rng(1))
     upright = verdicts(_design(truth), [(excitation, (None, 0))]).gains[0]
@@ -201,21 +242,32 @@ def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_throu
 
 
 def test_no_source_alone_is_better_than_all_of_them() -> None:
-    for gain in verdicts(_design(tx40_truth()), [(_excitation(np.random.default_rng(4)), (None, 0))]).gains:
-        assert all(alone >= gain.std_percent * (1.0 - 1e-9) for alone in gain.alone_percent.values())
+    for gain in verdicts(
+        _design(tx40_truth()), [(_excitation(np.random.default_rng(4)), (None, 0))]
+    ).gains:
+        assert all(
+            alone >= gain.std_percent * (1.0 - 1e-9) for alone in gain.alone_percent.values()
+        )
         assert gain.sources
 
 
 def test_the_advice_is_the_best_of_what_was_tried_and_says_what_it_gives() -> None:
     design = _design(tx40_truth())
-    weak = Design(replace(design.expectation, noise_a=100.0 * design.expectation.noise_a), design.base)
+    weak = Design(
+        replace(design.expectation, noise_a=100.0 * design.expectation.noise_a), design.base
+    )
     excitation = _excitation(np.random.default_rng(1), 100)
-    extras = [ExtraMoves(f"{rows} rows", 5.0, _excitation(np.random.default_rng(rows), rows)) for rows in (30, 300, 60)]
+    extras = [
+        ExtraMoves(f"{rows} rows", 5.0, _excitation(np.random.default_rng(rows), rows))
+        for rows in (30, 300, 60)
+    ]
     judged = verdicts(weak, [(excitation, (None, 0))], extras).gains
     for gain in judged:
         assert gain.advice is not None
         assert gain.advice.words == "300 rows"
-        added = weak.information(excitation, (None, 0)) + weak.information(extras[1].excitation, (None, 0))
+        added = weak.information(excitation, (None, 0)) + weak.information(
+            extras[1].excitation, (None, 0)
+        )
         assert gain.advice.std_percent == pytest.approx(weak.std_percent(added)[gain.axis])
         assert "add 5 s of 300 rows" in gain.words("J")
 
@@ -234,7 +286,10 @@ def test_two_mountings_have_unknowns_of_their_own() -> None:
 
 def test_base_parameters_of_the_geometry_do_not_depend_on_the_motion() -> None:
     model = Model(robot_from_urdf(TX40.urdf), tx40_truth().model.drive_train)
-    found = {visible_base(model, _motion(np.random.default_rng(seed), 700)).independent for seed in range(4)}
+    found = {
+        visible_base(model, _motion(np.random.default_rng(seed), 700)).independent
+        for seed in range(4)
+    }
     assert len(found) == 1
     assert len(found.pop()) == 61
 
@@ -242,7 +297,10 @@ def test_base_parameters_of_the_geometry_do_not_depend_on_the_motion() -> None:
 def test_what_a_payload_adds_to_friction_is_seen_in_loaded_runs_alone(truth: Truth) -> None:
     model = replace(truth.model, friction_by_payload=True)
     rng = np.random.default_rng(21)
-    runs = [record(truth, f"run{number}", rng, payload, seconds=8.0) for number, payload in enumerate((None, MOUNTED))]
+    runs = [
+        record(truth, f"run{number}", rng, payload, seconds=8.0)
+        for number, payload in enumerate((None, MOUNTED))
+    ]
     base = identify(model, runs, CONDITIONING, judge=False).system.base
     parameters = np.concatenate((truth.parameters, np.zeros(len(model.loaded_friction_columns))))
     noise = np.full(6, NOISE_A)

@@ -1,4 +1,6 @@
-"""Moves from limits alone: within the limits, better than random ones, and good for the σ that they predict."""
+"""Moves from limits alone: within the limits, better than random ones,
+and good for the σ that they predict.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from ident.arrays import FloatArray
 from ident.planning.effort import EFFORT_MARGIN, effort_shares
 from ident.planning.moves import _search_of
 
-EXAMPLE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[3] / "examples" / "gains_from_arrays.py")))
+EXAMPLE = SimpleNamespace(
+    **runpy.run_path(str(Path(__file__).parents[3] / "examples" / "gains_from_arrays.py"))
+)
 LIMITS = ident.JointLimits([-2.9, -2.0, -2.2], [2.9, 2.0, 2.2], [3.0, 2.5, 3.0], [12.0, 10.0, 12.0])
 RATE_HZ = 500.0
 lax: Any = ident  #: As a notebook sees it
@@ -25,7 +29,9 @@ lax: Any = ident  #: As a notebook sees it
 
 @pytest.fixture(scope="module")
 def model() -> ident.Model:
-    return ident.Model(ident.robot_from_urdf(EXAMPLE.URDF), ident.DriveTrain(np.diag(EXAMPLE.GEAR_RATIOS)))
+    return ident.Model(
+        ident.robot_from_urdf(EXAMPLE.URDF), ident.DriveTrain(np.diag(EXAMPLE.GEAR_RATIOS))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +56,9 @@ def test_moves_keep_the_limits_and_begin_and_end_at_rest(plan: ident.PlannedMove
     assert np.allclose(motion.position_rad[at_rest], plan.target_rad[1:])
 
 
-def test_velocity_and_acceleration_are_derivatives_of_the_position(plan: ident.PlannedMoves) -> None:
+def test_velocity_and_acceleration_are_derivatives_of_the_position(
+    plan: ident.PlannedMoves,
+) -> None:
     time_s, motion = plan.motion(5000.0)
     inner = slice(2, -2)
     velocity = np.gradient(motion.position_rad, time_s, axis=0)
@@ -59,21 +67,36 @@ def test_velocity_and_acceleration_are_derivatives_of_the_position(plan: ident.P
     assert np.abs(acceleration - motion.acceleration_rad_s2)[inner].max() < 0.05
 
 
-def _recorded(model: ident.Model, plan: ident.PlannedMoves, payload: ident.Payload | None, seed: int) -> ident.Run:
+def _recorded(
+    model: ident.Model, plan: ident.PlannedMoves, payload: ident.Payload | None, seed: int
+) -> ident.Run:
     """The run that a robot makes of a plan, with the example's truth and a noise of 0.3 A."""
     rng = np.random.default_rng(seed)
     time_s, motion = plan.motion(RATE_HZ)
     parameters = _parameters(model, payload)
     torque_nm = np.einsum("jck,c->kj", model.regressor(motion), parameters)
     current_a = torque_nm / EXAMPLE.TRUE_GAINS_NM_A + 0.3 * rng.standard_normal(torque_nm.shape)
-    return ident.Run("loaded" if payload else "bare", time_s, motion.position_rad, current_a, payload)
+    return ident.Run(
+        "loaded" if payload else "bare", time_s, motion.position_rad, current_a, payload
+    )
 
 
 def _parameters(model: ident.Model, payload: ident.Payload | None) -> FloatArray:
     """Standard parameters of an arm with links of 10, 5 and 3 kg."""
     truth: list[float] = []
     for mass in (10.0, 5.0, 3.0):
-        link = [0.02 * mass, 0.0, 0.0, 0.02 * mass, 0.0, 0.01 * mass, 0.05 * mass, 0.0, 0.12 * mass, mass]
+        link = [
+            0.02 * mass,
+            0.0,
+            0.0,
+            0.02 * mass,
+            0.0,
+            0.01 * mass,
+            0.05 * mass,
+            0.0,
+            0.12 * mass,
+            mass,
+        ]
         truth += [*link, 0.03, 5.0, 6.0, 0.1]
     parameters = np.array(truth)
     if payload is not None:
@@ -88,31 +111,43 @@ def test_a_fit_of_planned_moves_has_smaller_deviations_than_of_random_ones(
     assert plan.predicted_std_percent.max() < 0.8 * random.predicted_std_percent.max()
     worst: list[float] = []
     for moves in (plan, random):
-        runs = [_recorded(model, moves, load, seed) for load, seed in ((None, 1), (EXAMPLE.DISC, 2))]
+        runs = [
+            _recorded(model, moves, load, seed) for load, seed in ((None, 1), (EXAMPLE.DISC, 2))
+        ]
         found = ident.identify(model, runs)
-        assert np.all(np.abs(found.estimate.gains - EXAMPLE.TRUE_GAINS_NM_A) < 4.0 * found.estimate.gains_std)
+        assert np.all(
+            np.abs(found.estimate.gains - EXAMPLE.TRUE_GAINS_NM_A) < 4.0 * found.estimate.gains_std
+        )
         worst.append(float(np.max(found.estimate.gains_std / np.abs(found.estimate.gains))))
     assert worst[0] < worst[1]
 
 
 def test_the_same_seed_gives_the_same_moves(model: ident.Model, plan: ident.PlannedMoves) -> None:
-    again = ident.plan_moves(model, LIMITS, EXAMPLE.DISC, list(EXAMPLE.NAMEPLATE_NM_A), exchanges=400)
+    again = ident.plan_moves(
+        model, LIMITS, EXAMPLE.DISC, list(EXAMPLE.NAMEPLATE_NM_A), exchanges=400
+    )
     assert np.array_equal(again.target_rad, plan.target_rad)
-    other = ident.plan_moves(model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, seed=1, exchanges=0)
+    other = ident.plan_moves(
+        model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, seed=1, exchanges=0
+    )
     assert not np.array_equal(other.target_rad[0], plan.target_rad[0])
 
 
 def test_torques_keep_the_efforts_of_the_urdf(model: ident.Model, plan: ident.PlannedMoves) -> None:
     """With weak motors the planner makes other moves: those of strong ones ask for more torque."""
     weak = EXAMPLE.URDF.replace('effort="99"', 'effort="60"')
-    moves = ident.plan_moves(model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, urdf=weak, exchanges=20)
+    moves = ident.plan_moves(
+        model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, urdf=weak, exchanges=20
+    )
     gains = np.array(EXAMPLE.NAMEPLATE_NM_A)
     search = _search_of(model, LIMITS, EXAMPLE.DISC, gains, weak, ident.Conditioning())
     assert np.isfinite(search.effort).all()
 
     def largest(planned: ident.PlannedMoves) -> float:
         _, motion = planned.motion(RATE_HZ)
-        return float(effort_shares(search.design.expectation, search.effort, motion, (None, 0)).max())
+        return float(
+            effort_shares(search.design.expectation, search.effort, motion, (None, 0)).max()
+        )
 
     assert largest(moves) <= 1.02 / EFFORT_MARGIN  # looked at 50 times a second
     assert largest(plan) > 1.0 / EFFORT_MARGIN
@@ -123,40 +158,77 @@ def _planned_for(model: ident.Model, **settings: Any) -> Any:
 
 
 MOTIONS: list[tuple[str, dict[str, Any], Any, str]] = [
-    ("no rate", {}, 0.0, "rate_hz is 0; expected a finite number above 0; give the rate of the controller"),
+    (
+        "no rate",
+        {},
+        0.0,
+        "rate_hz is 0; expected a finite number above 0; give the rate of the controller",
+    ),
     ("negative rate", {}, -500.0, "rate_hz is -500"),
     ("rate of a text", {}, "500", "rate_hz is '500' of type str"),
     ("too many", {}, 1e12, r"samples at 1e\+12 Hz; expected at most 1e\+07"),
-    ("a move of 0 s", {"move_s": np.array([1.0, 0.0])}, 500.0, "move_s has 0 s; expected durations above 0 s"),
+    (
+        "a move of 0 s",
+        {"move_s": np.array([1.0, 0.0])},
+        500.0,
+        "move_s has 0 s; expected durations above 0 s",
+    ),
     ("a move of -5 s", {"move_s": np.array([-5.0, 1.0])}, 500.0, "move_s has -5 s"),
     ("no duration", {"move_s": np.array([1.0, np.nan])}, 500.0, "move_s holds 1 non-finite values"),
-    ("a move too many", {"move_s": np.ones(3)}, 500.0, r"target_rad of shape \(3, 1\) and move_s of shape \(3,\)"),
+    (
+        "a move too many",
+        {"move_s": np.ones(3)},
+        500.0,
+        r"target_rad of shape \(3, 1\) and move_s "
+        r"of shape \(3,\)",
+    ),
     ("a dwell of inf", {"dwell_s": np.inf}, 500.0, "dwell_s is inf"),
 ]
 
 
 @pytest.mark.parametrize(
-    ("changes", "rate_hz", "words"), [case[1:] for case in MOTIONS], ids=[case[0] for case in MOTIONS]
+    ("changes", "rate_hz", "words"),
+    [case[1:] for case in MOTIONS],
+    ids=[case[0] for case in MOTIONS],
 )
-def test_moves_that_take_no_time_are_no_motion(changes: dict[str, Any], rate_hz: Any, words: str) -> None:
-    moves = ident.PlannedMoves(np.array([[0.0], [1.0], [0.0]]), np.array([1.0, 2.0]), 0.1, np.ones(1))
+def test_moves_that_take_no_time_are_no_motion(
+    changes: dict[str, Any], rate_hz: Any, words: str
+) -> None:
+    moves = ident.PlannedMoves(
+        np.array([[0.0], [1.0], [0.0]]), np.array([1.0, 2.0]), 0.1, np.ones(1)
+    )
     with pytest.raises(ident.ModelError, match=words):
         replace(moves, **changes).motion(rate_hz)
 
 
 Call = Callable[[ident.Model], Any]
 WRONG: list[tuple[str, Call, str]] = [
-    ("dict", lambda m: lax.plan_moves(m, {}, EXAMPLE.DISC, [1, 1, 1]), "limits is of type dict; expected JointLimits"),
-    ("mass", lambda m: lax.plan_moves(m, LIMITS, 4.59, [1, 1, 1]), "payload is of type float; expected Payload"),
+    (
+        "dict",
+        lambda m: lax.plan_moves(m, {}, EXAMPLE.DISC, [1, 1, 1]),
+        "limits is of type dict; expected JointLimits",
+    ),
+    (
+        "mass",
+        lambda m: lax.plan_moves(m, LIMITS, 4.59, [1, 1, 1]),
+        "payload is of type float; expected Payload",
+    ),
     (
         "gains",
         lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1]),
         r"nameplate has shape \(2,\); expected \(3,\)",
     ),
-    ("zero", lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 0, 1]), r"nameplate is \[1.0, 0.0, 1.0\]"),
+    (
+        "zero",
+        lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 0, 1]),
+        r"nameplate is \[1.0, "
+        r"0.0, 1.0\]",
+    ),
     (
         "two limits",
-        lambda m: lax.plan_moves(m, lax.JointLimits([-1, -1], [1, 1], [1, 1], [1, 1]), EXAMPLE.DISC, [1, 1, 1]),
+        lambda m: lax.plan_moves(
+            m, lax.JointLimits([-1, -1], [1, 1], [1, 1], [1, 1]), EXAMPLE.DISC, [1, 1, 1]
+        ),
         r"limits.lower has shape \(2,\); expected \(3,\), one per joint",
     ),
     (
@@ -172,17 +244,25 @@ WRONG: list[tuple[str, Call, str]] = [
     (
         "no velocity",
         lambda m: lax.plan_moves(
-            m, lax.JointLimits(LIMITS.lower, LIMITS.upper, [1, 0, 1], LIMITS.acceleration), EXAMPLE.DISC, [1, 1, 1]
+            m,
+            lax.JointLimits(LIMITS.lower, LIMITS.upper, [1, 0, 1], LIMITS.acceleration),
+            EXAMPLE.DISC,
+            [1, 1, 1],
         ),
         r"limits.velocity: found \[1.0, 0.0, 1.0\]; expected numbers above zero",
     ),
     (
         "short",
         lambda m: lax.plan_moves(m, LIMITS, EXAMPLE.DISC, [1, 1, 1], duration_s=5.0),
-        r"found room for \d moves in 5 s; expected at least 10, and better 30; give a longer `duration_s`",
+        r"found room for \d moves in 5 s; expected at least 10, and better 30; give a longer "
+        r"`duration_s`",
     ),
     *(
-        (f"duration {value}", lambda m, value=value: _planned_for(m, duration_s=value), f"duration_s is .*{words}")
+        (
+            f"duration {value}",
+            lambda m, value=value: _planned_for(m, duration_s=value),
+            f"duration_s is .*{words}",
+        )
         for value, words in (
             (np.nan, "nan; expected a finite number above 0; give the time of one run, such as 40"),
             (np.inf, "inf; expected a finite number above 0"),
@@ -191,26 +271,49 @@ WRONG: list[tuple[str, Call, str]] = [
             ("40", "'40' of type str; expected a finite number"),
         )
     ),
-    ("seed", lambda m: _planned_for(m, seed=-1), "seed is -1; expected a whole number, zero or above"),
-    ("exchanges", lambda m: _planned_for(m, exchanges=1.5), "exchanges is 1.5; expected a whole number"),
-    ("a file", lambda m: _planned_for(m, urdf=b"robot"), "urdf is of type bytes; expected str; give the text"),
+    (
+        "seed",
+        lambda m: _planned_for(m, seed=-1),
+        "seed is -1; expected a whole number, zero or above",
+    ),
+    (
+        "exchanges",
+        lambda m: _planned_for(m, exchanges=1.5),
+        "exchanges is 1.5; expected a whole number",
+    ),
+    (
+        "a file",
+        lambda m: _planned_for(m, urdf=b"robot"),
+        "urdf is of type bytes; expected str; give the text",
+    ),
     (
         "slow",  # moves of days would have gigabytes of rows
         lambda m: lax.plan_moves(
-            m, lax.JointLimits(LIMITS.lower, LIMITS.upper, [1e-9] * 3, LIMITS.acceleration), EXAMPLE.DISC, [1, 1, 1]
+            m,
+            lax.JointLimits(LIMITS.lower, LIMITS.upper, [1e-9] * 3, LIMITS.acceleration),
+            EXAMPLE.DISC,
+            [1, 1, 1],
         ),
         "found room for 0 moves in 40 s",
     ),
-    ("words", lambda _: lax.JointLimits("abc", [1], [1], [1]), "limits.lower is no array of numbers"),
+    (
+        "words",
+        lambda _: lax.JointLimits("abc", [1], [1], [1]),
+        "limits.lower is no array of numbers",
+    ),
     (
         "no mass",
-        lambda m: lax.plan_moves(m, LIMITS, lax.Payload("disc", "flange", {}), [1, 1, 1], exchanges=0),
+        lambda m: lax.plan_moves(
+            m, LIMITS, lax.Payload("disc", "flange", {}), [1, 1, 1], exchanges=0
+        ),
         r"found gains that \d+ moves do not show: J1, J2, J3; .* a payload with a mass",
     ),
 ]
 
 
-@pytest.mark.parametrize(("call", "words"), [case[1:] for case in WRONG], ids=[case[0] for case in WRONG])
+@pytest.mark.parametrize(
+    ("call", "words"), [case[1:] for case in WRONG], ids=[case[0] for case in WRONG]
+)
 def test_what_no_plan_can_be_made_of_is_refused(model: ident.Model, call: Call, words: str) -> None:
     with pytest.raises(ident.IdentificationError, match=words):
         call(model)

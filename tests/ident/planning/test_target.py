@@ -26,8 +26,12 @@ GOOD_VERDICT = GainVerdict(
 )
 
 
-@given(std=st.lists(PERCENT, min_size=1, max_size=7), target=PERCENT, recorded_s=st.floats(1.0, 1e4))
-def test_after_the_time_left_every_gain_is_at_its_target(std: list[float], target: float, recorded_s: float) -> None:
+@given(
+    std=st.lists(PERCENT, min_size=1, max_size=7), target=PERCENT, recorded_s=st.floats(1.0, 1e4)
+)
+def test_after_the_time_left_every_gain_is_at_its_target(
+    std: list[float], target: float, recorded_s: float
+) -> None:
     found = time_to_target(np.array(std), np.full(len(std), target), recorded_s)
     # σ falls with the root of the time.
     then = np.array(std) * np.sqrt(recorded_s / (recorded_s + found.left_s))
@@ -80,14 +84,22 @@ ALONE = {GainSource.GRAVITY: np.inf, GainSource.INERTIA: 20.0, GainSource.COUPLI
         (replace(GOOD_VERDICT, gravity_acts=False), 1.0, SlowCause.INERTIA),
         (replace(GOOD_VERDICT, alone_percent=ALONE), 1.0, SlowCause.COUPLING),
         (replace(GOOD_VERDICT, std_percent=30.0, verdict=Visibility.UNSEEN), 1.0, SlowCause.MOTION),
-        (replace(GOOD_VERDICT, std_percent=np.inf, verdict=Visibility.UNSEEN), 3.0, SlowCause.MOTION),
         (
-            replace(GOOD_VERDICT, std_percent=5.0, verdict=Visibility.WEAK, known_preload_percent=1.0),
+            replace(GOOD_VERDICT, std_percent=np.inf, verdict=Visibility.UNSEEN),
+            3.0,
+            SlowCause.MOTION,
+        ),
+        (
+            replace(
+                GOOD_VERDICT, std_percent=5.0, verdict=Visibility.WEAK, known_preload_percent=1.0
+            ),
             3.0,
             SlowCause.PRELOAD,
         ),
     ],
 )
-def test_the_reason_is_that_of_the_verdict(verdict: GainVerdict, noise_ratio: float, cause: SlowCause) -> None:
+def test_the_reason_is_that_of_the_verdict(
+    verdict: GainVerdict, noise_ratio: float, cause: SlowCause
+) -> None:
     assert slow_cause(verdict, has_payload=True, noise_ratio=noise_ratio) is cause
     assert slow_cause(verdict, has_payload=False, noise_ratio=noise_ratio) is SlowCause.NO_PAYLOAD

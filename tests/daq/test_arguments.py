@@ -1,0 +1,166 @@
+"""Wrong arguments of the public functions:
+one error of the service, which names the argument and what it takes.
+"""
+
+from __future__ import annotations
+
+import inspect
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import daq
+from tests.conftest import CHECKOUT
+from tests.daq.calibrations import demo_calibration
+
+lax: Any = daq  #: As a notebook sees it
+CALIBRATION = demo_calibration()
+NOW = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+def _stand_in(kind: type) -> Any:
+    """An object of a class without content:
+    a wrong argument is refused before the right ones are used.
+    """
+    return object.__new__(kind)
+
+
+def _right_arguments() -> dict[str, dict[str, Any]]:
+    """Arguments of the right type for each public function."""
+    target = daq.FileTarget(Path("controller.yaml"))
+    cell = daq.load_cell(CHECKOUT / "configs/cells/demo.yaml")
+    logs = [Path("bare.mcap")]
+    return {
+        "load_cell": {"path": Path("cell.yaml")},
+        "load_run": {"path": Path("run.mcap"), "cell": cell, "lossy": daq.LossyLogs.REFUSED},
+        "read_log": {"path": Path("run.mcap")},
+        "load_calibration": {"path": Path("calibration.yaml"), "own_effects": ()},
+        "save_calibration": {"calibration": CALIBRATION, "path": Path("calibration.yaml")},
+        "fit_logs": {
+            "logs": logs,
+            "holdout": logs,
+            "cell": cell,
+            "created": NOW,
+            "own_effects": (),
+        },
+        "fit": {"logs": logs, "holdout": logs, "cell": cell, "gains_fixed": False},
+        "close_loop": {"start": _stand_in(daq.Fit), "seed": 0},
+        "calibration_of": {"fitted": _stand_in(daq.Fit), "created": NOW},
+        "validate": {"calibration": CALIBRATION, "logs": logs, "cell": cell},
+        "propose": {"target": target, "request": daq.Request(CALIBRATION, NOW)},
+        "apply": {
+            "proposal": _stand_in(daq.Proposal),
+            "now": NOW,
+            "audit": Path("audit.jsonl"),
+            "who": "Ada",
+        },
+        "rollback": {"target": target, "now": NOW, "audit": Path("audit.jsonl"), "who": "Ada"},
+    }
+
+
+RIGHT = _right_arguments()
+CASES = [(function, name) for function, arguments in RIGHT.items() for name in arguments]
+WRONG: tuple[Any, ...] = (
+    3.5,
+    -1,
+    "words",
+    b"words",
+    object(),
+    {"a": 1},
+    ["x", 3],
+    datetime(2026, 3, 1),
+)
+TEXTS = {"path", "audit", "who"}  #: Arguments that a text is right for
+
+
+def test_every_public_function_is_looked_at() -> None:
+    functions = {name for name in daq.__all__ if inspect.isfunction(getattr(daq, name))}
+    assert functions == set(RIGHT)
+    for name, arguments in RIGHT.items():
+        parameters = inspect.signature(getattr(daq, name)).parameters.values()
+        needed = {one.name for one in parameters if one.default is one.empty}
+        assert needed <= set(arguments), name
+
+
+@pytest.mark.parametrize(("function", "name"), CASES, ids=[".".join(case) for case in CASES])
+def test_an_argument_of_another_type_is_refused_by_name(
+    function: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for value in WRONG:
+        if isinstance(value, str) and name in TEXTS:
+            continue
+        if isinstance(value, list) and name == "own_effects":
+            continue  # what an effect lacks is said by `EffectRefused`
+        with pytest.raises(daq.UsageError) as caught:
+            getattr(lax, function)(**{**RIGHT[function], name: value})
+        assert caught.value.subject == f"{name} of {function}"
+        assert f"of type {type(value).__name__}" in caught.value.found
+        assert caught.value.expected
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "function", ["load_cell", "load_run", "read_log", "load_calibration", "save_calibration"]
+)
+def test_a_folder_or_no_name_in_the_place_of_a_file_is_refused(
+    function: str, tmp_path: Path
+) -> None:
+    arguments = {**RIGHT[function], "path": tmp_path}
+    with pytest.raises(daq.DaqError, match=str(tmp_path)):
+        getattr(lax, function)(**arguments)
+    with pytest.raises(daq.UsageError, match="expected the path of a file"):
+        getattr(lax, function)(**{**arguments, "path": ""})
+
+
+@pytest.mark.parametrize("function", ["fit", "fit_logs", "validate"])
+def test_one_log_in_the_place_of_a_list_is_named_with_the_list(function: str) -> None:
+    for log in ("bare.mcap", Path("bare.mcap")):
+        with pytest.raises(
+            daq.UsageError,
+            match=rf"logs of {function}: found .*give a list: "
+            r"\[bare, loaded\]",
+        ):
+            getattr(lax, function)(**{**RIGHT[function], "logs": log})
+
+
+def test_no_list_is_too_little_checked() -> None:
+    with pytest.raises(
+        daq.UsageError,
+        match=r"holdout of fit_logs: .*expected a list of paths, "
+        r"each as Path or text",
+    ):
+        lax.fit_logs(["bare.mcap"], holdout=[3])
+    with pytest.raises(
+        daq.UsageError, match="seed of close_loop: found True of type bool; expected a whole number"
+    ):
+        lax.close_loop(RIGHT["close_loop"]["start"], True)
+
+
+@pytest.mark.parametrize(
+    ("calibration", "now", "words"),
+    [
+        (
+            3.5,
+            NOW,
+            "calibration of the request: found 3.5 of type float; expected Calibration; "
+            "write Request",
+        ),
+        (
+            CALIBRATION,
+            "today",
+            "now of the request: found 'today' of type str; expected a datetime with its time zone",
+        ),
+    ],
+)
+def test_a_request_of_other_things_is_refused(calibration: Any, now: Any, words: str) -> None:
+    with pytest.raises(daq.UsageError, match=words):
+        lax.propose(RIGHT["propose"]["target"], daq.Request(calibration, now))
+
+
+def test_paths_may_be_texts(tmp_path: Path) -> None:
+    file = str(tmp_path / "calibration.yaml")
+    daq.save_calibration(CALIBRATION, file)
+    assert daq.load_calibration(file).gains == CALIBRATION.gains

@@ -1,0 +1,86 @@
+"""Refinement of settings: from any start in their ranges to the best values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.arrays import FloatArray
+from ident.discovery.candidates import CandidateTrial, SearchProblem
+from ident.discovery.refinement import refine_together
+from ident.effects.effect import Effect, Property, Range
+from ident.effects.signals import Abscissa, Signals
+from ident.model.model import Column
+
+LEAST = 0.5
+LARGEST = 3.0
+BEST = (1.7, 0.9)
+SCALE = 1e4
+"""Fall of the squared residual at the best settings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bump(Effect):
+    """A torque around a position, of a width."""
+
+    name = "bump"
+    declares = Property.INDEPENDENT_OF_VELOCITY
+    abscissa = Abscissa.POSITION
+    coefficients = (Column("height", "Nm"),)
+
+    centre_rad: Annotated[float, Range(LEAST, LARGEST)]
+    width_rad: Annotated[float, Range(LEAST, LARGEST)]
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (1, k)."""
+        raise AssertionError("the search problem of this test needs none")
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """What a refinement reads of a trial."""
+
+    fallen: FloatArray
+    coefficients: FloatArray
+
+
+class _Hill:
+    """A search problem whose fall has one hump, at BEST."""
+
+    def torque_at_rows(self, effect: Effect, axis: int) -> Effect:
+        return effect
+
+    def trials(self, effects: Sequence[Effect]) -> list[CandidateTrial]:
+        (effect,) = effects
+        centre, width = (effect.settings[name] for name in ("centre_rad", "width_rad"))
+        distance = (centre - BEST[0]) ** 2 + (width - BEST[1]) ** 2
+        fallen = np.array([SCALE / (1.0 + distance)])
+        return [cast(CandidateTrial, _Trial(fallen, np.array([1.0])))]
+
+
+def _refined(centre_rad: float, width_rad: float) -> tuple[float, ...]:
+    hill = cast(SearchProblem, _Hill())
+    effect = refine_together(hill, Bump(centre_rad, width_rad), axis=0)
+    return tuple(effect.settings.values())
+
+
+@given(st.floats(LEAST, LARGEST), st.floats(LEAST, LARGEST))
+@settings(max_examples=60)
+def test_settings_are_refined_to_the_best_from_any_start(centre: float, width: float) -> None:
+    assert _refined(centre, width) == pytest.approx(BEST, abs=0.02)
+
+
+@pytest.mark.parametrize("centre", [LEAST, LARGEST])
+@pytest.mark.parametrize("width", [LEAST, LARGEST])
+def test_settings_are_refined_from_the_ends_of_their_ranges(centre: float, width: float) -> None:
+    assert _refined(centre, width) == pytest.approx(BEST, abs=0.02)
+
+
+def test_settings_that_are_the_best_stay_as_they_are() -> None:
+    assert _refined(*BEST) == BEST

@@ -1,0 +1,264 @@
+"""Joints that follow an axis (`<mimic>` of a URDF):
+motion and torque against Pinocchio, and the gains of an arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.discovery.evidence import gather
+from ident.discovery.loop import find_effects
+from ident.errors import ModelError, PayloadUnseen
+from ident.estimators.identify import identify
+from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.model.closed_chain import assemble, follow
+from ident.model.model import DriveTrain, Model
+from ident.model.robot import Motion, Robot
+from ident.model.urdf import LinkPair, robot_from_urdf
+from tests.ident.recordings import PAYLOAD_TRUTH, positions
+
+FloatArray = NDArray[np.float64]
+MULTIPLIER = -1.5
+OFFSET_RAD = 0.2
+GAINS = np.array([33.9, 32.4, -24.2])
+FRICTION = ((7.0, 5.5), (4.4, 7.7), (1.6, 6.3))
+RATE_HZ = 250.0
+
+
+def _link(name: str, mass: float, centre: str) -> str:
+    inertia = '<inertia ixx="0.06" ixy="0.002" ixz="-0.003" iyy="0.08" iyz="0.004" izz="0.05"/>'
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{centre}"/><mass '
+        f'value="{mass}"/>{inertia}</inertial></link>'
+    )
+
+
+def _joint(
+    name: str,
+    parent: str,
+    child: str,
+    place: str,
+    axis: str,
+    more: str = "",
+    kind: str = "revolute",
+) -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="{place}"/><parent '
+        f'link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/><limit lower="-3" upper="3" '
+        f'velocity="3" effort="99"/>{more}</joint>'
+    )
+
+
+def _arm(multiplier: float = MULTIPLIER, kind: str = "revolute") -> str:
+    """A turntable, a shoulder, a link that a belt turns with the shoulder,
+    and a wrist at its end.
+    """
+    mimic = f'<mimic joint="shoulder" multiplier="{multiplier}" offset="{OFFSET_RAD}"/>'
+    parts = [
+        '<robot name="belted"><link name="base"/>',
+        _link("table", 10.0, "0.02 -0.03 0.1"),
+        _link("upper", 5.0, "0.05 0.02 0.15"),
+        _link("belted", 3.0, "-0.04 0.03 0.12"),
+        _link("hand", 2.0, "0.06 -0.05 0.08"),
+        _joint("turn", "base", "table", "0 0 0.2", "0 0 1"),
+        _joint("shoulder", "table", "upper", "0.05 0 0.2", "0 1 0"),
+        _joint("rod", "upper", "belted", "0 0 0.35", "0 1 0", mimic, kind),
+        _joint("wrist", "belted", "hand", "0.1 0 0.3", "0 1 0"),
+        "</robot>",
+    ]
+    return "".join(parts)
+
+
+def _pinocchio_torque(
+    urdf: str, multiplier: float, motion: Motion, hand: FloatArray | None = None
+) -> FloatArray:
+    """Torques of the three axes, τ = Gᵀ rnea(q, q̇, q̈) with q of all four joints and G =
+    ∂q/∂(axes), shape (k, 3).
+    """
+    model = pin.buildModelFromXML(urdf)
+    if hand is not None:
+        model.inertias[4] += pin.Inertia.FromDynamicParameters(hand)
+    data = model.createData()
+    to_joints = np.array(
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, multiplier, 0.0], [0.0, 0.0, 1.0]]
+    )
+    offset = np.array([0.0, 0.0, OFFSET_RAD, 0.0])
+    position = np.asarray(motion.position_rad) @ to_joints.T + offset
+    velocity = np.asarray(motion.velocity_rad_s) @ to_joints.T
+    acceleration = np.asarray(motion.acceleration_rad_s2) @ to_joints.T
+    states = zip(position, velocity, acceleration, strict=True)
+    torque = np.array([pin.rnea(model, data, q, v, a) for q, v, a in states])
+    return np.asarray(torque @ to_joints)
+
+
+PINOCCHIO_ORDER = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+
+
+def _standard(model: Model, urdf: str) -> FloatArray:
+    """Standard parameters of the URDF's links, without drives."""
+    standard = np.zeros(len(model.columns))
+    inertias = list(pin.buildModelFromXML(urdf).inertias)[1:]
+    for joint, inertia in enumerate(inertias):
+        by_name = dict(zip(PINOCCHIO_ORDER, inertia.toDynamicParameters(), strict=True))
+        standard[14 * joint : 14 * joint + 10] = [by_name[name] for name in LINK_PARAMETERS]
+    return standard
+
+
+def _model(robot: Robot) -> Model:
+    return Model(robot, DriveTrain(np.diag([40.0, 50.0, -45.0])))
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_the_torque_is_that_of_pinocchios_tree_projected_to_the_axes(kind: str) -> None:
+    urdf = _arm(kind=kind)
+    model = _model(robot_from_urdf(urdf))
+    rng = np.random.default_rng(1)
+    motion = Motion(*(rng.uniform(-1.5, 1.5, (40, 3)) for _ in range(3)))
+    expected = _pinocchio_torque(urdf, MULTIPLIER, motion)
+    standard = _standard(model, urdf)
+    by_columns = np.einsum("jck,c->kj", model.regressor(motion), standard)
+    np.testing.assert_allclose(by_columns, expected, atol=1e-9)
+    load, _, _ = model.torques(motion, standard)
+    np.testing.assert_allclose(load.T, expected, atol=1e-9)
+    # The mass matrix: the torque of an acceleration of one axis, less that at rest.
+    mass = model.inertia(np.asarray(motion.position_rad), standard)
+    still = np.zeros((40, 3))
+    at_rest = _pinocchio_torque(urdf, MULTIPLIER, Motion(motion.position_rad, still, still))
+    for axis, one in enumerate(np.eye(3)):
+        moved = _pinocchio_torque(urdf, MULTIPLIER, Motion(motion.position_rad, still, still + one))
+        np.testing.assert_allclose(mass[:, axis].T, moved - at_rest, atol=1e-9)
+
+
+def test_a_rack_with_many_radians_to_the_metre_is_followed() -> None:
+    """No step on the way to a position is too long for a joint that turns 200 rad in a metre of its
+    leader.
+    """
+    mimic = '<mimic joint="slide" multiplier="200" offset="-8"/>'
+    parts = [
+        '<robot name="rack"><link name="base"/>',
+        _link("carriage", 3.0, "0 0 0"),
+        _link("pinion", 0.5, "0.01 0 0"),
+        _joint("slide", "base", "carriage", "0 0 0", "1 0 0", kind="prismatic"),
+        _joint("pinion turns", "carriage", "pinion", "0 0 0.1", "0 0 1", mimic),
+        "</robot>",
+    ]
+    robot = robot_from_urdf("".join(parts))
+    position_m = np.linspace(-0.6, 0.9, 50)[:, None]
+    rate = np.ones_like(position_m)
+    found = follow(robot, assemble(robot), Motion(position_m, rate, 3.0 * rate)).joints
+    np.testing.assert_allclose(found.position_rad[:, 1], 200.0 * position_m[:, 0] - 8.0, atol=1e-9)
+    np.testing.assert_allclose(found.velocity_rad_s[:, 1], 200.0, atol=1e-9)
+    np.testing.assert_allclose(found.acceleration_rad_s2[:, 1], 600.0, atol=1e-9)
+
+
+def _recordings() -> tuple[Run, ...]:
+    """Runs of the arm without and with a payload on the hand, their currents by Pinocchio,
+    friction and the gains.
+    """
+    urdf = _arm()
+    train = _model(robot_from_urdf(urdf)).drive_train
+    body = np.array([PAYLOAD_TRUTH[name] for name in PINOCCHIO_ORDER])
+    payload = Payload("disc", "a", {"m": PAYLOAD_TRUTH["m"]})
+    rng = np.random.default_rng(7)
+    runs = []
+    for name, carried in (("bare", None), ("loaded", payload)):
+        q = positions(rng, 24.0, RATE_HZ, np.array([2.5, 1.2, 2.0]))
+        run = Run(name, np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), carried)
+        motion = differentiate(run, train, Conditioning(position_cutoff_hz=0.3 * RATE_HZ)).motion()
+        torque = _pinocchio_torque(urdf, MULTIPLIER, motion, None if carried is None else body)
+        viscous, dry = np.array(FRICTION).T
+        velocity = np.asarray(motion.velocity_rad_s)
+        torque = torque + viscous * velocity + dry * np.sign(velocity)
+        current = np.zeros_like(q)
+        current[1:-1] = torque / GAINS
+        noise = 0.02 * rng.standard_normal(current.shape)
+        runs.append(replace(run, current_a=current + noise))
+    return tuple(runs)
+
+
+@pytest.fixture(scope="module")
+def recordings() -> tuple[Run, ...]:
+    return _recordings()
+
+
+def _gains(recordings: tuple[Run, ...], multiplier: float) -> FloatArray:
+    model = _model(robot_from_urdf(_arm(multiplier)))
+    return np.asarray(identify(model, recordings, Conditioning()).estimate.gains)
+
+
+def test_the_gains_of_an_arm_with_a_follower_are_found(recordings: tuple[Run, ...]) -> None:
+    np.testing.assert_allclose(_gains(recordings, MULTIPLIER), GAINS, rtol=5e-3)
+
+
+def test_a_wrong_multiplier_bends_the_gains_or_is_refused(recordings: tuple[Run, ...]) -> None:
+    """Without it, the gains above could be right whatever is done with the ratio."""
+    error = np.abs(_gains(recordings, -1.4) / GAINS - 1.0)
+    assert error.min() > 0.02
+    assert error.max() > 0.04
+    with pytest.raises(PayloadUnseen, match="do not differ by the weight of the payload"):
+        _gains(recordings, 1.0)
+
+
+def test_a_follower_is_no_place_of_an_effect() -> None:
+    """Its friction is friction of its axis: the two columns would be alike."""
+    robot = robot_from_urdf(_arm())
+    assert [joint.name for joint in robot.places] == ["turn", "shoulder", "wrist"]
+    assert robot.passive_names == ("rod",)
+    assert robot.undriven_names == ()
+    model = _model(robot)
+    motion = Motion(*(np.full((4, 3), 0.1) for _ in range(3)))
+    followed = model.follow(motion)
+    assert model.leverage(followed).shape == (0, 3, 4)
+    assert np.asarray(model.at_places(followed).position_rad).shape == (4, 3)
+
+
+def test_a_spring_on_a_follower_is_found_as_one_of_its_axis(recordings: tuple[Run, ...]) -> None:
+    """The search works on the motion of the axes, in which the follower has no place."""
+    stiffness_nm_rad = 30.0
+    sprung = []
+    for run in recordings:
+        position = np.asarray(run.position_rad)[:, 1]
+        torque = MULTIPLIER * stiffness_nm_rad * (MULTIPLIER * position + OFFSET_RAD)
+        current = np.asarray(run.current_a).copy()
+        current[:, 1] += torque / GAINS[1]
+        sprung.append(replace(run, current_a=current))
+    found = identify(_model(robot_from_urdf(_arm())), sprung, Conditioning())
+    first = find_effects(gather(found, sprung), np.random.default_rng(0))[0]
+    # The best of its axes
+    spring = next(one for one in first.findings if one.effect.name == "spring")
+    assert spring.axis == 1
+    # Before the refit, a little of it is in the gravity of the links.
+    assert spring.coefficients[0] == pytest.approx(MULTIPLIER**2 * stiffness_nm_rad, rel=0.06)
+
+
+def test_columns_of_a_follower_are_its_links_alone() -> None:
+    model = _model(robot_from_urdf(_arm()))
+    rng = np.random.default_rng(4)
+    columns = model.regressor(Motion(*(rng.uniform(-1.0, 1.0, (30, 3)) for _ in range(3))))
+    rod = 14 * 2
+    assert np.abs(columns[1, rod : rod + len(LINK_PARAMETERS)]).max() > 1e-3
+    assert not columns[:, rod + len(LINK_PARAMETERS) : rod + 14].any()
+
+
+def test_a_motor_on_a_follower_and_a_follower_in_a_closed_chain_are_refused() -> None:
+    with pytest.raises(
+        ModelError,
+        match=r"joint 'rod' follows 'shoulder' and has a motor; "
+        r"expected one or the other",
+    ):
+        _model(robot_from_urdf(_arm(), motors=("turn", "rod", "wrist")))
+    loop = LinkPair("loop", "table", "hand", ("ry",))
+    with pytest.raises(
+        ModelError,
+        match=r"joint 'rod' has <mimic>, and the robot has closures; .* "
+        r"delete <mimic>",
+    ):
+        robot_from_urdf(_arm(), closures=(loop,), motors=("turn", "shoulder"))
