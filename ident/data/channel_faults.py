@@ -123,22 +123,20 @@ def find_faults(
     """
     if len(position) < 2:
         return ()
+    samples = len(position)
+    recorded = position
+    if ratio is not None:
+        recorded = motor_positions(position, ratio)
     found: list[ChannelFault] = []
-    if ratio is None:
-        read = position
-    else:
-        read = motor_positions(position, ratio)
-    for axis, readings in enumerate(_readings(read, rate_hz)):
-        others = np.delete(read, axis, axis=1)
-        found += _position_faults(
-            readings, others, ChannelPlace(ChannelKind.POSITION, axis, len(position), unit)
-        )
+    for axis, readings in enumerate(_readings(recorded, rate_hz)):
+        others = np.delete(recorded, axis, axis=1)
+        place = ChannelPlace(ChannelKind.POSITION, axis, samples, unit)
+        found += _position_faults(readings, others, place)
     if ratio is not None:
         found = _with_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
-        found += _current_faults(
-            readings, read[:, axis], ChannelPlace(ChannelKind.CURRENT, axis, len(position))
-        )
+        place = ChannelPlace(ChannelKind.CURRENT, axis, samples)
+        found += _current_faults(readings, recorded[:, axis], place)
     if usable is None:
         return tuple(found)
     return faults_in_use(found, usable)
@@ -173,8 +171,10 @@ def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
     motor_rad = np.empty_like(position)
     for motor, row in enumerate(ratio):
         joints = np.flatnonzero(row)
-        turned = position[:, joints] @ row[joints]
-        largest = float(np.max(np.abs(position[:, joints]) @ np.abs(row[joints])))
+        of_joints = position[:, joints]
+        ratios = row[joints]
+        turned = of_joints @ ratios
+        largest = float(np.max(np.abs(of_joints) @ np.abs(ratios)))
         if len(joints) > 1 and largest > 0.0:
             # The sum over joints has rounding errors, with which nothing would repeat.
             turned = np.round(turned / largest, ROUNDED_DIGITS) * largest
@@ -212,9 +212,10 @@ def _with_joints(
         others = np.delete(position, joint, axis=1)
         place = ChannelPlace(ChannelKind.POSITION, joint, len(position), JOINT_UNIT)
         faults = list(_position_faults(readings, others, place))
-        if any(one.is_left_out for one in faults):
+        has_left_out = any(one.is_left_out for one in faults)
+        if has_left_out:
             found = [one for one in found if one not in own]
-        if any(one.is_left_out for one in faults) or not own:
+        if has_left_out or not own:
             found += faults
     return found
 
@@ -250,10 +251,14 @@ def replaced_samples(
         shape: of the columns.
         ratio: R of the drive train, where the columns are joints, shape (n, n).
     """
-    turned_by = None if ratio is None else _turned_by(ratio)
+    turned_by = None
+    if ratio is not None:
+        turned_by = _turned_by(ratio)
     marked = np.zeros(shape, dtype=np.bool_)
     for one in faults:
-        is_replaced = one.is_filled or (one.quantity is ChannelKind.POSITION and one.is_left_out)
+        is_replaced = one.is_filled
+        if one.quantity is ChannelKind.POSITION and one.is_left_out:
+            is_replaced = True
         if one.quantity is not quantity or not is_replaced:
             continue
         columns = np.array([one.axis])
@@ -286,14 +291,12 @@ def mended(
     replaced = replaced_samples(faults, quantity, values.shape, ratio)
     if not np.any(replaced):
         return values
+    longest = 0
     if quantity is ChannelKind.POSITION:
         longest = longest_smooth(rate_hz)
-    else:
-        longest = 0
-    columns = [
-        fill_damaged(own, wrong, longest, time)
-        for own, wrong in zip(values.T, replaced.T, strict=True)
-    ]
+    columns: list[FloatArray] = []
+    for own, wrong in zip(values.T, replaced.T, strict=True):
+        columns.append(fill_damaged(own, wrong, longest, time))
     return np.stack(columns, axis=1)
 
 
@@ -316,7 +319,8 @@ def left_out_samples(
             continue
         for first, end in one.stretches.tolist():
             if one.quantity is ChannelKind.POSITION:
-                out[max(first - margin, 0) : end + margin] = True
+                begin = max(first - margin, 0)
+                out[begin : end + margin] = True
             else:
                 out[first:end, one.axis] = True
     return out
@@ -336,15 +340,15 @@ class ChannelPlace:
     ) -> ChannelFault:
         """Make a fault of this channel."""
         return ChannelFault(
-            kind,
-            self.quantity,
-            self.axis,
-            stretches,
-            size,
-            self.samples,
-            readings.rate_hz,
-            readings.count,
-            self.unit,
+            kind=kind,
+            quantity=self.quantity,
+            axis=self.axis,
+            stretches=stretches,
+            size=size,
+            samples=self.samples,
+            rate_hz=readings.rate_hz,
+            count=readings.count,
+            unit=self.unit,
         )
 
 
@@ -354,79 +358,101 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
     A channel that hardly changes is taken to be as fine as the coarsest of the others.
     """
     counts = [smallest_change(values) for values in channels.T]
-    coarsest = max((count for count in counts if count is not None), default=0.0)
+    coarsest = 0.0
+    for count in counts:
+        if count is not None:
+            coarsest = max(coarsest, count)
     for values, count in zip(channels.T, counts, strict=True):
         held = held_channel(values, rate_hz)
         if held is None:
             sample = np.arange(len(values))
         else:
             sample = np.flatnonzero(~held)
-        yield Readings(values[sample], sample, rate_hz, coarsest if count is None else count)
+        own_count = coarsest
+        if count is not None:
+            own_count = count
+        yield Readings(values[sample], sample, rate_hz, own_count)
 
 
 def _position_faults(
     readings: Readings, others: FloatArray, place: ChannelPlace
 ) -> Iterator[ChannelFault]:
-    """Judge a position, beside those of the other columns, shape (k, n − 1)."""
+    """Judge a position, given those of the other columns, shape (k, n − 1)."""
     jumps = find_jumps(readings, is_position=True)
-    whole = wrap_size(readings, jumps, is_position=True)
-    if whole is not None:
-        yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
+    counter_range = wrap_size(readings, jumps, is_position=True)
+    if counter_range is not None:
+        stretches = _steps(readings, jumps.step)
+        yield place.fault(FaultKind.WRAPPING, readings, stretches, counter_range)
         return
     if jumps.glitches:
-        yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
-    moved = _without(readings, jumps)
-    frozen = np.concatenate((frozen_position(moved), frozen_to_the_end(moved, others)))
+        stretches = _glitched(readings, jumps)
+        yield place.fault(FaultKind.GLITCH, readings, stretches, _largest(jumps))
+    without_glitches = _without(readings, jumps)
+    frozen = np.concatenate(
+        (frozen_position(without_glitches), frozen_to_the_end(without_glitches, others))
+    )
     if len(frozen):
         yield place.fault(FaultKind.FROZEN, readings, frozen)
     else:
-        clipped = clipped_position(moved)
+        clipped = clipped_position(without_glitches)
         if len(clipped):
             yield place.fault(FaultKind.CLIPPED, readings, clipped)
-    steps = np.abs(np.diff(readings.values))
-    if len(steps):
-        usual = float(np.percentile(steps, USUAL_PERCENTILE))
-    else:
-        usual = 0.0
-    lost = np.abs(jumps.step_size) > LOST_PLACE * usual
-    beside = np.isin(readings.sample[jumps.step] + 1, frozen) | np.isin(
-        readings.sample[jumps.step + 1], frozen
-    )
-    lost &= ~beside
+    lost = _lost_place(readings, jumps, frozen)
     if np.any(lost):
         size = float(np.max(np.abs(jumps.step_size[lost])))
-        yield place.fault(FaultKind.DISPLACED, readings, _steps(readings, jumps.step[lost]), size)
+        stretches = _steps(readings, jumps.step[lost])
+        yield place.fault(FaultKind.DISPLACED, readings, stretches, size)
+
+
+def _lost_place(readings: Readings, jumps: Jumps, frozen: IntArray) -> BoolArray:
+    """Steps after which a position goes on displaced, shape (s,),
+    without those at the ends of frozen stretches.
+    """
+    steps = np.abs(np.diff(readings.values))
+    usual = 0.0
+    if len(steps):
+        usual = float(np.percentile(steps, USUAL_PERCENTILE))
+    is_large = np.abs(jumps.step_size) > LOST_PLACE * usual
+    leaves_frozen = np.isin(readings.sample[jumps.step] + 1, frozen)
+    enters_frozen = np.isin(readings.sample[jumps.step + 1], frozen)
+    return np.asarray(is_large & ~(leaves_frozen | enters_frozen))
 
 
 def _current_faults(
     readings: Readings, motor_rad: FloatArray, place: ChannelPlace
 ) -> Iterator[ChannelFault]:
+    """Judge the current of a motor, given its positions, shape (k,)."""
     upper = is_split(readings.values)
     if upper is not None:
         step = np.flatnonzero(np.diff(upper))
         sizes = np.abs(np.diff(readings.values)[step])
-        yield place.fault(
-            FaultKind.UNSIGNED, readings, _steps(readings, step), float(np.median(sizes))
-        )
+        stretches = _steps(readings, step)
+        yield place.fault(FaultKind.UNSIGNED, readings, stretches, float(np.median(sizes)))
         return
     jumps = find_jumps(readings, is_position=False)
-    whole = wrap_size(readings, jumps, is_position=False)
-    if whole is not None:
-        yield place.fault(FaultKind.WRAPPING, readings, _steps(readings, jumps.step), whole)
+    counter_range = wrap_size(readings, jumps, is_position=False)
+    if counter_range is not None:
+        stretches = _steps(readings, jumps.step)
+        yield place.fault(FaultKind.WRAPPING, readings, stretches, counter_range)
         return
     if jumps.glitches:
-        yield place.fault(FaultKind.GLITCH, readings, _glitched(readings, jumps), _largest(jumps))
+        stretches = _glitched(readings, jumps)
+        yield place.fault(FaultKind.GLITCH, readings, stretches, _largest(jumps))
     frozen = frozen_current(_without(readings, jumps), motor_rad)
     if len(frozen):
         yield place.fault(FaultKind.FROZEN, readings, frozen)
 
 
 def _glitched(readings: Readings, jumps: Jumps) -> IntArray:
-    after = np.append(readings.sample, readings.sample[-1] + 1)
-    return np.array([(after[one.first], after[one.end]) for one in jumps.glitches], dtype=np.int64)
+    """First sample and end of each glitch, shape (g, 2)."""
+    samples = np.append(readings.sample, readings.sample[-1] + 1)
+    first = [one.first for one in jumps.glitches]
+    end = [one.end for one in jumps.glitches]
+    return np.column_stack((samples[first], samples[end]))
 
 
 def _largest(jumps: Jumps) -> float:
+    """Largest distance of a glitch from the course."""
     return max(one.size for one in jumps.glitches)
 
 

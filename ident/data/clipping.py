@@ -10,8 +10,8 @@ LEAST_SAMPLES = 20  #: Least number of clipped samples of a run
 LEAST_CLIPPED = 0.002  #: Least share of the samples of a moving motor that a limit has clipped
 LONG_STRETCH = 5
 """Least length of two stretches at a limit, in samples and in multiples of the longest stretch of
-one value elsewhere. A smooth current of few counts, or one that is held between slow readings, has
-stretches everywhere.
+one value elsewhere. A smooth current of few counts, or one that is repeated between slow readings,
+has stretches everywhere.
 """
 LEAST_STRETCHES = 2
 SAME_LIMIT = 0.05  #: Largest relative difference of the limits of both directions
@@ -50,7 +50,9 @@ def _clipped(current: FloatArray, usable: BoolArray) -> BoolArray:
     least = max(LEAST_SAMPLES, LEAST_CLIPPED * np.count_nonzero(usable))
     clipped = np.zeros(len(current), dtype=np.bool_)
     for limit in (highest, lowest):
-        of_its_sign = limit > 0.0 if limit == highest else limit < 0.0
+        has_its_sign = limit < 0.0
+        if limit == highest:
+            has_its_sign = limit > 0.0
         at_limit = used & (values == limit)
         elsewhere = used & ~at_limit & (values != 0.0)
         if is_one_limit:
@@ -58,6 +60,6 @@ def _clipped(current: FloatArray, usable: BoolArray) -> BoolArray:
         longest_elsewhere = int(np.max(lengths[elsewhere], initial=1))
         is_long = at_limit & (lengths >= LONG_STRETCH * longest_elsewhere)
         is_often = np.count_nonzero(is_long) >= LEAST_STRETCHES
-        if of_its_sign and is_often and lengths[at_limit].sum() >= least:
+        if has_its_sign and is_often and lengths[at_limit].sum() >= least:
             clipped |= np.repeat(at_limit, lengths)
     return clipped

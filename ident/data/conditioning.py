@@ -1,5 +1,5 @@
 """The filters between samples and rows (paper §2.3),
-chosen once and reported beside every relative error.
+chosen once and reported with every relative error.
 
 Positions go through a zero-phase Butterworth low-pass before they are differentiated. Every column
 of the equations, and the currents, then go through one decimator. Both are written out here: they
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
+from math import ceil
 from typing import Any, Self
 
 import numpy as np
@@ -32,7 +33,7 @@ class Conditioning:
     #: zero-phase Butterworth on the position, before the central differences
     position_cutoff_hz: float = 40.0
     position_order: int = 4  #: order of that filter
-    #: Of the parallel decimation of every column; a row is kept every 1/(2.5 cut-off).
+    #: Of the parallel decimation of every column; there is a row every 1/(2.5 cut-off).
     decimation_cutoff_hz: float = 20.0
     #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty,
     #: it is derived from each run (`ident.data.dataset.standstill_speed`).
@@ -45,7 +46,9 @@ class Conditioning:
         """Return filters for recordings of some sampling rates:
         the usual ones, lower for slow recordings.
         """
-        share = min((1.0, *(rate_hz / FULL_FILTER_HZ for rate_hz in rates_hz)))
+        share = 1.0
+        for rate_hz in rates_hz:
+            share = min(share, rate_hz / FULL_FILTER_HZ)
         usual = cls()
         return cls(
             position_cutoff_hz=share * usual.position_cutoff_hz,
@@ -75,7 +78,9 @@ class Conditioning:
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""
-        return asdict(self) | {"standstill_rad_s": list(self.standstill_rad_s)}
+        document = asdict(self)
+        document["standstill_rad_s"] = list(self.standstill_rad_s)
+        return document
 
 
 def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
@@ -96,8 +101,10 @@ def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -
     before = 2.0 * values[:, :1] - values[:, pad:0:-1]
     after = 2.0 * values[:, -1:] - values[:, -2 : -pad - 2 : -1]
     sections = _butterworth(order, cutoff_hz / rate_hz)
-    forwards = _filtered(sections, np.concatenate((before, values, after), axis=1))
-    return _filtered(sections, forwards[:, ::-1])[:, ::-1][:, pad:-pad]
+    padded = np.concatenate((before, values, after), axis=1)
+    forwards = _filtered(sections, padded)
+    backwards = _filtered(sections, forwards[:, ::-1])
+    return backwards[:, ::-1][:, pad:-pad]
 
 
 def central_differences(
@@ -106,57 +113,77 @@ def central_differences(
     """Position, velocity and acceleration of all samples but the first and last;
     time last, (c, k) → (c, k − 2).
     """
+    before = smooth[:, :-2]
     position = smooth[:, 1:-1]
-    velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate_hz)
-    return position, velocity, (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate_hz**2
+    after = smooth[:, 2:]
+    velocity = (after - before) * (0.5 * rate_hz)
+    acceleration = (after - 2.0 * position + before) * rate_hz**2
+    return position, velocity, acceleration
 
 
-def _butterworth(order: int, cutoff: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Second-order sections (b_0, b_1, b_2), (a_1, a_2) of gain one at rest,
-    by the bilinear transform.
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """A section y_k + a_1 y_k−1 + a_2 y_k−2 = b_0 x_k + b_1 x_k−1 + b_2 x_k−2."""
+
+    b0: float
+    b1: float
+    b2: float
+    a1: float
+    a2: float
+
+
+def _butterworth(order: int, cutoff: float) -> list[_Section]:
+    """Sections of second order with gain one at rest, by the bilinear transform.
 
     Args:
         order: N; an odd one ends with a section of first order.
         cutoff: as a share of the sampling rate.
     """
     w = float(np.tan(np.pi * cutoff))
-    sections: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
+    sections: list[_Section] = []
     for pair in range(order // 2):
         # s² + 2 sin θ w s + w²: a pair of poles on the circle of radius w.
-        damping = 2.0 * float(np.sin(np.pi * (2 * pair + 1) / (2 * order))) * w
+        angle = np.pi * (2 * pair + 1) / (2 * order)
+        damping = 2.0 * float(np.sin(angle)) * w
         scale = 1.0 + damping + w**2
         gain = w**2 / scale
-        sections.append(
-            ((gain, 2.0 * gain, gain), (2.0 * (w**2 - 1.0) / scale, (1.0 - damping + w**2) / scale))
+        section = _Section(
+            b0=gain,
+            b1=2.0 * gain,
+            b2=gain,
+            a1=2.0 * (w**2 - 1.0) / scale,
+            a2=(1.0 - damping + w**2) / scale,
         )
+        sections.append(section)
     if order % 2:
         gain = w / (1.0 + w)
-        sections.append(((gain, gain, 0.0), ((w - 1.0) / (1.0 + w), 0.0)))
+        feedback = (w - 1.0) / (1.0 + w)
+        sections.append(_Section(b0=gain, b1=gain, b2=0.0, a1=feedback, a2=0.0))
     return sections
 
 
-def _filtered(
-    sections: list[tuple[tuple[float, ...], tuple[float, ...]]], values: FloatArray
-) -> FloatArray:
+def _filtered(sections: list[_Section], values: FloatArray) -> FloatArray:
     """Run the sections over values that were constant before their first sample, shape (c, k)."""
-    from scipy.linalg import lapack  # noqa: PLC0415 - a cell file holds filter settings, and reading it needs no LAPACK
+    from scipy.linalg import lapack  # noqa: PLC0415 - a cell file has filter settings, and reading it needs no LAPACK
 
     start = values[:, :1]
     out = values - start
     band = np.ones((3, out.shape[1]), order="F")
-    for (b0, b1, b2), feedback in sections:
-        driven = b0 * out
-        driven[:, 1:] += b1 * out[:, :-1]
-        driven[:, 2:] += b2 * out[:, :-2]
+    for section in sections:
+        driven = section.b0 * out
+        driven[:, 1:] += section.b1 * out[:, :-1]
+        driven[:, 2:] += section.b2 * out[:, :-2]
         # y_k + a_1 y_k−1 + a_2 y_k−2 = driven_k is a triangular system with two bands.
-        band[1], band[2] = feedback
-        out = lapack.dtbtrs(band, driven.T, uplo="L", diag="U")[0].T
+        band[1] = section.a1
+        band[2] = section.a2
+        solution, _ = lapack.dtbtrs(band, driven.T, uplo="L", diag="U")
+        out = solution.T
     return np.asarray(out + start)
 
 
 @dataclass(frozen=True, slots=True)
 class Decimator:
-    """A symmetric FIR low-pass that keeps every q-th output:
+    """A symmetric FIR low-pass of which every q-th output is used:
     zero phase, and a window of finite length.
 
     The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of
@@ -172,9 +199,11 @@ class Decimator:
         return len(self.taps) // 2
 
     def rows(self, samples: int) -> int:
-        """Outputs whose whole window lies inside so many samples."""
+        """Outputs whose complete window lies inside so many samples."""
         inside = samples - 2 * self.half
-        return 0 if inside < 1 else (inside - 1) // self.factor + 1
+        if inside < 1:
+            return 0
+        return (inside - 1) // self.factor + 1
 
     def centres(self, samples: int) -> IntArray:
         """Index of the sample at the centre of each output's window."""
@@ -182,28 +211,27 @@ class Decimator:
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Filter and decimate along the last axis: shape (..., k) → (..., rows(k))."""
-        shape = columns.shape
-        count = self.rows(shape[-1])
+        *leading, samples = columns.shape
+        count = self.rows(samples)
         factor = self.factor
         # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over
         # blocks of samples: one matrix product that reads every sample once.
-        blocks = -(-len(self.taps) // factor)
+        blocks = ceil(len(self.taps) / factor)
         taps = np.zeros(blocks * factor)
         taps[: len(self.taps)] = self.taps
         length = (count + blocks - 1) * factor
-        flat = columns.reshape(-1, shape[-1])
-        if shape[-1] != length:
+        flat = columns.reshape(-1, samples)
+        if samples != length:
             padded = np.zeros((len(flat), length))
-            padded[:, : min(length, shape[-1])] = flat[:, :length]
+            padded[:, : min(length, samples)] = flat[:, :length]
             flat = padded
         # Taps first: the sums below then run along memory.
-        weighted = (taps.reshape(blocks, factor) @ flat.reshape(-1, factor).T).reshape(
-            blocks, len(flat), -1
-        )
+        weighted = taps.reshape(blocks, factor) @ flat.reshape(-1, factor).T
+        by_block = weighted.reshape(blocks, len(flat), -1)
         out = np.zeros((len(flat), count))
-        for block, share in enumerate(weighted):
+        for block, share in enumerate(by_block):
             out += share[:, block : block + count]
-        return out.reshape(*shape[:-1], count)
+        return out.reshape(*leading, count)
 
 
 @lru_cache(maxsize=64)
@@ -213,7 +241,7 @@ def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
     """
     factor = max(1, round(rate_hz / (2.5 * cutoff_hz)))
     half = round(3.3 * rate_hz / cutoff_hz / 2.0)
-    taps = np.sinc(2.0 * cutoff_hz / rate_hz * np.arange(-half, half + 1)) * np.hamming(
-        2 * half + 1
-    )
+    samples = np.arange(-half, half + 1)
+    response = np.sinc(2.0 * cutoff_hz / rate_hz * samples)
+    taps = response * np.hamming(2 * half + 1)
     return Decimator(taps / taps.sum(), factor)

@@ -53,6 +53,9 @@ SETTLED_PERIODS = 4.0
 1e-4 of it is left.
 """
 
+LARGEST_JITTER = 0.01  #: Range of the steps of time, as a share of their median
+MEDIAN_OF_NORMAL = 0.6745  #: Median of |Z| of a standard normal Z
+
 LONGEST_MOVE_S = 2.0
 """Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a
 second).
@@ -100,7 +103,9 @@ class Dataset:
     def motion(self, part: slice = slice(None)) -> Motion:
         """Motion of the joints over some of the samples."""
         return Motion(
-            self.position_rad[part], self.velocity_rad_s[part], self.acceleration_rad_s2[part]
+            position_rad=self.position_rad[part],
+            velocity_rad_s=self.velocity_rad_s[part],
+            acceleration_rad_s2=self.acceleration_rad_s2[part],
         )
 
 
@@ -128,78 +133,125 @@ def differentiate(
         raise refuse(
             f"time_s has shape {time_s.shape}; expected (n_samples,), one entry per sample"
         )
-    shape = (len(time_s), len(drive_train.ratio))
-    each = "one row per entry of time_s, one column per axis"
-    position = as_array("position_rad", run.position_rad, shape, each, refuse)
-    current = as_array("current_a", run.current_a, shape, each, refuse)
-    if run.valid is None:
-        usable = None
-    else:
-        usable = as_array("valid", run.valid, shape, each, refuse)
-    if run.move is None:
-        logged = None
-    else:
-        logged = as_array("move", run.move, shape[:1], "one entry per sample", refuse)
-    temperature_c = _temperature(run.temperature_c, shape, each, refuse)
-    run = replace(run, time_s=time_s)
-    _check(run, shape[1], conditioning, refuse)
-    rate = run.rate_hz
-    recorded_current = current
-    faults = find_faults(position, current, rate, drive_train.ratio)
-    position, current, held = fill_held(
-        position,
-        current,
-        rate,
+    given = _checked(run, time_s, drive_train, conditioning, refuse)
+    shape = given.current.shape
+    rate_hz = replace(run, time_s=time_s).rate_hz
+    faults = find_faults(given.position, given.current, rate_hz, drive_train.ratio)
+    filled_position, filled_current, held = fill_held(
+        given.position,
+        given.current,
+        rate_hz,
         replaced_samples(faults, ChannelKind.POSITION, shape, drive_train.ratio),
         replaced_samples(faults, ChannelKind.CURRENT, shape),
     )
-    raw = np.ascontiguousarray(position.T)
-    smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
-    position, velocity, acceleration = central_differences(smooth, rate)
-    speed = np.asarray(
-        conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning)
-    )
+    raw = np.ascontiguousarray(filled_position.T)
+    smooth = low_pass(raw, rate_hz, conditioning.position_cutoff_hz, conditioning.position_order)
+    position, velocity, acceleration = central_differences(smooth, rate_hz)
+    if conditioning.standstill_rad_s:
+        speed = np.asarray(conditioning.standstill_rad_s)
+    else:
+        speed = standstill_speed(raw, smooth, rate_hz, conditioning)
     moving, motor_moving = moving_samples(velocity, speed, drive_train)
-    if usable is None:
-        valid = np.ones_like(moving).T
-    else:
-        valid = np.array(usable[1:-1], dtype=np.bool_, order="F")
-    margin = round(SETTLED_PERIODS * rate / conditioning.position_cutoff_hz)
-    valid &= ~left_out_samples(faults, shape, margin)[1:-1]
-    clipped = clipped_samples(recorded_current[1:-1], valid & motor_moving.T)
+    # Central differences leave the first and the last sample out.
+    inner = slice(1, -1)
+    valid = np.ones_like(moving).T
+    faults_found = faults
+    if given.usable is not None:
+        valid = np.array(given.usable[inner], dtype=np.bool_, order="F")
+        faults_found = faults_in_use(faults, given.usable != 0.0)
+    margin = round(SETTLED_PERIODS * rate_hz / conditioning.position_cutoff_hz)
+    valid &= ~left_out_samples(faults, shape, margin)[inner]
+    clipped = clipped_samples(given.current[inner], valid & motor_moving.T)
     valid &= ~clipped
-    # If the log has no moves, a new one begins after every standstill of all joints.
-    any_moving = np.any(moving, axis=0)
-    move: FloatArray | IntArray
-    if logged is None:
-        begins_to_move = np.diff(any_moving.astype(np.int64), prepend=1) > 0
-        move = np.cumsum(begins_to_move)
+    move: IntArray | FloatArray
+    if given.move is None:
+        move = _moves_between_standstills(moving)
     else:
-        move = logged[1:-1]
-    # Long moves are split: σ and folds need many moves, and continuous motion would be a single
-    # one.
-    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
-    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
-    move = np.cumsum(since % round(LONGEST_MOVE_S * rate) == 0, dtype=np.int64) - 1
+        move = given.move[inner]
+    temperature_c = given.temperature_c
+    if temperature_c is not None:
+        temperature_c = np.asfortranarray(temperature_c[inner])
     return Dataset(
         name=run.name,
-        rate_hz=rate,
-        time_s=time_s[1:-1],
+        rate_hz=rate_hz,
+        time_s=time_s[inner],
         position_rad=np.ascontiguousarray(position).T,
         velocity_rad_s=velocity.T,
         acceleration_rad_s2=acceleration.T,
-        current_a=np.asfortranarray(current[1:-1]),
+        current_a=np.asfortranarray(filled_current[inner]),
         moving=moving.T,
         motor_moving=motor_moving.T,
         valid=valid,
-        move=move,
+        move=_split_moves(move, round(LONGEST_MOVE_S * rate_hz)),
         payload=run.payload,
         started_s=run.started_s,
-        temperature_c=None if temperature_c is None else np.asfortranarray(temperature_c[1:-1]),
+        temperature_c=temperature_c,
         clipped=clipped,
         held=held,
-        faults=faults if usable is None else faults_in_use(faults, usable != 0.0),
+        faults=faults_found,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CheckedArrays:
+    """Arrays of a run of k samples and n axes, of the expected shapes."""
+
+    position: FloatArray  #: shape (k, n)
+    current: FloatArray  #: shape (k, n)
+    usable: FloatArray | None  #: zero for a sample that may not be used, shape (k, n)
+    move: FloatArray | None  #: shape (k,)
+    temperature_c: FloatArray | None  #: shape (k, n)
+
+
+def _checked(
+    run: Run,
+    time_s: FloatArray,
+    drive_train: DriveTrain,
+    conditioning: Conditioning,
+    refuse: Refusal,
+) -> _CheckedArrays:
+    """Check the arrays of a run, and its times against the filters.
+
+    Raises:
+        DataUnfit: as of `differentiate`.
+    """
+    axes = len(drive_train.ratio)
+    shape = (len(time_s), axes)
+    each = "one row per entry of time_s, one column per axis"
+    position = as_array("position_rad", run.position_rad, shape, each, refuse)
+    current = as_array("current_a", run.current_a, shape, each, refuse)
+    usable = None
+    if run.valid is not None:
+        usable = as_array("valid", run.valid, shape, each, refuse)
+    move = None
+    if run.move is not None:
+        move = as_array("move", run.move, shape[:1], "one entry per sample", refuse)
+    temperature_c = _temperature(run.temperature_c, shape, each, refuse)
+    _check(replace(run, time_s=time_s), axes, conditioning, refuse)
+    return _CheckedArrays(position, current, usable, move, temperature_c)
+
+
+def _moves_between_standstills(moving: BoolArray) -> IntArray:
+    """Number of the move of each sample, shape (n, k) → (k,):
+    a new one begins after every standstill of all joints.
+    """
+    any_moving = np.any(moving, axis=0).astype(np.int64)
+    begins = np.diff(any_moving, prepend=1) > 0
+    return np.cumsum(begins)
+
+
+def _split_moves(move: IntArray | FloatArray, longest: int) -> IntArray:
+    """Number of the move of each sample where long moves are split after so many samples,
+    shape (k,).
+
+    σ and folds need many moves, and continuous motion would be a single one.
+    """
+    count = len(move)
+    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    lengths = np.diff(starts, append=count)
+    since_start = np.arange(count) - np.repeat(starts, lengths)
+    begins = since_start % longest == 0
+    return np.cumsum(begins, dtype=np.int64) - 1
 
 
 def _temperature(
@@ -226,9 +278,11 @@ def moving_samples(
         drive_train: R, for the speed of coupled motors.
     """
     moving = np.abs(velocity) >= speed[:, None]
-    # Motor speed divided by the reduction, compared at the motor's own joint, which may have
-    # another number.
-    return moving, np.abs(drive_train.direction @ velocity) >= speed[list(drive_train.joints), None]
+    # Motor speed divided by the reduction, compared at the motor's joint, which may have another
+    # number.
+    motor_velocity = drive_train.direction @ velocity
+    motor_speed = speed[list(drive_train.joints), None]
+    return moving, np.abs(motor_velocity) >= motor_speed
 
 
 def standstill_speed(
@@ -251,22 +305,27 @@ def standstill_speed(
         rate_hz: sampling rate.
         conditioning: the low-pass.
     """
-    impulse = np.zeros(
-        (1, min(raw.shape[1], 2 * round(20.0 * rate_hz / conditioning.position_cutoff_hz) + 1))
-    )
+    cutoff_hz = conditioning.position_cutoff_hz
+    length = 2 * round(20.0 * rate_hz / cutoff_hz) + 1
+    impulse = np.zeros((1, min(raw.shape[1], length)))
     impulse[0, impulse.shape[1] // 2] = 1.0
-    response = low_pass(
-        impulse, rate_hz, conditioning.position_cutoff_hz, conditioning.position_order
-    )
+    response = low_pass(impulse, rate_hz, cutoff_hz, conditioning.position_order)
     removed = float(np.linalg.norm(impulse - response))
-    kept = float(np.linalg.norm(0.5 * rate_hz * (response[:, 2:] - response[:, :-2])))
-    noise = np.median(np.abs(raw - smooth), axis=1) / 0.6745 / removed
-    # A joint that is held exactly still has rounding noise alone.
-    noise = np.maximum(noise, 1e-12 * np.maximum(np.abs(raw).max(axis=1), 1.0))
-    speed = np.quantile(np.abs(0.5 * rate_hz * (smooth[:, 2:] - smooth[:, :-2])), 0.95, axis=1)
-    return np.asarray(
-        np.maximum(STANDSTILL_SHARE_OF_SPEED * speed, STANDSTILL_SIGMAS * kept * noise)
-    )
+    remaining_rate = float(np.linalg.norm(_differences(response, rate_hz)))
+    removed_noise = np.median(np.abs(raw - smooth), axis=1)
+    noise = removed_noise / MEDIAN_OF_NORMAL / removed
+    # A joint that stands exactly still has rounding noise alone.
+    largest = np.maximum(np.abs(raw).max(axis=1), 1.0)
+    noise = np.maximum(noise, 1e-12 * largest)
+    speed = np.quantile(np.abs(_differences(smooth, rate_hz)), 0.95, axis=1)
+    by_speed = STANDSTILL_SHARE_OF_SPEED * speed
+    by_noise = STANDSTILL_SIGMAS * remaining_rate * noise
+    return np.asarray(np.maximum(by_speed, by_noise))
+
+
+def _differences(values: FloatArray, rate_hz: float) -> FloatArray:
+    """Central differences, shape (c, k) → (c, k − 2)."""
+    return 0.5 * rate_hz * (values[:, 2:] - values[:, :-2])
 
 
 @takes(motion=Motion, payload=Payload | None)
@@ -286,10 +345,9 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     rate_hz = require_number(
         "rate_hz", rate_hz, above=0.0, remedy="give the rate of the samples, such as 500"
     )
-    labels = "position_rad", "velocity_rad_s", "acceleration_rad_s2"
-    position, velocity, acceleration = (
-        as_array(label, getattr(motion, label), refuse=refuse) for label in labels
-    )
+    position = as_array("position_rad", motion.position_rad, refuse=refuse)
+    velocity = as_array("velocity_rad_s", motion.velocity_rad_s, refuse=refuse)
+    acceleration = as_array("acceleration_rad_s2", motion.acceleration_rad_s2, refuse=refuse)
     shape = position.shape
     if position.ndim != 2 or not shape == velocity.shape == acceleration.shape:
         found = (
@@ -315,12 +373,16 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
 
 
 def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) -> None:
+    """Refuse times that are not uniform or too few, and filters that do not fit them.
+
+    Raises:
+        DataUnfit: as of `differentiate`.
+    """
     samples = len(run.time_s)
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):
         raise refuse(f"{speeds} standstill speeds for {count} joints; give one a joint")
-    step = np.diff(run.time_s)
-    if samples < 3 or np.any(step <= 0) or np.ptp(step) > 0.01 * float(np.median(step)):
+    if samples < 3 or not _is_uniform(run.time_s):
         raise refuse(
             "the sampling times are not uniform; derivatives need a constant rate without gaps"
         )
@@ -330,16 +392,31 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
             f"time_s has {between_s:g} s between samples; expected seconds, and at most "
             f"{1.0 / SLOWEST_HZ:g} s; if these are milliseconds, divide them by 1000"
         )
-    lowest, highest = sorted((conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz))
+    cutoffs_hz = {
+        "position": conditioning.position_cutoff_hz,
+        "decimation": conditioning.decimation_cutoff_hz,
+    }
+    lowest = min(cutoffs_hz.values())
     if not lowest > 0.0:
         raise refuse(
             f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning"
         )
-    if not run.rate_hz > 2.5 * highest:
-        position = conditioning.position_cutoff_hz >= conditioning.decimation_cutoff_hz
-        key = f"conditioning.{'position' if position else 'decimation'}_cutoff_hz"
-        needed = f"`{key}` of {highest:g} Hz needs more than {2.5 * highest:g} Hz"
+    name, highest = max(cutoffs_hz.items(), key=lambda item: item[1])
+    least_rate_hz = 2.5 * highest
+    if not run.rate_hz > least_rate_hz:
+        needed = (
+            f"`conditioning.{name}_cutoff_hz` of {highest:g} Hz needs more than "
+            f"{least_rate_hz:g} Hz"
+        )
         raise refuse(f"sampled at {run.rate_hz:g} Hz; {needed}: record faster, or lower it")
     if samples < 2.0 * run.rate_hz:
         long = f"only {samples / run.rate_hz:.2g} s long"
         raise refuse(f"{long}; expected at least 2 s, and about 30 moves for one percent")
+
+
+def _is_uniform(time_s: FloatArray) -> bool:
+    """Whether times rise in steps of one length."""
+    steps = np.diff(time_s)
+    if np.any(steps <= 0):
+        return False
+    return bool(np.ptp(steps) <= LARGEST_JITTER * float(np.median(steps)))

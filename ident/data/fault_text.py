@@ -8,9 +8,11 @@ from math import log2
 from ident.data.channel_faults import ChannelFault, ChannelKind, FaultKind
 from ident.errors import Diagnosis, ReadingsDamaged
 
-DAMAGED, FROZEN = "readings-damaged", "readings-frozen"  #: Names of diagnoses
+DAMAGED = "readings-damaged"  #: Name of a diagnosis
+FROZEN = "readings-frozen"  #: Name of a diagnosis
 COUNTS = "counts"  #: Unit of a channel that has one a count
 NEAR_BITS = 0.02  #: Largest distance of the size of a counter from a power of two, in bits
+SHORTEST_COUNTER = 7.0  #: Bits of a counter that are named are more than these
 
 
 def require_usable(run: str, faults: Sequence[ChannelFault], axes: Sequence[str]) -> None:
@@ -26,9 +28,10 @@ def require_usable(run: str, faults: Sequence[ChannelFault], axes: Sequence[str]
     """
     for fault in faults:
         if fault.is_refused:
+            axis = axes[fault.axis]
             raise ReadingsDamaged(
                 run,
-                (axes[fault.axis],),
+                (axis,),
                 found=found(fault),
                 expected=expected(fault),
                 remedy=remedy(fault),
@@ -43,15 +46,11 @@ def fault_diagnosis(run: str, fault: ChannelFault, axis: str) -> Diagnosis:
         fault: of it.
         axis: name of the axis.
     """
-    name = DAMAGED if fault.is_filled else FROZEN
-    return Diagnosis(
-        name,
-        (run,),
-        (axis,),
-        f"{found(fault)}; {what_is_done(fault)}",
-        expected(fault),
-        remedy(fault),
-    )
+    name = FROZEN
+    if fault.is_filled:
+        name = DAMAGED
+    found_and_done = f"{found(fault)}; {what_is_done(fault)}"
+    return Diagnosis(name, (run,), (axis,), found_and_done, expected(fault), remedy(fault))
 
 
 def what_is_done(fault: ChannelFault) -> str:
@@ -63,16 +62,18 @@ def what_is_done(fault: ChannelFault) -> str:
 
 def found(fault: ChannelFault) -> str:
     """Say what a fault is, how often, and where it begins."""
-    at = f"at {fault.first / fault.rate_hz:.6g} s"
+    first_s = fault.first / fault.rate_hz
+    percent = 100.0 * fault.share
     times = len(fault.stretches)
-    often = at if times == 1 else f"{times} times, first {at}"
+    often = f"at {first_s:.6g} s"
+    if times > 1:
+        often = f"{times} times, first {often}"
     what = f"a {fault.quantity.value}"
-    share = f"in {100.0 * fault.share:.2g} % of the samples"
+    share = f"in {percent:.2g} % of the samples"
     match fault.kind:
         case FaultKind.GLITCH:
-            longest_ms = (
-                1e3 * max(end - first for first, end in fault.stretches.tolist()) / fault.rate_hz
-            )
+            lengths = fault.stretches[:, 1] - fault.stretches[:, 0]
+            longest_ms = 1e3 * int(lengths.max()) / fault.rate_hz
             return (
                 f"{what} that leaves its course by up to {_sized(fault)} and returns within "
                 f"{longest_ms:.3g} ms, {often}, {share}"
@@ -131,6 +132,7 @@ def remedy(fault: ChannelFault) -> str:
 
 
 def _sized(fault: ChannelFault) -> str:
+    """Size of a fault with its unit."""
     return f"{fault.size:.4g} {fault.unit}".strip()
 
 
@@ -138,10 +140,14 @@ def _bits(fault: ChannelFault) -> str:
     """Say how many bits a counter has, where its range is a power of two in counts;
     else nothing.
     """
-    count = 1.0 if fault.unit == COUNTS else fault.count
+    count = fault.count
+    if fault.unit == COUNTS:
+        count = 1.0
     if not count > 0.0:
         return ""
     bits = log2(fault.size / count)
-    if abs(bits - round(bits)) < NEAR_BITS and bits > 7.0:
-        return f" of {round(bits)} bits"
+    nearest = round(bits)
+    is_power_of_two = abs(bits - nearest) < NEAR_BITS
+    if is_power_of_two and bits > SHORTEST_COUNTER:
+        return f" of {nearest} bits"
     return ""

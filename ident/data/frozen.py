@@ -20,15 +20,17 @@ from ident.data.held import ROUNDING
 LEAST_S = 0.05  #: Shortest stretch; shorter ones are held readings
 LEAST_CURRENT_S = 0.1  #: Likewise of a current
 ABRUPT = 3.0
-"""Way within BESIDE_S beside a stretch, in multiples of the largest usual change of it from one
+"""Way within BESIDE_S next to a stretch, in multiples of the largest usual change of it from one
 such time to the next: what a motor has on its way to a standstill is half of that.
 """
 USUAL_PERCENTILE = 98.0  #: Of these changes, away from every stretch
 ABRUPT_COUNTS = 10.0  #: And in counts
 JUMP = 3.0  #: Jump at the end of a frozen stretch, in multiples of the largest usual step
 STEP_PERCENTILE = 99.0  #: Of the steps of a position: the largest usual one
-BESIDE_S, LEAST_BESIDE = 0.01, 3  #: Time, and samples, over which that way is measured
+BESIDE_S = 0.01  #: Time over which that way is measured
+LEAST_BESIDE = 3  #: Least samples of that time
 LONGER = 10.0  #: Frozen current, in multiples of what else is constant in it
+LENGTH_PERCENTILE = 99.0  #: Of the lengths of what else is constant
 #: Least share of the changes of a current that turn back: without noise, constant shows nothing
 NOISY = 0.25
 MOVED = 0.02  #: Least way of a motor that moves in a stretch, as a share of its range
@@ -43,17 +45,15 @@ def frozen_position(readings: Readings) -> IntArray:
         readings: of a motor's position.
     """
     steps = np.abs(np.diff(readings.values))
+    usual = 0.0
     if len(steps):
         usual = float(np.percentile(steps, STEP_PERCENTILE))
-    else:
-        usual = 0.0
     if not usual > 0.0:
         return _no_stretch()  # nothing says how fast it moves
-    least = JUMP * usual + ABRUPT_COUNTS * readings.count
-    tiny = ROUNDING * float(np.ptp(readings.values))
+    smallest_jump = JUMP * usual + ABRUPT_COUNTS * readings.count
     found: list[tuple[int, int]] = []
-    for first, last in _constant(readings, tiny, LEAST_S):
-        if last < len(steps) and steps[last] > least:
+    for first, last in _constant(readings, _rounding(readings), LEAST_S):
+        if last < len(steps) and steps[last] > smallest_jump:
             found.append((first, last))
     return _samples(readings, found)
 
@@ -65,29 +65,43 @@ def frozen_to_the_end(readings: Readings, others: FloatArray) -> IntArray:
         readings: of a motor's position.
         others: positions of the other motors at every sample, shape (k, n − 1).
     """
-    tiny = ROUNDING * float(np.ptp(readings.values))
-    stretches = _constant(readings, tiny, LEAST_S)
-    if not stretches or stretches[-1][1] != len(readings.values) - 1:
+    stretches = _constant(readings, _rounding(readings), LEAST_S)
+    if not stretches:
         return _no_stretch()
     first, last = stretches[-1]
+    is_at_end = last == len(readings.values) - 1
     begin = int(readings.sample[first])
-    if not _go_on(others, begin + round(LATER_S * readings.rate_hz)):
+    later = begin + round(LATER_S * readings.rate_hz)
+    if not (is_at_end and _go_on(others, later)):
         return _no_stretch()
-    beside = _samples_beside(readings)
-    course = _course(readings)[: begin + 1]
-    if len(course) <= 4 * beside:
-        return _no_stretch()
-    way = course[beside:] - course[:-beside]
-    speed_changes = np.abs(way[beside:] - way[:-beside])[: -2 * beside]
-    least_way = ABRUPT_COUNTS * readings.count
-    directions = np.sign(way[np.abs(way) > least_way])
-    if np.count_nonzero(np.diff(directions)) < LEAST_TURNS:
-        return _no_stretch()
-    usual = float(np.max(speed_changes))
-    stopped_from = abs(float(way[-1]))
-    if stopped_from <= ABRUPT * usual + least_way:
+    until_stop = _course(readings)[: begin + 1]
+    if not _stops_abruptly(until_stop, _samples_of_span(readings), readings.count):
         return _no_stretch()
     return _samples(readings, [(first, last)])
+
+
+def _stops_abruptly(course: FloatArray, span: int, count: float) -> bool:
+    """Whether a position stops at its last sample, and every other stop and turn before was far
+    gentler.
+
+    Args:
+        course: position at every sample, shape (k,).
+        span: samples over which its way is measured.
+        count: of the channel.
+    """
+    if len(course) <= 4 * span:
+        return False
+    way = course[span:] - course[:-span]
+    smallest_way = ABRUPT_COUNTS * count
+    directions = np.sign(way[np.abs(way) > smallest_way])
+    turns = np.count_nonzero(np.diff(directions))
+    if turns < LEAST_TURNS:
+        return False
+    speed_changes = np.abs(way[span:] - way[:-span])
+    before_stop = speed_changes[: -2 * span]
+    usual = float(np.max(before_stop))
+    last_way = abs(float(way[-1]))
+    return last_way > ABRUPT * usual + smallest_way
 
 
 def _go_on(others: FloatArray, sample: int) -> bool:
@@ -96,8 +110,8 @@ def _go_on(others: FloatArray, sample: int) -> bool:
     if not later.size:
         return False
     way = np.ptp(later, axis=0)
-    whole_range = np.ptp(others, axis=0)
-    return bool(np.any((way > 0.0) & (way >= MOVED * whole_range)))
+    smallest_way = MOVED * np.ptp(others, axis=0)
+    return bool(np.any((way > 0.0) & (way >= smallest_way)))
 
 
 def clipped_position(readings: Readings) -> IntArray:
@@ -117,30 +131,34 @@ def _abrupt(readings: Readings) -> IntArray:
     """Stretches in which a position is constant and that begin or end without any acceleration,
     shape (s, 2).
     """
-    tiny = ROUNDING * float(np.ptp(readings.values))
-    stretches = _constant(readings, tiny, LEAST_S)
-    beside = _samples_beside(readings)
+    rounding = _rounding(readings)
+    stretches = _constant(readings, rounding, LEAST_S)
+    span = _samples_of_span(readings)
     course = _course(readings)
-    if not stretches or len(course) <= 4 * beside:
+    if not stretches or len(course) <= 4 * span:
         return _no_stretch()
-    way = np.abs(course[beside:] - course[:-beside])
-    changes = np.abs(course[2 * beside :] - 2.0 * course[beside:-beside] + course[: -2 * beside])
-    counts = way[beside:] > tiny
+    way = np.abs(course[span:] - course[:-span])
+    changes = np.abs(course[2 * span :] - 2.0 * course[span:-span] + course[: -2 * span])
+    counts = way[span:] > rounding
     for first, last in stretches:
         begin = int(readings.sample[first])
         end = int(readings.sample[last])
-        counts[max(begin - 3 * beside, 0) : end + beside] = False
+        counts[max(begin - 3 * span, 0) : end + span] = False
     if not np.any(counts):
         return _no_stretch()
     usual = float(np.percentile(changes[counts], USUAL_PERCENTILE))
-    least = ABRUPT * usual + ABRUPT_COUNTS * readings.count
+    smallest_way = ABRUPT * usual + ABRUPT_COUNTS * readings.count
     found: list[tuple[int, int]] = []
     for first, last in stretches:
         begin = int(readings.sample[first])
         end = int(readings.sample[last])
-        before = way[begin - beside] if begin >= beside else 0.0
-        after = way[end] if end < len(way) else 0.0
-        if max(before, after) > least:
+        before = 0.0
+        if begin >= span:
+            before = way[begin - span]
+        after = 0.0
+        if end < len(way):
+            after = way[end]
+        if max(before, after) > smallest_way:
             found.append((first, last))
     return _samples(readings, found)
 
@@ -156,26 +174,34 @@ def frozen_current(readings: Readings, motor_rad: FloatArray) -> IntArray:
     """
     values = readings.values
     steps = np.diff(values)
-    changed = steps[steps != 0.0]
+    changes = steps[steps != 0.0]
     range_rad = float(np.ptp(motor_rad))
-    if len(changed) < 2 or not range_rad > 0.0:
+    if len(changes) < 2 or not range_rad > 0.0:
         return _no_stretch()
-    turns_back = float(np.mean(changed[1:] * changed[:-1] < 0.0))
-    if turns_back < NOISY:
+    is_turn = changes[1:] * changes[:-1] < 0.0
+    if float(np.mean(is_turn)) < NOISY:
         return _no_stretch()
     starts = np.concatenate(([0], np.flatnonzero(steps) + 1))
-    usual = float(np.percentile(np.diff(starts, append=len(values)), 99.0))
+    lengths = np.diff(starts, append=len(values))
+    usual = float(np.percentile(lengths, LENGTH_PERCENTILE))
     limits = (float(values.min()), float(values.max()))
     found: list[tuple[int, int]] = []
     for first, last in _constant(readings, 0.0, LEAST_CURRENT_S):
-        part = motor_rad[readings.sample[first] : readings.sample[last] + 1]
-        is_moved = float(np.ptp(part)) >= MOVED * range_rad
-        if is_moved and last + 1 - first >= LONGER * usual and values[first] not in limits:
+        begin = readings.sample[first]
+        end = readings.sample[last] + 1
+        is_moved = float(np.ptp(motor_rad[begin:end])) >= MOVED * range_rad
+        is_long = last + 1 - first >= LONGER * usual
+        if is_moved and is_long and values[first] not in limits:
             found.append((first, last))
     return _samples(readings, found)
 
 
-def _samples_beside(readings: Readings) -> int:
+def _rounding(readings: Readings) -> float:
+    """Largest change of a channel that is rounding."""
+    return ROUNDING * float(np.ptp(readings.values))
+
+
+def _samples_of_span(readings: Readings) -> int:
     """Samples in BESIDE_S."""
     return max(LEAST_BESIDE, round(BESIDE_S * readings.rate_hz))
 
@@ -199,23 +225,26 @@ def at_limit(readings: Readings, stretches: IntArray) -> bool:
     return is_largest or is_smallest
 
 
-def _constant(readings: Readings, tiny: float, least_s: float) -> list[tuple[int, int]]:
+def _constant(readings: Readings, rounding: float, least_s: float) -> list[tuple[int, int]]:
     """First and last reading of every stretch that is constant for so long."""
-    changed = np.abs(np.diff(readings.values)) > tiny
-    first = np.concatenate(([0], np.flatnonzero(changed) + 1))
+    is_changed = np.abs(np.diff(readings.values)) > rounding
+    first = np.concatenate(([0], np.flatnonzero(is_changed) + 1))
     last = np.append(first[1:], len(readings.values)) - 1
-    long = readings.sample[last] + 1 - readings.sample[first] > least_s * readings.rate_hz
-    return list(zip(first[long].tolist(), last[long].tolist(), strict=True))
+    samples = readings.sample[last] + 1 - readings.sample[first]
+    is_long = samples > least_s * readings.rate_hz
+    return list(zip(first[is_long].tolist(), last[is_long].tolist(), strict=True))
 
 
 def _samples(readings: Readings, found: list[tuple[int, int]]) -> IntArray:
+    """First sample and end of stretches that are given by their first and last reading, shape (s,
+    2).
+    """
     if not found:
         return _no_stretch()
-    return np.array(
-        [(readings.sample[first], readings.sample[last] + 1) for first, last in found],
-        dtype=np.int64,
-    )
+    first, last = np.array(found).T
+    return np.column_stack((readings.sample[first], readings.sample[last] + 1))
 
 
 def _no_stretch() -> IntArray:
+    """No stretch at all, shape (0, 2)."""
     return np.zeros((0, 2), dtype=np.int64)

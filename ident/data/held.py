@@ -75,31 +75,37 @@ def fill_held(
         position and current, the same arrays where nothing was filled in, and what was held, or
         None.
     """
-    none = np.zeros(position.shape, dtype=np.bool_)
     if damaged_position is None:
-        damaged_position = none
+        damaged_position = np.zeros(position.shape, dtype=np.bool_)
     if damaged_current is None:
-        damaged_current = none
-    positions = [
-        without_held(channel, rate_hz, smooth=True, damaged=damaged)
-        for channel, damaged in zip(position.T, damaged_position.T, strict=True)
-    ]
-    currents = [
-        without_held(channel, rate_hz, smooth=False, damaged=damaged)
-        for channel, damaged in zip(current.T, damaged_current.T, strict=True)
-    ]
+        damaged_current = np.zeros(position.shape, dtype=np.bool_)
+    positions = _without_held_of_each(position, damaged_position, rate_hz, smooth=True)
+    currents = _without_held_of_each(current, damaged_current, rate_hz, smooth=False)
     is_held = any(channel.share for channel in (*positions, *currents))
-    if not is_held and not np.any(damaged_position) and not np.any(damaged_current):
+    is_damaged = np.any(damaged_position) or np.any(damaged_current)
+    if not is_held and not is_damaged:
         return position, current, None
-    held = HeldChannels(
-        position_share=np.array([channel.share for channel in positions]),
-        position_hold_s=np.array([channel.hold_s for channel in positions]),
-        current_share=np.array([channel.share for channel in currents]),
-        current_hold_s=np.array([channel.hold_s for channel in currents]),
-    )
+    held = None
+    if is_held:
+        held = HeldChannels(
+            position_share=np.array([channel.share for channel in positions]),
+            position_hold_s=np.array([channel.hold_s for channel in positions]),
+            current_share=np.array([channel.share for channel in currents]),
+            current_hold_s=np.array([channel.hold_s for channel in currents]),
+        )
     filled_position = np.stack([channel.values for channel in positions], axis=1)
     filled_current = np.stack([channel.values for channel in currents], axis=1)
-    return filled_position, filled_current, held if is_held else None
+    return filled_position, filled_current, held
+
+
+def _without_held_of_each(
+    columns: FloatArray, damaged: BoolArray, rate_hz: float, *, smooth: bool
+) -> list[Channel]:
+    """`without_held` of each channel, shape (k, n)."""
+    channels: list[Channel] = []
+    for values, own_damaged in zip(columns.T, damaged.T, strict=True):
+        channels.append(without_held(values, rate_hz, smooth=smooth, damaged=own_damaged))
+    return channels
 
 
 def held_channel(values: FloatArray, rate_hz: float) -> BoolArray | None:
@@ -110,7 +116,9 @@ def held_channel(values: FloatArray, rate_hz: float) -> BoolArray | None:
         rate_hz: sampling rate.
     """
     held = held_samples(values, rate_hz)
-    return held if _share_held(values, held) >= LEAST_HELD else None
+    if _share_held(values, held) < LEAST_HELD:
+        return None
+    return held
 
 
 def without_held(
@@ -129,22 +137,25 @@ def without_held(
         damaged = np.zeros(len(values), dtype=np.bool_)
     held = held_channel(values, rate_hz)
     if held is None:
-        return Channel(fill_damaged(values, damaged, longest_smooth(rate_hz) if smooth else 0))
-    share = _share_held(values, held)
-    sample = np.arange(len(values))
-    read = ~held & ~damaged
-    held = ~read
+        longest = 0
+        if smooth:
+            longest = longest_smooth(rate_hz)
+        return Channel(fill_damaged(values, damaged, longest))
+    is_read = ~held & ~damaged
+    read = np.flatnonzero(is_read)
+    missing = np.flatnonzero(~is_read)
     if smooth:
         from scipy.interpolate import CubicSpline  # noqa: PLC0415 - verbs that only judge a log need no scipy
 
-        filled = CubicSpline(sample[read], values[read])(sample[held])
+        spline = CubicSpline(read, values[read])
+        filled = spline(missing)
     else:
-        filled = np.interp(sample[held], sample[read], values[read])
+        filled = np.interp(missing, read, values[read])
     out = values.copy()
-    out[held] = filled
-    lengths = np.diff(np.flatnonzero(read))
-    hold_s = float(np.median(lengths[lengths > 1])) / rate_hz
-    return Channel(out, share, hold_s)
+    out[missing] = filled
+    lengths = np.diff(read)
+    hold = float(np.median(lengths[lengths > 1]))
+    return Channel(out, _share_held(values, held), hold / rate_hz)
 
 
 def longest_smooth(rate_hz: float) -> int:
@@ -166,26 +177,28 @@ def fill_damaged(
     """
     if not np.any(damaged) or np.all(damaged):
         return values
+    if time is None:
+        time = np.arange(len(values), dtype=np.float64)
     out = values.copy()
     right = np.flatnonzero(~damaged)
     wrong = np.flatnonzero(damaged)
-    if time is None:
-        at = np.arange(len(values), dtype=np.float64)
-    else:
-        at = time
-    out[wrong] = np.interp(at[wrong], at[right], values[right])
-    for block in np.split(wrong, np.flatnonzero(np.diff(wrong) > 1) + 1):
+    out[wrong] = np.interp(time[wrong], time[right], values[right])
+    gaps = np.flatnonzero(np.diff(wrong) > 1) + 1
+    for block in np.split(wrong, gaps):
         if len(block) > longest:
             continue
-        wide = max(BESIDE, len(block))
-        place = int(np.searchsorted(right, block[0]))
-        near = right[max(place - wide, 0) : place + wide]
+        count = max(BESIDE, len(block))
+        after = int(np.searchsorted(right, block[0]))
+        first = max(after - count, 0)
+        near = right[first : after + count]
         is_between = near[0] < block[0] and near[-1] > block[-1]
         # Beyond the first and the last reading a cubic goes astray.
-        degree = 3 if is_between and len(near) > BESIDE else 1
-        middle = float(np.mean(at[near]))
-        fitted = np.polyfit(at[near] - middle, values[near], degree)
-        out[block] = np.polyval(fitted, at[block] - middle)
+        degree = 1
+        if is_between and len(near) > BESIDE:
+            degree = 3
+        middle = float(np.mean(time[near]))
+        coefficients = np.polyfit(time[near] - middle, values[near], degree)
+        out[block] = np.polyval(coefficients, time[block] - middle)
     return out
 
 
@@ -203,21 +216,20 @@ def held_samples(values: FloatArray, rate_hz: float) -> BoolArray:
     if not len(lengths) or lengths.max() == 1:
         return held
     jumps = np.abs(np.diff(values[first]))
-    is_held = (
-        (lengths > 1)
-        & (lengths <= LONGEST_HOLD_S * rate_hz)
-        & (jumps > JUMP_COUNTS * _count(values, jumps))
-    )
-    held[: first[-1]] = np.repeat(is_held, lengths)
+    is_repeated = (lengths > 1) & (lengths <= LONGEST_HOLD_S * rate_hz)
+    then_jumps = jumps > JUMP_COUNTS * _count(values, jumps)
+    held[: first[-1]] = np.repeat(is_repeated & then_jumps, lengths)
     held[first] = False
     return held
 
 
 def _count(values: FloatArray, jumps: FloatArray) -> float:
     """Size of a count of a channel: its smallest change; 0 for a channel without counts."""
-    least = ROUNDING * float(np.ptp(values))
-    counts = jumps[jumps > least]
-    return float(counts.min()) if len(counts) else 0.0
+    rounding = ROUNDING * float(np.ptp(values))
+    changes = jumps[jumps > rounding]
+    if not len(changes):
+        return 0.0
+    return float(changes.min())
 
 
 def _share_held(values: FloatArray, held: BoolArray) -> float:

@@ -63,34 +63,38 @@ def channels_of(model: Model, data: Dataset) -> RunChannels:
         model: the declared model.
         data: a differentiated run.
     """
-    kinds = [joint.kind for joint in model.robot.axes]
-    least_range = np.array([STILL_RANGE[kind] for kind in kinds])
-    moved = np.ptp(data.position_rad, axis=0)
-    still = (moved <= least_range) | (np.mean(data.moving, axis=0) < LEAST_MOVING)
-    if data.clipped is not None:
-        clipped = data.clipped
-    else:
+    axes = model.robot.axes
+    count = len(axes)
+    smallest_range = np.array([STILL_RANGE[joint.kind] for joint in axes])
+    range_ = np.ptp(data.position_rad, axis=0)
+    moving_share = np.mean(data.moving, axis=0)
+    still = (range_ <= smallest_range) | (moving_share < LEAST_MOVING)
+    clipped = data.clipped
+    if clipped is None:
         clipped = np.zeros_like(data.valid)
     usable = data.motor_moving & (data.valid | clipped)
-    percent = (
-        100.0 * np.count_nonzero(clipped, axis=0) / np.maximum(np.count_nonzero(usable, axis=0), 1)
-    )
+    usable_counts = np.maximum(np.count_nonzero(usable, axis=0), 1)
+    clipped_percent = 100.0 * np.count_nonzero(clipped, axis=0) / usable_counts
     limits = np.max(np.abs(data.current_a), axis=0, where=usable, initial=0.0)
-    is_constant = np.zeros(len(kinds), dtype=np.bool_)
-    for motor in range(len(kinds)):
+    is_constant = np.zeros(count, dtype=np.bool_)
+    for motor in range(count):
         own = data.current_a[usable[:, motor], motor]
-        is_constant[motor] = len(own) >= LEAST_SAMPLES and not still[motor] and np.ptp(own) == 0.0
+        if len(own) >= LEAST_SAMPLES and not still[motor]:
+            is_constant[motor] = np.ptp(own) == 0.0
+    mounting = None
+    if data.payload is not None:
+        mounting = data.payload.mounting
     return RunChannels(
         run=data.name,
-        mounting=None if data.payload is None else data.payload.mounting,
+        mounting=mounting,
         still=still,
-        range=moved,
+        range=range_,
         constant_current=is_constant,
-        clipped_percent=percent,
+        clipped_percent=clipped_percent,
         held=data.held,
         faults=data.faults,
-        limited_percent=np.zeros(len(kinds)),
-        torque_limits=np.full(len(kinds), np.nan),
+        limited_percent=np.zeros(count),
+        torque_limits=np.full(count, np.nan),
         limits=limits,
     )
 
@@ -103,11 +107,11 @@ def require_usable_channels(run: RunChannels, axes: Sequence[str]) -> None:
         CurrentConstant: a motor moves, and its current has one value.
     """
     require_usable(run.run, run.faults, axes)
-    dead = np.flatnonzero(run.constant_current).tolist()
-    if dead:
-        raise CurrentConstant(
-            run.run, tuple(axes[axis] for axis in dead), float(run.limits[dead[0]])
-        )
+    constant = np.flatnonzero(run.constant_current).tolist()
+    if constant:
+        names = tuple(axes[axis] for axis in constant)
+        first_value = float(run.limits[constant[0]])
+        raise CurrentConstant(run.run, names, first_value)
 
 
 def clip_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
@@ -137,6 +141,7 @@ def limit_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterato
 
 
 def _clip_diagnosis(run: RunChannels, axis: int, name: str) -> Diagnosis:
+    """Name the current of an axis that a limit has clipped."""
     return Diagnosis(
         "current-clipped",
         (run.run,),
@@ -159,31 +164,34 @@ def fault_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterato
 def held_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> Iterator[Diagnosis]:
     """Name channels whose readings were held; what was held was filled in."""
     for run in runs:
-        if run.held is None:
+        held = run.held
+        if held is None:
             continue
-        if run.held.position_share.any():
+        if held.position_share.any():
             yield _held_diagnosis(
-                run.run, "positions", axes, run.held.position_share, run.held.position_hold_s
+                run.run, "positions", axes, held.position_share, held.position_hold_s
             )
-        if run.held.current_share.any():
+        if held.current_share.any():
             yield _held_diagnosis(
-                run.run, "currents", axes, run.held.current_share, run.held.current_hold_s
+                run.run, "currents", axes, held.current_share, held.current_hold_s
             )
 
 
 def _held_diagnosis(
-    run: str, what: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray
+    run: str, quantity: str, axes: Sequence[str], share: FloatArray, hold_s: FloatArray
 ) -> Diagnosis:
-    held = np.flatnonzero(share).tolist()
+    """Name readings of some axes that were held."""
+    affected = np.flatnonzero(share).tolist()
     percent = 100.0 * float(np.max(share))
-    typical_ms = 1e3 * float(np.median(hold_s[held]))
+    typical_ms = 1e3 * float(np.median(hold_s[affected]))
+    names = tuple(axes[axis] for axis in affected)
     return Diagnosis(
         "readings-held",
         (run,),
-        tuple(axes[axis] for axis in held),
-        f"{what} that repeat the reading before while the robot moves, in up to {percent:.0f} % of "
-        f"the samples, for some {typical_ms:.3g} ms; what lies between two new readings was filled "
-        "in",
+        names,
+        f"{quantity} that repeat the reading before while the robot moves, in up to {percent:.0f} "
+        f"% of the samples, for some {typical_ms:.3g} ms; what lies between two new readings was "
+        "filled in",
         "a new reading in every sample",
         "record at the rate at which the controller answers, or let it answer at the rate of the "
         "recording; noise of a current between the readings is lost, and makes the error larger",
@@ -201,7 +209,8 @@ def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStil
         own = [run for run in runs if run.mounting == mounting]
         still = np.all([run.still for run in own], axis=0)
         if np.any(still):
-            return JointStill(_names(own), _still_axes(still, axes), _still_text(own, still, axes))
+            found = _still_text(own, still, axes)
+            return JointStill(_names(own), _still_axes(still, axes), found)
     return None
 
 
@@ -239,23 +248,24 @@ def still_diagnoses(runs: Sequence[RunChannels], axes: Sequence[str]) -> tuple[D
 
 
 def _names(runs: Sequence[RunChannels]) -> str:
+    """Names of runs, for a message."""
     return ", ".join(run.run for run in runs)
 
 
 def _still_axes(still: BoolArray, axes: Sequence[str]) -> tuple[str, ...]:
-    return tuple(axes[axis] for axis in np.flatnonzero(still).tolist())
+    """Names of the joints that never move."""
+    indices = np.flatnonzero(still).tolist()
+    return tuple(axes[axis] for axis in indices)
 
 
 def _still_text(runs: Sequence[RunChannels], still: BoolArray, axes: Sequence[str]) -> str:
     """Say how still the joints are."""
-    names = " and ".join(_still_axes(still, axes))
-    if np.count_nonzero(still) == 1:
+    names = _still_axes(still, axes)
+    verb = "never move"
+    if len(names) == 1:
         verb = "never moves"
-    else:
-        verb = "never move"
-    largest = max(float(np.max(run.range[still])) for run in runs)
-    if largest == 0.0:
+    largest_range = max(float(np.max(run.range[still])) for run in runs)
+    how = "no motion is above the standstill speed"
+    if largest_range == 0.0:
         how = "the position is constant"
-    else:
-        how = "no motion is above the standstill speed"
-    return f"{names} {verb}: {how}"
+    return f"{' and '.join(names)} {verb}: {how}"

@@ -26,7 +26,7 @@ class TorqueChannel:
 
     time_s: FloatArray  #: on the clock of the samples, increasing
     current_a: FloatArray  #: recorded current at that time
-    nearby_a: FloatArray  #: recorded current shortly before and after, with noise of its own
+    nearby_a: FloatArray  #: recorded current shortly before and after, whose noise is independent
     #: torque of the motor by its drive, seen at its joint (× N) [Nm; N for a prismatic joint]
     torque_nm: FloatArray
 
@@ -41,7 +41,7 @@ class TorqueSlope:
 
 
 def torque_slope(channels: Sequence[TorqueChannel]) -> TorqueSlope | None:
-    """Fit τ = s·v + o to the readings of an axis, with an offset o of its own for each run.
+    """Fit τ = s·v + o to the readings of an axis, with another offset o for each run.
 
     By least squares the noise of the current v would make the slope too small (errors in
     variables). The current nearby is the instrument z: it follows the same motion, and its noise is
@@ -62,28 +62,37 @@ def torque_slope(channels: Sequence[TorqueChannel]) -> TorqueSlope | None:
     runs = [channel for channel in channels if len(channel.time_s) > 1]
     if not runs:
         return None
-    nearby, current, torque = (
-        np.concatenate([getattr(run, name) - getattr(run, name).mean() for run in runs])
-        for name in ("nearby_a", "current_a", "torque_nm")
-    )
-    size = np.sqrt(np.mean(np.concatenate([run.current_a for run in runs]) ** 2))
+    nearby = _about_means([run.nearby_a for run in runs])
+    current = _about_means([run.current_a for run in runs])
+    torque = _about_means([run.torque_nm for run in runs])
+    recorded = np.concatenate([run.current_a for run in runs])
+    root_mean_square = np.sqrt(np.mean(recorded**2))
+    current_changes = np.std(current) > SMALLEST_SHARE * root_mean_square
     blocks = _blocks(runs)
     count = len(np.unique(blocks))
-    if count < FEWEST_BLOCKS or not np.std(current) > SMALLEST_SHARE * size or not torque.any():
+    if count < FEWEST_BLOCKS or not current_changes or not torque.any():
         return None
     gram = float(nearby @ current)
     slope = float(nearby @ torque) / gram
-    scores = np.bincount(blocks, weights=nearby * (torque - slope * current))
-    std = float(np.sqrt(count / (count - 1) * float(scores @ scores))) / abs(gram)
+    errors = torque - slope * current
+    scores = np.bincount(blocks, weights=nearby * errors)
+    variance = count / (count - 1) * float(scores @ scores)
+    std = float(np.sqrt(variance)) / abs(gram)
     return TorqueSlope(slope, std, len(current))
+
+
+def _about_means(runs: Sequence[FloatArray]) -> FloatArray:
+    """Readings of all runs, counted from the mean of each."""
+    return np.concatenate([values - values.mean() for values in runs])
 
 
 def _blocks(runs: Sequence[TorqueChannel]) -> IntArray:
     """Number of the block of each reading, shape (m,); blocks end with their run."""
     first = 0
-    parts = []
+    parts: list[IntArray] = []
     for run in runs:
-        part = ((run.time_s - run.time_s[0]) / BLOCK_S).astype(np.int64) + first
+        since_start_s = run.time_s - run.time_s[0]
+        part = (since_start_s / BLOCK_S).astype(np.int64) + first
         parts.append(part)
         first = int(part.max()) + 1
     return np.concatenate(parts)

@@ -25,11 +25,9 @@ VISITS = 6
 The sizes of the currents of two real robots and a simulated one make 6 to 37 in 9 to 40 s; the same
 currents with a sign, shifted until they have one sign alone, make 4 at most.
 """
-COARSE = 0.05
+COARSE = 0.05  #: Largest share that one count is of a current that needs VISITS
+#: Least visits of a coarser current: rounding takes others to zero, up to 6 times
 COARSE_VISITS = 12
-"""A current of which one count is a larger share needs more visits:
-rounding takes others to zero, up to 6 times.
-"""
 APART_S = 0.1  #: Two visits are at least so far apart
 REST_S = 0.05  #: A value that stays so long is a brake's, or of a drive without power, and no visit
 BOUNCE = 3.0
@@ -63,7 +61,9 @@ def require_signed_currents(run: Run, ratio: FloatArray, axes: Sequence[str]) ->
 
 def missing_sign(current: FloatArray) -> str:
     """Return the sign that currents of one sign do not have, in words."""
-    return "negative" if current.max() > 0.0 else "positive"
+    if current.max() > 0.0:
+        return "negative"
+    return "positive"
 
 
 def unsigned_currents(run: Run, ratio: FloatArray) -> BoolArray:
@@ -72,9 +72,17 @@ def unsigned_currents(run: Run, ratio: FloatArray) -> BoolArray:
     """
     found = one_sided_currents(run, ratio)
     for axis in np.flatnonzero(found).tolist():
-        used = slice(None) if run.valid is None else run.valid[:, axis]
-        found[axis] = bounces(np.abs(run.current_a[used, axis]), run.time_s[used])
+        used = _used_samples(run, axis)
+        size = np.abs(run.current_a[used, axis])
+        found[axis] = bounces(size, run.time_s[used])
     return found
+
+
+def _used_samples(run: Run, axis: int) -> BoolArray | slice:
+    """Samples of an axis that may be used."""
+    if run.valid is None:
+        return slice(None)
+    return run.valid[:, axis]
 
 
 def one_sided_currents(run: Run, ratio: FloatArray) -> BoolArray:
@@ -85,10 +93,9 @@ def one_sided_currents(run: Run, ratio: FloatArray) -> BoolArray:
     motor_rad = run.position_rad @ ratio.T
     found = np.zeros(run.current_a.shape[1], dtype=np.bool_)
     for axis in range(len(found)):
-        used = slice(None) if run.valid is None else run.valid[:, axis]
-        found[axis] = has_one_sign(run.current_a[used, axis]) and turns_both_ways(
-            motor_rad[used, axis]
-        )
+        used = _used_samples(run, axis)
+        if has_one_sign(run.current_a[used, axis]):
+            found[axis] = turns_both_ways(motor_rad[used, axis])
     return found
 
 
@@ -96,7 +103,8 @@ def has_one_sign(current: FloatArray) -> bool:
     """Whether a current, shape (k,), is never below zero, or never above it."""
     if not current.size:
         return False
-    limit = BELOW_ZERO * float(np.percentile(np.abs(current), USUAL_PERCENTILE))
+    usual = float(np.percentile(np.abs(current), USUAL_PERCENTILE))
+    limit = BELOW_ZERO * usual
     return bool(current.min() >= -limit or current.max() <= limit)
 
 
@@ -117,14 +125,29 @@ def bounces(size: FloatArray, time_s: FloatArray) -> bool:
     start = np.flatnonzero(np.diff(size, prepend=np.nan) != 0.0)
     end = np.append(start[1:], len(size)) - 1
     is_rest = time_s[end] - time_s[start] > REST_S
-    near = start[(size[start] < NEAR_ZERO * usual) & ~is_rest]
+    is_near = size[start] < NEAR_ZERO * usual
+    near = start[is_near & ~is_rest]
     if len(near) < VISITS:
         return False
     count = float(np.diff(np.unique(size)).min())
-    least = VISITS if count <= COARSE * usual else COARSE_VISITS
-    first_of_visit = np.flatnonzero(np.diff(time_s[near], prepend=-np.inf) > APART_S)
-    visits = np.array([part[np.argmin(size[part])] for part in np.split(near, first_of_visit[1:])])
-    return len(visits) >= least and rise_ratio(size, visits, time_s, RISE * usual) < BOUNCE
+    fewest_visits = COARSE_VISITS
+    if count <= COARSE * usual:
+        fewest_visits = VISITS
+    visits = _visits(size, near, time_s)
+    if len(visits) < fewest_visits:
+        return False
+    return rise_ratio(size, visits, time_s, RISE * usual) < BOUNCE
+
+
+def _visits(size: FloatArray, near: IntArray, time_s: FloatArray) -> IntArray:
+    """Sample nearest to zero of each visit, of the samples near zero in all of them."""
+    pauses_s = np.diff(time_s[near], prepend=-np.inf)
+    first_of_visit = np.flatnonzero(pauses_s > APART_S)
+    visits: list[int] = []
+    for samples in np.split(near, first_of_visit[1:]):
+        nearest = int(np.argmin(size[samples]))
+        visits.append(int(samples[nearest]))
+    return np.array(visits)
 
 
 def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: float) -> float:
@@ -140,10 +163,12 @@ def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: flo
     Returns:
         the ratio for the shortest t; infinity where the current rises too slowly.
     """
-    longest = round(LONGEST_RISE_S / (time_s[1] - time_s[0]))
-    lags = np.unique(np.round(np.geomspace(1.0, max(longest, 1), 40)).astype(int))
-    for lag in lags.tolist():
-        inside = visits[(visits >= 2 * lag) & (visits < len(size) - 2 * lag)]
+    step_s = time_s[1] - time_s[0]
+    longest = max(round(LONGEST_RISE_S / step_s), 1)
+    lags = np.round(np.geomspace(1.0, longest, 40)).astype(int)
+    for lag in np.unique(lags).tolist():
+        is_inside = (visits >= 2 * lag) & (visits < len(size) - 2 * lag)
+        inside = visits[is_inside]
         if not len(inside):
             break
         near = median_rise(size, inside, lag)

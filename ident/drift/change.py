@@ -1,4 +1,4 @@
-"""Significance of changed gains: one change against its noise, a recalibration as a whole,
+"""Significance of changed gains: one change against its noise, all changes of a recalibration,
 and the pattern of many.
 
 Recordings of different days are independent, so σ of a difference is the root of the sum of
@@ -33,6 +33,7 @@ other.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import compress
@@ -52,11 +53,9 @@ FALSE_ALARM = 0.01
 over all axes.
 """
 
+#: Weight of the prior in the pooled estimate, in numbers of successive differences
 _POOLED_WEIGHT = 10.0
-_AXIS_WEIGHT = 30.0
-"""Weights of the prior and of the pooled estimate beside an axis' own,
-in numbers of successive differences.
-"""
+_AXIS_WEIGHT = 30.0  #: Weight of the pooled estimate in that of an axis, likewise
 _MIN_DIFFERENCES = 4
 #: Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of
 #: any size
@@ -124,15 +123,23 @@ def change_significance(
         ValueError: a number is not finite, or a σ or the dispersion negative.
     """
     numbers = np.array([old, old_std, new, new_std, dispersion])
-    if not np.isfinite(numbers).all() or (numbers[[1, 3, 4]] < 0).any():
+    are_finite = np.isfinite(numbers).all()
+    has_negative = np.min([old_std, new_std, dispersion]) < 0
+    if has_negative or not are_finite:
         raise ValueError(
             f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± "
             f"{new_std} and dispersion {dispersion}"
         )
-    change = (new - old) * (np.sign(old) or 1.0)
-    sigmas = _ratio(float(change), dispersion * math.hypot(old_std, new_std))
+    sign = 1.0
+    if old < 0.0:
+        sign = -1.0
+    change = float((new - old) * sign)
+    change_std = dispersion * math.hypot(old_std, new_std)
+    sigmas = _ratio(change, change_std)
     return Change(
-        100.0 * _ratio(float(change), abs(old)), sigmas, math.erfc(abs(sigmas) / math.sqrt(2.0))
+        percent=100.0 * _ratio(change, abs(old)),
+        sigmas=sigmas,
+        probability=math.erfc(abs(sigmas) / math.sqrt(2.0)),
     )
 
 
@@ -162,37 +169,73 @@ def decide(
     Raises:
         ValueError: shapes do not fit, a number is not finite, or a σ or a dispersion is negative.
     """
-    n = len(axes)
-    columns = [
-        np.broadcast_to(np.asarray(c, float), (n,))
-        for c in (old, old_std, new, new_std, dispersion)
-    ]
-    changes = tuple(
-        change_significance(*map(float, four), dispersion=float(factor))
-        for *four, factor in zip(*columns, strict=True)
+    count = len(axes)
+    olds = _one_an_axis(old, count)
+    old_stds = _one_an_axis(old_std, count)
+    news = _one_an_axis(new, count)
+    new_stds = _one_an_axis(new_std, count)
+    factors = _one_an_axis(dispersion, count)
+    changes: list[Change] = []
+    for axis in range(count):
+        change = change_significance(
+            olds[axis], old_stds[axis], news[axis], new_stds[axis], dispersion=factors[axis]
+        )
+        changes.append(change)
+    adjusted = _adjusted([change.probability for change in changes])
+    significant = tuple(probability <= FALSE_ALARM for probability in adjusted)
+    return ChangeDecision(
+        differs=any(significant),
+        axes=axes,
+        changes=tuple(changes),
+        adjusted=adjusted,
+        significant=significant,
+        words=_decision_words(axes, changes, adjusted, significant),
     )
-    # Holm: the smallest probability counts times their number, the next times one less, never
-    # falling.
-    probabilities = np.array([change.probability for change in changes])
-    order = np.argsort(probabilities)
-    adjusted = np.empty(n)
-    adjusted[order] = np.maximum.accumulate(
-        np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1))
-    )
-    significant = tuple(bool(probability <= FALSE_ALARM) for probability in adjusted)
-    differs = any(significant)
-    words = "no gain to compare"
-    if axes:
-        parts = [
-            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, {_probability(p)} "
-            f"among {n})"
-            for axis, change, p in zip(axes, changes, adjusted, strict=True)
-        ]
-        largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
-        words = f"no gain has changed by more than noise: the largest change is {largest}"
-        if differs:
-            words = f"changed by more than noise: {', '.join(compress(parts, significant))}"
-    return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), significant, words)
+
+
+def _one_an_axis(values: ArrayLike, count: int) -> list[float]:
+    """Numbers of so many axes, of which one may be given for all."""
+    numbers = np.broadcast_to(np.asarray(values, float), (count,))
+    return [float(number) for number in numbers]
+
+
+def _adjusted(probabilities: Sequence[float]) -> tuple[float, ...]:
+    """Holm: the smallest probability counts times their number, the next times one less,
+    never falling.
+    """
+    given = np.array(probabilities)
+    count = len(given)
+    order = np.argsort(given)
+    multiplied = given[order] * np.arange(count, 0, -1)
+    bounded = np.minimum(1.0, multiplied)
+    adjusted = np.empty(count)
+    adjusted[order] = np.maximum.accumulate(bounded)
+    return tuple(float(probability) for probability in adjusted)
+
+
+def _decision_words(
+    axes: Sequence[str],
+    changes: Sequence[Change],
+    adjusted: Sequence[float],
+    significant: Sequence[bool],
+) -> str:
+    """Describe a decision in one sentence."""
+    if not axes:
+        return "no gain to compare"
+    count = len(axes)
+    parts: list[str] = []
+    for axis, change, probability in zip(axes, changes, adjusted, strict=True):
+        sigmas = _short(abs(change.sigmas))
+        parts.append(
+            f"{axis} {change.percent:+.2g} % ({sigmas} σ, {_probability(probability)} "
+            f"among {count})"
+        )
+    if any(significant):
+        changed = ", ".join(compress(parts, significant))
+        return f"changed by more than noise: {changed}"
+    sizes = [abs(change.sigmas) for change in changes]
+    largest = parts[int(np.argmax(sizes))]
+    return f"no gain has changed by more than noise: the largest change is {largest}"
 
 
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
@@ -216,15 +259,24 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     if count < _MIN_DIFFERENCES:
         return np.full(values.shape[:-1], DISPERSION)
     # Differences not about their own centre: the centre of few differences is too near to them.
+    half_differences = np.abs(np.diff(values / 2.0))
     with np.errstate(over="ignore"):
-        away = 2.0 * (np.abs(np.diff(values / 2.0)) / np.hypot(stds[..., 1:], stds[..., :-1]))
-    squares = np.minimum(away, _FARTHEST) ** 2
-    own = _robust_variance(squares)
-    all_axes = _robust_variance(squares.reshape(*squares.shape[:-2], -1))
+        difference_stds = np.hypot(stds[..., 1:], stds[..., :-1])
+        in_sigmas = 2.0 * (half_differences / difference_stds)
+    squares = np.minimum(in_sigmas, _FARTHEST) ** 2
+    of_axis = _robust_variance(squares)
+    of_all_axes = _robust_variance(squares.reshape(*squares.shape[:-2], -1))
     total = count * values.shape[-2]
-    pooled = (_POOLED_WEIGHT * DISPERSION**2 + total * all_axes) / (_POOLED_WEIGHT + total)
-    drawn = (_AXIS_WEIGHT * pooled[..., None] + count * own) / (_AXIS_WEIGHT + count)
-    return np.asarray(np.sqrt(np.maximum(drawn, 1.0)))
+    pooled = _weighted_mean(DISPERSION**2, _POOLED_WEIGHT, of_all_axes, total)
+    variance = _weighted_mean(pooled[..., None], _AXIS_WEIGHT, of_axis, count)
+    return np.asarray(np.sqrt(np.maximum(variance, 1.0)))
+
+
+def _weighted_mean(
+    prior: FloatArray | float, prior_weight: float, found: FloatArray, weight: int
+) -> FloatArray:
+    """Mean of a prior and of what was found."""
+    return np.asarray((prior_weight * prior + weight * found) / (prior_weight + weight))
 
 
 def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
@@ -240,16 +292,20 @@ def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLik
     """
     changes = np.asarray(change_percent, float)
     stds = np.asarray(std_percent, float)
-    count = int(np.count_nonzero(alarmed))
-    if count < 2:
-        return Pattern.ONE if count else Pattern.NONE
+    alarm_count = int(np.count_nonzero(alarmed))
+    if alarm_count == 0:
+        return Pattern.NONE
+    if alarm_count == 1:
+        return Pattern.ONE
     from scipy.special import chdtrc  # noqa: PLC0415 - half of the start-up of `history`, which seldom needs it
 
     weights = 1.0 / stds**2
-    common = float(weights @ changes / weights.sum())
-    spread = float(weights @ (changes - common) ** 2)
-    alike = chdtrc(len(changes) - 1, spread) > _UNLIKE
-    if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS:
+    total = weights.sum()
+    mean = float(weights @ changes / total)
+    square_sum = float(weights @ (changes - mean) ** 2)
+    probability = chdtrc(len(changes) - 1, square_sum)
+    mean_sigmas = abs(mean) * total**0.5
+    if probability > _UNLIKE and mean_sigmas > _COMMON_SIGMAS:
         return Pattern.COMMON
     return Pattern.SEVERAL
 
@@ -258,17 +314,20 @@ def _robust_variance(squares: FloatArray) -> FloatArray:
     """Solve mean(min(x², c² s)) = s E min(Z², c²) for s along the last axis,
     starting from the median.
     """
-    found = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
+    variance = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
     for _ in range(_STEPS):
-        found = np.minimum(squares, _CUT**2 * found[..., None]).mean(axis=-1) / _MEAN_OF_CUT
-    return np.asarray(found)
+        largest = _CUT**2 * variance[..., None]
+        variance = np.minimum(squares, largest).mean(axis=-1) / _MEAN_OF_CUT
+    return np.asarray(variance)
 
 
-def _ratio(part: float, whole: float) -> float:
+def _ratio(change: float, size: float) -> float:
     """Quotient; infinite for a change of a value known exactly, 0 without a change."""
-    if whole:
-        return part / whole
-    return math.copysign(math.inf, part) if part else 0.0
+    if size:
+        return change / size
+    if change:
+        return math.copysign(math.inf, change)
+    return 0.0
 
 
 def _probability(p: float) -> str:
@@ -280,7 +339,9 @@ def _probability(p: float) -> str:
 
 def _short(sigmas: float) -> str:
     """Format a number in a few digits, however large."""
-    return f"{sigmas:.1f}" if sigmas < 1e4 else f"{sigmas:.1e}"
+    if sigmas < 1e4:
+        return f"{sigmas:.1f}"
+    return f"{sigmas:.1e}"
 
 
 #: Calibrations of the first line that is tested; through fewer it is hardly more than one
@@ -290,8 +351,7 @@ FEWEST = 4
 #: recent
 _RECENT = 3
 _FINEST = 2.0**-52  #: Smallest σ of the largest gain over itself: no number is written finer
-#: Largest factor between a σ and the median one: beyond, a weight is all or nothing anyway
-_APART = 1e3
+_LARGEST_FACTOR = 1e3  #: Between a σ and the median one: beyond, a weight is all or nothing anyway
 
 
 @dataclass(frozen=True, slots=True)
@@ -390,65 +450,115 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION)
             f"expected as many values as σ, at least one, found shapes {values.shape} "
             f"and {stds.shape}"
         )
-    if not (np.isfinite(values).all() and np.isfinite(stds).all() and (stds > 0).all()):
+    are_finite = np.isfinite(values).all() and np.isfinite(stds).all()
+    if not (are_finite and (stds > 0).all()):
         raise ValueError("expected finite gains with σ > 0")
     scale = float(np.abs(values).max())
     if scale == 0:
         raise ValueError("expected gains other than zero")
     values = values / scale
     stds = _bounded(stds, scale)
-    sign = 1.0 if values.sum() > 0 else -1.0
-    deviations, upper, lower = cusum_paths(sign * values, stds, dispersion, CHART)
-    slopes = trend_statistic(sign * values, stds, dispersion)
-    found: list[Alarm] = []
-    for index, (z, above, below, slope) in enumerate(
-        zip(deviations, upper, lower, slopes, strict=True)
-    ):
-        if max(above, below) > CHART.threshold:
-            found.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
-        elif abs(z) > CHART.single:
-            found.append(Alarm(index, AlarmKind.JUMP, bool(z > 0)))
-        elif abs(slope) > CHART.trend:
-            found.append(Alarm(index, AlarmKind.TREND, bool(slope > 0)))
-    alarms = tuple(found)
+    sign = -1.0
+    if values.sum() > 0:
+        sign = 1.0
+    magnitudes = sign * values
+    deviations, upper, lower = cusum_paths(magnitudes, stds, dispersion, CHART)
+    slopes = trend_statistic(magnitudes, stds, dispersion)
+    alarms = _alarms(deviations, upper, lower, slopes)
     # The onset of an alarm that has passed bounds no baseline: that change is over.
     present = _present(alarms, len(values))
-    onset = None if present is None else 0
-    if present is not None and present.kind is not AlarmKind.TREND:
+    onset = None
+    if present is None:
+        since = _change_since_baseline(values, stds, onset)
+    elif present.kind is AlarmKind.TREND:
+        onset = 0
+        since = _change_along_line(values, stds)
+    else:
+        path = lower
+        if present.rose:
+            path = upper
         # Where the sum that has the alarm was zero for the last time (Page's estimate of the change
         # point).
-        onset = int(
-            np.flatnonzero((upper if present.rose else lower)[: present.index + 1] == 0.0)[-1]
-        )
-    if present is not None and present.kind is AlarmKind.TREND:
-        line = fit_line(values, stds)
-        steps = len(values) - 1
-        baseline = line.start
-        baseline_std = line.start_std
-        change = steps * line.slope
-        change_std = steps * line.slope_std
-    else:
-        # The baseline ends at the onset, and the newest calibrations begin behind both.
-        first = max(1, min(len(values) - 1 if onset is None else onset + 1, CHART.baseline))
-        since = first if onset is None else max(first, onset + 1)
-        newest = max(1, min(_RECENT, len(values) - since))
-        baseline, baseline_std = _mean(values[:first], stds[:first])
-        recent, recent_std = _mean(values[-newest:], stds[-newest:])
-        change = recent - baseline if len(values) > 1 else 0.0
-        change_std = math.hypot(recent_std, baseline_std)
-    if baseline == 0:
+        zeros = np.flatnonzero(path[: present.index + 1] == 0.0)
+        onset = int(zeros[-1])
+        since = _change_since_baseline(values, stds, onset)
+    if since.baseline == 0:
         raise ValueError("expected gains other than zero")
     return Drift(
-        baseline=scale * baseline,
-        baseline_std=dispersion * scale * baseline_std,
+        baseline=scale * since.baseline,
+        baseline_std=dispersion * scale * since.baseline_std,
         deviations=deviations,
         upper=upper,
         lower=lower,
         trend=slopes,
         alarms=alarms,
         onset=onset,
-        change_percent=100.0 * sign * change / abs(baseline),
-        change_sigmas=sign * change / (dispersion * change_std),
+        change_percent=100.0 * sign * since.change / abs(since.baseline),
+        change_sigmas=sign * since.change / (dispersion * since.change_std),
+    )
+
+
+def _alarms(
+    deviations: FloatArray, upper: FloatArray, lower: FloatArray, slopes: FloatArray
+) -> tuple[Alarm, ...]:
+    """Alarms of all calibrations, in their order; each by the first rule that applies."""
+    alarms: list[Alarm] = []
+    for index, (z, above, below, slope) in enumerate(
+        zip(deviations, upper, lower, slopes, strict=True)
+    ):
+        if max(above, below) > CHART.threshold:
+            alarms.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
+        elif abs(z) > CHART.single:
+            alarms.append(Alarm(index, AlarmKind.JUMP, bool(z > 0)))
+        elif abs(slope) > CHART.trend:
+            alarms.append(Alarm(index, AlarmKind.TREND, bool(slope > 0)))
+    return tuple(alarms)
+
+
+@dataclass(frozen=True, slots=True)
+class _ChangeSinceBaseline:
+    """Baseline of a gain and its change since, with their σ, in one unit."""
+
+    baseline: float
+    baseline_std: float
+    change: float
+    change_std: float
+
+
+def _change_along_line(values: FloatArray, stds: FloatArray) -> _ChangeSinceBaseline:
+    """Change along the line through all calibrations."""
+    line = fit_line(values, stds)
+    steps = len(values) - 1
+    return _ChangeSinceBaseline(
+        baseline=line.start,
+        baseline_std=line.start_std,
+        change=steps * line.slope,
+        change_std=steps * line.slope_std,
+    )
+
+
+def _change_since_baseline(
+    values: FloatArray, stds: FloatArray, onset: int | None
+) -> _ChangeSinceBaseline:
+    """Change of the newest calibrations; the baseline ends at the onset,
+    and the newest begin behind both.
+    """
+    count = len(values)
+    most = count - 1
+    if onset is not None:
+        most = onset + 1
+    baseline_count = max(1, min(most, CHART.baseline))
+    behind = baseline_count
+    if onset is not None:
+        behind = max(baseline_count, onset + 1)
+    newest = max(1, min(_RECENT, count - behind))
+    baseline, baseline_std = _mean(values[:baseline_count], stds[:baseline_count])
+    recent, recent_std = _mean(values[-newest:], stds[-newest:])
+    change = 0.0
+    if count > 1:
+        change = recent - baseline
+    return _ChangeSinceBaseline(
+        baseline, baseline_std, change, math.hypot(recent_std, baseline_std)
     )
 
 
@@ -464,15 +574,15 @@ def cusum_paths(
     """
     weights = np.cumsum(1.0 / stds**2, axis=-1)
     means = np.cumsum(values / stds**2, axis=-1) / weights
-    shape = values.shape
-    n = values.shape[-1]
-    deviations = np.zeros(shape)
-    upper = np.zeros(shape)
-    lower = np.zeros(shape)
-    for i in range(1, n):
+    deviations = np.zeros(values.shape)
+    upper = np.zeros(values.shape)
+    lower = np.zeros(values.shape)
+    for i in range(1, values.shape[-1]):
         last = min(i, chart.baseline) - 1
-        std = dispersion * np.sqrt(stds[..., i] ** 2 + 1.0 / weights[..., last])
-        deviations[..., i] = z = (values[..., i] - means[..., last]) / std
+        baseline_variance = 1.0 / weights[..., last]
+        std = dispersion * np.sqrt(stds[..., i] ** 2 + baseline_variance)
+        z = (values[..., i] - means[..., last]) / std
+        deviations[..., i] = z
         upper[..., i] = np.maximum(0.0, upper[..., i - 1] + z - chart.reference)
         lower[..., i] = np.maximum(0.0, lower[..., i - 1] - z - chart.reference)
     return deviations, upper, lower
@@ -491,21 +601,27 @@ def trend_statistic(
     Returns:
         shape (..., n), positive where the magnitude rises; 0 for the first FEWEST − 1.
     """
-    found = np.zeros(values.shape)
-    total, middle, mean, spread, product = (np.zeros(values.shape[:-1]) for _ in range(5))
+    statistic = np.zeros(values.shape)
+    zeros = np.zeros(values.shape[:-1])
+    total = zeros  # Σ w
+    mean_index = zeros  # ī
+    mean = zeros  # ḡ
+    index_square = zeros  # Σ w (i − ī)²
+    product = zeros  # Σ w (i − ī) (g − ḡ)
     # About running means (West 1979): differences of large sums lose their digits where one σ is
     # far below the others.
     for i in range(values.shape[-1]):
+        value = values[..., i]
         weight = 1.0 / stds[..., i] ** 2
         total = total + weight
-        away = i - middle
-        middle = middle + weight / total * away
-        mean = mean + weight / total * (values[..., i] - mean)
-        spread = spread + weight * away * (i - middle)
-        product = product + weight * away * (values[..., i] - mean)
+        distance = i - mean_index
+        mean_index = mean_index + weight / total * distance
+        mean = mean + weight / total * (value - mean)
+        index_square = index_square + weight * distance * (i - mean_index)
+        product = product + weight * distance * (value - mean)
         if i + 1 >= FEWEST:
-            found[..., i] = product / np.sqrt(spread) / dispersion
-    return found
+            statistic[..., i] = product / np.sqrt(index_square) / dispersion
+    return statistic
 
 
 @dataclass(frozen=True, slots=True)
@@ -522,13 +638,20 @@ def fit_line(values: FloatArray, stds: FloatArray) -> GainTrend:
     """Fit a line by weighted least squares to values of shape (n,), n ≥ 2, oldest first, σ > 0."""
     weights = 1.0 / stds**2
     total = float(weights.sum())
-    places = np.arange(len(values))
-    middle = float(weights @ places) / total
+    indices = np.arange(len(values))
+    mean_index = float(weights @ indices) / total
     mean = float(weights @ values) / total
-    spread = float(weights @ (places - middle) ** 2)
-    slope = float(weights @ ((places - middle) * (values - mean))) / spread
-    start_std = math.sqrt(1.0 / total + middle**2 / spread)
-    return GainTrend(mean - slope * middle, start_std, slope, 1.0 / math.sqrt(spread))
+    distances = indices - mean_index
+    square_sum = float(weights @ distances**2)
+    product = float(weights @ (distances * (values - mean)))
+    slope = product / square_sum
+    start_variance = 1.0 / total + mean_index**2 / square_sum
+    return GainTrend(
+        start=mean - slope * mean_index,
+        start_std=math.sqrt(start_variance),
+        slope=slope,
+        slope_std=1.0 / math.sqrt(square_sum),
+    )
 
 
 def _bounded(stds: FloatArray, scale: float) -> FloatArray:
@@ -538,18 +661,24 @@ def _bounded(stds: FloatArray, scale: float) -> FloatArray:
     with np.errstate(over="ignore"):
         relative = np.clip(stds / scale, _FINEST, 1.0 / _FINEST)
     middle = float(np.median(relative))
-    return np.asarray(np.clip(relative, middle / _APART, middle * _APART))
+    smallest = middle / _LARGEST_FACTOR
+    largest = middle * _LARGEST_FACTOR
+    return np.asarray(np.clip(relative, smallest, largest))
 
 
 def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
     """Mean weighted by 1/σ², and its σ."""
     weights = 1.0 / stds**2
     total = float(weights.sum())
-    return float(weights @ values) / total, math.sqrt(1.0 / total)
+    mean = float(weights @ values) / total
+    return mean, math.sqrt(1.0 / total)
 
 
 def _present(alarms: tuple[Alarm, ...], count: int) -> Alarm | None:
     """Alarm of the newest of `count` calibrations."""
-    if alarms and alarms[-1].index == count - 1:
-        return alarms[-1]
+    if not alarms:
+        return None
+    last = alarms[-1]
+    if last.index == count - 1:
+        return last
     return None

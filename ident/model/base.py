@@ -14,6 +14,7 @@ from ident.arrays import FloatArray
 SMALLEST_COLUMN = 1e-9  #: Norm of a column, relative to the largest, that is rounding error
 #: Share of a column's norm that is left of it where it is clearly independent of others
 CLEAR = 1e-3
+SMALLEST_WEIGHT = 1e-6  #: Smaller weights count as zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,23 +44,24 @@ def independent_columns(
             of them could be chosen, and the condition number would become 1e16.
     """
     norms = np.linalg.norm(matrix, axis=0)
-    left = np.flatnonzero(norms > smallest * float(norms.max(initial=0.0))).tolist()
+    is_nonzero = norms > smallest * float(norms.max(initial=0.0))
+    candidates = np.flatnonzero(is_nonzero).tolist()
     independent: list[int] = []
     basis = np.zeros((matrix.shape[0], 0))
-    for least in (max(CLEAR, tolerance), tolerance):
+    for smallest_share in (max(CLEAR, tolerance), tolerance):
         deferred: list[int] = []
-        for column in left:
+        for column in candidates:
             unit = matrix[:, column] / norms[column]
             rest = unit - basis @ (basis.T @ unit)
             # Twice is enough (Kahan): the first projection cancels digits
             rest -= basis @ (basis.T @ rest)
-            size = float(np.linalg.norm(rest))
-            if size > least:
+            share = float(np.linalg.norm(rest))
+            if share > smallest_share:
                 independent.append(column)
-                basis = np.column_stack((basis, rest / size))
-            elif size > tolerance:
+                basis = np.column_stack((basis, rest / share))
+            elif share > tolerance:
                 deferred.append(column)
-        left = deferred
+        candidates = deferred
     return sorted(independent)
 
 
@@ -76,17 +78,21 @@ def base_parameters(
         tolerance: of `independent_columns`.
     """
     norms = np.linalg.norm(triangle, axis=0)
-    present = norms > SMALLEST_COLUMN * float(norms.max(initial=0.0))
+    is_present = norms > SMALLEST_COLUMN * float(norms.max(initial=0.0))
     independent = independent_columns(triangle, tolerance)
-    chosen = triangle[:, independent]
     scale = norms[independent]
-    weights = linalg.lstsq(chosen / scale, triangle)[0] / scale[:, None]
-    weights[:, ~present] = 0.0
+    scaled = triangle[:, independent] / scale
+    scaled_weights, *_ = linalg.lstsq(scaled, triangle)
+    weights = scaled_weights / scale[:, None]
+    weights[:, ~is_present] = 0.0
     weights[:, independent] = np.eye(len(independent))
-    weights[np.abs(weights) < 1e-6] = 0.0
-    grouped = [names[leading] for leading in independent]
+    weights[np.abs(weights) < SMALLEST_WEIGHT] = 0.0
+    base_names = [names[leading] for leading in independent]
     for number, other in np.argwhere(weights):
         if other != independent[number]:
             weight = round(float(weights[number, other]), 6)
-            grouped[number] += f" {'+' if weight > 0 else '-'} {abs(weight)}*{names[other]}"
-    return BaseParameters(tuple(independent), weights, tuple(grouped))
+            sign = "-"
+            if weight > 0:
+                sign = "+"
+            base_names[number] += f" {sign} {abs(weight)}*{names[other]}"
+    return BaseParameters(tuple(independent), weights, tuple(base_names))

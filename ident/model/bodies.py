@@ -62,10 +62,11 @@ class Payload:
             require_kind(f"known[{name!r}]", value, Real, "give numbers in SI units: {'m': 4.59}")
         foreign = sorted(set(self.known) - set(LINK_PARAMETERS))
         if foreign:
+            found = ", ".join(map(repr, foreign))
+            expected = ", ".join(LINK_PARAMETERS)
             raise ModelError(
-                f"payload {self.name!r} has the known parameters {', '.join(map(repr, foreign))}; "
-                f"expected names among {', '.join(LINK_PARAMETERS)}; write its mass as {{'m': "
-                "4.59}"
+                f"payload {self.name!r} has the known parameters {found}; expected names among "
+                f"{expected}; write its mass as {{'m': 4.59}}"
             )
         require_kind(
             "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
@@ -93,7 +94,8 @@ class Payload:
     @property
     def known_parameters(self) -> FloatArray:
         """χ_kL in the order of LINK_PARAMETERS, zero where unknown, shape (10,)."""
-        return np.array([self.known.get(name, 0.0) for name in LINK_PARAMETERS])
+        values = [self.known.get(name, 0.0) for name in LINK_PARAMETERS]
+        return np.array(values)
 
 
 def _require_possible_inertia(payload: Payload) -> None:
@@ -104,30 +106,27 @@ def _require_possible_inertia(payload: Payload) -> None:
         ModelError: the second moments Σ, or the pseudo-inertia where the centre is known too, have
             a negative value.
     """
+    known = payload.known
     moments = set(LINK_PARAMETERS[:6])
-    if not moments <= set(payload.known):
-        negative = [name for name in ("Ixx", "Iyy", "Izz") if payload.known.get(name, 0.0) < 0.0]
-        if negative:
-            found = ", ".join(f"{name} = {payload.known[name]:g} kg m²" for name in negative)
-            raise ModelError(
-                f"payload {payload.name!r} has {found}; expected moments of inertia of zero or more"
-            )
+    if not moments <= set(known):
+        _require_no_negative_moment(payload)
         return
     pseudo = pseudo_inertia(payload.known_parameters)
-    if set(payload.known) != set(LINK_PARAMETERS):
+    if set(known) != set(LINK_PARAMETERS):
         pseudo = pseudo[:3, :3]
     size = max(float(np.trace(pseudo[:3, :3])), 0.0)
-    scale = np.ones(len(pseudo))
     # The rows of the second moments and of the mass have other units: compare them at a common
     # size.
-    scale[:3] = np.sqrt(size) or 1.0
-    scale[3:] = np.sqrt(payload.known.get("m", 1.0))
-    least = float(np.linalg.eigvalsh(pseudo / np.outer(scale, scale))[0])
-    if least >= -ROUNDING:
+    scale = np.ones(len(pseudo))
+    if size > 0.0:
+        scale[:3] = np.sqrt(size)
+    scale[3:] = np.sqrt(known.get("m", 1.0))
+    scaled = pseudo / np.outer(scale, scale)
+    smallest = float(np.linalg.eigvalsh(scaled)[0])
+    if smallest >= -ROUNDING:
         return
-    inertia = ", ".join(
-        f"{name} = {payload.known[name]:g}" for name in LINK_PARAMETERS if name in payload.known
-    )
+    values = [f"{name} = {known[name]:g}" for name in LINK_PARAMETERS if name in known]
+    inertia = ", ".join(values)
     raise ModelError(
         f"payload {payload.name!r} has an inertia that no body has: {inertia} [kg m², kg m, kg]; "
         "expected one whose principal moments are positive, none above the sum of the others, "
@@ -136,14 +135,34 @@ def _require_possible_inertia(payload: Payload) -> None:
     )
 
 
+def _require_no_negative_moment(payload: Payload) -> None:
+    """Refuse a negative moment of inertia among what is known.
+
+    Raises:
+        ModelError: one is.
+    """
+    found: list[str] = []
+    for name in ("Ixx", "Iyy", "Izz"):
+        value = payload.known.get(name, 0.0)
+        if value < 0.0:
+            found.append(f"{name} = {value:g} kg m²")
+    if found:
+        negative = ", ".join(found)
+        raise ModelError(
+            f"payload {payload.name!r} has {negative}; expected moments of inertia of zero or more"
+        )
+
+
 def pseudo_inertia(link: FloatArray) -> FloatArray:
     """P of a link's parameters in the order of LINK_PARAMETERS, shape (10,) → (4, 4) [kg m², kg m,
     kg].
     """
     inertia = _symmetric(link[:6])
+    first_moment = link[6:9]
     out = np.empty((4, 4))
     out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    out[:3, 3] = out[3, :3] = link[6:9]
+    out[:3, 3] = first_moment
+    out[3, :3] = first_moment
     out[3, 3] = link[9]
     return out
 
@@ -152,9 +171,10 @@ def link_parameters(pseudo: FloatArray) -> FloatArray:
     """The inverse of `pseudo_inertia`, shape (4, 4) → (10,);
     a matrix that is not symmetric counts as its mean.
     """
-    even = 0.5 * (pseudo + pseudo.T)
-    inertia = np.trace(even[:3, :3]) * np.eye(3) - even[:3, :3]
-    return np.concatenate((inertia[_ROWS, _COLUMNS], even[:3, 3], even[3:, 3]))
+    symmetric = 0.5 * (pseudo + pseudo.T)
+    second_moments = symmetric[:3, :3]
+    inertia = np.trace(second_moments) * np.eye(3) - second_moments
+    return np.concatenate((inertia[_ROWS, _COLUMNS], symmetric[:3, 3], symmetric[3:, 3]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,9 +191,10 @@ class Body:
         """About the link frame's origin (Huygens-Steiner), in the order of LINK_PARAMETERS,
         shape (10,).
         """
-        c = self.centre_m
-        inertia = self.inertia_kg_m2 + self.mass_kg * (c @ c * np.eye(3) - np.outer(c, c))
-        return np.concatenate((inertia[_ROWS, _COLUMNS], self.mass_kg * c, (self.mass_kg,)))
+        mass = self.mass_kg
+        inertia = self.inertia_kg_m2 + mass * _steiner(self.centre_m)
+        first_moment = mass * self.centre_m
+        return np.concatenate((inertia[_ROWS, _COLUMNS], first_moment, (mass,)))
 
 
 def body_of(link: FloatArray) -> Body:
@@ -183,11 +204,19 @@ def body_of(link: FloatArray) -> Body:
         link: in the order of LINK_PARAMETERS, with a positive mass, shape (10,).
     """
     mass = float(link[9])
-    c = link[6:9] / mass
-    return Body(mass, c, _symmetric(link[:6]) - mass * (c @ c * np.eye(3) - np.outer(c, c)))
+    centre_m = link[6:9] / mass
+    inertia = _symmetric(link[:6]) - mass * _steiner(centre_m)
+    return Body(mass, centre_m, inertia)
+
+
+def _steiner(centre_m: FloatArray) -> FloatArray:
+    """c · c 1 − c cᵀ, shape (3, 3): inertia of a unit mass at a point."""
+    return np.asarray(centre_m @ centre_m * np.eye(3) - np.outer(centre_m, centre_m))
 
 
 def _symmetric(upper: FloatArray) -> FloatArray:
+    """Symmetric matrix of its upper triangle, row by row, shape (6,) → (3, 3)."""
     out = np.zeros((3, 3))
     out[_ROWS, _COLUMNS] = upper
-    return out + np.triu(out, 1).T
+    lower = np.triu(out, 1).T
+    return out + lower

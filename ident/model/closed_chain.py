@@ -18,6 +18,7 @@ like with like.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.errors import ModelError
 from ident.model.closures import loops, origin, with_followers
-from ident.model.robot import JointKind, Motion, Robot, poses
+from ident.model.robot import Closure, JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
 """Largest condition (Frobenius) of J_d, the derivatives to the joints that follow,
@@ -50,6 +51,7 @@ STRIDE_RAD = 0.25
 STEP_RAD = 0.15  #: Longest step on that way [rad, or m divided by the robot's size]
 LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
 MAX_ITERATIONS = 30
+SMALLEST_SIZE_M = 1e-3  #: Of a robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,13 +94,13 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
             the motors do not move every degree of freedom, or the pose is singular.
     """
     count = robot.joint_count
-    everything = tuple(range(count))
-    if robot.assembly_rad is None:
-        start = np.zeros(count)
-    else:
+    joints = tuple(range(count))
+    start = np.zeros(count)
+    if robot.assembly_rad is not None:
         start = np.asarray(robot.assembly_rad, dtype=np.float64)
     if not robot.is_constrained:
-        return Assembly(start, everything, (), _size(robot, start), 1.0)
+        size_m = _size(robot, start)
+        return Assembly(start, joints, (), size_m, condition=1.0)
     _check(robot, start)
     start = with_followers(robot, start)
     size_m = _size(robot, start)
@@ -112,36 +114,48 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
             f"{mobility} as declared: is a closure missing, or does one hold a direction that must "
             "be free (`directions`)?"
         )
-    motors = list(robot.axis_joints)
-    driven = free[motors]
-    names = ", ".join(robot.joints[joint].name for joint in motors)
-    if len(motors) < found or np.linalg.matrix_rank(driven, tol=1e-6) < found:
-        if len(motors) >= found and _generic_rank(robot, position, free, size_m) == found:
-            raise ModelError(
-                f"the robot is singular at the assembly pose: there the motors {names} do not move "
-                f"all of its {found} degrees of freedom, beside it they do; give an assembly pose "
-                "inside the workspace"
-            )
-        raise ModelError(
-            f"the motors {names} do not move all {found} degrees of freedom that the closures "
-            "leave; name a joint that each motor drives, one for each degree of freedom at least "
-            "(`motors`)"
-        )
-    if len(motors) == found:
-        independent = tuple(motors)
-    else:
+    motors = robot.axis_joints
+    _require_driven(robot, position, free, size_m)
+    independent = motors
+    if len(motors) != found:
         independent = _independent(free)
-    dependent = tuple(joint for joint in everything if joint not in independent)
+    dependent = tuple(joint for joint in joints if joint not in independent)
+    condition = 1.0
     if dependent:
-        condition = float(_condition(np.linalg.qr(jacobian[None, :, dependent]).R)[0])
-    else:
-        condition = 1.0
+        _, triangle = np.linalg.qr(jacobian[None, :, dependent])
+        condition = float(_condition(triangle)[0])
     if condition > LARGEST_CONDITION:
         raise ModelError(
             f"the assembly pose is close to a singularity: condition {condition:.3g} of the "
             f"closures; expected below {LARGEST_CONDITION:g}: give a pose inside the workspace"
         )
     return Assembly(position, independent, dependent, size_m, condition)
+
+
+def _require_driven(robot: Robot, position: FloatArray, free: FloatArray, size_m: float) -> None:
+    """Refuse motors that do not move every free motion of the joints, shape (n, d),
+    at the assembly pose.
+
+    Raises:
+        ModelError: they do not.
+    """
+    motors = list(robot.axis_joints)
+    mobility = free.shape[1]
+    has_enough = len(motors) >= mobility
+    if has_enough and np.linalg.matrix_rank(free[motors], tol=1e-6) == mobility:
+        return
+    names = ", ".join(robot.joints[joint].name for joint in motors)
+    if has_enough and _generic_rank(robot, position, free, size_m) == mobility:
+        raise ModelError(
+            f"the robot is singular at the assembly pose: there the motors {names} do not move all "
+            f"of its {mobility} degrees of freedom, beside it they do; give an assembly pose "
+            "inside the workspace"
+        )
+    raise ModelError(
+        f"the motors {names} do not move all {mobility} degrees of freedom that the closures "
+        "leave; name a joint that each motor drives, one for each degree of freedom at least "
+        "(`motors`)"
+    )
 
 
 def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
@@ -165,43 +179,53 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     """
     motors = list(robot.axis_joints)
     x = list(assembly.independent)
-    rest = list(assembly.dependent)
-    measured = np.asarray(axes.position_rad, dtype=np.float64)
-    samples = len(measured)
+    dependent = list(assembly.dependent)
+    axes_rad = np.asarray(axes.position_rad, dtype=np.float64)
+    samples = len(axes_rad)
     count = robot.joint_count
-    d = len(x)
     if not robot.is_constrained:
-        one = np.broadcast_to(np.eye(count), (samples, count, count))
-        return TreeMotion(axes, one, one, np.ones(samples))
-    position = positions(robot, assembly, measured)
-    closing = loops(robot, position, assembly.size_m)
-    q, r = np.linalg.qr(closing.jacobian[:, :, rest])
-    to_joints = np.zeros((samples, count, d))
-    to_joints[:, x] = np.eye(d)
-    to_joints[:, rest] = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ closing.jacobian[:, :, x])
+        identity = np.broadcast_to(np.eye(count), (samples, count, count))
+        return TreeMotion(axes, identity, identity, np.ones(samples))
+    position = positions(robot, assembly, axes_rad)
+    jacobian = loops(robot, position, assembly.size_m).jacobian
+    # J_d = Q R, so that G_d = −R⁻¹ Qᵀ J_x
+    q, r = np.linalg.qr(jacobian[:, :, dependent])
+    right = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
+    to_joints = np.zeros((samples, count, len(x)))
+    to_joints[:, x] = np.eye(len(x))
+    to_joints[:, dependent] = -np.linalg.solve(r, right)
     to_motors = to_joints[:, motors]
     speed_x = _least_squares(to_motors, np.asarray(axes.velocity_rad_s))
-    velocity = np.einsum("knd,kd->kn", to_joints, speed_x)
-    bias = np.zeros((samples, count))
+    velocity = np.einsum("knd,kd->kn", to_joints, speed_x)  # G ẋ
+    # h_d = −R⁻¹ Qᵀ J̇ q̇
     turning = loops(robot, position, assembly.size_m, velocity).bias
-    bias[:, rest] = -np.linalg.solve(r, np.einsum("kcr,kc->kr", q, turning)[..., None])[..., 0]
-    acceleration_x = _least_squares(
-        to_motors, np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
-    )
-    acceleration = np.einsum("knd,kd->kn", to_joints, acceleration_x) + bias
+    turning_right = np.einsum("kcr,kc->kr", q, turning)
+    bias = np.zeros((samples, count))
+    bias[:, dependent] = -np.linalg.solve(r, turning_right[..., None])[..., 0]
+    axes_acceleration = np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
+    acceleration_x = _least_squares(to_motors, axes_acceleration)
+    acceleration = np.einsum("knd,kd->kn", to_joints, acceleration_x) + bias  # G ẍ + h
     condition = _condition(r)
-    for of, values in (
-        ("closures", condition),
-        ("motors", _condition_of_motors(robot, assembly, to_motors)),
-    ):
-        worst = int(np.argmax(values))
-        if values[worst] > LARGEST_CONDITION:
-            raise ModelError(
-                f"the motion comes close to a singularity at {_at(robot, measured[worst])}: "
-                f"condition {values[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: "
-                "record moves away from it"
-            )
-    return TreeMotion(Motion(position, velocity, acceleration), to_joints, to_motors, condition)
+    condition_of_motors = _condition_of_motors(robot, assembly, to_motors)
+    _require_regular(robot, axes_rad, condition, "closures")
+    _require_regular(robot, axes_rad, condition_of_motors, "motors")
+    joints = Motion(position, velocity, acceleration)
+    return TreeMotion(joints, to_joints, to_motors, condition)
+
+
+def _require_regular(robot: Robot, axes_rad: FloatArray, condition: FloatArray, of: str) -> None:
+    """Refuse positions at which a condition, shape (k,), is too large.
+
+    Raises:
+        ModelError: one is above LARGEST_CONDITION.
+    """
+    worst = int(np.argmax(condition))
+    if condition[worst] > LARGEST_CONDITION:
+        raise ModelError(
+            f"the motion comes close to a singularity at {_at(robot, axes_rad[worst])}: condition "
+            f"{condition[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record "
+            "moves away from it"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,15 +256,18 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     """
     found = reach(robot, assembly, axes_rad)
     units = _units(robot, assembly)
-    # Zero where m = d
-    apart = np.abs(found.position_rad[:, list(robot.axis_joints)] - axes_rad) / units
-    worst, axis = divmod(int(np.argmax(apart)), apart.shape[1])
-    if apart[worst, axis] > LARGEST_MISFIT:
+    motors = list(robot.axis_joints)
+    difference = np.abs(found.position_rad[:, motors] - axes_rad)
+    misfit = difference / units  # zero where m = d
+    worst, axis = divmod(int(np.argmax(misfit)), misfit.shape[1])
+    if misfit[worst, axis] > LARGEST_MISFIT:
+        name = robot.axes[axis].name
+        found_misfit = misfit[worst, axis] * units[axis]
+        largest_misfit = LARGEST_MISFIT * units[axis]
         raise ModelError(
-            f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: "
-            f"{robot.axes[axis].name} is {apart[worst, axis] * units[axis]:.2g} away from where "
-            f"the others hold it; expected at most {LARGEST_MISFIT * units[axis]:.2g} (rad or m): "
-            "are signs, zeros and ratios of the axes right?"
+            f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: {name} is "
+            f"{found_misfit:.2g} away from where the others hold it; expected at most "
+            f"{largest_misfit:.2g} (rad or m): are signs, zeros and ratios of the axes right?"
         )
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
@@ -254,15 +281,26 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
 
 def _units(robot: Robot, assembly: Assembly) -> FloatArray:
     """A radian, or the robot's size, of each motor's joint, shape (m,)."""
-    return np.array(
-        [1.0 if joint.kind is JointKind.REVOLUTE else assembly.size_m for joint in robot.axes]
-    )
+    return _unit_of_each(robot, robot.axis_joints, assembly.size_m)
+
+
+def _unit_of_each(robot: Robot, joints: Sequence[int], size_m: float) -> FloatArray:
+    """A radian of each revolute joint, the robot's size of each prismatic one."""
+    units: list[float] = []
+    for joint in joints:
+        if robot.joints[joint].kind is JointKind.REVOLUTE:
+            units.append(1.0)
+        else:
+            units.append(size_m)
+    return np.array(units)
 
 
 def _condition(triangle: FloatArray) -> FloatArray:
     """Condition by the Frobenius norm of a triangle in each sample, shape (k,)."""
     inverse = _solve_each(triangle, np.eye(triangle.shape[-1]))
-    return np.asarray(np.linalg.norm(triangle, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2)))
+    norm = np.linalg.norm(triangle, axis=(1, 2))
+    inverse_norm = np.linalg.norm(inverse, axis=(1, 2))
+    return np.asarray(norm * inverse_norm)
 
 
 def _condition_of_motors(robot: Robot, assembly: Assembly, to_motors: FloatArray) -> FloatArray:
@@ -271,15 +309,18 @@ def _condition_of_motors(robot: Robot, assembly: Assembly, to_motors: FloatArray
     """
     if robot.axis_count == assembly.mobility:
         return np.ones(len(to_motors))
-    kinds = [robot.joints[joint].kind for joint in assembly.independent]
-    size = np.array([1.0 if kind is JointKind.REVOLUTE else assembly.size_m for kind in kinds])
-    _, triangle = np.linalg.qr(to_motors * size / _units(robot, assembly)[:, None])
+    units_of_x = _unit_of_each(robot, assembly.independent, assembly.size_m)
+    units_of_motors = _units(robot, assembly)
+    scaled = to_motors * units_of_x / units_of_motors[:, None]
+    _, triangle = np.linalg.qr(scaled)
     return _condition(triangle)
 
 
 def _at(robot: Robot, axes_rad: FloatArray) -> str:
-    named = zip(robot.axes, axes_rad, strict=True)
-    return ", ".join(f"{joint.name} {value:.4g}" for joint, value in named) + " (rad or m)"
+    """Positions of the axes, for a message."""
+    pairs = zip(robot.axes, axes_rad, strict=True)
+    named = [f"{joint.name} {value:.4g}" for joint, value in pairs]
+    return ", ".join(named) + " (rad or m)"
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
@@ -287,32 +328,55 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     as far as they close.
     """
     samples = len(axes_rad)
-    motors = list(robot.axis_joints)
     if not robot.is_constrained:
-        return Reach(axes_rad, np.zeros(samples), np.zeros(samples), np.ones(samples))
+        return Reach(
+            position_rad=axes_rad,
+            gap=np.zeros(samples),
+            misfit=np.zeros(samples),
+            condition=np.ones(samples),
+        )
+    motors = list(robot.axis_joints)
     start = assembly.position_rad[motors]
     units = _units(robot, assembly)
-    largest = float(np.max(np.abs(np.diff(axes_rad, axis=0)) / units, initial=0.0))
-    stride = min(LONGEST_STRIDE, max(1, int(STRIDE_RAD / max(largest, 1e-9))))
-    coarse = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
-    steps = int(np.ceil(np.max(np.abs(axes_rad[coarse] - start) / units, initial=0.0) / STEP_RAD))
+    steps_of_samples = np.abs(np.diff(axes_rad, axis=0)) / units
+    largest_step = float(np.max(steps_of_samples, initial=0.0))
+    longest = int(STRIDE_RAD / max(largest_step, 1e-9))
+    stride = min(LONGEST_STRIDE, max(1, longest))
+    coarse = _every(stride, samples)
+    goal = axes_rad[coarse]
+    distances = np.abs(goal - start) / units
+    farthest = np.max(distances, initial=0.0)
+    steps = int(np.ceil(farthest / STEP_RAD))
     found = np.tile(assembly.position_rad, (len(coarse), 1))
     gap = np.zeros(len(coarse))
     condition = np.full(len(coarse), assembly.condition)
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
-        way = start + (axes_rad[coarse] - start) * (step / steps)
+        way = start + (goal - start) * (step / steps)
         found, gap, condition = _newton(robot, assembly, found, way, on_the_way=step < steps)
     while len(coarse) < samples:
         stride = max(1, stride // 8)
-        finer = np.unique(np.append(np.arange(0, samples, stride), samples - 1))
+        finer = _every(stride, samples)
         if len(coarse) > 1:
             near = _between(coarse, found, finer)
         else:
             near = np.repeat(found, len(finer), axis=0)
         coarse = finer
         found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
-    return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
+    return Reach(found, gap, _largest_misfit(found[:, motors], axes_rad), condition)
+
+
+def _every(stride: int, samples: int) -> IntArray:
+    """Indices of every so many of the samples, and of the last one."""
+    indices = np.arange(0, samples, stride)
+    return np.unique(np.append(indices, samples - 1))
+
+
+def _largest_misfit(found_rad: FloatArray, axes_rad: FloatArray) -> FloatArray:
+    """Largest difference of a motor's joint from its measured position in each sample,
+    shape (k,).
+    """
+    return np.asarray(np.max(np.abs(found_rad - axes_rad), axis=1))
 
 
 def reach_near(
@@ -329,7 +393,7 @@ def reach_near(
     """
     motors = list(robot.axis_joints)
     found, gap, condition = _newton(robot, assembly, near_rad, axes_rad)
-    return Reach(found, gap, np.max(np.abs(found[:, motors] - axes_rad), axis=1), condition)
+    return Reach(found, gap, _largest_misfit(found[:, motors], axes_rad), condition)
 
 
 def _newton(
@@ -345,39 +409,43 @@ def _newton(
 
     ``on_the_way`` to other positions it is enough to stay near the pose.
     """
+    largest_gap = CLOSED
+    longest_step_rad = 1e-9
     if on_the_way:
-        closed = NEARLY_CLOSED
-        settled_rad = 1e-3
-    else:
-        closed = CLOSED
-        settled_rad = 1e-9
+        largest_gap = NEARLY_CLOSED
+        longest_step_rad = 1e-3
     motors = list(robot.axis_joints)
     x = list(assembly.independent)
-    rest = list(assembly.dependent)
+    dependent = list(assembly.dependent)
     position = position.copy()
-    redundant = len(motors) > len(x)
-    if not redundant:
+    samples, count = position.shape
+    is_redundant = len(motors) > len(x)
+    if not is_redundant:
         position[:, motors] = axes_rad
     position = with_followers(robot, position)
     for _ in range(MAX_ITERATIONS):
         closing = loops(robot, position, assembly.size_m)
         gap = np.max(np.abs(closing.residual), axis=1)
-        q, r = np.linalg.qr(closing.jacobian[:, :, rest])
-        wanted = np.concatenate((closing.residual[:, :, None], closing.jacobian[:, :, x]), axis=2)
-        answer = -_solve_each(r, np.swapaxes(q, 1, 2) @ wanted)
+        # −J_d⁻¹ [φ | J_x]: the step that closes the loops, and G_d
+        q, r = np.linalg.qr(closing.jacobian[:, :, dependent])
+        right = np.concatenate((closing.residual[:, :, None], closing.jacobian[:, :, x]), axis=2)
+        solution = -_solve_each(r, np.swapaxes(q, 1, 2) @ right)
         change = np.zeros_like(position)
-        change[:, rest] = answer[:, :, 0]
-        if redundant:
-            to_joints = np.zeros((len(position), position.shape[1], len(x)))
-            to_joints[:, x], to_joints[:, rest] = np.eye(len(x)), answer[:, :, 1:]
-            left = axes_rad - position[:, motors] - change[:, motors]
-            change += np.einsum("knd,kd->kn", to_joints, _least_squares(to_joints[:, motors], left))
+        change[:, dependent] = solution[:, :, 0]
+        if is_redundant:
+            to_joints = np.zeros((samples, count, len(x)))
+            to_joints[:, x] = np.eye(len(x))
+            to_joints[:, dependent] = solution[:, :, 1:]
+            misfit = axes_rad - position[:, motors] - change[:, motors]
+            change_x = _least_squares(to_joints[:, motors], misfit)
+            change += np.einsum("knd,kd->kn", to_joints, change_x)  # G Δx
         step = np.max(np.abs(change), axis=1)
         # Where there is no pose, Newton's steps become longer and longer
-        lost = ~(step < LONGEST_STEP_RAD)
-        change[lost] = 0.0
+        is_lost = ~(step < LONGEST_STEP_RAD)
+        change[is_lost] = 0.0
         position += change
-        if np.all(lost | ((gap < closed) & (step < settled_rad))):
+        is_closed = (gap < largest_gap) & (step < longest_step_rad)
+        if np.all(is_lost | is_closed):
             break
     return position, gap, _condition(r)
 
@@ -387,60 +455,93 @@ def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray
     cubic polynomials with the slopes of differences.
     """
     slope = np.gradient(found, coarse, axis=0)
-    before = np.clip(np.searchsorted(coarse, finer, side="right") - 1, 0, len(coarse) - 2)
-    length = (coarse[before + 1] - coarse[before])[:, None]
+    before = np.searchsorted(coarse, finer, side="right") - 1
+    before = np.clip(before, 0, len(coarse) - 2)
+    after = before + 1
+    length = (coarse[after] - coarse[before])[:, None]
     s = (finer - coarse[before])[:, None] / length
     first = found[before]
-    second = found[before + 1]
-    bend = first - second
-    a = slope[before] * length + bend
-    b = -slope[before + 1] * length - bend
-    return np.asarray((1 - s) * first + s * second + s * (1 - s) * ((1 - s) * a + s * b))
+    second = found[after]
+    difference = first - second
+    a = slope[before] * length + difference
+    b = -slope[after] * length - difference
+    straight = (1 - s) * first + s * second
+    return np.asarray(straight + s * (1 - s) * ((1 - s) * a + s * b))
 
 
 def _solve_each(triangle: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of R x = b in each sample; huge where R is singular."""
     diagonal = np.einsum("kii->ki", triangle)
-    tiny = np.finfo(np.float64).tiny
-    if not np.all(np.abs(diagonal) > tiny):
+    is_zero = np.abs(diagonal) <= np.finfo(np.float64).tiny
+    if is_zero.any():
         triangle = triangle.copy()
-        np.einsum("kii->ki", triangle)[np.abs(diagonal) <= tiny] = 1e-300
-    return np.asarray(
-        np.linalg.solve(triangle, np.broadcast_to(right, (len(triangle), *right.shape[-2:])))
-    )
+        np.einsum("kii->ki", triangle)[is_zero] = 1e-300
+    shape = (len(triangle), *right.shape[-2:])
+    solution = np.linalg.solve(triangle, np.broadcast_to(right, shape))
+    return np.asarray(solution)
 
 
 def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
-    """Close the loops near a declared pose: with the motors where they are if that is possible."""
-    motors = list(robot.axis_joints)
-    rest = [joint for joint in range(robot.joint_count) if joint not in motors]
-    declared = float(np.max(np.abs(loops(robot, start[None], size_m).residual)))
-    for moved in (rest, list(range(robot.joint_count))) if declared < LARGEST_GAP else ():
-        position = start.copy()
-        for _ in range(MAX_ITERATIONS):
-            closing = loops(robot, position[None], size_m)
-            gap = float(np.max(np.abs(closing.residual)))
-            if gap < CLOSED or not np.isfinite(gap):
-                break
-            position[moved] -= np.linalg.lstsq(
-                closing.jacobian[0][:, moved], closing.residual[0], rcond=1e-8
-            )[0]
-        if gap < CLOSED and float(np.max(np.abs(position - start))) < np.pi:
-            return position
-    closing = loops(robot, start[None], size_m)
-    ends = np.cumsum([len(closure.directions) for closure in robot.closures])
-    parts = np.split(np.abs(closing.residual[0]), ends[:-1])
-    worst = max(zip(robot.closures, parts, strict=True), key=lambda pair: float(pair[1].max()))
-    name = worst[0].name
-    values = ", ".join(map(_gap, worst[0].directions, worst[1] * size_m, worst[1]))
+    """Close the loops near a declared pose: with the motors where they are if that is possible.
+
+    Raises:
+        ModelError: they cannot be closed near it.
+    """
+    joints = list(range(robot.joint_count))
+    passive = list(robot.passive_joints)
+    residual = loops(robot, start[None], size_m).residual[0]
+    if float(np.max(np.abs(residual))) < LARGEST_GAP:
+        for moved in (passive, joints):
+            position = _closed_by(robot, start, size_m, moved)
+            if position is not None:
+                return position
+    closure, gaps = _worst_closure(robot, np.abs(residual))
+    values = ", ".join(map(_gap, closure.directions, gaps * size_m, gaps))
     raise ModelError(
-        f"closure {name!r} cannot close at the assembly pose: {values} apart where it is declared; "
-        "expected a pose of all joints at which the frames of every closure nearly coincide "
-        "(assembly_deg, assembly_mm)"
+        f"closure {closure.name!r} cannot close at the assembly pose: {values} apart where it is "
+        "declared; expected a pose of all joints at which the frames of every closure nearly "
+        "coincide (assembly_deg, assembly_mm)"
     )
 
 
+def _closed_by(
+    robot: Robot, start: FloatArray, size_m: float, moved: list[int]
+) -> FloatArray | None:
+    """Close the loops by moving some joints less than half a turn;
+    None where Newton's iteration does not.
+    """
+    position = start.copy()
+    for _ in range(MAX_ITERATIONS):
+        closing = loops(robot, position[None], size_m)
+        residual = closing.residual[0]
+        gap = float(np.max(np.abs(residual)))
+        if gap < CLOSED or not np.isfinite(gap):
+            break
+        jacobian = closing.jacobian[0][:, moved]
+        position[moved] -= _shortest_step(jacobian, residual)
+    farthest = float(np.max(np.abs(position - start)))
+    if gap < CLOSED and farthest < np.pi:
+        return position
+    return None
+
+
+def _shortest_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    """The shortest x with J x = φ, or nearly so, shape (n,)."""
+    step, *_ = np.linalg.lstsq(jacobian, residual, rcond=1e-8)
+    return np.asarray(step)
+
+
+def _worst_closure(robot: Robot, gaps: FloatArray) -> tuple[Closure, FloatArray]:
+    """The closure with the largest gap, and its gaps in its directions."""
+    ends = np.cumsum([len(closure.directions) for closure in robot.closures])
+    parts = np.split(gaps, ends[:-1])
+    largest = [float(part.max()) for part in parts]
+    worst = int(np.argmax(largest))
+    return robot.closures[worst], parts[worst]
+
+
 def _gap(direction: str, length_m: float, angle_rad: float) -> str:
+    """A gap in one direction, for a message."""
     if "r" in direction:
         return f"{direction} {np.degrees(angle_rad):.3g}°"
     return f"{direction} {1e3 * length_m:.3g} mm"
@@ -450,38 +551,48 @@ def _independent(free: FloatArray) -> tuple[int, ...]:
     """Joints that move most independently of each other, by pivoted QR of the free motions,
     shape (n, d).
     """
-    left = free.copy()
-    chosen = list[int]()
+    remaining = free.copy()
+    chosen: list[int] = []
     for _ in range(free.shape[1]):
-        joint = int(np.argmax(np.linalg.norm(left, axis=1)))
-        way = left[joint] / np.linalg.norm(left[joint])
-        left -= np.outer(left @ way, way)
+        norms = np.linalg.norm(remaining, axis=1)
+        joint = int(np.argmax(norms))
+        direction = remaining[joint] / np.linalg.norm(remaining[joint])
+        remaining -= np.outer(remaining @ direction, direction)
         chosen.append(joint)
     return tuple(sorted(chosen))
 
 
 def null_space(jacobian: FloatArray) -> FloatArray:
     """Motions of the joints that the closures leave free, shape (n, d)."""
-    _, values, ways = np.linalg.svd(jacobian)
-    rank = int(np.sum(values > SMALLEST_RANK * values.max(initial=0.0)))
-    return np.asarray(ways[rank:].T)
+    _, values, directions = np.linalg.svd(jacobian)
+    smallest = SMALLEST_RANK * values.max(initial=0.0)
+    rank = int(np.sum(values > smallest))
+    return np.asarray(directions[rank:].T)
 
 
 def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: float) -> int:
-    """Degrees of freedom that the motors move a little beside the assembly pose."""
+    """Degrees of freedom that the motors move a little away from the assembly pose."""
+    motors = list(robot.axis_joints)
     draw = np.random.default_rng(0)
     best = 0
     for _ in range(4):
-        beside = position + 0.02 * free @ draw.standard_normal(free.shape[1])
+        near = position + 0.02 * free @ draw.standard_normal(free.shape[1])
         for _ in range(MAX_ITERATIONS):
-            closing = loops(robot, beside[None], size_m)
-            beside -= np.linalg.lstsq(closing.jacobian[0], closing.residual[0], rcond=1e-8)[0]
-        moved = null_space(loops(robot, beside[None], size_m).jacobian[0])
-        best = max(best, int(np.linalg.matrix_rank(moved[list(robot.axis_joints)], tol=1e-6)))
+            closing = loops(robot, near[None], size_m)
+            near -= _shortest_step(closing.jacobian[0], closing.residual[0])
+        jacobian = loops(robot, near[None], size_m).jacobian[0]
+        driven = null_space(jacobian)[motors]
+        rank = int(np.linalg.matrix_rank(driven, tol=1e-6))
+        best = max(best, rank)
     return best
 
 
 def _check(robot: Robot, start: FloatArray) -> None:
+    """Refuse a closed chain that is described with contradictions.
+
+    Raises:
+        ModelError: of the assembly pose, the motors or a closure.
+    """
     if start.shape != (robot.joint_count,):
         raise ModelError(
             f"the assembly pose has shape {start.shape}; expected a position of each joint"
@@ -491,12 +602,9 @@ def _check(robot: Robot, start: FloatArray) -> None:
             "a robot with closures or couplings needs the list of its motors' joints (`motors`); "
             "found none"
         )
-    if len(set(robot.motors)) < len(robot.motors):
-        twice = (
-            robot.joints[joint].name
-            for joint in sorted(set(robot.motors))
-            if robot.motors.count(joint) > 1
-        )
+    driven = sorted(set(robot.motors))
+    if len(driven) < len(robot.motors):
+        twice = [robot.joints[joint].name for joint in driven if robot.motors.count(joint) > 1]
         raise ModelError(
             f"two motors drive {', '.join(twice)}; expected a joint of its own for each (`motors`)"
         )
@@ -526,13 +634,17 @@ def _check(robot: Robot, start: FloatArray) -> None:
 def _size(robot: Robot, position: FloatArray) -> float:
     """Largest distance of a joint, or of a frame that closes a loop, from the base."""
     placed = poses(robot, position[None])
-    points = [*placed.origin_m[1:, 0]]
+    points = list(placed.origin_m[1:, 0])
     for closure in robot.closures:
-        points += [origin(placed, place)[0] for place in (closure.first, closure.second)]
-    return float(max(np.linalg.norm(points, axis=1).max(), 1e-3))
+        points.append(origin(placed, closure.first)[0])
+        points.append(origin(placed, closure.second)[0])
+    distances_m = np.linalg.norm(points, axis=1)
+    return float(max(distances_m.max(), SMALLEST_SIZE_M))
 
 
 def _least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of A x = b, shapes (k, m, d) and (k, m); for square A exact."""
     q, r = np.linalg.qr(matrix)
-    return np.asarray(np.linalg.solve(r, np.einsum("kmd,km->kd", q, right)[..., None])[..., 0])
+    projected = np.einsum("kmd,km->kd", q, right)  # Qᵀ b
+    solution = np.linalg.solve(r, projected[..., None])
+    return np.asarray(solution[..., 0])

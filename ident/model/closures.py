@@ -39,41 +39,43 @@ def loops(
             q̇ is empty.
         size_m: that divides lengths.
     """
-    placed = poses(robot, position)
     samples = len(position)
-    axes = (
-        placed.rotation[1:] @ np.array([joint.axis for joint in robot.joints])[:, None, :, None]
-    )[..., 0]
-    if velocity is None:
-        moved = None
-    else:
-        moved = _spin(robot, placed, axes, position, velocity)
+    placed = poses(robot, position)
+    axes_of_joints = np.array([joint.axis for joint in robot.joints])
+    axes = (placed.rotation[1:] @ axes_of_joints[:, None, :, None])[..., 0]
     width = sum(len(closure.directions) for closure in robot.closures) + len(robot.couplings)
     residual = np.empty((samples, width))
     jacobian = np.empty((samples, width, robot.joint_count))
-    bias = np.empty((samples, width if moved is not None else 0))
+    if velocity is None:
+        moved = None
+        bias = np.empty((samples, 0))
+    else:
+        moved = _spin(robot, placed, axes, position, velocity)
+        bias = np.empty((samples, width))
     first = 0
     for closure in robot.closures:
-        part = slice(first, first + len(closure.directions))
-        residual[:, part], jacobian[:, part], turning = _closure(
-            robot, closure, placed, axes, moved
-        )
+        end = first + len(closure.directions)
+        own = _closure(robot, closure, placed, axes, moved)
+        residual[:, first:end] = own.residual
+        jacobian[:, first:end] = own.jacobian
+        lengths = [first + row for row, name in enumerate(closure.directions) if name in _INDEX]
+        residual[:, lengths] /= size_m
+        jacobian[:, lengths] /= size_m
         if moved is not None:
-            bias[:, part] = turning
-        lengths = [first + row for row, one in enumerate(closure.directions) if "r" not in one]
-        for array in (residual, jacobian, bias) if moved is not None else (residual, jacobian):
-            array[:, lengths] /= size_m
-        first = part.stop
+            bias[:, first:end] = own.bias
+            bias[:, lengths] /= size_m
+        first = end
     for row, coupling in enumerate(robot.couplings, start=first):
-        if robot.joints[coupling.follower].kind is JointKind.REVOLUTE:
+        follower = coupling.follower
+        leader = coupling.leader
+        unit = size_m
+        if robot.joints[follower].kind is JointKind.REVOLUTE:
             unit = 1.0
-        else:
-            unit = size_m
-        followed = coupling.multiplier * position[:, coupling.leader] + coupling.offset
-        residual[:, row] = (position[:, coupling.follower] - followed) / unit
+        followed = coupling.multiplier * position[:, leader] + coupling.offset
+        residual[:, row] = (position[:, follower] - followed) / unit
         jacobian[:, row] = 0.0
-        jacobian[:, row, coupling.follower] = 1.0 / unit
-        jacobian[:, row, coupling.leader] = -coupling.multiplier / unit
+        jacobian[:, row, follower] = 1.0 / unit
+        jacobian[:, row, leader] = -coupling.multiplier / unit
         if moved is not None:
             bias[:, row] = 0.0
     return Loops(residual, jacobian, bias)
@@ -85,9 +87,8 @@ def with_followers(robot: Robot, position: FloatArray) -> FloatArray:
     """
     out = position.copy()
     for coupling in robot.couplings:
-        out[..., coupling.follower] = (
-            coupling.multiplier * position[..., coupling.leader] + coupling.offset
-        )
+        leader_position = position[..., coupling.leader]
+        out[..., coupling.follower] = coupling.multiplier * leader_position + coupling.offset
     return out
 
 
@@ -106,14 +107,19 @@ class _Spin:
 def _spin(
     robot: Robot, placed: Poses, axes: FloatArray, position: FloatArray, velocity: FloatArray
 ) -> _Spin:
+    """Motion of every link, from the base outwards."""
     shape = (robot.joint_count + 1, len(position), 3)
-    w, v, dw, dv = (np.zeros(shape) for _ in range(4))
+    w = np.zeros(shape)
+    v = np.zeros(shape)
+    dw = np.zeros(shape)
+    dv = np.zeros(shape)
     for index, joint in enumerate(robot.joints):
         p = joint.parent + 1
         i = index + 1
         along = axes[index] * velocity[:, index, None]
         arm = placed.origin_m[i] - placed.origin_m[p]
-        w[i], dw[i] = w[p], dw[p]
+        w[i] = w[p]
+        dw[i] = dw[p]
         v[i] = v[p] + _cross(w[p], arm)
         dv[i] = dv[p] + _cross(dw[p], arm) + _cross(w[p], _cross(w[p], arm))
         if joint.kind is JointKind.REVOLUTE:
@@ -125,15 +131,17 @@ def _spin(
     return _Spin(w, v, dw, dv)
 
 
-_AHEAD = np.array([1, 2, 0])
-_BEHIND = np.array([2, 0, 1])
+_NEXT = np.array([1, 2, 0])  #: Component after each one
+_LAST = np.array([2, 0, 1])  #: Component before each one
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products of vectors, shape (…, 3);
     without the checks of numpy's, which take longer than the products.
     """
-    return np.asarray(a[..., _AHEAD] * b[..., _BEHIND] - a[..., _BEHIND] * b[..., _AHEAD])
+    positive = a[..., _NEXT] * b[..., _LAST]
+    negative = a[..., _LAST] * b[..., _NEXT]
+    return np.asarray(positive - negative)
 
 
 def origin(placed: Poses, place: Place) -> FloatArray:
@@ -150,22 +158,23 @@ def _columns(
     """
     linear = np.zeros_like(axes)
     angular = np.zeros_like(axes)
-    moved = list[int]()
+    revolute: list[int] = []
     joint = place.joint
     while joint >= 0:
         if robot.joints[joint].kind is JointKind.REVOLUTE:
-            moved.append(joint)
+            revolute.append(joint)
         else:
             linear[joint] = axes[joint]
         joint = robot.joints[joint].parent
-    angular[moved] = axes[moved]
-    linear[moved] = _cross(axes[moved], origin(placed, place) - placed.origin_m[1:][moved])
+    arms = origin(placed, place) - placed.origin_m[1:][revolute]
+    angular[revolute] = axes[revolute]
+    linear[revolute] = _cross(axes[revolute], arms)
     return linear, angular
 
 
 def _closure(
     robot: Robot, closure: Closure, placed: Poses, axes: FloatArray, moved: _Spin | None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> Loops:
     """φ, J and J̇ q̇ of one closure, in m and rad.
 
     Lengths are Rᵀ(p₂ − p₁) in the first frame. Angles are entries of E = R₁ᵀR₂ that are zero where
@@ -177,76 +186,107 @@ def _closure(
     first = closure.first
     second = closure.second
     frame = placed.rotation[first.joint + 1] @ first.rotation
-    other = placed.rotation[second.joint + 1] @ second.rotation
-    apart = origin(placed, second) - origin(placed, first)
-    turned = np.swapaxes(frame, 1, 2)
-    (v1, w1), (v2, w2) = (_columns(robot, placed, axes, place) for place in (first, second))
-    residual = []
-    jacobian = []
-    bias = []
-    gap = np.einsum("kij,kj->ki", turned, apart)
-    lengths = turned @ (v2 - v1 - _cross(w1, apart)).transpose(1, 2, 0)
-    turns = any("r" in direction for direction in closure.directions)
-    if turns:
-        turning = turned @ (w2 - w1).transpose(1, 2, 0)
-    else:
-        turning = np.empty(0)
-    parallel = turned @ other if turns else np.empty(0)
+    to_frame = np.swapaxes(frame, 1, 2)  # R₁ᵀ
+    gap = origin(placed, second) - origin(placed, first)
+    v1, w1 = _columns(robot, placed, axes, first)
+    v2, w2 = _columns(robot, placed, axes, second)
+    gap_in_frame = _in_frame(to_frame, gap)
+    gap_rates = v2 - v1 - _cross(w1, gap)
+    gap_jacobian = to_frame @ gap_rates.transpose(1, 2, 0)
+    parallel = np.empty(0)
+    turn_jacobian = np.empty(0)
+    if any(direction not in _INDEX for direction in closure.directions):
+        other = placed.rotation[second.joint + 1] @ second.rotation
+        parallel = to_frame @ other  # E
+        turn_jacobian = to_frame @ (w2 - w1).transpose(1, 2, 0)
     if moved is not None:
-        motion = [_place_motion(moved, placed, place) for place in (first, second)]
-        (u1, o1, du1, do1), (u2, o2, du2, do2) = motion
-        rate = u2 - u1
-        drift = (
-            du2 - du1 - _cross(do1, apart) - 2.0 * _cross(o1, rate) + _cross(o1, _cross(o1, apart))
-        )
-        drift = np.einsum("kij,kj->ki", turned, drift)
-        spin = np.einsum("kij,kj->ki", turned, o2 - o1)
-        spin_bias = np.einsum("kij,kj->ki", turned, do2 - do1 - _cross(o1, o2 - o1))
+        gap_bias = _in_frame(to_frame, _gap_acceleration(moved, placed, closure, gap))
+        turn_rate, turn_bias = _relative_turn(moved, closure, to_frame)
+    residual: list[FloatArray] = []
+    jacobian: list[FloatArray] = []
+    bias: list[FloatArray] = []
     for direction in closure.directions:
         if direction in _INDEX:
-            i = _INDEX[direction]
-            residual.append(gap[:, i])
-            jacobian.append(lengths[:, i])
+            index = _INDEX[direction]
+            residual.append(gap_in_frame[:, index])
+            jacobian.append(gap_jacobian[:, index])
             if moved is not None:
-                bias.append(drift[:, i])
+                bias.append(gap_bias[:, index])
             continue
         along, axis = _parallel_axes(closure.directions, direction[1])
         column = parallel[:, :, axis]
         unit = np.eye(3)[along]
-        residual.append(column[:, along])
         lever = _cross(column, unit)
-        jacobian.append(np.einsum("ki,kin->kn", lever, turning))
+        residual.append(column[:, along])
+        jacobian.append(np.einsum("ki,kin->kn", lever, turn_jacobian))
         if moved is not None:
-            swung = _cross(_cross(spin, column), unit)
-            bias.append(
-                np.einsum("ki,ki->k", spin_bias, lever) + np.einsum("ki,ki->k", spin, swung)
-            )
-    return (
-        np.stack(residual, 1),
-        np.stack(jacobian, 1),
-        np.stack(bias, 1) if bias else np.empty((len(apart), 0)),
-    )
+            lever_rate = _cross(_cross(turn_rate, column), unit)
+            bias.append(_dot(turn_bias, lever) + _dot(turn_rate, lever_rate))
+    if moved is None:
+        all_bias = np.empty((len(gap), 0))
+    else:
+        all_bias = np.stack(bias, 1)
+    return Loops(np.stack(residual, 1), np.stack(jacobian, 1), all_bias)
+
+
+def _in_frame(to_frame: FloatArray, vector: FloatArray) -> FloatArray:
+    """Vectors in another frame, R v, shapes (k, 3, 3) and (k, 3)."""
+    return np.asarray(np.einsum("kij,kj->ki", to_frame, vector))
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Products a · b, shape (k,)."""
+    return np.asarray(np.einsum("ki,ki->k", a, b))
+
+
+def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatArray) -> FloatArray:
+    """Acceleration of p₂ − p₁ as the first frame sees it, with all joint accelerations zero,
+    shape (k, 3).
+    """
+    v1, dv1 = _place_motion(moved, placed, closure.first)
+    v2, dv2 = _place_motion(moved, placed, closure.second)
+    at = closure.first.joint + 1
+    w1 = moved.angular[at]
+    dw1 = moved.angular_bias[at]
+    coriolis = 2.0 * _cross(w1, v2 - v1)
+    centripetal = _cross(w1, _cross(w1, gap))
+    return dv2 - dv1 - _cross(dw1, gap) - coriolis + centripetal
+
+
+def _relative_turn(
+    moved: _Spin, closure: Closure, to_frame: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angular velocity of the second frame in the first one,
+    and its rate with all joint accelerations zero.
+    """
+    first = closure.first.joint + 1
+    second = closure.second.joint + 1
+    w1 = moved.angular[first]
+    relative = moved.angular[second] - w1
+    rate = moved.angular_bias[second] - moved.angular_bias[first] - _cross(w1, relative)
+    return _in_frame(to_frame, relative), _in_frame(to_frame, rate)
 
 
 def _parallel_axes(directions: tuple[str, ...], about: str) -> tuple[int, int]:
     """Entry of E = R₁ᵀR₂ that must be zero so that the frames do not turn about an axis."""
     following = _AFTER[about]
     last = _AFTER[following]
-    if sum(direction in directions for direction in ("rx", "ry", "rz")) == 2:
-        free = next(axis for axis in "xyz" if f"r{axis}" not in directions)
-        return _INDEX[following if last == free else last], _INDEX[free]
+    free = [axis for axis in "xyz" if f"r{axis}" not in directions]
+    if len(free) == 1:
+        (free_axis,) = free
+        along = last
+        if last == free_axis:
+            along = following
+        return _INDEX[along], _INDEX[free_axis]
     return _INDEX[last], _INDEX[following]
 
 
-def _place_motion(
-    moved: _Spin, placed: Poses, place: Place
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Velocity of a frame's origin, its angular velocity,
-    and both accelerations without joint accelerations.
-    """
+def _place_motion(moved: _Spin, placed: Poses, place: Place) -> tuple[FloatArray, FloatArray]:
+    """Velocity of a frame's origin, and its acceleration with all joint accelerations zero."""
     at = place.joint + 1
     arm = placed.rotation[at] @ place.translation_m
     w = moved.angular[at]
     dw = moved.angular_bias[at]
-    linear = moved.linear[at] + _cross(w, arm)
-    return linear, w, moved.linear_bias[at] + _cross(dw, arm) + _cross(w, _cross(w, arm)), dw
+    velocity = moved.linear[at] + _cross(w, arm)
+    acceleration = moved.linear_bias[at] + _cross(dw, arm) + _cross(w, _cross(w, arm))
+    return velocity, acceleration

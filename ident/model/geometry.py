@@ -81,12 +81,13 @@ def geometry_parameters(robot: Robot) -> tuple[GeometryParameter, ...]:
 
 def base_places(robot: Robot) -> tuple[GeometryParameter, ...]:
     """Return the coordinates of all joints on the base."""
-    on_base = [joint.name for joint in robot.joints if joint.parent < 0]
-    found = []
-    for name in on_base:
-        for axis in DIRECTIONS:
-            found.append(GeometryParameter(GeometryKind.PLACE, name, axis))
-    return tuple(found)
+    places: list[GeometryParameter] = []
+    for joint in robot.joints:
+        if joint.parent < 0:
+            places += [
+                GeometryParameter(GeometryKind.PLACE, joint.name, axis) for axis in DIRECTIONS
+            ]
+    return tuple(places)
 
 
 def encoder_delays(robot: Robot) -> tuple[GeometryParameter, ...]:
@@ -96,18 +97,31 @@ def encoder_delays(robot: Robot) -> tuple[GeometryParameter, ...]:
     return tuple(GeometryParameter(GeometryKind.DELAY, joint.name) for joint in robot.axes)
 
 
-def _lengths(robot: Robot) -> Iterator[GeometryParameter]:
+@dataclass(frozen=True, slots=True)
+class _LinkEnd:
+    """A point of a link, at which another joint or a closure is."""
+
+    link: int  #: joint that moves the link, −1 for the base
+    end: str  #: name of the other joint, or of the closure
+    vector_m: FloatArray  #: from the origin of the link's joint, shape (3,)
+
+
+def _link_ends(robot: Robot) -> Iterator[_LinkEnd]:
+    """Points of all links: the joints behind them, then the frames that close loops."""
     for joint in robot.joints:
-        if joint.parent >= 0 and np.linalg.norm(joint.translation_m) > SHORTEST_LENGTH_M:
-            yield GeometryParameter(
-                GeometryKind.LENGTH, robot.joints[joint.parent].name, joint.name
-            )
+        yield _LinkEnd(joint.parent, joint.name, joint.translation_m)
     for closure in robot.closures:
         for place in (closure.first, closure.second):
-            if place.joint >= 0 and np.linalg.norm(place.translation_m) > SHORTEST_LENGTH_M:
-                yield GeometryParameter(
-                    GeometryKind.LENGTH, robot.joints[place.joint].name, closure.name
-                )
+            yield _LinkEnd(place.joint, closure.name, place.translation_m)
+
+
+def _lengths(robot: Robot) -> Iterator[GeometryParameter]:
+    """Lengths of the moving links."""
+    for one in _link_ends(robot):
+        length_m = np.linalg.norm(one.vector_m)
+        if one.link >= 0 and length_m > SHORTEST_LENGTH_M:
+            link = robot.joints[one.link].name
+            yield GeometryParameter(GeometryKind.LENGTH, link, one.end)
 
 
 def described_length(robot: Robot, parameter: GeometryParameter) -> float:
@@ -117,15 +131,13 @@ def described_length(robot: Robot, parameter: GeometryParameter) -> float:
         ModelError: the robot has no such link or joint.
     """
     if parameter in base_places(robot):
-        joint = robot.joints[_joint_number(robot, parameter.joint)]
-        return float(joint.translation_m[DIRECTIONS.index(parameter.end)])
-    for joint in robot.joints:
-        if _is_end(robot, parameter, joint.parent, joint.name):
-            return float(np.linalg.norm(joint.translation_m))
-    for closure in robot.closures:
-        for place in (closure.first, closure.second):
-            if _is_end(robot, parameter, place.joint, closure.name):
-                return float(np.linalg.norm(place.translation_m))
+        number = _joint_number(robot, parameter.joint)
+        direction = DIRECTIONS.index(parameter.end)
+        place_m = robot.joints[number].translation_m
+        return float(place_m[direction])
+    for one in _link_ends(robot):
+        if _is_end(robot, parameter, one.link, one.end):
+            return float(np.linalg.norm(one.vector_m))
     raise _unknown(robot, parameter)
 
 
@@ -144,97 +156,115 @@ def with_geometry(robot: Robot, changes: Iterable[GeometryChange]) -> Robot:
     changed = robot
     known = {*geometry_parameters(robot), *base_places(robot)}
     for one in changes:
-        if one.parameter not in known:
-            raise _unknown(robot, one.parameter)
-        match one.parameter.kind:
+        parameter = one.parameter
+        if parameter not in known:
+            raise _unknown(robot, parameter)
+        match parameter.kind:
             case GeometryKind.ZERO:
-                changed = _with_zero(changed, one.parameter.joint, one.change)
+                changed = _with_zero(changed, parameter.joint, one.change)
             case GeometryKind.PLACE:
-                changed = _with_place(changed, one.parameter, one.change)
+                changed = _with_place(changed, parameter, one.change)
             case _:
-                changed = _with_length(changed, one.parameter, one.change)
+                changed = _with_length(changed, parameter, one.change)
     return changed
 
 
 def _unknown(robot: Robot, parameter: GeometryParameter) -> ModelError:
+    """Error of a number that the description does not have."""
     known = (*geometry_parameters(robot), *base_places(robot))
     names = ", ".join(one.name for one in known)
     return ModelError(f"the robot has no {parameter.name}; expected one of: {names}")
 
 
 def _joint_number(robot: Robot, name: str) -> int:
-    return [joint.name for joint in robot.joints].index(name)
+    """Index of a joint."""
+    names = [joint.name for joint in robot.joints]
+    return names.index(name)
+
+
+def _with_joint(robot: Robot, number: int, joint: Joint) -> Robot:
+    """The robot with another joint at an index."""
+    joints = list(robot.joints)
+    joints[number] = joint
+    return replace(robot, joints=tuple(joints))
 
 
 def _with_place(robot: Robot, parameter: GeometryParameter, change_m: float) -> Robot:
+    """The robot with a joint elsewhere on the base."""
     number = _joint_number(robot, parameter.joint)
     joint = robot.joints[number]
+    direction = DIRECTIONS.index(parameter.end)
     place_m = joint.translation_m.copy()
-    place_m[DIRECTIONS.index(parameter.end)] += change_m
+    place_m[direction] += change_m
     moved = replace(joint, translation_m=place_m)
-    return replace(robot, joints=(*robot.joints[:number], moved, *robot.joints[number + 1 :]))
+    return _with_joint(robot, number, moved)
 
 
 def _with_zero(robot: Robot, name: str, change: float) -> Robot:
+    """The robot with another zero of a joint."""
     number = _joint_number(robot, name)
     joint = robot.joints[number]
     if joint.kind is JointKind.REVOLUTE:
-        moved = replace(joint, rotation=joint.rotation @ _turn(joint.axis, change))
+        rotation = joint.rotation @ _turn(joint.axis, change)
+        moved = replace(joint, rotation=rotation)
     else:
-        moved = replace(
-            joint, translation_m=joint.translation_m + change * (joint.rotation @ joint.axis)
-        )
-    joints = (*robot.joints[:number], moved, *robot.joints[number + 1 :])
-    pose = robot.assembly_rad
-    if pose is not None:
-        pose = pose.copy()
-        pose[number] -= change
-    return replace(robot, joints=joints, assembly_rad=pose)
+        direction = joint.rotation @ joint.axis
+        translation_m = joint.translation_m + change * direction
+        moved = replace(joint, translation_m=translation_m)
+    changed = _with_joint(robot, number, moved)
+    if robot.assembly_rad is None:
+        return changed
+    pose_rad = robot.assembly_rad.copy()
+    pose_rad[number] -= change
+    return replace(changed, assembly_rad=pose_rad)
 
 
 def _turn(axis: FloatArray, angle_rad: float) -> FloatArray:
     """Rotation by an angle about a unit vector, shape (3, 3): Rodrigues' formula."""
     cross = skew(axis)
-    return np.asarray(
-        np.eye(3) + np.sin(angle_rad) * cross + (1.0 - np.cos(angle_rad)) * (cross @ cross)
-    )
+    sine = np.sin(angle_rad)
+    one_less_cosine = 1.0 - np.cos(angle_rad)
+    return np.asarray(np.eye(3) + sine * cross + one_less_cosine * (cross @ cross))
 
 
 def _with_length(robot: Robot, parameter: GeometryParameter, change_m: float) -> Robot:
-    joints = tuple(
-        _moved_joint(joint, change_m)
-        if _is_end(robot, parameter, joint.parent, joint.name)
-        else joint
-        for joint in robot.joints
-    )
-    closures = tuple(
-        _moved_closure(robot, parameter, closure, change_m) for closure in robot.closures
-    )
-    return replace(robot, joints=joints, closures=closures)
+    """The robot with another length of a link."""
+    joints: list[Joint] = []
+    for joint in robot.joints:
+        moved = joint
+        if _is_end(robot, parameter, joint.parent, joint.name):
+            translation_m = _longer(joint.translation_m, change_m)
+            moved = replace(joint, translation_m=translation_m)
+        joints.append(moved)
+    closures = [_moved_closure(robot, parameter, closure, change_m) for closure in robot.closures]
+    return replace(robot, joints=tuple(joints), closures=tuple(closures))
 
 
 def _is_end(robot: Robot, parameter: GeometryParameter, link: int, end: str) -> bool:
     """Whether a length leads from the joint of a link to this end."""
-    return link >= 0 and (robot.joints[link].name, end) == (parameter.joint, parameter.end)
-
-
-def _moved_joint(joint: Joint, change_m: float) -> Joint:
-    return replace(joint, translation_m=_longer(joint.translation_m, change_m))
+    if link < 0:
+        return False
+    name = robot.joints[link].name
+    return name == parameter.joint and end == parameter.end
 
 
 def _moved_closure(
     robot: Robot, parameter: GeometryParameter, closure: Closure, change_m: float
 ) -> Closure:
+    """A closure whose frames move with a length."""
     ends: list[Place] = []
     for place in (closure.first, closure.second):
+        moved = place
         if _is_end(robot, parameter, place.joint, closure.name):
-            ends.append(replace(place, translation_m=_longer(place.translation_m, change_m)))
-        else:
-            ends.append(place)
-    return replace(closure, first=ends[0], second=ends[1])
+            translation_m = _longer(place.translation_m, change_m)
+            moved = replace(place, translation_m=translation_m)
+        ends.append(moved)
+    first, second = ends
+    return replace(closure, first=first, second=second)
 
 
 def _longer(vector_m: FloatArray, change_m: float) -> FloatArray:
     """Return a vector that is longer by some length."""
     length_m = float(np.linalg.norm(vector_m))
-    return np.asarray(vector_m * (1.0 + change_m / length_m))
+    factor = 1.0 + change_m / length_m
+    return np.asarray(vector_m * factor)

@@ -58,7 +58,7 @@ def torque_derivative(
 
     Raises:
         ModelError: the robot has no such joint or link, or its loops cannot be closed with the
-            geometry beside it.
+            geometry a step away.
     """
     if step is None:
         step = STEP * unit_of(model, parameter)
@@ -70,13 +70,16 @@ def torque_derivative(
 def unit_of(model: Model, parameter: GeometryParameter) -> float:
     """Return the size to compare a change with: a radian, or the size of the robot [m]."""
     kinds = {joint.name: joint.kind for joint in model.robot.joints}
-    is_angle = parameter.kind is GeometryKind.ZERO and kinds[parameter.joint] is JointKind.REVOLUTE
-    return 1.0 if is_angle else model.assembly.size_m
+    is_zero = parameter.kind is GeometryKind.ZERO
+    if is_zero and kinds[parameter.joint] is JointKind.REVOLUTE:
+        return 1.0
+    return model.assembly.size_m
 
 
 def _torque(
     model: Model, motion: Motion, standard: FloatArray, change: GeometryChange
 ) -> FloatArray:
     """Torque at each axis of a robot with another geometry [Nm or N], shape (m, k)."""
-    _, _, whole = model_with_geometry(model, (change,)).torques(motion, standard)
-    return whole
+    changed = model_with_geometry(model, (change,))
+    _, _, torque = changed.torques(motion, standard)
+    return torque

@@ -12,6 +12,7 @@ in no equation: the columns are then those of the least τ without it,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING
@@ -33,11 +34,15 @@ DRIVE_UNITS = {
 }
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
 REMEMBERED_BYTES = 2**28
-"""Largest size of the motions of closed chains that a model keeps:
-a fit asks for those of the same few runs again.
+"""Largest size of the motions of closed chains that a model stores:
+a fit needs those of the same few runs again.
 """
+LARGEST_CONDITION = 1e8  #: Of a drive train that is invertible
 #: Standard parameters of a joint: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off
 JOINT_COLUMNS = 14
+#: Ia, fv, fs, off among them
+ROTOR_INERTIA, VISCOUS_FRICTION, DRY_FRICTION, OFFSET = range(10, JOINT_COLUMNS)
+COUPLED_COLUMNS = 3  #: Parameters of a motor that turns with several joints: Iam, fvm, fsm
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +61,16 @@ class DriveTrain:
     def __post_init__(self) -> None:
         ratio = as_array("the drive train", self.ratio)
         object.__setattr__(self, "ratio", ratio)
-        if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
+        is_square = ratio.ndim == 2 and ratio.shape[0] == ratio.shape[1]
+        if not is_square:
+            remedy = ""
             if ratio.ndim == 1:
                 remedy = "; write np.diag(gear_ratios)"
-            else:
-                remedy = ""
             raise ModelError(
                 f"the drive train must be a square matrix, found shape {ratio.shape}{remedy}"
             )
         condition = float(np.linalg.cond(ratio))
-        if not np.isfinite(condition) or condition > 1e8:
+        if not condition <= LARGEST_CONDITION:
             raise ModelError(
                 f"the drive train is not invertible (condition {condition:.3g}): {ratio.tolist()}"
             )
@@ -75,16 +80,20 @@ class DriveTrain:
         """The joint that each motor belongs to:
         its own, or that of its largest ratio where it does not drive that.
         """
-        return tuple(
-            i if row[i] != 0.0 else int(np.argmax(np.abs(row))) for i, row in enumerate(self.ratio)
-        )
+        joints: list[int] = []
+        for motor, row in enumerate(self.ratio):
+            joint = motor
+            if row[motor] == 0.0:
+                joint = int(np.argmax(np.abs(row)))
+            joints.append(joint)
+        return tuple(joints)
 
     @property
     def reduction(self) -> FloatArray:
         """N of each motor, shape (n,): its ratio to the joint that it belongs to."""
-        return np.asarray(
-            self.ratio[np.arange(len(self.ratio)), list(self.joints)], dtype=np.float64
-        )
+        motors = np.arange(len(self.ratio))
+        joints = list(self.joints)
+        return np.asarray(self.ratio[motors, joints], dtype=np.float64)
 
     @property
     def direction(self) -> FloatArray:
@@ -98,14 +107,17 @@ class DriveTrain:
         """T with g_i v_i = (T τ_joint)_i, the inverse of the transposed directions, shape (n,
         n).
         """
-        return np.asarray(np.linalg.inv(self.direction.T), dtype=np.float64)
+        inverse = np.linalg.inv(self.direction.T)
+        return np.asarray(inverse, dtype=np.float64)
 
     @property
     def coupled(self) -> tuple[int, ...]:
         """Motors that turn with more than one joint:
-        their rotor inertia and friction need columns of their own.
+        their rotor inertia and friction need further columns.
         """
-        return tuple(i for i, row in enumerate(self.ratio) if np.count_nonzero(row) > 1)
+        joint_counts = np.count_nonzero(self.ratio, axis=1)
+        motors = np.flatnonzero(joint_counts > 1)
+        return tuple(motors.tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +138,9 @@ class Column:
         """The same at a joint: Nm and rad of a revolute one are N and m of a prismatic one."""
         if kind is JointKind.REVOLUTE:
             return self
-        return replace(self, unit=self.unit.replace("Nm", "N").replace("rad", "m"))
+        unit = self.unit.replace("Nm", "N")
+        unit = unit.replace("rad", "m")
+        return replace(self, unit=unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,16 +175,16 @@ class Model:
         require_kind(
             "drive_train", self.drive_train, DriveTrain, "write DriveTrain(np.diag(gear_ratios))"
         )
-        motors = len(self.drive_train.ratio)
+        ratio = self.drive_train.ratio
         axes = self.robot.axis_count
-        if motors != axes:
+        if len(ratio) != axes:
             raise ModelError(
-                f"the drive train has shape {self.drive_train.ratio.shape}, expected "
-                f"{(axes, axes)}: the robot has {axes} driven joints; give one motor for each"
+                f"the drive train has shape {ratio.shape}, expected {(axes, axes)}: the robot has "
+                f"{axes} driven joints; give one motor for each"
             )
         object.__setattr__(self, "assembly", assemble(self.robot))
-        ratio = self.drive_train.ratio
-        if self.is_redundant and np.count_nonzero(ratio - np.diag(np.diag(ratio))):
+        off_diagonal = ratio - np.diag(np.diag(ratio))
+        if self.is_redundant and off_diagonal.any():
             raise ModelError(
                 "the robot has more motors than degrees of freedom, and motors that turn with the "
                 "joint of another; expected a diagonal drive train there"
@@ -189,50 +203,69 @@ class Model:
         columns: list[Column] = []
         for number, joint in enumerate(self.robot.joints, start=1):
             force, rate, inertia = DRIVE_UNITS[joint.kind]
-            link = zip(LINK_PARAMETERS, LINK_UNITS, strict=True)
-            drive = ("Ia", inertia), ("fv", f"{force}/({rate})"), ("fs", force), ("off", force)
-            columns += [Column(f"{name}{number}", unit) for name, unit in (*link, *drive)]
+            for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True):
+                columns.append(Column(f"{name}{number}", unit))
+            columns.append(Column(f"Ia{number}", inertia))
+            columns.append(Column(f"fv{number}", f"{force}/({rate})"))
+            columns.append(Column(f"fs{number}", force))
+            columns.append(Column(f"off{number}", force))
+        joint_of_motor = self.drive_train.joints
         for motor in self.drive_train.coupled:
-            force, rate, inertia = DRIVE_UNITS[self.robot.axes[self.drive_train.joints[motor]].kind]
-            coupling = ("Iam", inertia), ("fvm", f"{force}/({rate})"), ("fsm", force)
-            columns += [Column(f"{name}{motor + 1}", unit) for name, unit in coupling]
+            joint = self.robot.axes[joint_of_motor[motor]]
+            force, rate, inertia = DRIVE_UNITS[joint.kind]
+            number = motor + 1
+            columns.append(Column(f"Iam{number}", inertia))
+            columns.append(Column(f"fvm{number}", f"{force}/({rate})"))
+            columns.append(Column(f"fsm{number}", force))
         if self.friction_by_payload:
-            friction = [columns[place] for place in self.friction_columns]
-            columns += [replace(column, name=f"{column.name}{LOADED}") for column in friction]
+            for index in self.friction_columns.tolist():
+                column = columns[index]
+                columns.append(replace(column, name=f"{column.name}{LOADED}"))
         return tuple(columns)
 
     @property
     def link_columns(self) -> IntArray:
         """Columns of the links' parameters among the standard ones, shape (n, 10)."""
-        return JOINT_COLUMNS * np.arange(self.robot.joint_count)[:, None] + np.arange(
-            len(LINK_PARAMETERS)
-        )
+        joints = np.arange(self.robot.joint_count)
+        first = JOINT_COLUMNS * joints
+        return first[:, None] + np.arange(len(LINK_PARAMETERS))
+
+    @property
+    def _axis_columns(self) -> IntArray:
+        """First column of the joint of each axis among the standard ones, shape (m,)."""
+        return JOINT_COLUMNS * np.array(self.robot.axis_joints)
 
     @property
     def viscous_friction_columns(self) -> IntArray:
         """Column of fv of each axis among the standard ones, shape (m,)."""
-        return JOINT_COLUMNS * np.array(self.robot.axis_joints) + 11
+        return self._axis_columns + VISCOUS_FRICTION
 
     @property
     def dry_friction_columns(self) -> IntArray:
         """Column of fs of each axis among the standard ones, shape (m,)."""
-        return JOINT_COLUMNS * np.array(self.robot.axis_joints) + 12
+        return self._axis_columns + DRY_FRICTION
 
     @property
     def rotor_columns(self) -> IntArray:
         """Column of Ia of each axis among the standard ones, shape (m,)."""
-        return JOINT_COLUMNS * np.array(self.robot.axis_joints) + len(LINK_PARAMETERS)
+        return self._axis_columns + ROTOR_INERTIA
+
+    @property
+    def _coupled_columns(self) -> IntArray:
+        """First column of each motor that turns with several joints, shape (coupled,):
+        Iam, then fvm and fsm.
+        """
+        first = JOINT_COLUMNS * self.robot.joint_count
+        count = len(self.drive_train.coupled)
+        return first + COUPLED_COLUMNS * np.arange(count)
 
     @property
     def friction_columns(self) -> IntArray:
         """Columns of fv and fs of each axis, and of fvm and fsm of each motor that turns with
         several joints.
         """
-        of_axes = JOINT_COLUMNS * np.array(self.robot.axis_joints)[:, None] + np.array([11, 12])
-        first = JOINT_COLUMNS * self.robot.joint_count
-        of_coupled = (
-            first + 3 * np.arange(len(self.drive_train.coupled))[:, None] + np.array([1, 2])
-        )
+        of_axes = self._axis_columns[:, None] + np.array([VISCOUS_FRICTION, DRY_FRICTION])
+        of_coupled = self._coupled_columns[:, None] + np.array([1, 2])
         return np.concatenate((of_axes.ravel(), of_coupled.ravel()))
 
     @property
@@ -240,8 +273,12 @@ class Model:
         """Columns of what a payload adds to the friction parameters,
         in the order of `friction_columns`; or empty.
         """
-        declared = JOINT_COLUMNS * self.robot.joint_count + 3 * len(self.drive_train.coupled)
-        return declared + np.arange(len(self.friction_columns) if self.friction_by_payload else 0)
+        coupled = len(self.drive_train.coupled)
+        declared = JOINT_COLUMNS * self.robot.joint_count + COUPLED_COLUMNS * coupled
+        count = 0
+        if self.friction_by_payload:
+            count = len(self.friction_columns)
+        return declared + np.arange(count)
 
     @property
     def flange(self) -> slice:
@@ -254,25 +291,28 @@ class Model:
         """Mask of the standard parameters that load each axis, shape (m, c);
         all else in the regressor is zero.
         """
-        count = self.robot.joint_count
-        axes = self.robot.axis_count
-        out = np.zeros((axes, len(self.columns)), dtype=np.bool_)
-        for axis, joint in enumerate(self.robot.axis_joints):
-            first = JOINT_COLUMNS * joint
-            out[:, first + 10 : first + JOINT_COLUMNS] |= self.is_redundant
-            out[axis, first + 10 : first + JOINT_COLUMNS] = True
-        for link in range(count):
+        out = np.zeros((self.robot.axis_count, len(self.columns)), dtype=np.bool_)
+        for axis, first in enumerate(self._axis_columns.tolist()):
+            drive = slice(first + ROTOR_INERTIA, first + JOINT_COLUMNS)
+            if self.is_redundant:
+                out[:, drive] = True
+            out[axis, drive] = True
+        for link in range(self.robot.joint_count):
             first = JOINT_COLUMNS * link
-            joint = link
-            # A link loads its own joint and those before it
-            while joint >= 0 and not self.robot.is_constrained:
-                out[joint, first : first + 10] = True
-                joint = self.robot.joints[joint].parent
+            own = slice(first, first + len(LINK_PARAMETERS))
             if self.robot.is_constrained:
-                out[:, first : first + 10] = True
-        for index, motor in enumerate(self.drive_train.coupled):
-            first = JOINT_COLUMNS * count + 3 * index
-            out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
+                out[:, own] = True
+                continue
+            joint = link
+            while joint >= 0:  # a link loads its joint and those before it
+                out[joint, own] = True
+                joint = self.robot.joints[joint].parent
+        direction = self.drive_train.direction
+        for motor, first in zip(
+            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
+        ):
+            is_turned = direction[motor] != 0.0
+            out[:, first : first + COUPLED_COLUMNS] = is_turned[:, None]
         if self.friction_by_payload:
             out[:, self.loaded_friction_columns] = out[:, self.friction_columns]
         return out
@@ -292,7 +332,8 @@ class Model:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         if not self.robot.is_constrained:
-            return self._tree_regressor(*self._joint_first(motion), loaded=loaded)
+            position, velocity, acceleration = self._joint_first(motion)
+            return self._tree_regressor(position, velocity, acceleration, loaded=loaded)
         columns, to_motors = self.balance(motion, loaded=loaded)
         if self.is_redundant:
             return spread(columns, to_motors)
@@ -304,20 +345,23 @@ class Model:
         Arguments and errors are those of `regressor`.
         """
         followed = self.follow(motion)
-        columns = self._tree_regressor(*self._first(followed.joints), loaded=loaded)
+        position, velocity, acceleration = self._first(followed.joints)
+        columns = self._tree_regressor(position, velocity, acceleration, loaded=loaded)
         projected = np.zeros((self.assembly.mobility, *columns.shape[1:]))
-        per_joint = np.ascontiguousarray(np.transpose(followed.to_joints, (1, 2, 0)))
-        for joint, part in enumerate(columns):  # most links are moved by few joints
-            held = np.flatnonzero(part.any(axis=1))
-            for way, rate in zip(projected, per_joint[joint], strict=True):
+        to_joints = np.ascontiguousarray(np.transpose(followed.to_joints, (1, 2, 0)))
+        # Σ_n G_nd W_nc of each coordinate d: most links are moved by few joints
+        for rates, own in zip(to_joints, columns, strict=True):
+            nonzero = np.flatnonzero(own.any(axis=1))
+            for equation, rate in zip(projected, rates, strict=True):
                 if rate.any():
-                    way[held] += rate * part[held]
-        return projected, np.ascontiguousarray(np.transpose(followed.to_motors, (2, 1, 0)))
+                    equation[nonzero] += rate * own[nonzero]
+        to_motors = np.transpose(followed.to_motors, (2, 1, 0))
+        return projected, np.ascontiguousarray(to_motors)
 
     def follow(self, motion: Motion) -> TreeMotion:
         """Motion of all joints from that of the axes; see `ident.model.closed_chain.follow`.
 
-        In a closed chain its arrays are read-only, because the last few motions are kept.
+        In a closed chain its arrays are read-only, because the last few motions are stored.
 
         Raises:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
@@ -325,48 +369,48 @@ class Model:
         states = self._joint_first(motion)
         if not self.robot.is_constrained:
             return follow(self.robot, self.assembly, motion)
-        digest = blake2b(b"".join(state.tobytes() for state in states)).digest()
-        # Replaced as a whole: of two threads, one may lose what the other has added, but neither
-        # finds half of it.
-        others = tuple(one for one in self._followed if one[0] != digest)
-        found = next((followed for key, followed in self._followed if key == digest), None)
+        content = b"".join(state.tobytes() for state in states)
+        digest = blake2b(content).digest()
+        stored = dict(self._followed)
+        found = stored.pop(digest, None)
         if found is None:
             found = follow(self.robot, self.assembly, motion)
             for array in _arrays(found):
                 array.flags.writeable = False
-        kept = list[tuple[bytes, TreeMotion]]()
-        size = 0
-        for key, followed in ((digest, found), *others):
-            size += sum(array.nbytes for array in _arrays(followed))
-            if size > REMEMBERED_BYTES:
-                break
-            kept.append((key, followed))
-        object.__setattr__(self, "_followed", tuple(kept))
+        # Replaced at once: of two threads, one may lose what the other has added, but neither finds
+        # half of it.
+        newest = _newest([(digest, found), *stored.items()])
+        object.__setattr__(self, "_followed", newest)
         return found
 
     def _tree_regressor(
         self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, *, loaded: bool
     ) -> FloatArray:
+        """Torque at each joint of the tree per unit of every standard parameter, shape (n, c,
+        k).
+        """
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
-        by_link = out[:, : JOINT_COLUMNS * count].reshape(count, count, JOINT_COLUMNS, samples)
-        fill_rigid(self.robot, position, velocity, acceleration, by_link[:, :, :10])
+        of_joints = out[:, : JOINT_COLUMNS * count]
+        by_link = of_joints.reshape(count, count, JOINT_COLUMNS, samples)
+        fill_rigid(
+            self.robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)]
+        )
         axes = list(self.robot.axis_joints)
         for joint in axes:
             own = by_link[joint, joint]
-            own[10], own[11], own[12], own[13] = (
-                acceleration[joint],
-                velocity[joint],
-                sign[joint],
-                1.0,
-            )
+            own[ROTOR_INERTIA] = acceleration[joint]
+            own[VISCOUS_FRICTION] = velocity[joint]
+            own[DRY_FRICTION] = sign[joint]
+            own[OFFSET] = 1.0
         direction = self.drive_train.direction
         motor_speed = direction @ velocity[axes]
-        for index, motor in enumerate(self.drive_train.coupled):
-            first = JOINT_COLUMNS * count + 3 * index
+        for motor, first in zip(
+            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
+        ):
             r = direction[motor]
-            cross = np.outer(r, r) - np.diag(r**2)
+            cross = _off_diagonal(r)
             out[axes, first] = cross @ acceleration[axes]
             out[axes, first + 1] = cross @ velocity[axes]
             out[axes, first + 2] = r[:, None] * np.sign(motor_speed[motor])
@@ -383,11 +427,11 @@ class Model:
         """
         if body is None:
             return standard
-        whole = standard.copy()
-        whole[self.flange] += body
+        loaded = standard.copy()
+        loaded[self.flange] += body
         if self.friction_by_payload:
-            whole[self.friction_columns] += standard[self.loaded_friction_columns]
-        return whole
+            loaded[self.friction_columns] += standard[self.loaded_friction_columns]
+        return loaded
 
     def torques(
         self, motion: Motion, standard: FloatArray
@@ -405,38 +449,34 @@ class Model:
             ModelError: the motion is not one of m axes, or the loops cannot be closed.
         """
         position, velocity, acceleration = self._joint_first(motion)
-        of_joints = JOINT_COLUMNS * self.robot.joint_count
-        links = standard[:of_joints].reshape(-1, JOINT_COLUMNS)
-        motors = standard[of_joints : of_joints + 3 * len(self.drive_train.coupled)].reshape(
-            -1, 3, 1
-        )
-        own = links[list(self.robot.axis_joints)]
+        links = standard[self.link_columns]
+        followed = None
         if self.robot.is_constrained:
             followed = self.follow(motion)
-        else:
-            followed = None
-        if followed is None:
-            load = rigid_torque(self.robot, position, velocity, acceleration, links[:, :10])
-        else:
             joints = self._first(followed.joints)
-            load = self.at_axes(
-                followed, rigid_torque(self.robot, joints[0], joints[1], joints[2], links[:, :10])
-            )
-        geared = load + own[:, 11, None] * velocity + own[:, 12, None] * np.sign(velocity)
-        whole = geared + own[:, 10, None] * acceleration + own[:, 13, None]
-        for motor, (inertia, viscous, dry) in zip(self.drive_train.coupled, motors, strict=True):
-            r = self.drive_train.direction[motor]
-            cross = np.outer(r, r) - np.diag(r**2)
-            whole += cross @ (inertia * acceleration + viscous * velocity) + r[
-                :, None
-            ] * dry * np.sign(r @ velocity)
+            tree_load = rigid_torque(self.robot, joints[0], joints[1], joints[2], links)
+            load = self.at_axes(followed, tree_load)
+        else:
+            load = rigid_torque(self.robot, position, velocity, acceleration, links)
+        viscous = standard[self.viscous_friction_columns, None]
+        dry = standard[self.dry_friction_columns, None]
+        rotor = standard[self.rotor_columns, None]
+        offset = standard[self._axis_columns + OFFSET, None]
+        geared = load + viscous * velocity + dry * np.sign(velocity)
+        total = geared + rotor * acceleration + offset
+        direction = self.drive_train.direction
+        for motor, first in zip(
+            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
+        ):
+            inertia, viscous, dry = standard[first : first + COUPLED_COLUMNS]
+            r = direction[motor]
+            smooth = _off_diagonal(r) @ (inertia * acceleration + viscous * velocity)
+            total += smooth + r[:, None] * dry * np.sign(r @ velocity)
         if followed is not None and self.is_redundant:
-            return (
-                without_preload(followed, load),
-                without_preload(followed, geared),
-                without_preload(followed, whole),
-            )
-        return load, geared, whole
+            load = without_preload(followed, load)
+            geared = without_preload(followed, geared)
+            total = without_preload(followed, total)
+        return load, geared, total
 
     def inertia(self, position_rad: FloatArray, standard: FloatArray) -> FloatArray:
         """Mass matrix of links and payload: torque at axis i per unit of acceleration of axis j,
@@ -451,25 +491,31 @@ class Model:
         """
         links = standard[self.link_columns]
         if not self.robot.is_constrained:
-            return mass_matrix(self.robot, np.ascontiguousarray(position_rad.T), links)
+            position = np.ascontiguousarray(position_rad.T)
+            return mass_matrix(self.robot, position, links)
         still = np.zeros_like(position_rad)
         followed = self.follow(Motion(position_rad, still, still))
-        tree = mass_matrix(self.robot, np.ascontiguousarray(followed.joints.position_rad.T), links)
-        per_x = np.einsum("ijk,kjd->idk", tree, followed.to_joints)
-        per_axis = np.linalg.pinv(followed.to_motors)
-        return self.at_axes(followed, np.einsum("idk,kda->iak", per_x, per_axis))
+        position = np.ascontiguousarray(followed.joints.position_rad.T)
+        tree = mass_matrix(self.robot, position, links)
+        # M G A⁺ of the joints of the tree: torque per unit of acceleration of each axis
+        per_coordinate = np.einsum("ijk,kjd->idk", tree, followed.to_joints)
+        coordinates_per_axis = np.linalg.pinv(followed.to_motors)
+        per_axis = np.einsum("idk,kda->iak", per_coordinate, coordinates_per_axis)
+        return self.at_axes(followed, per_axis)
 
     def leverage(self, followed: TreeMotion) -> FloatArray:
         """Torque at each axis per unit of torque on each place without a motor (`Robot.places`),
         shape (u, m, k).
         """
-        unit = np.eye(self.robot.joint_count)[
-            :, list(self.robot.place_joints[self.robot.axis_count :])
-        ]
-        torque = np.repeat(unit[:, :, None], len(followed.to_joints), axis=2)
-        per_joint = pivot_rates(self.robot, followed.joints.position_rad)
-        torque = np.concatenate((torque, np.transpose(per_joint, (2, 1, 0))), axis=1)
-        return np.ascontiguousarray(np.swapaxes(self.at_axes(followed, torque), 0, 1))
+        samples = len(followed.to_joints)
+        undriven = list(self.robot.place_joints[self.robot.axis_count :])
+        unit = np.eye(self.robot.joint_count)[:, undriven]
+        of_joints = np.repeat(unit[:, :, None], samples, axis=2)
+        rates = pivot_rates(self.robot, followed.joints.position_rad)
+        of_pivots = np.transpose(rates, (2, 1, 0))
+        torque = np.concatenate((of_joints, of_pivots), axis=1)
+        of_axes = self.at_axes(followed, torque)
+        return np.ascontiguousarray(np.swapaxes(of_axes, 0, 1))
 
     def at_places(self, followed: TreeMotion) -> Motion:
         """Motion of all places (`Robot.places`) from that of the joints, arrays of shape (k,
@@ -478,53 +524,80 @@ class Model:
         joints = list(self.robot.place_joints)
         tree = followed.joints
         pivots = pivot_motion(self.robot, self.assembly, tree)
+
+        def with_pivots(of_joints: FloatArray, of_pivots: FloatArray) -> FloatArray:
+            return np.concatenate((of_joints[:, joints], of_pivots), axis=1)
+
         return Motion(
-            np.concatenate((tree.position_rad[:, joints], pivots.position_rad), axis=1),
-            np.concatenate((tree.velocity_rad_s[:, joints], pivots.velocity_rad_s), axis=1),
-            np.concatenate(
-                (tree.acceleration_rad_s2[:, joints], pivots.acceleration_rad_s2), axis=1
-            ),
+            position_rad=with_pivots(tree.position_rad, pivots.position_rad),
+            velocity_rad_s=with_pivots(tree.velocity_rad_s, pivots.velocity_rad_s),
+            acceleration_rad_s2=with_pivots(tree.acceleration_rad_s2, pivots.acceleration_rad_s2),
         )
 
     def at_axes(self, followed: TreeMotion, torque: FloatArray) -> FloatArray:
         """Torques of all joints as torques of the axes, B Gᵀ τ [Nm or N], shapes (n, …, k) and (m,
         …, k).
         """
+        # Gᵀ τ: Σ_n G_knd τ_nk of each coordinate d and sample k
         projected = np.einsum("knd,n...k->d...k", followed.to_joints, torque)
         if not self.is_redundant:
             return np.asarray(projected)
-        return spread(projected, np.transpose(followed.to_motors, (2, 1, 0)))
+        to_motors = np.transpose(followed.to_motors, (2, 1, 0))
+        return spread(projected, to_motors)
 
     def _joint_first(self, motion: Motion) -> list[FloatArray]:
-        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        """Positions, velocities and accelerations of the axes, shape (m, k) each,
+        once their shapes are checked.
+        """
         count = self.robot.axis_count
-        shapes = [np.shape(state) for state in states]
-        if shapes != [(*shapes[0][:1], count)] * 3:
+        shapes = [np.shape(state) for state in _states(motion)]
+        expected = (*shapes[0][:1], count)
+        if shapes != [expected] * 3:
+            found = ", ".join(map(str, shapes))
             raise ModelError(
-                "position, velocity and acceleration have the shapes "
-                f"{', '.join(map(str, shapes))}; expected (n_samples, {count}) each: a row a "
-                "sample, a column a joint"
+                f"position, velocity and acceleration have the shapes {found}; expected "
+                f"(n_samples, {count}) each: a row a sample, a column a joint"
             )
         return self._first(motion)
 
     @staticmethod
     def _first(motion: Motion) -> list[FloatArray]:
-        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-        return [np.ascontiguousarray(np.transpose(state)) for state in states]
+        """Positions, velocities and accelerations, joint first."""
+        return [np.ascontiguousarray(np.transpose(state)) for state in _states(motion)]
+
+
+def _states(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Positions, velocities and accelerations."""
+    return motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
 
 
 def _arrays(followed: TreeMotion) -> tuple[FloatArray, ...]:
     """All arrays of a motion."""
-    states = (
-        followed.joints.position_rad,
-        followed.joints.velocity_rad_s,
-        followed.joints.acceleration_rad_s2,
-    )
+    states = _states(followed.joints)
     return *states, followed.to_joints, followed.to_motors, followed.condition
 
 
+def _newest(motions: Sequence[tuple[bytes, TreeMotion]]) -> tuple[tuple[bytes, TreeMotion], ...]:
+    """The first motions, as many as REMEMBERED_BYTES allow."""
+    newest: list[tuple[bytes, TreeMotion]] = []
+    size = 0
+    for digest, followed in motions:
+        size += sum(array.nbytes for array in _arrays(followed))
+        if size > REMEMBERED_BYTES:
+            break
+        newest.append((digest, followed))
+    return tuple(newest)
+
+
+def _off_diagonal(direction: FloatArray) -> FloatArray:
+    """r rᵀ without its diagonal, shape (m, m):
+    how a motor's rotor couples the joints that it turns with.
+    """
+    return np.outer(direction, direction) - np.diag(direction**2)
+
+
 def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
-    """The least torques of the axes that do what columns of the d equations ask, B y.
+    """The least torques of the axes that satisfy the d equations with the given columns, B y.
 
     Args:
         columns: y, shape (d, …, k).
@@ -534,8 +607,11 @@ def spread(columns: FloatArray, to_motors: FloatArray) -> FloatArray:
         shape (m, …, k).
     """
     a = np.transpose(to_motors, (2, 1, 0))
-    back = a @ np.linalg.inv(np.swapaxes(a, 1, 2) @ a)
-    return np.asarray(np.einsum("kmd,d...k->m...k", back, columns, optimize=True))
+    gram = np.swapaxes(a, 1, 2) @ a
+    b = a @ np.linalg.inv(gram)  # B = A (AᵀA)⁻¹
+    # Σ_d B_kmd y_dk of each axis m and sample k
+    torque = np.einsum("kmd,d...k->m...k", b, columns, optimize=True)
+    return np.asarray(torque)
 
 
 def preload_directions(to_motors: FloatArray) -> FloatArray:
@@ -547,11 +623,14 @@ def preload_directions(to_motors: FloatArray) -> FloatArray:
     Returns:
         shape (k, m, m − d).
     """
-    whole, _ = np.linalg.qr(np.transpose(to_motors, (2, 1, 0)), mode="complete")
-    return np.asarray(whole[:, :, len(to_motors) :])
+    a = np.transpose(to_motors, (2, 1, 0))
+    directions, _ = np.linalg.qr(a, mode="complete")
+    mobility = len(to_motors)
+    return np.asarray(directions[:, :, mobility:])
 
 
 def without_preload(followed: TreeMotion, torque: FloatArray) -> FloatArray:
     """Take internal preload out of torques of the axes [Nm or N], B Aᵀ τ, shape (m, k)."""
     to_motors = np.transpose(followed.to_motors, (2, 1, 0))
-    return np.asarray(spread(np.einsum("dmk,mk->dk", to_motors, torque), to_motors))
+    equations = np.einsum("dmk,mk->dk", to_motors, torque)  # Aᵀ τ
+    return spread(equations, to_motors)

@@ -31,7 +31,7 @@ from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, p
 #: Difference of two joints' speeds, relative to the largest, below which they turn alike
 ALIKE = 1e-7
 PARALLEL = 1e-6  #: Sine of the angle between two axes that count as parallel
-BESIDE = (0.0, 0.06, -0.09)
+AWAY = (0.0, 0.06, -0.09)
 """Lengths of the motions from the assembly pose after which speeds are compared [rad or m]."""
 
 
@@ -57,20 +57,26 @@ def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
         assembly = assemble(robot)
     except ModelError:
         return ()
-    whole = replace(robot, pivots=turning)
-    speeds = _speeds_beside(whole, assembly)
-    known = [speeds[:, joint] for joint in range(robot.joint_count)]
-    found = []
+    speeds = _speeds_near(replace(robot, pivots=turning), assembly)
+    count = robot.joint_count
+    known = [speeds[:, joint] for joint in range(count)]
+    found: list[Pivot] = []
     for number, pivot in enumerate(turning):
-        own = speeds[:, robot.joint_count + number]
-        scale = float(np.abs(own).max())
-        alike = [
-            min(np.abs(own - one).max(), np.abs(own + one).max()) <= ALIKE * scale for one in known
-        ]
-        if scale > 0.0 and not any(alike):
+        own = speeds[:, count + number]
+        turns = float(np.abs(own).max()) > 0.0
+        is_known = any(_turn_alike(own, other) for other in known)
+        if turns and not is_known:
             found.append(pivot)
             known.append(own)
     return tuple(found)
+
+
+def _turn_alike(own: FloatArray, other: FloatArray) -> bool:
+    """Whether speeds are those of another joint in every motion, or their negatives."""
+    largest = float(np.abs(own).max())
+    difference = np.abs(own - other).max()
+    difference_to_negative = np.abs(own + other).max()
+    return bool(min(difference, difference_to_negative) <= ALIKE * largest)
 
 
 def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
@@ -89,10 +95,10 @@ def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
     placed = poses(robot, position_rad)
     for number, pivot in enumerate(robot.pivots):
         about = _axis(robot, placed, pivot)
-        for joint, sign in _loop(robot, robot.closures[pivot.closure]).items():
-            rates[:, number, joint] = sign * np.einsum(
-                "ki,ki->k", about, _joint_axis(robot, placed, joint)
-            )
+        loop = _loop(robot, robot.closures[pivot.closure])
+        for joint, sign in loop.items():
+            axis = _joint_axis(robot, placed, joint)
+            rates[:, number, joint] = sign * np.einsum("ki,ki->k", about, axis)  # ± a · a_j
     return rates
 
 
@@ -125,11 +131,13 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
         away = _angle(robot, placed, pivot) - middle
         position[:, number] = middle + np.arctan2(np.sin(away), np.cos(away))
         about = _axis(robot, placed, pivot)
-        for joint, sign in _loop(robot, robot.closures[pivot.closure]).items():
-            before = turning[robot.joints[joint].parent + 1]
-            along = _joint_axis(robot, placed, joint) * joints.velocity_rad_s[:, joint, None]
-            swung = np.cross(before, along)
-            acceleration[:, number] += sign * np.einsum("ki,ki->k", about, swung)
+        loop = _loop(robot, robot.closures[pivot.closure])
+        for joint, sign in loop.items():
+            parent = robot.joints[joint].parent
+            of_parent = turning[parent + 1]
+            own = _joint_axis(robot, placed, joint) * joints.velocity_rad_s[:, joint, None]
+            turned = np.cross(of_parent, own)
+            acceleration[:, number] += sign * np.einsum("ki,ki->k", about, turned)
     return Motion(position, velocity, acceleration)
 
 
@@ -146,7 +154,9 @@ def _pivot_of(robot: Robot, index: int) -> Pivot | None:
         return None
     (about,) = {0, 1, 2}.difference(lengths)
     pivot = Pivot(index, about)
-    return pivot if _is_planar(robot, pivot) else None
+    if _is_planar(robot, pivot):
+        return pivot
+    return None
 
 
 def _is_planar(robot: Robot, pivot: Pivot) -> bool:
@@ -156,8 +166,11 @@ def _is_planar(robot: Robot, pivot: Pivot) -> bool:
     placed = poses(robot, np.zeros((1, robot.joint_count)))
     about = _axis(robot, placed, pivot)
     loop = _loop(robot, robot.closures[pivot.closure])
-    across = [np.linalg.norm(np.cross(about, _joint_axis(robot, placed, joint))) for joint in loop]
-    return bool(max(across, default=0.0) <= PARALLEL)
+    for joint in loop:
+        across = np.cross(about, _joint_axis(robot, placed, joint))
+        if np.linalg.norm(across) > PARALLEL:
+            return False
+    return True
 
 
 def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
@@ -182,7 +195,8 @@ def _joint_axis(robot: Robot, placed: Poses, joint: int) -> FloatArray:
 def _axis(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
     """Axis of a pivot in the base, shape (k, 3)."""
     first = robot.closures[pivot.closure].first
-    return np.asarray(placed.rotation[first.joint + 1] @ first.rotation[:, pivot.axis])
+    axis = first.rotation[:, pivot.axis]
+    return np.asarray(placed.rotation[first.joint + 1] @ axis)
 
 
 def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
@@ -193,7 +207,9 @@ def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
     turned = np.swapaxes(frame, 1, 2) @ other
     following = (pivot.axis + 1) % 3
     last = (pivot.axis + 2) % 3
-    return np.asarray(np.arctan2(turned[:, last, following], turned[:, following, following]))
+    sine = turned[:, last, following]
+    cosine = turned[:, following, following]
+    return np.asarray(np.arctan2(sine, cosine))
 
 
 def _angular_velocities(robot: Robot, placed: Poses, velocity_rad_s: FloatArray) -> FloatArray:
@@ -206,23 +222,26 @@ def _angular_velocities(robot: Robot, placed: Poses, velocity_rad_s: FloatArray)
     return turning
 
 
-def _speeds_beside(robot: Robot, assembly: Assembly) -> FloatArray:
-    """Speeds of all joints and pivots in free motions at and beside the assembly pose,
+def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:
+    """Speeds of all joints and pivots in free motions at and near the assembly pose,
     shape (motions, n + p).
     """
     draw = np.random.default_rng(0)
-    found = []
-    for size in BESIDE:
-        free = null_space(loops(robot, assembly.position_rad[None], assembly.size_m).jacobian[0])
-        position = assembly.position_rad + size * free @ draw.standard_normal(free.shape[1])
+    assembled = loops(robot, assembly.position_rad[None], assembly.size_m)
+    free = null_space(assembled.jacobian[0])
+    speeds: list[FloatArray] = []
+    for size in AWAY:
+        drawn = draw.standard_normal(free.shape[1])
+        position = assembly.position_rad + size * free @ drawn
         for _ in range(MAX_ITERATIONS):
             closing = loops(robot, position[None], assembly.size_m)
-            if np.abs(closing.residual).max() < CLOSED:
+            residual = closing.residual[0]
+            if np.abs(residual).max() < CLOSED:
                 break
-            position = (
-                position - np.linalg.lstsq(closing.jacobian[0], closing.residual[0], rcond=1e-8)[0]
-            )
-        joints = null_space(loops(robot, position[None], assembly.size_m).jacobian[0])
-        pivots = pivot_rates(robot, position[None])[0] @ joints
-        found.append(np.concatenate((joints, pivots)).T)
-    return np.concatenate(found)
+            step, *_ = np.linalg.lstsq(closing.jacobian[0], residual, rcond=1e-8)
+            position = position - step
+        closing = loops(robot, position[None], assembly.size_m)
+        of_joints = null_space(closing.jacobian[0])
+        of_pivots = pivot_rates(robot, position[None])[0] @ of_joints
+        speeds.append(np.concatenate((of_joints, of_pivots)).T)
+    return np.concatenate(speeds)

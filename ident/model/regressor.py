@@ -5,7 +5,7 @@ are written. Three kinds of them go from link to link by the same matrices, and 
 product: the velocity V = (ω, v), the acceleration A = (α, a′) and the screw S_j of every joint j
 that moves the link,
 
-    V_i = X V + S q̇,        A_i = X A + S q̈ + V × S q̇,        S_j,i = X S_j,        X = Σ_f f(q) X_f,
+    V_i = X V + S q̇,    A_i = X A + S q̈ + V × S q̇,    S_j,i = X S_j,    X = Σ_f f(q) X_f,
 
 with constant 6 × 6 matrices X_f and f of (1, cos q, sin q) for a revolute joint, (1, q) for a
 prismatic one. Gravity is a base acceleration of −g. With a = a′ + ω × v, the acceleration of the
@@ -16,16 +16,17 @@ link frame's origin, Newton-Euler gives the wrench there,
 linear in (I, h, m): a 6 × 10 matrix Y. The torque of joint j is the power of the wrench over its
 screw, S_jᵀ Y (paper eqs. 1-2, IDM_st without drive chain). Only what joint j moves is ever
 computed; every operation is a plain product of arrays that are contiguous in time.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
-from ident.model.robot import JointKind, Robot, skew
+from ident.model.robot import Joint, JointKind, Robot, skew
 
 #: Samples computed at once: with fewer, most of the time goes into the calls of numpy
 BLOCK_SAMPLES = 4096
@@ -48,19 +49,22 @@ def fill_rigid(
             k), time last.
         out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k):
             joint, link, parameter, sample; a view into a wider layout will do. Only links that the
-            joint moves are written, so that the rest may be zeroed once and for all.
+            joint moves are written, so the rest may be zeroed once.
         wanted: parameters of each link that are written, shape (n, 10); all when None.
     """
     links = _links(robot)
-    wanted = np.ones((len(links), 10), dtype=np.bool_) if wanted is None else wanted
-    inertias, moments = ([_spans(own) for own in part] for part in (wanted[:, :6], wanted[:, 6:]))
+    if wanted is None:
+        wanted = np.ones((len(links), 10), dtype=np.bool_)
+    inertias = [_spans(own) for own in wanted[:, :6]]
+    moments = [_spans(own) for own in wanted[:, 6:]]
     samples = position.shape[1]
     size = min(samples, BLOCK_SAMPLES)
     work = _work(robot, links, size)
     for first in range(0, samples, BLOCK_SAMPLES):
-        block = slice(first, min(first + BLOCK_SAMPLES, samples))
-        if block.stop - first != size:
-            work = _work(robot, links, block.stop - first)
+        end = min(first + BLOCK_SAMPLES, samples)
+        block = slice(first, end)
+        if end - first != size:
+            work = _work(robot, links, end - first)
         for index, link in enumerate(links):
             _move(
                 link,
@@ -76,23 +80,60 @@ def fill_rigid(
                 row = out[mover, index, :, block]
                 # Most joints turn or slide along an axis of their link's frame: their own row is
                 # one of Y's.
-                alone = link.component if mover == index else None
-                for part in inertias[index]:
-                    if alone is None:
-                        np.einsum("dk,dck->ck", screw[:3], work.inertia[:, part], out=row[:6][part])
-                    else:
-                        row[:6][part] = work.inertia[alone, part] if alone < 3 else 0.0
-                for part in moments[index]:
-                    if alone is None:
-                        np.einsum("dk,dck->ck", screw, work.moments[:, part], out=row[6:][part])
-                    else:
-                        row[6:][part] = work.moments[alone, part]
+                if mover == index and link.component is not None:
+                    _copy_row(work, link.component, row, inertias[index], moments[index])
+                else:
+                    _project_row(work, screw, row, inertias[index], moments[index])
+
+
+def _copy_row(
+    work: _Work,
+    component: int,
+    row: FloatArray,
+    inertias: Sequence[slice],
+    moments: Sequence[slice],
+) -> None:
+    """Write one row of Y, for the joint whose screw is a unit vector,
+    into the spans of the parameters.
+    """
+    of_inertia = row[:6]
+    of_moments = row[6:]
+    is_angular = component < 3
+    for span in inertias:
+        if is_angular:
+            of_inertia[span] = work.inertia[component, span]
+        else:
+            of_inertia[span] = 0.0
+    for span in moments:
+        of_moments[span] = work.moments[component, span]
+
+
+def _project_row(
+    work: _Work,
+    screw: FloatArray,
+    row: FloatArray,
+    inertias: Sequence[slice],
+    moments: Sequence[slice],
+) -> None:
+    """Write SᵀY of a joint, Σ_d S_dk Y_dck of parameter c and sample k,
+    into the spans of the parameters.
+    """
+    of_inertia = row[:6]
+    of_moments = row[6:]
+    angular = screw[:3]
+    for span in inertias:
+        np.einsum("dk,dck->ck", angular, work.inertia[:, span], out=of_inertia[span])
+    for span in moments:
+        np.einsum("dk,dck->ck", screw, work.moments[:, span], out=of_moments[span])
 
 
 def _spans(wanted: BoolArray) -> list[slice]:
-    """Stretches of what is wanted."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], wanted, [0])))).tolist()
-    return [slice(first, last) for first, last in zip(edges[::2], edges[1::2], strict=True)]
+    """Spans of indices that are wanted."""
+    padded = np.concatenate(([0], wanted, [0]))
+    edges = np.flatnonzero(np.diff(padded)).tolist()
+    starts = edges[::2]
+    ends = edges[1::2]
+    return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
 
 
 def rigid_torque(
@@ -105,27 +146,44 @@ def rigid_torque(
     """Torque of the rigid links [Nm or N], shape (n, k):
     the columns of `fill_rigid` times ``parameters``, (n, 10).
     """
-    links, out = _links(robot), np.empty_like(position)
+    links = _links(robot)
     inertias = [_inertia(own) for own in parameters]
+    out = np.empty_like(position)
     for first in range(0, position.shape[1], BLOCK_SAMPLES):
         block = slice(first, first + BLOCK_SAMPLES)
-        states = list(
-            zip(position[:, block], velocity[:, block], acceleration[:, block], strict=True)
-        )
-        work = _work(robot, links, len(states[0][0]), movers=False)
+        q = position[:, block]
+        dq = velocity[:, block]
+        ddq = acceleration[:, block]
+        samples = q.shape[1]
+        work = _work(robot, links, samples, movers=False)
         for index, link in enumerate(links):
-            _move(link, work, index, *states[index])
-        # The last one is what the base bears
-        wrenches = np.zeros((len(links) + 1, 6, len(states[0][0])))
-        for own, screws, inertia in zip(wrenches, work.screws, inertias, strict=False):
-            v, (momentum, own[:]) = screws[0], inertia @ screws
-            _add_cross(own[:3], v[:3], momentum[:3])
-            _add_cross(own[:3], v[3:], momentum[3:])
-            _add_cross(own[3:], v[:3], momentum[3:])
-        for index, link in reversed(list(enumerate(links))):
+            _move(link, work, index, q[index], dq[index], ddq[index])
+        wrenches = np.zeros((len(links) + 1, 6, samples))  # the last one is what the base bears
+        for index, inertia in enumerate(inertias):
+            _fill_inertial_wrench(wrenches[index], work.screws[index], inertia)
+        for index in reversed(range(len(links))):
+            link = links[index]
             out[index, block] = link.own @ wrenches[index]
-            wrenches[link.parent] += _borne(link, wrenches[index], states[index][0])
+            wrenches[link.parent] += _borne(link, wrenches[index], q[index])
     return out
+
+
+def _fill_inertial_wrench(wrench: FloatArray, screws: FloatArray, inertia: FloatArray) -> None:
+    """Write M A + V ×* M V of a link, moment first, shape (6, k).
+
+    Args:
+        wrench: to write into.
+        screws: V and A, shape (2, 6, k).
+        inertia: M, shape (6, 6).
+    """
+    angular = screws[0, :3]
+    linear = screws[0, 3:]
+    momentum, wrench[:] = inertia @ screws
+    moment = wrench[:3]
+    force = wrench[3:]
+    _add_cross(moment, angular, momentum[:3])
+    _add_cross(moment, linear, momentum[3:])
+    _add_cross(force, angular, momentum[3:])
 
 
 def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -137,18 +195,23 @@ def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> F
         position: of the joints, shape (n, k).
         parameters: of the links (LINK_PARAMETERS), shape (n, 10).
     """
-    links, (count, samples) = _links(robot), position.shape
-    inertias, out = [_inertia(own) for own in parameters], np.zeros((count, count, samples))
+    links = _links(robot)
+    inertias = [_inertia(own) for own in parameters]
+    count, samples = position.shape
+    out = np.zeros((count, count, samples))
     for first in range(0, samples, BLOCK_SAMPLES):
-        here = position[:, first : first + BLOCK_SAMPLES]
-        work, still = _work(robot, links, here.shape[1]), np.zeros(here.shape[1])
+        block = slice(first, first + BLOCK_SAMPLES)
+        q = position[:, block]
+        of_block = out[:, :, block]
+        work = _work(robot, links, q.shape[1])
+        still = np.zeros(q.shape[1])
         for index, (link, inertia) in enumerate(zip(links, inertias, strict=True)):
-            _move(link, work, index, here[index], still, still)
+            _move(link, work, index, q[index], still, still)
             screws = work.screws[index][2:]
-            part = out[:, :, first : first + BLOCK_SAMPLES]
-            part[np.ix_(link.movers, link.movers)] += np.einsum(
-                "idk,jdk->ijk", screws, inertia @ screws
-            )
+            momenta = inertia @ screws
+            # S_iᵀ M S_j of the joints i and j that move this link
+            of_link = np.einsum("idk,jdk->ijk", screws, momenta)
+            of_block[np.ix_(link.movers, link.movers)] += of_link
     return out
 
 
@@ -165,24 +228,26 @@ def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     tangent = np.tan(0.5 * angle)
     square = tangent * tangent
     share = 1.0 / (1.0 + square)
-    return (1.0 - square) * share, 2.0 * tangent * share
+    cosine = (1.0 - square) * share
+    sine = 2.0 * tangent * share
+    return cosine, sine
 
 
 def _inertia(parameters: FloatArray) -> FloatArray:
     """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS),
     shape (6, 6).
     """
-    first, mass = skew(parameters[6:9]), parameters[9] * np.eye(3)
-    return np.block(
-        [[parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3), first], [-first, mass]]
-    )
+    tensor = parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3)
+    first_moment = skew(parameters[6:9])
+    mass = parameters[9] * np.eye(3)
+    return np.block([[tensor, first_moment], [-first_moment, mass]])
 
 
 @dataclass(frozen=True, slots=True)
 class _Link:
     """Constants of a link.
 
-    Its joint turns or slides along z of a frame of its own: there cos q and sin q, or q, touch two
+    Its joint turns or slides along z of the joint's frame: there cos q and sin q, or q, touch two
     components in three, and most robots' links have that frame already.
     """
 
@@ -209,40 +274,74 @@ class _Work:
 
 
 def _links(robot: Robot) -> tuple[_Link, ...]:
+    """Constants of all links."""
     links: list[_Link] = []
     for index, joint in enumerate(robot.joints):
-        revolute, axis = joint.kind is JointKind.REVOLUTE, joint.axis
-        first = np.eye(3)[np.argmin(np.abs(axis))]
-        first = (first - axis * (axis @ first)) / np.sqrt(1.0 - (axis @ first) ** 2)
-        turn = np.array((first, skew(axis) @ first, axis))
-        own = np.zeros(6)
-        own[slice(0, 3) if revolute else slice(3, 6)] = axis
-        links.append(
-            _Link(
-                parent=joint.parent,
-                movers=(*(links[joint.parent].movers if joint.parent >= 0 else ()), index),
-                revolute=revolute,
-                fixed=_blocks(
-                    turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)
-                ),
-                back=None if (turn == np.eye(3)).all() else _blocks(turn.T),
-                own=own,
-                component=int(np.argmax(own))
-                if np.count_nonzero(own) == 1 and own.max() == 1.0
-                else None,
-            )
-        )
+        before: tuple[int, ...] = ()
+        if joint.parent >= 0:
+            before = links[joint.parent].movers
+        links.append(_link(joint, (*before, index)))
     return tuple(links)
 
 
+def _link(joint: Joint, movers: tuple[int, ...]) -> _Link:
+    """Constants of the link behind a joint."""
+    axis = joint.axis
+    revolute = joint.kind is JointKind.REVOLUTE
+    turn = _frame_about(axis)
+    own = np.zeros(6)
+    if revolute:
+        own[:3] = axis
+    else:
+        own[3:] = axis
+    back = None
+    if not np.array_equal(turn, np.eye(3)):
+        back = _blocks(turn.T)
+    component = None
+    if np.count_nonzero(own) == 1 and own.max() == 1.0:
+        component = int(np.argmax(own))
+    return _Link(
+        parent=joint.parent,
+        movers=movers,
+        revolute=revolute,
+        fixed=_blocks(
+            turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)
+        ),
+        back=back,
+        own=own,
+        component=component,
+    )
+
+
+def _frame_about(axis: FloatArray) -> FloatArray:
+    """Rotation to a frame whose z is an axis, shape (3, 3);
+    its x is near the axis of the frame most across to it.
+    """
+    across = np.eye(3)[np.argmin(np.abs(axis))]
+    cosine = axis @ across
+    x = (across - axis * cosine) / np.sqrt(1.0 - cosine**2)
+    y = skew(axis) @ x
+    return np.array((x, y, axis))
+
+
 def _work(robot: Robot, links: tuple[_Link, ...], samples: int, *, movers: bool = True) -> _Work:
+    """Arrays for so many samples; without movers, room for V and A alone."""
     base = np.zeros((2, 6, samples))
     base[1, 3:] = -robot.gravity_m_s2[:, None]
-    screws = [np.empty((2 + movers * len(link.movers), 6, samples)) for link in links]
-    for link, array in zip(links, screws, strict=True):
-        array[2:] = link.own[:, None]  # the last one stays
-    products = np.empty((1 + robot.joint_count, 2, 2, samples))
-    return _Work((*screws, base), products, np.zeros((3, 6, samples)), np.zeros((6, 4, samples)))
+    screws: list[FloatArray] = []
+    for link in links:
+        count = 2
+        if movers:
+            count += len(link.movers)
+        of_link = np.empty((count, 6, samples))
+        of_link[2:] = link.own[:, None]  # the last one stays
+        screws.append(of_link)
+    return _Work(
+        screws=(*screws, base),
+        products=np.empty((1 + robot.joint_count, 2, 2, samples)),
+        inertia=np.zeros((3, 6, samples)),
+        moments=np.zeros((6, 4, samples)),
+    )
 
 
 def _move(
@@ -255,14 +354,16 @@ def _move(
 ) -> None:
     """Carry the parent's screws to a link, through the frame of its joint."""
     before = work.screws[link.parent]
-    here = work.screws[index][: len(before)]
+    count = len(before)
+    here = work.screws[index][:count]
     np.matmul(link.fixed, before, out=here)
-    parts = here.reshape(len(here), 2, 3, -1)  # angular and linear
-    v, a = parts[:2]
+    parts = here.reshape(count, 2, 3, -1)  # angular and linear
+    v = parts[0]
+    a = parts[1]
     # S × S is nothing: V may be that before S q̇ is added.
     if link.revolute:
         cosine, sine = cos_sin(position)
-        turned = np.multiply(parts[:, :, 1::-1], sine, out=work.products[: len(here)])
+        turned = np.multiply(parts[:, :, 1::-1], sine, out=work.products[:count])
         parts[:, :, :2] *= cosine
         parts[:, :, 0] += turned[:, :, 0]
         parts[:, :, 1] -= turned[:, :, 1]
@@ -273,7 +374,9 @@ def _move(
         parts[:, 1, 1] -= position * parts[:, 0, 0]
         a[1, 0] += v[0, 1] * velocity
         a[1, 1] -= v[0, 0] * velocity
-    kind = 0 if link.revolute else 1
+    kind = 1
+    if link.revolute:
+        kind = 0
     v[kind, 2] += velocity
     a[kind, 2] += acceleration
     if link.back is not None:
@@ -282,19 +385,34 @@ def _move(
 
 def _borne(link: _Link, wrench: FloatArray, position: FloatArray) -> FloatArray:
     """A link's wrench at its parent, shape (6, k): the transpose of `_move`."""
-    n, f = (wrench if link.back is None else link.back.T @ wrench).reshape(2, 3, -1)
+    if link.back is not None:
+        wrench = link.back.T @ wrench
+    moment = wrench[:3]
+    force = wrench[3:]
     if link.revolute:
-        c, s = cos_sin(position)
-        n, f = (np.stack((c * x - s * y, s * x + c * y, z)) for x, y, z in (n, f))
+        cosine, sine = cos_sin(position)
+        moment = _turned_about_z(moment, cosine, sine)
+        force = _turned_about_z(force, cosine, sine)
     else:
-        n = np.stack((n[0] - position * f[1], n[1] + position * f[0], n[2]))
-    return link.fixed.T @ np.concatenate((n, f))
+        x = moment[0] - position * force[1]
+        y = moment[1] + position * force[0]
+        moment = np.stack((x, y, moment[2]))
+    return link.fixed.T @ np.concatenate((moment, force))
+
+
+def _turned_about_z(vector: FloatArray, cosine: FloatArray, sine: FloatArray) -> FloatArray:
+    """Vectors turned about z by the angle of a cosine and a sine, shape (3, k)."""
+    x, y, z = vector
+    turned_x = cosine * x - sine * y
+    turned_y = sine * x + cosine * y
+    return np.stack((turned_x, turned_y, z))
 
 
 def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray:
     """[[D, 0], [L, D]]: how screws (w, u) change frames."""
     out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = diagonal
+    out[:3, :3] = diagonal
+    out[3:, 3:] = diagonal
     if lower is not None:
         out[3:, :3] = lower
     return out
@@ -308,13 +426,38 @@ def _fill_wrench(
 
     What is zero in every motion is left as it is.
     """
-    w, v, dw = velocity[:3], velocity[3:], acceleration[:3]
-    xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
-    xy, xz, yz = w[0] * w[1], w[0] * w[2], w[1] * w[2]
-    # Columns of K(α) + [ω] K(ω), where I x = K(x) (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
-    inertia[0, 0] = inertia[1, 1] = inertia[2, 2] = dw[0]
-    inertia[0, 1] = inertia[1, 3] = inertia[2, 4] = dw[1]
-    inertia[0, 2] = inertia[1, 4] = inertia[2, 5] = dw[2]
+    w = velocity[:3]
+    squares = w * w
+    mixed = (w[0] * w[1], w[0] * w[2], w[1] * w[2])
+    _fill_inertia_columns(inertia, acceleration[:3], squares, mixed)
+    _fill_moment_columns(moments, velocity, acceleration, squares, mixed)
+
+
+def _fill_inertia_columns(
+    inertia: FloatArray,
+    dw: FloatArray,
+    squares: FloatArray,
+    mixed: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Columns of K(α) + [ω] K(ω), where I x = K(x) (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
+
+    Args:
+        inertia: to write into, shape (3, 6, k).
+        dw: α, shape (3, k).
+        squares: ω_x², ω_y², ω_z².
+        mixed: ω_x ω_y, ω_x ω_z, ω_y ω_z.
+    """
+    xx, yy, zz = squares
+    xy, xz, yz = mixed
+    inertia[0, 0] = dw[0]
+    inertia[1, 1] = dw[0]
+    inertia[2, 2] = dw[0]
+    inertia[0, 1] = dw[1]
+    inertia[1, 3] = dw[1]
+    inertia[2, 4] = dw[1]
+    inertia[0, 2] = dw[2]
+    inertia[1, 4] = dw[2]
+    inertia[2, 5] = dw[2]
     inertia[0, 1] -= xz
     inertia[0, 2] += xy
     inertia[1, 1] += yz
@@ -330,12 +473,35 @@ def _fill_wrench(
     np.subtract(yy, zz, out=inertia[0, 4])
     np.subtract(zz, xx, out=inertia[1, 2])
     np.subtract(xx, yy, out=inertia[2, 1])
-    # Force: m a + ([α] + [ω]²) h. Moment: −[a] h.
-    origin = moments[3:, 3]
-    np.add(acceleration[3], w[1] * v[2] - w[2] * v[1], out=origin[0])
-    np.add(acceleration[4], w[2] * v[0] - w[0] * v[2], out=origin[1])
-    np.add(acceleration[5], w[0] * v[1] - w[1] * v[0], out=origin[2])
-    moments[0, 1], moments[1, 2], moments[2, 0] = origin[2], origin[0], origin[1]
+
+
+def _fill_moment_columns(
+    moments: FloatArray,
+    velocity: FloatArray,
+    acceleration: FloatArray,
+    squares: FloatArray,
+    mixed: tuple[FloatArray, FloatArray, FloatArray],
+) -> None:
+    """Force m a + ([α] + [ω]²) h and moment −[a] h of unit (h, m).
+
+    Args:
+        moments: to write into, shape (6, 4, k).
+        velocity, acceleration: V and A, shape (6, k).
+        squares, mixed: of ω, as for `_fill_inertia_columns`.
+    """
+    w = velocity[:3]
+    v = velocity[3:]
+    dw = acceleration[:3]
+    dv = acceleration[3:]
+    xx, yy, zz = squares
+    xy, xz, yz = mixed
+    a = moments[3:, 3]
+    np.add(dv[0], w[1] * v[2] - w[2] * v[1], out=a[0])
+    np.add(dv[1], w[2] * v[0] - w[0] * v[2], out=a[1])
+    np.add(dv[2], w[0] * v[1] - w[1] * v[0], out=a[2])
+    moments[0, 1] = a[2]
+    moments[1, 2] = a[0]
+    moments[2, 0] = a[1]
     np.negative(moments[0, 1], out=moments[1, 0])
     np.negative(moments[1, 2], out=moments[2, 1])
     np.negative(moments[2, 0], out=moments[0, 2])

@@ -157,7 +157,7 @@ class Robot:
             leader.
         """
         followers = {coupling.follower for coupling in self.couplings}
-        passive = (joint for joint in self.passive_joints if joint not in followers)
+        passive = [joint for joint in self.passive_joints if joint not in followers]
         return (*self.axis_joints, *passive)
 
     @property
@@ -165,8 +165,9 @@ class Robot:
         """Where an effect can act: the joints of `place_joints`,
         and the pivots that loops are cut at.
         """
-        joints = (self.joints[joint] for joint in self.place_joints)
-        return (*joints, *map(self._as_joint, self.pivots))
+        joints = [self.joints[joint] for joint in self.place_joints]
+        pivots = [self._as_joint(pivot) for pivot in self.pivots]
+        return (*joints, *pivots)
 
     def _as_joint(self, pivot: Pivot) -> Joint:
         closure = self.closures[pivot.closure]
@@ -248,32 +249,38 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     samples, count = position_rad.shape
     rotation = np.empty((count + 1, samples, 3, 3))
     origin = np.empty((count + 1, samples, 3))
-    rotation[0], origin[0] = np.eye(3), 0.0
+    rotation[0] = np.eye(3)
+    origin[0] = 0.0
     own = _own_rotations(robot, position_rad)
     for index, joint in enumerate(robot.joints):
-        parent = rotation[joint.parent + 1]
-        np.add(origin[joint.parent + 1], parent @ joint.translation_m, out=origin[index + 1])
+        before = joint.parent + 1
+        here = index + 1
+        parent = rotation[before]
+        np.add(origin[before], parent @ joint.translation_m, out=origin[here])
         if joint.kind is JointKind.PRISMATIC:
-            origin[index + 1] += position_rad[:, index, None] * (
-                parent @ (joint.rotation @ joint.axis)
-            )
-        np.matmul(parent, own[index], out=rotation[index + 1])
+            direction = parent @ (joint.rotation @ joint.axis)
+            origin[here] += position_rad[:, index, None] * direction
+        np.matmul(parent, own[index], out=rotation[here])
     return Poses(rotation, origin)
 
 
 def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
-    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3):
-    Rodrigues' formula for all joints at once.
+    """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3).
+
+    Rodrigues' formula for all joints at once, R = R₀ (a aᵀ + cos q (1 − a aᵀ) + sin q [a]).
     """
-    axes = np.array([joint.axis for joint in robot.joints])
+    joints = robot.joints
+    axes = np.array([joint.axis for joint in joints])
+    fixed = np.array([joint.rotation for joint in joints])
+    is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in joints])
     outer = axes[:, :, None] * axes[:, None]
-    turns = np.stack((outer, np.eye(3) - outer, np.array([skew(axis) for axis in axes])), axis=1)
-    turns = np.array([joint.rotation for joint in robot.joints])[:, None] @ turns
-    turned = position_rad.T * np.array(
-        [[joint.kind is JointKind.REVOLUTE] for joint in robot.joints]
-    )
-    factors = np.stack((np.ones_like(turned), np.cos(turned), np.sin(turned)), axis=2)
-    return np.asarray((factors @ turns.reshape(-1, 3, 9)).reshape(*turned.shape, 3, 3))
+    crosses = np.array([skew(axis) for axis in axes])
+    parts = np.stack((outer, np.eye(3) - outer, crosses), axis=1)
+    parts = fixed[:, None] @ parts
+    angle = position_rad.T * is_revolute[:, None]
+    factors = np.stack((np.ones_like(angle), np.cos(angle), np.sin(angle)), axis=2)
+    rotations = factors @ parts.reshape(-1, 3, 9)
+    return np.asarray(rotations.reshape(*angle.shape, 3, 3))
 
 
 def skew(vector: FloatArray) -> FloatArray:

@@ -43,36 +43,44 @@ def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
         names: of the base parameters, each a leading standard parameter of this model and what it
             gathers.
     """
-    compared = [name for name in names if not name.split(" ", 1)[0].endswith(LOADED)]
+    compared = [name for name in names if not _leading_name(name).endswith(LOADED)]
     # Standard parameters as they are, none gathered with others, are right for their robot.
     is_grouped = any(TERM.search(name) for name in compared)
     if model.robot.is_constrained or not is_grouped:
         return None
-    kept = [
-        number for number, column in enumerate(model.columns) if not column.name.endswith(LOADED)
-    ]
-    regressor = model.regressor(_drawn_states(model.robot.axis_count))[:, kept]
-    rows = regressor.transpose(0, 2, 1).reshape(-1, len(kept))
+    columns: list[int] = []
+    column_names: list[str] = []
+    for number, column in enumerate(model.columns):
+        if not column.name.endswith(LOADED):
+            columns.append(number)
+            column_names.append(column.name)
+    states = _drawn_states(model.robot.axis_count)
+    regressor = model.regressor(states)[:, columns]
+    rows = regressor.transpose(0, 2, 1).reshape(-1, len(columns))
     size = np.linalg.norm(rows, axis=0)
     is_seen = size > RANK_TOLERANCE * float(size.max())
     scale = np.where(is_seen, size, 1.0)
     invisible = _null_space(rows / scale)
-    leading, weights = _weights(compared, [model.columns[number].name for number in kept])
+    leading, weights = _weights(compared, column_names)
     by_torque = scale[leading, None] / scale  # weights for columns of unit size
     change = np.linalg.norm((weights * by_torque) @ invisible, axis=1)
     is_gathered = weights != 0.0
-    allowed = is_gathered * WEIGHT_TOLERANCE * np.maximum(1.0, np.abs(weights)) + is_seen * ROUNDED
-    excess = change / np.linalg.norm(allowed * by_torque, axis=1)
+    largest_weight = np.maximum(1.0, np.abs(weights))
+    allowed_weight = is_gathered * WEIGHT_TOLERANCE * largest_weight + is_seen * ROUNDED
+    allowed = np.linalg.norm(allowed_weight * by_torque, axis=1)
+    excess = change / allowed
     # It moves nothing here, as a link's moment does where gravity is along the axis
     excess[~is_seen[leading]] = 0.0
     worst = int(np.argmax(excess))
-    return compared[worst] if excess[worst] > 1.0 else None
+    if excess[worst] > 1.0:
+        return compared[worst]
+    return None
 
 
 def _weights(names: Sequence[str], columns: Sequence[str]) -> tuple[list[int], FloatArray]:
     """Read names of base parameters: the index of each leading column, and G, shape (b, c)."""
     index = {name: number for number, name in enumerate(columns)}
-    leading = [index[name.split(" ", 1)[0]] for name in names]
+    leading = [index[_leading_name(name)] for name in names]
     weights = np.zeros((len(names), len(columns)))
     for row, (first, name) in enumerate(zip(leading, names, strict=True)):
         weights[row, first] = 1.0
@@ -82,9 +90,17 @@ def _weights(names: Sequence[str], columns: Sequence[str]) -> tuple[list[int], F
     return leading, weights
 
 
+def _leading_name(name: str) -> str:
+    """Standard parameter that a base parameter begins with."""
+    leading, _, _ = name.partition(" ")
+    return leading
+
+
 def _drawn_states(axis_count: int) -> Motion:
-    drawn = np.random.default_rng(0).uniform(-RANGE, RANGE, (3, STATES, axis_count))
-    return Motion(drawn[0], drawn[1], drawn[2])
+    """States at random, always the same ones."""
+    random = np.random.default_rng(0)
+    position, velocity, acceleration = random.uniform(-RANGE, RANGE, (3, STATES, axis_count))
+    return Motion(position, velocity, acceleration)
 
 
 def _null_space(rows: FloatArray) -> FloatArray:

@@ -29,13 +29,15 @@ def suggested_gravity(found_m_s2: FloatArray, std_m_s2: FloatArray) -> FloatArra
         gravity [m/s²], shape (3,).
     """
     size = float(np.linalg.norm(found_m_s2))
-    shown = np.abs(found_m_s2) > ZERO_SIGMAS * std_m_s2
-    shown[np.argmax(np.abs(found_m_s2))] = True
-    kept = np.where(shown, found_m_s2, 0.0)
-    kept *= size / np.linalg.norm(kept)
+    magnitude = np.abs(found_m_s2)
+    is_nonzero = magnitude > ZERO_SIGMAS * std_m_s2
+    is_nonzero[np.argmax(magnitude)] = True
+    gravity_m_s2 = np.where(is_nonzero, found_m_s2, 0.0)
+    gravity_m_s2 *= size / np.linalg.norm(gravity_m_s2)
     decimals = MOST_DECIMALS
-    largest_std_m_s2 = float(np.max(std_m_s2[shown]))
-    if np.count_nonzero(shown) > 1 and largest_std_m_s2 > 0.0:
+    largest_std_m_s2 = float(np.max(std_m_s2[is_nonzero]))
+    if np.count_nonzero(is_nonzero) > 1 and largest_std_m_s2 > 0.0:
         of_std = -math.floor(math.log10(largest_std_m_s2))
         decimals = min(MOST_DECIMALS, max(FEWEST_DECIMALS, of_std))
-    return np.asarray(np.round(kept, decimals) + 0.0)  # no minus before a zero
+    rounded = np.round(gravity_m_s2, decimals)
+    return np.asarray(rounded + 0.0)  # no minus before a zero

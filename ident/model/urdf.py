@@ -9,7 +9,7 @@ before them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import atan2, cos, inf, isfinite, sin, sqrt
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
@@ -31,7 +31,7 @@ from ident.model.robot import (
     poses,
 )
 
-HELD_ALIKE = 1e-3  #: Largest difference of two statements of one position [rad or m]
+SAME_POSITION = 1e-3  #: Largest difference of two statements of one position [rad or m]
 FOLLOWS_BY_ITSELF = "no `hold` of it: a joint that mimics an axis is read as one that follows it"
 """What to do about a held joint that follows an axis."""
 XACRO_SPACES = (
@@ -101,6 +101,8 @@ def robot_from_urdf(
             joint mimics one that does not move, or itself, or is in a closed chain.
     """
     found = read_urdf(urdf)
+    if assembly_rad is None:
+        assembly_rad = {}
     index = {joint.name: number for number, joint in enumerate(found.joints)}
     couplings = _couplings(mimics_of(urdf), index)
     if couplings and closures:
@@ -109,52 +111,17 @@ def robot_from_urdf(
             f"joint {follower!r} has <mimic>, and the robot has closures; expected one of the two: "
             "delete <mimic>, and describe what couples the joint as a closure"
         )
-
-    def link(name: str, what: str) -> Place:
-        if name not in found.links:
+    _require_joints("the list of motors", motors, index)
+    _require_joints("the assembly pose", assembly_rad, index)
+    closed = tuple(_closure(found, pair) for pair in closures)
+    carrier = None
+    if platform is not None:
+        carrier = _place_of(found, platform, "the platform")
+        if carrier.joint < 0:
             raise ModelError(
-                f"{what} names link {name!r}; the URDF has the links "
-                f"{', '.join(sorted(found.links))}"
+                f"the platform {platform!r} does not move; expected the link that "
+                "carries the payload"
             )
-        return found.links[name]
-
-    for what, names in (("the list of motors", motors), ("the assembly pose", assembly_rad or {})):
-        for name in names:
-            if name not in index:
-                raise ModelError(
-                    f"{what} names joint {name!r}; the URDF has the moving joints "
-                    f"{', '.join(index)}"
-                )
-    closed = []
-    for pair in closures:
-        require_kind(
-            "an entry of closures",
-            pair,
-            LinkPair,
-            "write LinkPair(name, first, second, directions)",
-        )
-        what = f"closure {pair.name!r}"
-        unknown = [direction for direction in pair.directions if direction not in DIRECTIONS]
-        if unknown or not pair.directions or len(set(pair.directions)) < len(pair.directions):
-            given = ", ".join(pair.directions) or "none"
-            raise ModelError(
-                f"{what} has the directions {given}; expected some of "
-                f"{', '.join(DIRECTIONS)}, each once"
-            )
-        closed.append(
-            Closure(
-                pair.name, link(pair.first, what), link(pair.second, what), tuple(pair.directions)
-            )
-        )
-    if platform is None:
-        carrier = None
-    else:
-        carrier = link(platform, "the platform")
-    if carrier is not None and carrier.joint < 0:
-        raise ModelError(
-            f"the platform {platform!r} does not move; expected the link that carries the payload"
-        )
-    pose = np.array([(assembly_rad or {}).get(joint.name, 0.0) for joint in found.joints])
     driven = tuple(index[name] for name in motors)
     if couplings and not driven:
         followers = {coupling.follower for coupling in couplings}
@@ -162,15 +129,69 @@ def robot_from_urdf(
     robot = Robot(
         joints=found.joints,
         gravity_m_s2=np.asarray(gravity_m_s2, dtype=np.float64),
-        closures=tuple(closed),
+        closures=closed,
         motors=driven,
-        assembly_rad=pose if closed or couplings else None,
         platform=carrier,
         couplings=couplings,
     )
-    if closed:
-        return replace(robot, pivots=cut_pivots(robot))
-    return robot
+    if not robot.is_constrained:
+        return robot
+    pose = [assembly_rad.get(joint.name, 0.0) for joint in found.joints]
+    robot = replace(robot, assembly_rad=np.array(pose))
+    if not closed:
+        return robot
+    return replace(robot, pivots=cut_pivots(robot))
+
+
+def _require_joints(source: str, names: Iterable[str], joints: Mapping[str, int]) -> None:
+    """Refuse names of joints that the URDF does not have.
+
+    Raises:
+        ModelError: one is not among the moving joints.
+    """
+    for name in names:
+        if name not in joints:
+            raise ModelError(
+                f"{source} names joint {name!r}; the URDF has the moving joints {', '.join(joints)}"
+            )
+
+
+def _place_of(found: UrdfRobot, link: str, source: str) -> Place:
+    """Frame of a link.
+
+    Raises:
+        ModelError: the URDF does not have it.
+    """
+    if link not in found.links:
+        names = ", ".join(sorted(found.links))
+        raise ModelError(f"{source} names link {link!r}; the URDF has the links {names}")
+    return found.links[link]
+
+
+def _closure(found: UrdfRobot, pair: LinkPair) -> Closure:
+    """Read a closure.
+
+    Raises:
+        ModelError: it has a link that the URDF does not have, or unknown directions.
+    """
+    require_kind(
+        "an entry of closures", pair, LinkPair, "write LinkPair(name, first, second, directions)"
+    )
+    source = f"closure {pair.name!r}"
+    are_known = set(pair.directions) <= set(DIRECTIONS)
+    are_distinct = len(set(pair.directions)) == len(pair.directions)
+    if not (pair.directions and are_known and are_distinct):
+        given = ", ".join(pair.directions) or "none"
+        raise ModelError(
+            f"{source} has the directions {given}; expected some of "
+            f"{', '.join(DIRECTIONS)}, each once"
+        )
+    return Closure(
+        name=pair.name,
+        first=_place_of(found, pair.first, source),
+        second=_place_of(found, pair.second, source),
+        directions=tuple(pair.directions),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +235,8 @@ def hold_joints(urdf: str, position_rad: Mapping[str, float]) -> str:
     followed = _followed(mimics, position_rad)
     for name, position in position_rad.items():
         _require_free(name, position, mimics, followed, movable)
-    for name, position in {**followed, **position_rad}.items():
+    positions = {**followed, **position_rad}
+    for name, position in positions.items():
         _fix(movable[name], position)
     return tostring(robot, encoding="unicode")
 
@@ -225,11 +247,14 @@ def mimics_of(urdf: str) -> dict[str, Mimic]:
     Raises:
         ModelError: the text is no URDF, or a multiplier or an offset is no number.
     """
-    return _mimics(_movable(_root(urdf)))
+    robot = _root(urdf)
+    return _mimics(_movable(robot))
 
 
 def _movable(robot: Element) -> dict[str, Element]:
-    return {_name(joint): joint for joint in robot.findall("joint") if joint.get("type") != "fixed"}
+    """Joints that are not fixed, by name."""
+    joints = [joint for joint in robot.findall("joint") if joint.get("type") != "fixed"]
+    return {_name(joint): joint for joint in joints}
 
 
 def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
@@ -253,14 +278,17 @@ def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
         seen.add(found.leader)
         before = mimics[found.leader]
         # q = a (b q_leader + c) + d
-        offset = found.multiplier * before.offset + found.offset
-        found = Mimic(before.leader, found.multiplier * before.multiplier, offset)
+        found = Mimic(
+            leader=before.leader,
+            multiplier=found.multiplier * before.multiplier,
+            offset=found.multiplier * before.offset + found.offset,
+        )
     return found
 
 
 def _couplings(mimics: Mapping[str, Mimic], index: Mapping[str, int]) -> tuple[JointCoupling, ...]:
     """Return how each follower depends on a joint that follows none."""
-    found = []
+    couplings: list[JointCoupling] = []
     for name in mimics:
         mimic = first_leader(name, mimics)
         if mimic.leader not in index:
@@ -269,14 +297,19 @@ def _couplings(mimics: Mapping[str, Mimic], index: Mapping[str, int]) -> tuple[J
                 f"joint {name!r} mimics {mimic.leader!r}, which is no joint of the URDF that "
                 f"moves; expected one of {moving}; hold {name!r} where it stays (`hold_joints`)"
             )
-        found.append(
-            JointCoupling(index[name], index[mimic.leader], mimic.multiplier, mimic.offset)
+        coupling = JointCoupling(
+            follower=index[name],
+            leader=index[mimic.leader],
+            multiplier=mimic.multiplier,
+            offset=mimic.offset,
         )
-    return tuple(found)
+        couplings.append(coupling)
+    return tuple(couplings)
 
 
 def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
-    found = {}
+    """What each of some joints follows, by its name; without those that follow none."""
+    found: dict[str, Mimic] = {}
     for name, joint in movable.items():
         mimic = joint.find("mimic")
         if mimic is None:
@@ -315,9 +348,11 @@ def _require_free(
     mimic = mimics.get(name)
     if mimic is None:
         return
-    elsewhere = mimic.offset if mimic.at_rest else followed.get(name)
+    elsewhere = followed.get(name)
+    if mimic.at_rest:
+        elsewhere = mimic.offset
     if elsewhere is not None:
-        if not np.isclose(position, elsewhere, rtol=0.0, atol=HELD_ALIKE):
+        if not np.isclose(position, elsewhere, rtol=0.0, atol=SAME_POSITION):
             raise ModelError(
                 f"joint {name!r} is held at {position:g} and mimics joint {mimic.leader!r}, by "
                 f"which it is at {elsewhere:g}; expected the same position [rad or m], or `hold` "
@@ -337,23 +372,30 @@ def _fix(element: Element, position: float) -> None:
     rotation, translation = _origin(element, name)
     if kind not in ("floating", "planar"):
         joint = _joint(element, Place(-1, rotation, translation))
-        placed = poses(Robot((joint,), np.zeros(3)), np.array([[position]]))
+        robot = Robot((joint,), np.zeros(3))
+        placed = poses(robot, np.array([[position]]))
         rotation = placed.rotation[1, 0]
         translation = placed.origin_m[1, 0]
     elif position != 0.0:
         raise ModelError(f"joint {name!r} is of type {kind!r} and held at {position:g}; expected 0")
+    for child in list(element):
+        if child.tag not in ("parent", "child"):
+            element.remove(child)
+    element.set("type", "fixed")
+    xyz = " ".join(map(repr, translation.tolist()))
+    rpy = " ".join(map(repr, _roll_pitch_yaw(rotation)))
+    element.append(Element("origin", {"xyz": xyz, "rpy": rpy}))
+
+
+def _roll_pitch_yaw(rotation: FloatArray) -> tuple[float, float, float]:
+    """Angles about the fixed axes x, y and z of a rotation [rad]."""
     roll = atan2(rotation[2, 1], rotation[2, 2])
-    # With this roll the other two are exact for every pitch, 90° included
-    s, c = sin(roll), cos(roll)
+    s = sin(roll)
+    c = cos(roll)
+    # With this roll the other two are exact for every pitch, 90° included.
     pitch = atan2(-rotation[2, 0], s * rotation[2, 1] + c * rotation[2, 2])
     yaw = atan2(s * rotation[0, 2] - c * rotation[0, 1], c * rotation[1, 1] - s * rotation[1, 2])
-    for child in [child for child in element if child.tag not in ("parent", "child")]:
-        element.remove(child)
-    element.set("type", "fixed")
-    spelled = {"xyz": translation.tolist(), "rpy": [roll, pitch, yaw]}
-    element.append(
-        Element("origin", {key: " ".join(map(repr, three)) for key, three in spelled.items()})
-    )
+    return roll, pitch, yaw
 
 
 def read_urdf(urdf: str) -> UrdfRobot:
@@ -376,19 +418,15 @@ def read_urdf(urdf: str) -> UrdfRobot:
     while pending:
         before, element = pending.pop()
         link = _link_at(element, "child")
-        rotation, translation = _origin(element, _name(element))
-        here = Place(
-            before.joint,
-            before.rotation @ rotation,
-            before.translation_m + before.rotation @ translation,
-        )
+        here = _place_behind(before, element)
+        body = _body(links[link])
         if element.get("type") != "fixed":
             joints.append(_joint(element, here))
-            bodies.append(_body(links[link]))
+            bodies.append(body)
             effort_limit.append(_effort_limit(element))
             here = Place(len(joints) - 1, np.eye(3), np.zeros(3))
         elif here.joint >= 0:
-            bodies[here.joint] = _joined(bodies[here.joint], _placed(_body(links[link]), here))
+            bodies[here.joint] = _joined(bodies[here.joint], _placed(body, here))
         places[link] = here
         pending += [(here, behind) for behind in joints_behind[link]]
     if not joints:
@@ -396,6 +434,16 @@ def read_urdf(urdf: str) -> UrdfRobot:
             "the URDF has no moving joint; expected at least one revolute or prismatic joint"
         )
     return UrdfRobot(tuple(joints), tuple(bodies), np.array(effort_limit), places)
+
+
+def _place_behind(before: Place, element: Element) -> Place:
+    """Frame of a joint, in the frame of the moving joint before it."""
+    rotation, translation = _origin(element, _name(element))
+    return Place(
+        joint=before.joint,
+        rotation=before.rotation @ rotation,
+        translation_m=before.translation_m + before.rotation @ translation,
+    )
 
 
 #: Characters of a path in the place of a text; a longer one is not repeated in a message
@@ -415,14 +463,15 @@ def _root(urdf: str) -> Element:
                 "is expanded by "
                 "`xacro robot.urdf.xacro > robot.urdf`"
             ) from error
-        text = str(urdf)
-        if text.strip() and len(text) <= LONGEST_NAME and "<" not in text and "\n" not in text:
+        if _looks_like_file_name(str(urdf)):
             raise ModelError(
                 f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()"
             ) from error
         raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
     space = robot.tag.removesuffix("robot")
-    if robot.tag != space + "robot" or (space and not space.startswith("{")):
+    is_robot = robot.tag == space + "robot"
+    is_namespace = not space or space.startswith("{")
+    if not (is_robot and is_namespace):
         raise ModelError(
             f"the URDF cannot be read: its outermost element is <{robot.tag}>; expected <robot>"
         )
@@ -432,9 +481,16 @@ def _root(urdf: str) -> Element:
     for element in robot.iter():
         if isinstance(element.tag, str):
             element.tag = element.tag.removeprefix(space)
-        else:
+        else:  # a comment
             element.tag = ""
     return robot
+
+
+def _looks_like_file_name(text: str) -> bool:
+    """Whether a text is short, of one line and without any element."""
+    is_one_line = "\n" not in text
+    has_element = "<" in text
+    return bool(text.strip()) and len(text) <= LONGEST_NAME and is_one_line and not has_element
 
 
 def _require_expanded(robot: Element) -> None:
@@ -444,10 +500,9 @@ def _require_expanded(robot: Element) -> None:
         is_macro = tag.startswith(XACRO_SPACES)
         has_expression = any(XACRO_EXPRESSION in value for value in element.attrib.values())
         if is_macro or has_expression:
+            name = f"{XACRO_EXPRESSION}...}} in <{tag}>"
             if is_macro:
                 name = f"<xacro:{tag.rpartition('}')[2]}>"
-            else:
-                name = f"{XACRO_EXPRESSION}...}} in <{tag}>"
             raise ModelError(
                 f"the file is xacro that is not expanded (it has {name}); expected the output of "
                 "`xacro robot.urdf.xacro > robot.urdf`"
@@ -467,12 +522,13 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
     behind: dict[str, list[Element]] = {name: [] for name in links}
     children = set()
     for name in sorted(joints, reverse=True):
-        parent, child = (_link_at(joints[name], end) for end in ("parent", "child"))
-        if parent not in links or child not in links:
-            unknown = child if parent in links else parent
-            raise ModelError(
-                f"joint {name!r} connects link {unknown!r}, which the URDF does not have"
-            )
+        parent = _link_at(joints[name], "parent")
+        child = _link_at(joints[name], "child")
+        for link in (parent, child):
+            if link not in links:
+                raise ModelError(
+                    f"joint {name!r} connects link {link!r}, which the URDF does not have"
+                )
         if child in children:
             raise ModelError(f"link {child!r} is the child of two joints; expected a tree")
         children.add(child)
@@ -495,20 +551,36 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
     return links, behind, roots[0]
 
 
+KINDS = {
+    "revolute": JointKind.REVOLUTE,
+    "continuous": JointKind.REVOLUTE,
+    "prismatic": JointKind.PRISMATIC,
+}
+"""Joints of one degree of freedom, by their type in a URDF."""
+
+
 def _joint(element: Element, at: Place) -> Joint:
+    """Read a moving joint.
+
+    Raises:
+        ModelError: it has several degrees of freedom, an axis without a direction, or lies too far
+            away.
+    """
     name = _name(element)
-    kind = element.get("type")
-    if kind not in ("revolute", "continuous", "prismatic"):
+    kind = element.get("type", "")
+    if kind not in KINDS:
+        found = element.get("type")
         raise ModelError(
-            f"joint {name!r} is of type {kind!r}; expected revolute, continuous, prismatic or fixed"
+            f"joint {name!r} is of type {found!r}; expected revolute, continuous, "
+            "prismatic or fixed"
         )
+    axis = np.array([1.0, 0.0, 0.0])
     declared = element.find("axis")
-    if declared is None:
-        axis = np.array([1.0, 0.0, 0.0])
-    else:
+    if declared is not None:
         axis = _vector(declared, "xyz", name)
     length = float(np.linalg.norm(axis))
-    axis = axis / length if length > 0.0 else axis
+    if length > 0.0:
+        axis = axis / length
     if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
         raise ModelError(
             f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one"
@@ -521,7 +593,7 @@ def _joint(element: Element, at: Place) -> Joint:
         )
     return Joint(
         name=name,
-        kind=JointKind.PRISMATIC if kind == "prismatic" else JointKind.REVOLUTE,
+        kind=KINDS[kind],
         parent=at.joint,
         rotation=at.rotation,
         translation_m=at.translation_m,
@@ -533,15 +605,14 @@ def _effort_limit(element: Element) -> float:
     """Effort limit of a moving joint; the limit element must be complete,
     and only a continuous joint may lack it.
     """
+    name = _name(element)
     limit = element.find("limit")
     if limit is None:
         if element.get("type") == "continuous":
             return inf
-        raise ModelError(
-            f"joint {_name(element)!r} has no <limit>; expected one with effort and velocity"
-        )
-    _number(limit, "velocity", _name(element))
-    return _number(limit, "effort", _name(element))
+        raise ModelError(f"joint {name!r} has no <limit>; expected one with effort and velocity")
+    _number(limit, "velocity", name)
+    return _number(limit, "effort", name)
 
 
 def _body(link: Element) -> Body:
@@ -557,34 +628,46 @@ def _body(link: Element) -> Body:
     except ModelError:
         return nothing
     try:
-        tensor = _part(inertial, "inertia", name)
-        xx, xy, xz, yy, yz, zz = (
-            _number(tensor, entry, name) for entry in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        )
+        tensor = _inertia_tensor(_part(inertial, "inertia", name), name)
     except ModelError:
         return Body(mass, centre, np.zeros((3, 3)))
-    return Body(
-        mass, centre, rotation @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ rotation.T
-    )
+    return Body(mass, centre, rotation @ tensor @ rotation.T)
+
+
+def _inertia_tensor(element: Element, name: str) -> FloatArray:
+    """Tensor of an <inertia>, shape (3, 3).
+
+    Raises:
+        ModelError: an entry is missing or no number.
+    """
+    xx = _number(element, "ixx", name)
+    xy = _number(element, "ixy", name)
+    xz = _number(element, "ixz", name)
+    yy = _number(element, "iyy", name)
+    yz = _number(element, "iyz", name)
+    zz = _number(element, "izz", name)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def _placed(body: Body, at: Place) -> Body:
     """Write a body in the frame of the joint that moves it."""
     centre = at.translation_m + at.rotation @ body.centre_m
-    return Body(body.mass_kg, centre, at.rotation @ body.inertia_kg_m2 @ at.rotation.T)
+    inertia = at.rotation @ body.inertia_kg_m2 @ at.rotation.T
+    return Body(body.mass_kg, centre, inertia)
 
 
 def _joined(first: Body, second: Body) -> Body:
     """Two bodies of one frame as one, about the common centre of mass."""
     mass = first.mass_kg + second.mass_kg
+    inertia = first.inertia_kg_m2 + second.inertia_kg_m2
     if mass == 0.0:
-        return Body(0.0, np.zeros(3), first.inertia_kg_m2 + second.inertia_kg_m2)
-    centre = (first.mass_kg * first.centre_m + second.mass_kg * second.centre_m) / mass
-    apart = first.centre_m - second.centre_m
-    steiner = (
-        first.mass_kg * second.mass_kg / mass * (apart @ apart * np.eye(3) - np.outer(apart, apart))
-    )
-    return Body(mass, centre, first.inertia_kg_m2 + second.inertia_kg_m2 + steiner)
+        return Body(0.0, np.zeros(3), inertia)
+    first_moment = first.mass_kg * first.centre_m + second.mass_kg * second.centre_m
+    centre = first_moment / mass
+    distance = first.centre_m - second.centre_m
+    reduced_mass = first.mass_kg * second.mass_kg / mass
+    steiner = reduced_mass * (distance @ distance * np.eye(3) - np.outer(distance, distance))
+    return Body(mass, centre, inertia + steiner)
 
 
 def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
@@ -598,26 +681,42 @@ def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
         raise ModelError(
             f"{name!r} has an origin with quat_xyzw, which URDF 1.0 does not know; expected rpy"
         )
-    half = 0.5 * _vector(origin, "rpy", name)
-    (cx, cy, cz), (sx, sy, sz) = map(cos, half), map(sin, half)
+    angles = _vector(origin, "rpy", name)
+    translation = _vector(origin, "xyz", name)
+    return _rotation(angles), translation
+
+
+def _rotation(angles_rad: FloatArray) -> FloatArray:
+    """Rotation by angles about the fixed axes x, y, z, in this order, shape (3, 3);
+    by its unit quaternion.
+    """
+    half = 0.5 * angles_rad
+    cx, cy, cz = map(cos, half)
+    sx, sy, sz = map(sin, half)
     x = sx * cy * cz - cx * sy * sz
     y = cx * sy * cz + sx * cy * sz
     z = cx * cy * sz - sx * sy * cz
     w = cx * cy * cz + sx * sy * sz
     length = sqrt(x * x + y * y + z * z + w * w)
-    x = x / length
-    y = y / length
-    z = z / length
-    w = w / length
-    rotation = [
-        [1.0 - (2.0 * y * y + 2.0 * z * z), 2.0 * y * x - 2.0 * z * w, 2.0 * z * x + 2.0 * y * w],
-        [2.0 * y * x + 2.0 * z * w, 1.0 - (2.0 * x * x + 2.0 * z * z), 2.0 * z * y - 2.0 * x * w],
-        [2.0 * z * x - 2.0 * y * w, 2.0 * z * y + 2.0 * x * w, 1.0 - (2.0 * x * x + 2.0 * y * y)],
-    ]
-    return np.array(rotation), _vector(origin, "xyz", name)
+    x /= length
+    y /= length
+    z /= length
+    w /= length
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - (2.0 * y * y + 2.0 * z * z)
+    rotation[0, 1] = 2.0 * y * x - 2.0 * z * w
+    rotation[0, 2] = 2.0 * z * x + 2.0 * y * w
+    rotation[1, 0] = 2.0 * y * x + 2.0 * z * w
+    rotation[1, 1] = 1.0 - (2.0 * x * x + 2.0 * z * z)
+    rotation[1, 2] = 2.0 * z * y - 2.0 * x * w
+    rotation[2, 0] = 2.0 * z * x - 2.0 * y * w
+    rotation[2, 1] = 2.0 * z * y + 2.0 * x * w
+    rotation[2, 2] = 1.0 - (2.0 * x * x + 2.0 * y * y)
+    return rotation
 
 
 def _name(element: Element) -> str:
+    """Name of a link or joint."""
     name = element.get("name", "")
     if not name:
         raise ModelError(
@@ -628,10 +727,12 @@ def _name(element: Element) -> str:
 
 def _link_at(joint: Element, end: str) -> str:
     """Name of the parent or child link of a joint."""
-    return _part(joint, end, _name(joint)).get("link", "")
+    part = _part(joint, end, _name(joint))
+    return part.get("link", "")
 
 
 def _part(element: Element, tag: str, name: str) -> Element:
+    """An element inside of another one."""
     found = element.find(tag)
     if found is None:
         raise ModelError(f"{element.tag} of {name!r} in the URDF has no <{tag}>; expected one")
@@ -650,6 +751,7 @@ def _vector(element: Element, key: str, name: str) -> FloatArray:
 
 
 def _number(element: Element, key: str, name: str) -> float:
+    """A number of an attribute."""
     text = element.get(key, "")
     number = _finite(text)
     if number is None:
@@ -660,8 +762,11 @@ def _number(element: Element, key: str, name: str) -> float:
 
 
 def _finite(text: str) -> float | None:
+    """A finite number from its text; None where it is none."""
     try:
         number = float(text)
     except ValueError:
         return None
-    return number if isfinite(number) and "_" not in text else None
+    if "_" in text or not isfinite(number):
+        return None
+    return number

@@ -14,7 +14,7 @@ import numpy as np
 from ident.arrays import FloatArray, IntArray
 from ident.errors import IdentificationError
 from ident.model.bodies import pseudo_inertia
-from ident.model.model import JOINT_COLUMNS, Model
+from ident.model.model import JOINT_COLUMNS, ROTOR_INERTIA, Model
 
 #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
 MARGIN = 1e-4
@@ -40,14 +40,14 @@ class Consistency:
     """Conditions on n links and on the s parameters that are no link's.
 
     Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry
-    friction fs and fsm, and the own parameters of motors that turn with several joints (Iam, fvm),
-    are not negative; the kinetic energy of the rotors and the power lost to viscous friction are
-    not negative in any motion, that is
+    friction fs and fsm, and Iam and fvm of motors that turn with several joints, are not negative;
+    the kinetic energy of the rotors and the power lost to viscous friction are not negative in any
+    motion, that is
 
-        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0
+        diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0, and the same with fv and fvm (paper eq.
+        25),
 
-    and the same with fv and fvm (paper eq. 25), which without coupled motors is Ia ≥ 0 and fv ≥ 0.
-    Offsets are free.
+    which without coupled motors is Ia ≥ 0 and fv ≥ 0. Offsets are free.
     """
 
     link_columns: IntArray  #: indices of each link's ten parameters, shape (n, 10)
@@ -71,17 +71,20 @@ class Consistency:
             room: least value of what may not be negative.
         """
         constraints = [link >> margin * np.eye(4) for link in links]
-        where = {int(column): number for number, column in enumerate(self.scalars)}
+        number_of = {int(column): number for number, column in enumerate(self.scalars)}
         if self.positive:
-            constraints.append(scalars[[where[column] for column in self.positive]] >= room)
+            positive = [number_of[column] for column in self.positive]
+            constraints.append(scalars[positive] >= room)
         for columns, parts in self.dissipative:
-            size = np.array([self.scales[where[column]] for column in columns])
+            numbers = [number_of[column] for column in columns]
+            sizes = self.scales[numbers]
             # In the scales of its diagonal, like everything else.
-            unit = np.sqrt([size[np.argmax(parts[:, k, k])] for k in range(parts.shape[1])])
-            matrix = sum(
-                scalars[where[column]] * (part * scale / np.outer(unit, unit))
-                for column, part, scale in zip(columns, parts, size, strict=True)
-            )
+            largest_on_diagonal = np.argmax(np.einsum("pkk->pk", parts), axis=0)
+            unit = np.sqrt(sizes[largest_on_diagonal])
+            unit_square = np.outer(unit, unit)
+            matrix: Any = 0
+            for number, part, size in zip(numbers, parts, sizes, strict=True):
+                matrix = matrix + scalars[number] * (part * size / unit_square)
             constraints.append(matrix >> room * np.eye(len(unit)))
         return constraints
 
@@ -117,20 +120,19 @@ def consistency_of(
             alone may have any sign.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
-    link_columns = model.link_columns
-    scalars = driven_scalars(model)
     coupled = model.drive_train.coupled
-    number_of = [joint + 1 for joint in model.robot.axis_joints]
-    own_friction = [axis for axis in range(model.robot.axis_count) if axis not in other_friction]
-    positive = [index[f"fs{number_of[axis]}"] for axis in own_friction]
-    positive += [index[f"Iam{motor + 1}"] for motor in coupled]
-    positive += [
-        index[f"{name}{motor + 1}"]
-        for motor in coupled
-        if motor in own_friction
-        for name in ("fvm", "fsm")
-    ]
-    dissipative = []
+    numbers = [joint + 1 for joint in model.robot.axis_joints]
+    positive: list[int] = []
+    for axis, number in enumerate(numbers):
+        if axis not in other_friction:
+            positive.append(index[f"fs{number}"])
+    for motor in coupled:
+        positive.append(index[f"Iam{motor + 1}"])
+    for motor in coupled:
+        if motor not in other_friction:
+            positive.append(index[f"fvm{motor + 1}"])
+            positive.append(index[f"fsm{motor + 1}"])
+    dissipative: list[tuple[tuple[int, ...], FloatArray]] = []
     for axes in _turned_together(model):
         motors = [
             motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])
@@ -138,38 +140,49 @@ def consistency_of(
         for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
             if single == "fv" and other_friction.intersection(axes):
                 continue
-            names = [f"{single}{number_of[axis]}" for axis in axes] + [
-                f"{shared}{motor + 1}" for motor in motors
-            ]
+            columns = [index[f"{single}{numbers[axis]}"] for axis in axes]
+            columns += [index[f"{shared}{motor + 1}"] for motor in motors]
             if len(axes) == 1:
-                positive.append(index[names[0]])
+                positive.append(columns[0])
             else:
-                # Contribution of each axis', then each motor's parameter to the matrix over these
-                # axes, (p, k, k).
-                turned = [model.drive_train.direction[motor, list(axes)] for motor in motors]
-                shares = [np.diag(unit) for unit in np.eye(len(axes))]
-                shares += [np.outer(r, r) - np.diag(r**2) for r in turned]
-                dissipative.append((tuple(index[name] for name in names), np.array(shares)))
-    return Consistency(link_columns, scalars, scales, tuple(positive), tuple(dissipative))
+                dissipative.append((tuple(columns), _contributions(model, axes, motors)))
+    return Consistency(
+        link_columns=model.link_columns,
+        scalars=driven_scalars(model),
+        scales=scales,
+        positive=tuple(positive),
+        dissipative=tuple(dissipative),
+    )
+
+
+def _contributions(model: Model, axes: Sequence[int], motors: Sequence[int]) -> FloatArray:
+    """Contribution of each axis', then each motor's parameter to the matrix over these axes,
+    shape (p, k, k).
+    """
+    parts = [np.diag(unit) for unit in np.eye(len(axes))]
+    for motor in motors:
+        r = model.drive_train.direction[motor, list(axes)]
+        parts.append(np.outer(r, r) - np.diag(r**2))
+    return np.array(parts)
 
 
 def driven_scalars(model: Model) -> IntArray:
     """Columns of rotors, friction and offsets, without those of joints that have no motor,
     shape (s,).
     """
-    of_links = model.link_columns.ravel()
-    undriven = [
-        JOINT_COLUMNS * joint + np.arange(10, JOINT_COLUMNS) for joint in model.robot.passive_joints
-    ]
-    return np.setdiff1d(np.arange(len(model.columns)), np.concatenate((of_links, *undriven)))
+    others = [model.link_columns.ravel()]
+    drive = np.arange(ROTOR_INERTIA, JOINT_COLUMNS)
+    for joint in model.robot.passive_joints:
+        others.append(JOINT_COLUMNS * joint + drive)
+    return np.setdiff1d(np.arange(len(model.columns)), np.concatenate(others))
 
 
 def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
     """Q = L⁻¹ P L⁻ᵀ of links, shapes (n, 4, 4) and (n, 10) → (n, 4, 4)."""
-    inverse = np.linalg.inv(factors)
-    return np.array(
-        [inv @ pseudo_inertia(link) @ inv.T for inv, link in zip(inverse, links, strict=True)]
-    )
+    relative: list[FloatArray] = []
+    for inverse, link in zip(np.linalg.inv(factors), links, strict=True):
+        relative.append(inverse @ pseudo_inertia(link) @ inverse.T)
+    return np.array(relative)
 
 
 def solve_programme(
@@ -190,14 +203,11 @@ def solve_programme(
                 problem.solve(solver=cp.CLARABEL, **settings)
             except cp.SolverError as error:
                 message = str(error)
-        if problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} and all(
-            one.value is not None for one in unknowns
-        ):
+        is_solved = problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE}
+        if is_solved and all(one.value is not None for one in unknowns):
             return
-    raise NotPhysical(
-        "the semidefinite programme has no solution",
-        f"{problem.status or 'failed'} {message}".strip(),
-    )
+    status = problem.status or "failed"
+    raise NotPhysical("the semidefinite programme has no solution", f"{status} {message}".strip())
 
 
 def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
@@ -205,6 +215,12 @@ def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
     groups: list[set[int]] = [{axis} for axis in range(model.robot.axis_count)]
     for motor in model.drive_train.coupled:
         turned = set(np.flatnonzero(model.drive_train.direction[motor]).tolist())
-        touched = [group for group in groups if group & turned]
-        groups = [group for group in groups if not group & turned] + [set().union(*touched)]
+        joined: set[int] = set()
+        others: list[set[int]] = []
+        for group in groups:
+            if group & turned:
+                joined |= group
+            else:
+                others.append(group)
+        groups = [*others, joined]
     return tuple(tuple(sorted(group)) for group in groups)

@@ -3,15 +3,16 @@
 The standard parameters of a motor that turns with several joints are split so that a fit sees them
 (paper eq. 25): with r the motor's direction, Iam and fvm are the off-diagonal part of r rᵀ, and the
 diagonal is in Ia and fv of the joints. Simulators have it the other way round: a rotor t acts on
-the joints as t r rᵀ, a whole matrix, and a joint has an inertia of its own. With t of each coupled
+the joints as t r rᵀ, with its diagonal, and a joint has an inertia too. With t of each coupled
 motor m and a of each joint,
 
-    diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) = diag(a) + Σ_m t_m r_m r_mᵀ,    t_m = Iam_m,  a = Ia − Σ_m Iam_m r_m²,
+    diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) = diag(a) + Σ_m t_m r_m r_mᵀ,
+    t_m = Iam_m,    a = Ia − Σ_m Iam_m r_m²,
 
 and the same with fv and fvm. No simulator has a negative a or t. Where identified values would need
 one, t_m is as large as a ≥ 0 allows, the diagonal is still right, and the rest of Iam_m is named as
 left out.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from scipy.optimize import nnls
 
 from ident.arrays import FloatArray
 from ident.model.bodies import LOADED
-from ident.model.model import JOINT_COLUMNS, Model
+from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model
 
 ROUNDING = 1e-12  #: Share of a parameter below which what is left of it is rounding error
 
@@ -66,27 +67,33 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     """
     coupled = list(model.drive_train.coupled)
     first = JOINT_COLUMNS * model.robot.joint_count
-    motors = np.zeros((model.robot.axis_count, 3))
-    motors[coupled] = standard[first : first + 3 * len(coupled)].reshape(-1, 3)
+    of_coupled = slice(first, first + COUPLED_COLUMNS * len(coupled))
+    of_motors = np.zeros((model.robot.axis_count, COUPLED_COLUMNS))
+    of_motors[coupled] = standard[of_coupled].reshape(-1, COUPLED_COLUMNS)
+    rotors = standard[model.rotor_columns]
+    viscous = standard[model.viscous_friction_columns]
+    dry = standard[model.dry_friction_columns]
     directions = model.drive_train.direction
     squares = directions**2
-    for place, of_joints in enumerate((model.rotor_columns, model.viscous_friction_columns)):
-        own = motors[:, place]
-        if np.any(own < 0.0) or np.any(own @ squares > standard[of_joints]):
-            motors[coupled, place] = _least_of_motors(own[coupled], directions[coupled])
-    dry = standard[model.dry_friction_columns]
-    inertia = _split(standard[model.rotor_columns], motors[:, 0], squares)
-    damping = _split(standard[model.viscous_friction_columns], motors[:, 1], squares)
-    dry_friction = Terms(np.maximum(dry, 0.0), np.maximum(motors[:, 2], 0.0))
-    held = standard.copy()
-    held[model.link_columns] = 0.0
-    held[first : first + 3 * len(coupled)] = motors[coupled].ravel()
-    missing = held - _standard_of(model, inertia, damping, dry_friction)
+    for kind, of_joints in enumerate((rotors, viscous)):
+        own = of_motors[:, kind]
+        if np.any(own < 0.0) or np.any(own @ squares > of_joints):
+            of_motors[coupled, kind] = _least_of_motors(own[coupled], directions[coupled])
+    inertia = _split(rotors, of_motors[:, 0], squares)
+    damping = _split(viscous, of_motors[:, 1], squares)
+    dry_friction = Terms(
+        of_axes=np.maximum(dry, 0.0),
+        of_motors=np.maximum(of_motors[:, 2], 0.0),
+    )
+    wanted = standard.copy()
+    wanted[of_coupled] = of_motors[coupled].ravel()
+    missing = wanted - _standard_of(model, inertia, damping, dry_friction)
     missing[model.link_columns] = 0.0
-    left_over = []
-    for column, value, whole in zip(model.columns, missing, standard, strict=True):
+    left_over: list[LeftOver] = []
+    for column, value, identified in zip(model.columns, missing, standard, strict=True):
         # What a payload adds to friction is no part of the robot without one.
-        if abs(value) > ROUNDING * abs(whole) and not column.name.endswith(LOADED):
+        is_missing = abs(value) > ROUNDING * abs(identified)
+        if is_missing and not column.name.endswith(LOADED):
             left_over.append(LeftOver(column.name, float(value), column.unit))
     return DriveTerms(inertia, damping, dry_friction, tuple(left_over))
 
@@ -105,8 +112,10 @@ def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArra
     first, second = np.triu_indices(directions.shape[1], 1)
     couplings = (directions[:, first] * directions[:, second]).T
     wanted = couplings @ of_motors
-    least, left = nnls(couplings, wanted)
-    return np.asarray(least if left <= ROUNDING * np.linalg.norm(wanted) else of_motors)
+    least, residual = nnls(couplings, wanted)
+    if residual <= ROUNDING * np.linalg.norm(wanted):
+        return np.asarray(least)
+    return of_motors
 
 
 def _split(of_joints: FloatArray, of_motors: FloatArray, squares: FloatArray) -> Terms:
@@ -124,9 +133,9 @@ def _split(of_joints: FloatArray, of_motors: FloatArray, squares: FloatArray) ->
     is_short = used > room
     allowed[is_short] = room[is_short] / used[is_short]
     shares = [float(allowed[row > 0.0].min()) for row in squares]
-    along = wanted * np.array(shares)
-    alone = np.maximum(room - along @ squares, 0.0)
-    return Terms(alone, along)
+    motors_alone = wanted * np.array(shares)
+    axes_alone = np.maximum(room - motors_alone @ squares, 0.0)
+    return Terms(of_axes=axes_alone, of_motors=motors_alone)
 
 
 def _standard_of(model: Model, inertia: Terms, damping: Terms, dry_friction: Terms) -> FloatArray:
@@ -137,8 +146,9 @@ def _standard_of(model: Model, inertia: Terms, damping: Terms, dry_friction: Ter
     standard[model.viscous_friction_columns] = damping.of_axes + damping.of_motors @ squares
     standard[model.dry_friction_columns] = dry_friction.of_axes
     first = JOINT_COLUMNS * model.robot.joint_count
-    for number, motor in enumerate(model.drive_train.coupled):
-        own = first + 3 * number
-        along = (inertia.of_motors[motor], damping.of_motors[motor], dry_friction.of_motors[motor])
-        standard[own : own + 3] = along
+    for motor in model.drive_train.coupled:
+        standard[first] = inertia.of_motors[motor]
+        standard[first + 1] = damping.of_motors[motor]
+        standard[first + 2] = dry_friction.of_motors[motor]
+        first += COUPLED_COLUMNS
     return standard

@@ -47,6 +47,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -72,6 +73,7 @@ _DEPENDENT = 1e-10
 _LOOSE = 1e-9  #: Singular value, of columns of norm one, relative to the largest, that is none
 #: Least value of what may not be negative, in units of its scale: above the solver's tolerance
 _ROOM = 1e-6
+LARGER_PART = 0.5  #: Share of a variance above which it is the larger part
 
 
 class RestsOn(Enum):
@@ -106,14 +108,15 @@ class LinkPrior:
     @property
     def factors(self) -> FloatArray:
         """L of each link, shape (n, 4, 4)."""
-        return np.array([np.linalg.cholesky(pseudo_inertia(link)) for link in self.links])
+        pseudo_inertias = np.array([pseudo_inertia(link) for link in self.links])
+        return np.linalg.cholesky(pseudo_inertias)
 
     def directions(self) -> FloatArray:
         """Change of each link's ten parameters for one σ of ten independent numbers, columns,
         shape (n, 10, 10).
         """
         basis = _symmetric_basis()
-        directions = []
+        directions: list[FloatArray] = []
         for factor in self.factors:
             columns = [link_parameters(factor @ unit @ factor.T) for unit in basis]
             directions.append(self.tolerance * np.column_stack(columns))
@@ -123,7 +126,7 @@ class LinkPrior:
         """Links of a robot that the prior describes, shape (n, 10);
         bodies that cannot exist are drawn again.
         """
-        drawn = []
+        drawn: list[FloatArray] = []
         for link, directions in zip(self.links, self.directions(), strict=True):
             body = link + directions @ rng.standard_normal(10)
             while np.linalg.eigvalsh(pseudo_inertia(body))[0] <= 0.0:
@@ -156,7 +159,13 @@ class FullParameters:
     @property
     def basis(self) -> tuple[RestsOn, ...]:
         """What each standard parameter rests on."""
-        return tuple(RestsOn.PRIOR if share > 0.5 else RestsOn.DATA for share in self.prior_share)
+        basis: list[RestsOn] = []
+        for share in self.prior_share:
+            if share > LARGER_PART:
+                basis.append(RestsOn.PRIOR)
+            else:
+                basis.append(RestsOn.DATA)
+        return tuple(basis)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,7 +192,8 @@ class _Equations:
     @property
     def right(self) -> FloatArray:
         """y, shape (r + p,)."""
-        return np.concatenate((self.weight @ self.theta, self.prior_right))
+        data_right = self.weight @ self.theta
+        return np.concatenate((data_right, self.prior_right))
 
     @property
     def standard(self) -> slice:
@@ -235,47 +245,52 @@ def full_parameters(
         ModuleNotFoundError: the solution has to be bounded, and cvxpy or Clarabel is not installed.
     """
     _require_full(system, prior)
+    model = system.model
     equations, ratio = _equations(system, estimate, prior)
     gains = equations.gains
     own = equations.standard
-    links = system.model.link_columns
+    links = model.link_columns
+    # With the gains of the estimate
     given = _solved(equations, gains)
     values, is_bounded = _possible(equations, prior, given, other_friction)
-    with_prior = estimate.gains
-    with_prior_std = estimate.gains_std
-    if gains:
-        joint = _solved(equations, 0)
-        with_prior = _possible(equations, prior, joint, other_friction)[0][:gains]
-        with_prior_std = joint.std[:gains]
     standard = values[own]
+    standard_std = given.std[own]
+    gains_with_prior = estimate.gains
+    gains_with_prior_std = estimate.gains_std
+    if gains:
+        free = _solved(equations, 0)
+        free_values, _ = _possible(equations, prior, free, other_friction)
+        gains_with_prior = free_values[:gains]
+        gains_with_prior_std = free.std[:gains]
     grouping = system.base.grouping
     base_covariance = grouping @ given.covariance[own, own] @ grouping.T
     prior_std = np.full(len(standard), np.inf)
     prior_std[links] = np.linalg.norm(prior.directions(), axis=2)
     prior_variance = np.diag(given.from_prior)[own]
+    relative_links = relative_to_prior(prior.factors, standard[links])
+    data_covariance = equations.weight @ equations.covariance @ equations.weight.T
+    check = check_prior(
+        matrix=equations.matrix,
+        right=equations.right,
+        data_covariance=data_covariance,
+        links=len(prior.links),
+        tolerance=prior.tolerance,
+    )
     return FullParameters(
-        names=tuple(column.name for column in system.model.columns),
-        units=tuple(column.unit for column in system.model.columns),
+        names=tuple(column.name for column in model.columns),
+        units=tuple(column.unit for column in model.columns),
         standard=standard,
-        standard_std=given.std[own],
+        standard_std=standard_std,
         prior_std=prior_std,
-        prior_share=prior_variance / given.std[own] ** 2,
-        gains=with_prior,
-        gains_std=with_prior_std,
+        prior_share=prior_variance / standard_std**2,
+        gains=gains_with_prior,
+        gains_std=gains_with_prior_std,
         base=grouping @ standard,
         base_std=np.sqrt(np.diag(base_covariance)),
-        eigenvalues=np.asarray(
-            np.linalg.eigvalsh(relative_to_prior(prior.factors, standard[links]))[:, 0]
-        ),
+        eigenvalues=np.asarray(np.linalg.eigvalsh(relative_links)[:, 0]),
         bounded=is_bounded,
         variance_ratio=ratio,
-        check=check_prior(
-            equations.matrix,
-            equations.right,
-            equations.weight @ equations.covariance @ equations.weight.T,
-            len(prior.links),
-            prior.tolerance,
-        ),
+        check=check,
     )
 
 
@@ -289,25 +304,26 @@ def _solved(equations: _Equations, first: int) -> _Solution:
     matrix = equations.matrix
     free = matrix[:, first:]
     scale = np.linalg.norm(free, axis=0)
-    names = [column.name for column in equations.model.columns]
     unseen = np.flatnonzero(scale == 0.0)
     if len(unseen):
-        shown = ", ".join(names[column + first - equations.gains] for column in unseen)
-        raise NotPhysical("neither data nor prior say anything of some parameters", shown)
+        columns = equations.model.columns
+        names = ", ".join(columns[number + first - equations.gains].name for number in unseen)
+        raise NotPhysical("neither data nor prior say anything of some parameters", names)
     q, upper = np.linalg.qr(free / scale)
-    least = float(np.abs(np.diag(upper)).min())
-    if least < _DEPENDENT:
+    smallest = float(np.abs(np.diag(upper)).min())
+    if smallest < _DEPENDENT:
         raise NotPhysical(
             "data and prior together do not determine every parameter",
-            f"smallest share {least:.1e}",
+            f"smallest share {smallest:.1e}",
         )
-    back = linalg.solve_triangular(upper, q.T) / scale[:, None]
+    inverse = linalg.solve_triangular(upper, q.T) / scale[:, None]  # M⁺ of the free unknowns
     rows = len(equations.data)
-    # x = (ĝ, back (y − M_g ĝ)): A is the derivative to θ̂, B that to the prior's rows.
-    from_theta = back[:, :rows] @ equations.weight
-    from_theta[:, :first] -= back @ matrix[:, :first]
+    prior_rows = len(matrix) - rows
+    # x = (ĝ, M⁺ (y − M_g ĝ)): A is the derivative to θ̂, B that to the prior's rows.
+    from_theta = inverse[:, :rows] @ equations.weight
+    from_theta[:, :first] -= inverse @ matrix[:, :first]
     by_data = np.concatenate((np.eye(first, from_theta.shape[1]), from_theta))
-    by_prior = np.concatenate((np.zeros((first, matrix.shape[0] - rows)), back[:, rows:]))
+    by_prior = np.concatenate((np.zeros((first, prior_rows)), inverse[:, rows:]))
     values = by_data @ equations.theta + by_prior @ equations.prior_right
     return _Solution(
         values=values,
@@ -319,6 +335,11 @@ def _solved(equations: _Equations, first: int) -> _Solution:
 
 
 def _require_full(system: System, prior: LinkPrior) -> None:
+    """Refuse robots and fits whose standard parameters cannot be found.
+
+    Raises:
+        ModelError: as of `full_parameters`.
+    """
     robot = system.model.robot
     if robot.is_constrained:
         raise ModelError(
@@ -343,12 +364,15 @@ def _triangle(system: System, estimate: Estimate) -> FloatArray:
     """R of the whitened equations around an estimate, shape (θ, θ)."""
     currents = system.currents
     gains = estimate.gains
-    free = len(estimate.parameters) + (0 if estimate.gains_fixed else len(gains))
-    noise = currents.noise(gains, estimate.parameters, free)
+    parameters = estimate.parameters
+    free = len(parameters)
+    if not estimate.gains_fixed:
+        free += len(gains)
+    noise = currents.noise(gains, parameters, free)
     whitened = currents.whitened(gains, noise)
     columns = -whitened.linear
     if not estimate.gains_fixed:
-        residual = whitened.residual(gains, estimate.parameters)
+        residual = whitened.residual(gains, parameters)
         drive = currents.corrected(gains, noise, whitened, residual)
         columns = np.concatenate((drive, columns), axis=1)
     return np.asarray(np.linalg.qr(columns, mode="r"))
@@ -362,41 +386,53 @@ def _variance_ratio(triangle: FloatArray, covariance: FloatArray) -> float:
     inverse = linalg.solve_triangular(triangle / scale, np.eye(len(triangle)))
     independent = np.sum(inverse**2, axis=1) / scale**2
     ratio = float(np.mean(np.diag(covariance) / independent))
-    return ratio if ratio > 0.0 else 1.0
+    if not ratio > 0.0:
+        return 1.0
+    return ratio
 
 
 def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> tuple[_Equations, float]:
     """Rows of data and prior, and the ratio of variances by which the data are scaled."""
-    fixed = len(estimate.gains) if estimate.gains_fixed else 0
+    fixed = 0
+    if estimate.gains_fixed:
+        fixed = len(estimate.gains)
     gains = len(estimate.gains) - fixed
     covariance = estimate.covariance[fixed:, fixed:]
     triangle = _triangle(system, estimate)
     ratio = _variance_ratio(triangle, covariance)
     weight = triangle / np.sqrt(ratio)
     grouping = system.base.grouping
-    base, standard = grouping.shape
-    others = len(estimate.parameters) - base
-    to_theta = linalg.block_diag(np.eye(gains), grouping, np.eye(others))
+    base_count, standard_count = grouping.shape
+    other_count = len(estimate.parameters) - base_count
+    to_theta = linalg.block_diag(np.eye(gains), grouping, np.eye(other_count))
     data = weight @ to_theta
-    theta = np.concatenate((estimate.gains[:gains], estimate.parameters))
-    size = float(
-        np.linalg.norm(data[:, gains : gains + standard] @ _any_standard(system, estimate))
-    )
-    of_drives = np.zeros((0, data.shape[1]))
-    loose = _loose_drives(system, weight[:, gains : gains + base] @ grouping, size)
-    if len(loose):
-        of_drives = np.zeros((len(loose), data.shape[1]))
-        of_drives[:, gains : gains + standard] = loose
-    of_links = np.zeros((prior.links.size, data.shape[1]))
+    unknown_count = data.shape[1]
+    standard = slice(gains, gains + standard_count)
+    base = slice(gains, gains + base_count)
+    torque = data[:, standard] @ _any_standard(system, estimate)
+    loose = _loose_drives(system, weight[:, base] @ grouping, float(np.linalg.norm(torque)))
+    of_drives = np.zeros((len(loose), unknown_count))
+    of_drives[:, standard] = loose
+    of_links = np.zeros((prior.links.size, unknown_count))
     right = [np.zeros(len(loose))]
-    for number, (link, directions) in enumerate(zip(prior.links, prior.directions(), strict=True)):
+    first = 0
+    for link, directions, columns in zip(
+        prior.links, prior.directions(), system.model.link_columns, strict=True
+    ):
+        end = first + len(link)
         whitening = np.linalg.inv(directions)
-        rows = slice(10 * number, 10 * number + 10)
-        of_links[rows, gains + system.model.link_columns[number]] = whitening
+        of_links[first:end, gains + columns] = whitening
         right.append(whitening @ link)
-    rows_of_prior = np.concatenate((of_drives, of_links))
+        first = end
     equations = _Equations(
-        system.model, data, rows_of_prior, weight, theta, np.concatenate(right), covariance, gains
+        model=system.model,
+        data=data,
+        prior=np.concatenate((of_drives, of_links)),
+        weight=weight,
+        theta=np.concatenate((estimate.gains[:gains], estimate.parameters)),
+        prior_right=np.concatenate(right),
+        covariance=covariance,
+        gains=gains,
     )
     return equations, ratio
 
@@ -405,8 +441,9 @@ def _any_standard(system: System, estimate: Estimate) -> FloatArray:
     """Standard parameters with the base parameters of an estimate:
     those that lead them, shape (c,).
     """
+    leading = list(system.base.independent)
     standard = np.zeros(system.base.grouping.shape[1])
-    standard[list(system.base.independent)] = estimate.parameters[: len(system.base.independent)]
+    standard[leading] = estimate.parameters[: len(leading)]
     return standard
 
 
@@ -415,7 +452,7 @@ def _loose_drives(system: System, columns: FloatArray, size: float) -> FloatArra
     shape (k, c).
 
     Two motors that both turn two joints, one of them against the other, have rotors whose
-    difference alone is seen. Such a combination is zero, give or take what would make the whole
+    difference alone is seen. Such a combination is zero, give or take what would make the total
     torque if it were seen.
 
     Args:
@@ -423,13 +460,15 @@ def _loose_drives(system: System, columns: FloatArray, size: float) -> FloatArra
         columns: of each standard parameter in the whitened equations, shape (r, c).
         size: of the modelled torque in these equations.
     """
-    scalars = np.setdiff1d(np.arange(columns.shape[1]), system.model.link_columns)
-    norms = np.linalg.norm(columns[:, scalars], axis=0)
+    count = columns.shape[1]
+    scalars = np.setdiff1d(np.arange(count), system.model.link_columns)
+    of_scalars = columns[:, scalars]
+    norms = np.linalg.norm(of_scalars, axis=0)
     if not np.all(norms > 0.0):
-        return np.zeros((0, columns.shape[1]))
-    _, singular, right = np.linalg.svd(columns[:, scalars] / norms, full_matrices=True)
+        return np.zeros((0, count))
+    _, singular, right = np.linalg.svd(of_scalars / norms, full_matrices=True)
     rank = int(np.sum(singular > _LOOSE * singular[0]))
-    rows = np.zeros((len(scalars) - rank, columns.shape[1]))
+    rows = np.zeros((len(scalars) - rank, count))
     rows[:, scalars] = right[rank:] * (norms / size)
     return rows
 
@@ -444,7 +483,8 @@ def _possible(
     own = equations.standard
     standard = solution.values[own]
     scalars = np.setdiff1d(np.arange(len(standard)), model.link_columns)
-    scales = np.maximum(np.abs(standard), np.sqrt(np.diag(solution.from_data)[own]))[scalars]
+    data_std = np.sqrt(np.diag(solution.from_data)[own])
+    scales = np.maximum(np.abs(standard), data_std)[scalars]
     consistency = consistency_of(model, scales, other_friction)
     factors = prior.factors
     if consistency.is_met(factors, standard, MARGIN):
@@ -459,16 +499,20 @@ def _possible(
     steps[solution.free :] = inverse_factor / column_scale[:, None]
     moved = steps[own]
     step = cp.Variable(len(factor))
-    links = []
+    links: list[Any] = []
     for inverse, columns in zip(np.linalg.inv(factors), model.link_columns, strict=True):
         at_solution = inverse @ pseudo_inertia(standard[columns]) @ inverse.T
-        turned = [inverse @ pseudo_inertia(change) @ inverse.T for change in moved[columns].T]
-        change = np.stack([one.ravel() for one in turned], axis=1)
-        link = at_solution + cp.reshape(change @ step, (4, 4), order="C")
+        changes: list[FloatArray] = []
+        for change in moved[columns].T:
+            relative = inverse @ pseudo_inertia(change) @ inverse.T
+            changes.append(relative.ravel())
+        per_step = np.stack(changes, axis=1)
+        link = at_solution + cp.reshape(per_step @ step, (4, 4), order="C")
         links.append(0.5 * (link + link.T))
     drive = standard[scalars] / scales + (moved[scalars] / scales[:, None]) @ step
     constraints = consistency.constraints(cp, links, drive, 2.0 * MARGIN, _ROOM)
-    solve_programme(cp, cp.Minimize(cp.sum_squares(step)), constraints, (step,))
+    objective = cp.Minimize(cp.sum_squares(step))
+    solve_programme(cp, objective, constraints, (step,))
     found = solution.values + steps @ step.value
     if not consistency.is_met(factors, found[own], 0.5 * MARGIN):
         raise NotPhysical(
@@ -479,10 +523,14 @@ def _possible(
 
 def _symmetric_basis() -> Sequence[FloatArray]:
     """Ten symmetric matrices, orthonormal under tr(A B)."""
-    basis = []
+    basis: list[FloatArray] = []
     for row in range(4):
         for column in range(row, 4):
+            value = np.sqrt(0.5)
+            if row == column:
+                value = 1.0
             unit = np.zeros((4, 4))
-            unit[row, column] = unit[column, row] = 1.0 if row == column else np.sqrt(0.5)
+            unit[row, column] = value
+            unit[column, row] = value
             basis.append(unit)
     return basis

@@ -1,4 +1,4 @@
-"""Whether data contradict a prior: by its misfit as a whole, and by how heavy they find its links.
+"""Whether data contradict a prior: by its total misfit, and by how heavy they find its links.
 
 Rows of data and prior in units of their σ, M x = y, leave a misfit r = (1 − Q Qᵀ) y, Q an
 orthonormal basis of M. With S the covariance of the rows, that of r is Σ = (1 − Q Qᵀ) S (1 − Q Qᵀ).
@@ -41,13 +41,15 @@ class PriorCheck:
 
     @property
     def is_misfit(self) -> bool:
-        """Whether the misfit as a whole is more than chance."""
-        return float(special.chdtrc(self.degrees_of_freedom, self.chi_square)) < LEVEL / 3.0
+        """Whether the total misfit is more than chance."""
+        probability = special.chdtrc(self.degrees_of_freedom, self.chi_square)
+        return float(probability) < LEVEL / 3.0
 
     @property
     def is_mass_wrong(self) -> bool:
         """Whether the data find all links lighter or heavier than the tolerance allows."""
-        return _chance((self.mass_ratio - 1.0) / self.mass_ratio_std) < LEVEL / 3.0
+        sigmas = (self.mass_ratio - 1.0) / self.mass_ratio_std
+        return _chance(sigmas) < LEVEL / 3.0
 
     @property
     def wrong_links(self) -> tuple[int, ...]:
@@ -76,38 +78,47 @@ def check_prior(
         tolerance: of the prior, one relative standard deviation.
     """
     basis, _ = np.linalg.qr(matrix / np.linalg.norm(matrix, axis=0))
-    left = right - basis @ (basis.T @ right)
+    misfit = right - basis @ (basis.T @ right)
     rows = len(right)
-    data = len(data_covariance)
+    data_rows = len(data_covariance)
     covariance = np.eye(rows)
-    covariance[:data, :data] = data_covariance
-    rest = np.eye(rows) - basis @ basis.T
-    spread = rest @ covariance @ rest
-    mean = float(np.trace(spread))
-    square_sum = float(np.sum(spread**2))
-    heavier = np.zeros((rows, links))
-    first = rows - 10 * links
-    on_diagonal = np.array([0, 4, 7, 9])
-    for link in range(links):
-        # E = 1: P, and with it all ten parameters, is 1 + t times the prior's.
-        heavier[first + 10 * link + on_diagonal, link] = 1.0 / tolerance
-    seen = rest @ heavier
-    seen = np.column_stack((seen, seen.sum(axis=1)))  # the last one is of all links together
-    square = np.sum(seen**2, axis=0)
-    visible = square > _VISIBLE * 4.0 / tolerance**2
-    square = np.where(visible, square, np.inf)
-    weights = seen / square
-    ratios = 1.0 - weights.T @ left
+    covariance[:data_rows, :data_rows] = data_covariance
+    projection = np.eye(rows) - basis @ basis.T
+    misfit_covariance = projection @ covariance @ projection
+    mean = float(np.trace(misfit_covariance))
+    square_sum = float(np.sum(misfit_covariance**2))
+    columns = projection @ _columns_of_mass(rows, links, tolerance)
+    of_all_links = columns.sum(axis=1)
+    columns = np.column_stack((columns, of_all_links))
+    squares = np.sum(columns**2, axis=0)
+    is_visible = squares > _VISIBLE * 4.0 / tolerance**2
+    squares = np.where(is_visible, squares, np.inf)
+    weights = columns / squares
+    ratios = 1.0 - weights.T @ misfit
+    variances = np.einsum("rl,rs,sl->l", weights, covariance, weights)  # wᵀ S w of each column
     stds = np.full(links + 1, np.inf)
-    stds[visible] = np.sqrt(np.einsum("rl,rs,sl->l", weights, covariance, weights))[visible]
+    stds[is_visible] = np.sqrt(variances)[is_visible]
     return PriorCheck(
-        chi_square=float(left @ left) * mean / square_sum,
+        chi_square=float(misfit @ misfit) * mean / square_sum,
         degrees_of_freedom=mean**2 / square_sum,
         mass_ratio=float(ratios[-1]),
         mass_ratio_std=float(stds[-1]),
         link_ratios=ratios[:-1],
         link_ratio_stds=stds[:-1],
     )
+
+
+def _columns_of_mass(rows: int, links: int, tolerance: float) -> FloatArray:
+    """Change of all rows where a link is heavier than its prior, per unit of s, shape (r, n).
+
+    With E = 1, P and with it all ten parameters are 1 + t times the prior's.
+    """
+    columns = np.zeros((rows, links))
+    first = rows - 10 * links
+    on_diagonal = np.array([0, 4, 7, 9])
+    for link in range(links):
+        columns[first + 10 * link + on_diagonal, link] = 1.0 / tolerance
+    return columns
 
 
 def _chance(sigmas: float) -> float:

@@ -43,29 +43,32 @@ def prior_shares(
         covariance: C of the base parameters, shape (b, b).
         prior: of each link, in the order of the robot's joints.
     """
-    present = np.union1d(model.link_columns.ravel(), np.flatnonzero(grouping.any(axis=0)))
+    in_grouping = np.flatnonzero(grouping.any(axis=0))
+    present = np.union1d(model.link_columns.ravel(), in_grouping)
     scale = _scales(model, prior)[present]
-    # In units of the prior: a null space of kg beside kg m² would lose the small ones.
+    # In units of the prior: a null space of kg together with kg m² would lose the small ones.
     scaled = grouping[:, present] * scale
-    rows = np.linalg.norm(scaled, axis=1)
-    scaled /= rows[:, None]
-    null = linalg.null_space(scaled, rcond=_LOOSE)
-    precision = _precision(model, prior)[np.ix_(present, present)] * np.outer(scale, scale)
+    row_norms = np.linalg.norm(scaled, axis=1)
+    scaled /= row_norms[:, None]
+    null = linalg.null_space(scaled, rcond=_LOOSE)  # N
+    precision = _precision(model, prior)[np.ix_(present, present)]
+    precision *= np.outer(scale, scale)
     inner = null.T @ precision @ null
     inverse = np.linalg.pinv(inner, rcond=_LOOSE, hermitian=True)
-    by_prior = null @ inverse @ null.T
-    from_data = np.linalg.pinv(scaled, rcond=_LOOSE) / rows
-    from_data -= by_prior @ precision @ from_data
-    data_variance = np.einsum("xb,bc,xc->x", from_data, covariance, from_data)
-    variance = np.diag(by_prior) + data_variance
-    shares = np.zeros(len(model.columns))
-    shares[present] = np.where(
-        variance > 0.0, np.diag(by_prior) / np.where(variance > 0.0, variance, 1.0), 0.0
-    )
+    by_prior = null @ inverse @ null.T  # N (Nᵀ S⁻¹ N)⁻¹ Nᵀ
+    from_data = np.linalg.pinv(scaled, rcond=_LOOSE) / row_norms
+    from_data -= by_prior @ precision @ from_data  # A
+    data_variance = np.einsum("xb,bc,xc->x", from_data, covariance, from_data)  # diagonal of A C Aᵀ
+    prior_variance = np.diag(by_prior)
+    variance = prior_variance + data_variance
+    own_shares = np.zeros(len(present))
+    np.divide(prior_variance, variance, where=variance > 0.0, out=own_shares)
     # A direction without a prior that the data do not determine has no finite variance.
     loose = null - null @ (inverse @ inner)
     is_loose = np.linalg.norm(loose, axis=1) > np.sqrt(_LOOSE)
-    shares[present[is_loose]] = 1.0
+    own_shares[is_loose] = 1.0
+    shares = np.zeros(len(model.columns))
+    shares[present] = own_shares
     return shares
 
 
@@ -78,7 +81,8 @@ def _scales(model: Model, prior: LinkPrior) -> FloatArray:
 
 def _precision(model: Model, prior: LinkPrior) -> FloatArray:
     """S⁻¹: zero for all but the links' parameters, shape (c, c)."""
-    precision = np.zeros((len(model.columns), len(model.columns)))
+    count = len(model.columns)
+    precision = np.zeros((count, count))
     for columns, directions in zip(model.link_columns, prior.directions(), strict=True):
         whitening = np.linalg.inv(directions)
         precision[np.ix_(columns, columns)] = whitening.T @ whitening

@@ -32,11 +32,13 @@ class _Tree:
         None where it is shut.
         """
         room = np.where(upper > lower, upper - lower, 1.0)
-        distances = np.linalg.norm((np.array(self._positions) - target) / room, axis=1)
+        differences = np.array(self._positions) - target
+        distances = np.linalg.norm(differences / room, axis=1)
         nearest = int(np.argmin(distances))
+        start = self._positions[nearest]
         if distances[nearest] < SAME:
-            return nearest, self._positions[nearest]
-        reached = farthest_towards(checker, self._positions[nearest], target, lower, upper)
+            return nearest, start
+        reached = farthest_towards(checker, start, target, lower, upper)
         if reached is None:
             return None
         self._positions.append(reached)
@@ -77,14 +79,15 @@ def clear_way(
     from_start = _Tree(start)
     from_end = _Tree(end)
     for branch in range(MOST_BRANCHES):
-        is_first = branch % 2 == 0
-        if is_first:
+        from_start_grows = branch % 2 == 0
+        if from_start_grows:
             growing = from_start
             other = from_end
         else:
             growing = from_end
             other = from_start
-        grown = growing.grow(checker, rng.uniform(lower, upper), lower, upper)
+        target = rng.uniform(lower, upper)
+        grown = growing.grow(checker, target, lower, upper)
         if grown is None:
             continue
         number, reached = grown
@@ -95,7 +98,9 @@ def clear_way(
         if checker.obstruction(reached, meeting) is not None:
             continue
         way = [*growing.way_to(number), *reversed(other.way_to(other_number))]
-        return _shortened(checker, way if is_first else way[::-1])
+        if not from_start_grows:
+            way.reverse()
+        return _shortened(checker, way)
     return None
 
 
@@ -118,11 +123,12 @@ def _shortened(checker: Checker, way: list[FloatArray]) -> tuple[FloatArray, ...
     """Positions between the ends of a way, without those that a straight way can leave out."""
     turns: list[FloatArray] = []
     here = 0
+    last = len(way) - 1
     while True:
-        ahead = len(way) - 1
+        ahead = last
         while ahead > here + 1 and checker.obstruction(way[here], way[ahead]) is not None:
             ahead -= 1
-        if ahead == len(way) - 1:
+        if ahead == last:
             return tuple(turns)
         turns.append(way[ahead])
         here = ahead

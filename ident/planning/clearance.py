@@ -1,15 +1,15 @@
 """Clearance of an arm from itself, from obstacles and from the walls of its workspace,
-along a whole move.
+all along a move.
 
 Links are capsules: a capsule is a segment with a radius, so the distance of two capsules, or of a
 capsule and a box, is that of their segments less the radii. These distances have closed forms
 (`segment_to_segment`, `segment_to_box`).
 
 A synchronised point-to-point move is a straight line in joint space, q(s) = q₀ + s Δq, so no point
-of a capsule on link b moves relative to link a by more than Σ_k |Δq_k| ℓ_k over the whole of it,
-with k the joints between the two and ℓ_k the longest lever from joint k to the capsule. A stretch
-of half-width h about s is clear when the distance at s is at least h times that; else it is halved.
-So nothing is jumped over, whatever the speed.
+of a capsule on link b moves relative to link a by more than Σ_k |Δq_k| ℓ_k from its start to its
+end, with k the joints between the two and ℓ_k the longest lever from joint k to the capsule. A
+stretch of half-width h about s is clear when the distance at s is at least h times that; else it is
+halved. So nothing is jumped over, whatever the speed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from ident.arrays import BoolArray, FloatArray
 from ident.model.closed_chain import assemble, reach
 from ident.model.robot import JointKind, Robot, poses
 
+_Point = tuple[float, float, float]
 BASE = -1  #: Index of the link that does not move
 RESOLUTION_M = 0.004
 """A stretch in which nothing moves farther than this, and which is still not known to be clear,
@@ -58,7 +59,7 @@ class Scene:
     boxes: tuple[Box, ...]  #: obstacles; capsules of the base may touch them
     workspace: Box | None  #: box that the confined capsules must not leave, None for no bounds
     confined: tuple[int, ...]  #: indices of capsules
-    minimum_m: float  #: distance that must be kept
+    minimum_m: float  #: smallest distance that is allowed
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,35 +105,38 @@ class Checker:
         self.robot = robot
         self.scene = scene
         self._assembly = assemble(robot)
-        capsules = scene.capsules
-        boxes = scene.boxes
-        moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
         # Bodies are the capsules in their order, then the boxes; the ends of a box are opposite
         # corners.
-        behind = range(len(capsules), len(capsules) + len(boxes))
-        self._pairs = [*scene.pairs, *((index, box) for index in moving for box in behind)]
+        names: list[str] = []
+        frames: list[int] = []
+        ends: list[tuple[_Point, _Point]] = []
+        radii: list[float] = []
+        for capsule in scene.capsules:
+            names.append(capsule.name)
+            frames.append(capsule.link + 1)
+            ends.append((capsule.start_m, capsule.end_m))
+            radii.append(capsule.radius_m)
+        for box in scene.boxes:
+            names.append(box.name)
+            frames.append(0)
+            ends.append((box.lower_m, box.upper_m))
+            radii.append(0.0)
+        self._names = names
+        self._frame = np.array(frames, dtype=np.int64)
+        self._ends = np.array(ends).reshape(-1, 2, 3).swapaxes(1, 2)
+        self._radius = np.array(radii)
+        half_lengths = 0.5 * np.linalg.norm(self._ends[:, :, 1] - self._ends[:, :, 0], axis=1)
+        self._sphere = self._radius + half_lengths
+        self._pairs = [*scene.pairs, *_pairs_with_boxes(scene)]
+        self._confined: tuple[int, ...] = ()
         if scene.workspace is not None:
             self._confined = scene.confined
-        else:
-            self._confined = ()
-        self._names = [body.name for bodies in (capsules, boxes) for body in bodies]
-        self._frame = np.array(
-            [capsule.link + 1 for capsule in capsules] + [0] * len(boxes), dtype=np.int64
-        )
-        ends = [(c.start_m, c.end_m) for c in capsules] + [
-            (box.lower_m, box.upper_m) for box in boxes
-        ]
-        self._ends = np.array(ends).reshape(-1, 2, 3).swapaxes(1, 2)
-        self._radius = np.array([capsule.radius_m for capsule in capsules] + [0.0] * len(boxes))
-        self._sphere = self._radius + 0.5 * np.linalg.norm(
-            self._ends[:, :, 1] - self._ends[:, :, 0], axis=1
-        )
         self._everywhere = np.full(len(self._pairs) + len(self._confined), np.inf)
         self._first, self._second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
 
     def margins(self, position: FloatArray) -> FloatArray:
         """Compute the smallest distance beyond the minimum in each posture [m],
-        negative where it is not kept.
+        negative where bodies are closer.
 
         Args:
             position: of the axes [rad or m], shape (k, m).
@@ -142,13 +146,11 @@ class Checker:
             closed chain do not close, or nearly have a singularity.
         """
         if not self.robot.is_constrained:
-            return np.asarray(self._margins(position, self._everywhere).min(axis=0, initial=np.inf))
+            margins = self._margins(position, self._everywhere)
+            return np.asarray(margins.min(axis=0, initial=np.inf))
         found = self._reached(position)
-        return np.where(
-            found.usable,
-            self._margins(found.joints, self._everywhere).min(axis=0, initial=np.inf),
-            -np.inf,
-        )
+        margins = self._margins(found.joints, self._everywhere)
+        return np.where(found.usable, margins.min(axis=0, initial=np.inf), -np.inf)
 
     def fitting(self, position: FloatArray) -> FloatArray:
         """Positions of the axes that fit each other, near given ones, shape (…, m):
@@ -156,8 +158,9 @@ class Checker:
         """
         if not self.robot.is_constrained:
             return position
-        found = reach(self.robot, self._assembly, np.atleast_2d(position)).position_rad
-        return found[:, list(self.robot.axis_joints)].reshape(position.shape)
+        found = reach(self.robot, self._assembly, np.atleast_2d(position))
+        of_axes = found.position_rad[:, list(self.robot.axis_joints)]
+        return of_axes.reshape(position.shape)
 
     def joints(self, position: FloatArray) -> FloatArray:
         """Positions of all joints, shape (k, n), for those of the axes, shape (k, m)."""
@@ -169,13 +172,11 @@ class Checker:
         return self._assembly.position_rad[list(self.robot.axis_joints)]
 
     def _reached(self, position: FloatArray) -> _Reached:
+        """Poses of a closed chain at positions of the axes, shape (k, m)."""
         found = reach(self.robot, self._assembly, position)
-        usable = (
-            found.closed
-            & (found.condition < LARGEST_PLANNED_CONDITION)
-            & (found.misfit < LARGEST_PLANNED_MISFIT)
-        )
-        return _Reached(found.position_rad, usable)
+        is_regular = found.condition < LARGEST_PLANNED_CONDITION
+        fits = found.misfit < LARGEST_PLANNED_MISFIT
+        return _Reached(found.position_rad, found.closed & is_regular & fits)
 
     def apart(self, position: FloatArray) -> FloatArray:
         """Share of postures, shape (k, n), in which each of the scene's pairs does not touch,
@@ -185,7 +186,8 @@ class Checker:
             found = self._reached(position)
             position = found.joints[found.usable]
         margins = self._margins(position, self._everywhere)[: len(self.scene.pairs)]
-        return np.asarray((margins + self.scene.minimum_m > 0.0).mean(axis=1))
+        distances = margins + self.scene.minimum_m
+        return np.asarray((distances > 0.0).mean(axis=1))
 
     def obstruction(self, start: FloatArray, end: FloatArray) -> Obstruction | None:
         """Find an obstruction on a straight line in joint space, None when all of it is clear.
@@ -194,34 +196,47 @@ class Checker:
             start, end: positions of the axes [rad or m], shape (m,).
         """
         if self.robot.is_constrained:
-            return self._ways(start[None], end[None])[0]
-        # A bound on the path of any point of one body relative to the other, for each row of
-        # `_margins` [m].
-        rows = [*self._pairs, *((index, len(self.scene.capsules)) for index in self._confined)]
-        travel = np.array(
-            [self._relative_travel(first, second, start, end) for first, second in rows]
-        )
+            (found,) = self._ways(start[None], end[None])
+            return found
+        travel_m = self._travel_of_rows(start, end)
         middles = np.array([0.5])
         half = 0.5
         while len(middles):
             position = start + (end - start) * middles[:, None]
-            needed = half * travel
+            needed = half * travel_m
             margins = self._margins(position, needed)
-            unsure = margins < needed[:, None]
-            blocked = (margins < 0.0) | (unsure & (needed < RESOLUTION_M)[:, None])
-            if blocked.any():
-                row, sample = np.argwhere(blocked)[0]
-                margin_m = float(margins[row, sample])
-                where = tuple(position[sample].tolist())
-                if row < len(self._pairs):
-                    first, second = (self._names[index] for index in self._pairs[row])
-                    return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
-                confined = self.scene.capsules[self._confined[row - len(self._pairs)]]
-                return Obstruction(confined.name, WORKSPACE_END, margin_m, where)
+            is_unsure = margins < needed[:, None]
+            is_fine = (needed < RESOLUTION_M)[:, None]
+            is_blocked = (margins < 0.0) | (is_unsure & is_fine)
+            if is_blocked.any():
+                row, sample = np.argwhere(is_blocked)[0]
+                return self._obstruction_at(int(row), float(margins[row, sample]), position[sample])
             half /= 2.0
-            open_ = middles[unsure.any(axis=0)]
-            middles = np.concatenate((open_ - half, open_ + half))
+            unsure_middles = middles[is_unsure.any(axis=0)]
+            middles = np.concatenate((unsure_middles - half, unsure_middles + half))
         return None
+
+    def _travel_of_rows(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """Bound on the path of any point of one body relative to the other,
+        of each row of `_margins` [m].
+        """
+        travel_m = [
+            self._relative_travel(first, second, start, end) for first, second in self._pairs
+        ]
+        outside = len(self.scene.capsules)  # a body that does not move
+        for index in self._confined:
+            travel_m.append(self._relative_travel(index, outside, start, end))
+        return np.array(travel_m)
+
+    def _obstruction_at(self, row: int, margin_m: float, position: FloatArray) -> Obstruction:
+        """Obstruction by the bodies of a row of `_margins`."""
+        where = tuple(position.tolist())
+        if row < len(self._pairs):
+            first, second = self._pairs[row]
+            distance_m = margin_m + self.scene.minimum_m
+            return Obstruction(self._names[first], self._names[second], distance_m, where)
+        confined = self._confined[row - len(self._pairs)]
+        return Obstruction(self._names[confined], WORKSPACE_END, margin_m, where)
 
     def farthest(
         self, start: FloatArray, ends: FloatArray, lower: FloatArray, upper: FloatArray
@@ -234,68 +249,71 @@ class Checker:
                 other, which may be outside the limits.
         """
         ends = self.fitting(ends)
-        inside = np.all((ends >= lower) & (ends <= upper), axis=1)
+        is_inside = np.all((ends >= lower) & (ends <= upper), axis=1)
         if not self.robot.is_constrained:
-            return next((end for end in ends[inside] if self.obstruction(start, end) is None), None)
-        found = self._ways(np.broadcast_to(start, ends.shape), ends)
-        clear = (
-            end
-            for end, within, obstruction in zip(ends, inside, found, strict=True)
-            if within and not obstruction
-        )
-        return next(clear, None)
+            for end in ends[is_inside]:
+                if self.obstruction(start, end) is None:
+                    return np.asarray(end)
+            return None
+        obstructions = self._ways(np.broadcast_to(start, ends.shape), ends)
+        for end, inside, obstruction in zip(ends, is_inside, obstructions, strict=True):
+            if inside and obstruction is None:
+                return np.asarray(end)
+        return None
 
     def _ways(self, starts: FloatArray, ends: FloatArray) -> list[Obstruction | None]:
         """Look at poses of straight ways so close to each other that nothing happens between
         them.
         """
-        share = np.linspace(0.0, 1.0, round(1.0 / STEP_SHARE) + 1)[:, None]
-        position = starts[:, None] + (ends - starts)[:, None] * share
-        shape = position.shape[:2]
-        found = self._reached(position.reshape(-1, position.shape[2]))
-        usable = found.usable.reshape(shape)
-        margins = self._margins(found.joints, self._everywhere)
+        shares = np.linspace(0.0, 1.0, round(1.0 / STEP_SHARE) + 1)
+        position = starts[:, None] + (ends - starts)[:, None] * shares[:, None]
+        ways, samples, axes = position.shape
+        found = self._reached(position.reshape(-1, axes))
+        usable = found.usable.reshape(ways, samples)
+        margins = self._margins(found.joints, self._everywhere).reshape(-1, ways, samples)
+        placed = self._placed(found.joints).reshape(-1, ways, samples, 3, 2)
         # A body moves at most as far between two poses as the fastest of its ends: from the nearer
         # one at most half of that, and two bodies that both move come closer by all of it. (The way
         # of an end between poses is taken as straight; it is bent by less than a hundredth of its
         # length.)
-        both = np.array(
-            [max(pair) < len(self.scene.capsules) for pair in self._pairs]
-            + [False] * len(self._confined)
-        )
-        placed = self._placed(found.joints).reshape(-1, *shape, 3, 2)
-        travel = np.linalg.norm(np.diff(placed, axis=2), axis=3).max(axis=(0, 2, 3), initial=0.0)
-        answers: list[Obstruction | None] = []
+        steps = np.linalg.norm(np.diff(placed, axis=2), axis=3)
+        travel = steps.max(axis=(0, 2, 3), initial=0.0)
+        share_of_travel = self._shares_of_travel()
+        obstructions: list[Obstruction | None] = []
         for way, moved in enumerate(travel.tolist()):
-            own = margins.reshape(-1, *shape)[:, way] - moved * np.where(both, 1.0, 0.5)[:, None]
+            own = margins[:, way] - moved * share_of_travel[:, None]
             if not usable[way].all():
-                at = tuple(position[way, int(np.argmin(usable[way]))].tolist())
-                answers.append(Obstruction(CLOSURES, "a pose that they allow", 0.0, at))
+                first_unusable = int(np.argmin(usable[way]))
+                where = tuple(position[way, first_unusable].tolist())
+                obstructions.append(Obstruction(CLOSURES, "a pose that they allow", 0.0, where))
             elif not own.size or own.min() >= 0.0:
-                answers.append(None)
+                obstructions.append(None)
             else:
                 row, sample = np.unravel_index(int(np.argmin(own)), own.shape)
-                first, second = self._names_of(int(row))
-                distance_m = float(own[row, sample]) + (
-                    self.scene.minimum_m if row < len(self._pairs) else 0.0
-                )
-                answers.append(
-                    Obstruction(first, second, distance_m, tuple(position[way, sample].tolist()))
-                )
-        return answers
+                margin_m = float(own[row, sample])
+                obstructions.append(self._obstruction_at(int(row), margin_m, position[way, sample]))
+        return obstructions
 
-    def _names_of(self, row: int) -> tuple[str, str]:
-        if row < len(self._pairs):
-            first, second = self._pairs[row]
-            return self._names[first], self._names[second]
-        return self.scene.capsules[self._confined[row - len(self._pairs)]].name, WORKSPACE_END
+    def _shares_of_travel(self) -> FloatArray:
+        """Share of the travel of an end by which the bodies of each row of `_margins` may come
+        closer.
+        """
+        shares: list[float] = []
+        for pair in self._pairs:
+            both_move = max(pair) < len(self.scene.capsules)
+            if both_move:
+                shares.append(1.0)
+            else:
+                shares.append(0.5)
+        shares += [0.5] * len(self._confined)
+        return np.array(shares)
 
     def _placed(self, joints: FloatArray) -> FloatArray:
         """Both ends of every body in each posture, shape (bodies, k, 3, 2)."""
-        at = poses(self.robot, joints)
-        return np.asarray(
-            at.rotation[self._frame] @ self._ends[:, None] + at.origin_m[self._frame][..., None]
-        )
+        placed = poses(self.robot, joints)
+        rotation = placed.rotation[self._frame]
+        origin_m = placed.origin_m[self._frame]
+        return np.asarray(rotation @ self._ends[:, None] + origin_m[..., None])
 
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Margin of each pair, then of each confined capsule, shape (pairs + confined, k).
@@ -310,71 +328,103 @@ class Checker:
         pairs = len(self._pairs)
         first = self._first
         second = self._second
+        minimum_m = self.scene.minimum_m
         middle = 0.5 * (start + end)
         between = _length(middle[first] - middle[second])
-        out[:pairs] = (
-            between - (self._sphere[first] + self._sphere[second] + self.scene.minimum_m)[:, None]
-        )
+        of_spheres = self._sphere[first] + self._sphere[second] + minimum_m
+        out[:pairs] = between - of_spheres[:, None]
         row, sample = np.nonzero(out[:pairs] < needed[:pairs, None])
         to_box = second[row] >= len(self.scene.capsules)
         for distance, chosen in ((segment_to_segment, ~to_box), (segment_to_box, to_box)):
             if chosen.any():
-                number = row[chosen]
+                pair = row[chosen]
                 k = sample[chosen]
-                one = first[number]
-                other = second[number]
-                kept = self._radius[one] + self._radius[other] + self.scene.minimum_m
-                out[number, k] = (
-                    distance(start[one, k], end[one, k], start[other, k], end[other, k]) - kept
-                )
+                one = first[pair]
+                other = second[pair]
+                distance_m = distance(start[one, k], end[one, k], start[other, k], end[other, k])
+                smallest_m = self._radius[one] + self._radius[other] + minimum_m
+                out[pair, k] = distance_m - smallest_m
         if self.scene.workspace is not None:
-            lower = np.array(self.scene.workspace.lower_m)
-            upper = np.array(self.scene.workspace.upper_m)
             for last, index in enumerate(self._confined, start=pairs):
-                inside = [
-                    np.minimum(ends[index] - lower, upper - ends[index]).min(axis=1)
-                    for ends in (start, end)
-                ]
-                out[last] = np.minimum(*inside) - self._radius[index]
+                start_margin = _margin_inside(start[index], self.scene.workspace)
+                end_margin = _margin_inside(end[index], self.scene.workspace)
+                out[last] = np.minimum(start_margin, end_margin) - self._radius[index]
         return out
 
     def _relative_travel(
         self, first: int, second: int, start: FloatArray, end: FloatArray
     ) -> float:
-        capsules = self.scene.capsules
-        links = [
-            capsules[index].link if index < len(capsules) else BASE for index in (first, second)
-        ]
-        chains = [self._chain(link) for link in links]
-        total = 0.0
-        for index, chain, other in ((first, chains[0], chains[1]), (second, chains[1], chains[0])):
-            if index >= len(capsules):
-                continue
-            lever = max(
-                float(np.linalg.norm(point))
-                for point in (capsules[index].start_m, capsules[index].end_m)
-            )
-            for joint in chain:  # from the capsule towards the base
-                if joint in other:
-                    break
-                declared = self.robot.joints[joint]
-                distance = abs(float(end[joint] - start[joint]))
-                prismatic = declared.kind is JointKind.PRISMATIC
-                total += distance * (1.0 if prismatic else lever)
-                lever += float(np.linalg.norm(declared.translation_m))
-                if prismatic:
-                    lever += max(abs(float(start[joint])), abs(float(end[joint])))
-                else:
-                    lever += 0.0
-        return total
+        """Bound on the path of any point of one body relative to another one [m]."""
+        first_chain = self._chain(first)
+        second_chain = self._chain(second)
+        travel_m = self._travel_beyond(first, first_chain, second_chain, start, end)
+        return self._travel_beyond(second, second_chain, first_chain, start, end, travel_m)
 
-    def _chain(self, link: int) -> list[int]:
-        """Joints from a link to the base."""
-        chain = []
+    def _travel_beyond(
+        self,
+        body: int,
+        chain: list[int],
+        other: list[int],
+        start: FloatArray,
+        end: FloatArray,
+        travel_m: float = 0.0,
+    ) -> float:
+        """Add the path that the joints of a chain, which are not in another one,
+        can move a capsule along [m].
+        """
+        if body >= len(self.scene.capsules):
+            return travel_m
+        capsule = self.scene.capsules[body]
+        start_lever = float(np.linalg.norm(capsule.start_m))
+        end_lever = float(np.linalg.norm(capsule.end_m))
+        lever = max(start_lever, end_lever)
+        for number in chain:  # from the capsule towards the base
+            if number in other:
+                break
+            joint = self.robot.joints[number]
+            distance = abs(float(end[number] - start[number]))
+            length_m = float(np.linalg.norm(joint.translation_m))
+            if joint.kind is JointKind.PRISMATIC:
+                farthest = max(abs(float(start[number])), abs(float(end[number])))
+                travel_m += distance
+                lever += length_m
+                lever += farthest
+            else:
+                travel_m += distance * lever
+                lever += length_m
+        return travel_m
+
+    def _chain(self, body: int) -> list[int]:
+        """Joints from a body to the base; none of a box."""
+        chain: list[int] = []
+        if body >= len(self.scene.capsules):
+            return chain
+        link = self.scene.capsules[body].link
         while link != BASE:
             chain.append(link)
             link = self.robot.joints[link].parent
         return chain
+
+
+def _pairs_with_boxes(scene: Scene) -> list[tuple[int, int]]:
+    """Pairs of each capsule that moves with each box,
+    whose indices follow those of the capsules.
+    """
+    pairs: list[tuple[int, int]] = []
+    first_box = len(scene.capsules)
+    for index, capsule in enumerate(scene.capsules):
+        if capsule.link != BASE:
+            pairs += [(index, first_box + box) for box in range(len(scene.boxes))]
+    return pairs
+
+
+def _margin_inside(point_m: FloatArray, box: Box) -> FloatArray:
+    """Distance of points inside a box from its nearest face [m], shape (k, 3) → (k,);
+    negative outside.
+    """
+    from_lower = point_m - np.array(box.lower_m)
+    from_upper = np.array(box.upper_m) - point_m
+    return np.asarray(np.minimum(from_lower, from_upper).min(axis=1))
 
 
 def segment_to_segment(
@@ -394,12 +444,14 @@ def segment_to_segment(
     between = start - other_start
     a = _dot(along, along)
     b = _dot(along, other)
-    e = _dot(other, other)
     c = _dot(along, between)
+    e = _dot(other, other)
     f = _dot(other, between)
-    t = _share(b * _share(b * f - c * e, a * e - b * b) + f, e)
+    first_s = _share(b * f - c * e, a * e - b * b)
+    t = _share(b * first_s + f, e)
     s = _share(b * t - c, a)
-    return _length(between + s[:, None] * along - t[:, None] * other)
+    nearest = between + s[:, None] * along - t[:, None] * other
+    return _length(nearest)
 
 
 def segment_to_box(
@@ -416,20 +468,26 @@ def segment_to_box(
         start, end: ends of the segment [m], shape (k, 3).
         lower, upper: opposite corners of the box [m], shape (k, 3).
     """
+    samples = len(start)
     along = end - start
-    crossings = [_share(plane - start, along) for plane in (lower, upper)]
-    limits = np.broadcast_to([0.0, 1.0], (len(start), 2))
-    bends = np.sort(np.concatenate((*crossings, limits), axis=1), axis=1)
+    crosses_lower = _share(lower - start, along)
+    crosses_upper = _share(upper - start, along)
+    limits = np.broadcast_to([0.0, 1.0], (samples, 2))
+    bends = np.concatenate((crosses_lower, crosses_upper, limits), axis=1)
+    bends = np.sort(bends, axis=1)
     at_bends = start[:, None] + along[:, None] * bends[:, :, None]
-    slope = _dot(along[:, None], at_bends - np.clip(at_bends, lower[:, None], upper[:, None]))
-    # The first bend behind the zero
-    after = np.clip((slope < 0.0).sum(axis=1), 1, bends.shape[1] - 1)
-    sample = np.arange(len(start))
-    low = slope[sample, after - 1]
+    excess = at_bends - np.clip(at_bends, lower[:, None], upper[:, None])
+    slope = _dot(along[:, None], excess)
+    falling = (slope < 0.0).sum(axis=1)
+    after = np.clip(falling, 1, bends.shape[1] - 1)  # the first bend behind the zero
+    before = after - 1
+    sample = np.arange(samples)
+    low = slope[sample, before]
     high = slope[sample, after]
-    first = bends[sample, after - 1]
+    first = bends[sample, before]
     last = bends[sample, after]
-    nearest = start + along * (first + (last - first) * _share(-low, high - low))[:, None]
+    zero = first + (last - first) * _share(-low, high - low)
+    nearest = start + along * zero[:, None]
     distance = _length(nearest - np.clip(nearest, lower, upper))
     depth = _depth(start, end, lower, upper)
     return np.where(depth > 0.0, -depth, distance)
@@ -443,17 +501,19 @@ def _depth(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatAr
     product of one with the segment.
     """
     edges = np.broadcast_to(np.eye(3), (len(start), 3, 3))
-    crosses = np.cross(edges, (end - start)[:, None])
+    along = end - start
+    crosses = np.cross(edges, along[:, None])
     length = np.linalg.norm(crosses, axis=2)
-    normals = np.concatenate(
-        (edges, crosses / np.where(length > 0.0, length, 1.0)[:, :, None]), axis=1
-    )
+    divisor = np.where(length > 0.0, length, 1.0)
+    normals = np.concatenate((edges, crosses / divisor[:, :, None]), axis=1)
     middle = 0.5 * (lower + upper)
     half = 0.5 * (upper - lower)
-    ends = np.einsum("knd,ekd->ekn", normals, np.stack((start - middle, end - middle)))
-    depths = np.einsum("knd,kd->kn", np.abs(normals), half) + np.minimum(
-        ends.max(axis=0), -ends.min(axis=0)
-    )
+    from_middle = np.stack((start - middle, end - middle))
+    # Along each normal n: of both ends e of the segment, and half the extent of the box
+    ends = np.einsum("knd,ekd->ekn", normals, from_middle)
+    half_extent = np.einsum("knd,kd->kn", np.abs(normals), half)
+    nearer_side = np.minimum(ends.max(axis=0), -ends.min(axis=0))
+    depths = half_extent + nearer_side
     depths[:, 3:][length == 0.0] = np.inf
     return np.asarray(depths.min(axis=1))
 
@@ -467,8 +527,11 @@ def _share(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
 
 
 def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Products a · b over the last axis."""
     return np.asarray(np.einsum("...d,...d->...", first, second))
 
 
 def _length(vectors: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(_dot(vectors, vectors)))
+    """Lengths over the last axis."""
+    squares = _dot(vectors, vectors)
+    return np.asarray(np.sqrt(squares))

@@ -1,4 +1,4 @@
-"""Torque that a motion asks of the joints, beside what their drives can give.
+"""Torque that a motion needs of the joints, compared with what their drives can give.
 
 A drive whose current is at its limit falls behind its set-point, and trips with a following error.
 So a plan must know the torque of its moves before they are made: it comes from the expected robot,
@@ -35,7 +35,8 @@ def axis_torques(expectation: Expectation, motion: Motion, payload: int | None) 
     else:
         parameters[model.flange] += expectation.payloads[payload].parameters
     columns = model.regressor(motion, loaded=True)
-    return np.asarray(np.einsum("jck,c->jk", columns, parameters))
+    torque = np.einsum("jck,c->jk", columns, parameters)
+    return np.asarray(torque)
 
 
 def effort_shares(
@@ -73,6 +74,8 @@ def believable_efforts(
         position: postures within the limits of the axes, shape (k, n).
         payloads: mounted in turn, None without load.
     """
-    at_rest = np.zeros_like(position)
-    shares = effort_shares(expectation, effort, Motion(position, at_rest, at_rest), payloads)
-    return np.where(shares.max(axis=1) < 1.0, effort, np.inf)
+    still = np.zeros_like(position)
+    at_rest = Motion(position, still, still)
+    shares = effort_shares(expectation, effort, at_rest, payloads)
+    is_believable = shares.max(axis=1) < 1.0
+    return np.where(is_believable, effort, np.inf)

@@ -4,13 +4,13 @@ With T from the drive train the fit's model is v_i = γ_i (T W χ + T W_uL χ_uL
 e_i, e_i of standard deviation σ_i, γ_i = 1/g_i (see ident/estimators/maximum_likelihood.py). Its
 rows, differentiated by the unknowns and divided by σ_i, are
 
-    ∂/∂χ = γ_i (T W)_i / σ_i,      ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,      ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
+    ∂/∂χ = γ_i (T W)_i / σ_i,    ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,    ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
 
-with τ the whole expected torque. The information about all unknowns is the sum of JᵀJ over the
+with τ the total expected torque. The information about all unknowns is the sum of JᵀJ over the
 rows, and the covariance of ln g the inverse of its Schur complement: the part of the gains' columns
 that is independent of all others. The expectation before a fit is a nominal robot, made from the
 URDF: good enough to choose moves, never to fit.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ident.equations.currents import whitening_transform
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
-from ident.model.model import Model, preload_directions
+from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model, preload_directions
 from ident.model.robot import Motion, Robot
 from ident.model.urdf import read_urdf
 from ident.planning.limits import JointLimits
@@ -36,6 +36,9 @@ IntArray = NDArray[np.intp]
 
 UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the better source
 UNSEEN = 1e-9  #: Share of a column that counts as nothing when the others are projected out of it
+#: Of a gain in directions that nothing shows, up to which it is still identifiable
+LARGEST_UNSEEN_SHARE = 1e-6
+SMALLEST_PIVOT = 1e-5  #: Of a Cholesky factor whose digits are not rounding errors
 #: Mass of each link where the URDF has no inertias, as a slender rod to the next joint
 LINK_MASS_KG = 5.0
 ROD_RADIUS_M = 0.05
@@ -101,11 +104,15 @@ def recorded(model: Model, data: Dataset, conditioning: Conditioning) -> Excitat
     """Return the rows of a recorded run:
     its motion at their centres, and which of them the fit uses.
     """
-    centres = row_filter(data, conditioning).centres(len(data.time_s))
+    filter_ = row_filter(data, conditioning)
+    centres = filter_.centres(len(data.time_s))
     motion = Motion(
-        data.position_rad[centres], data.velocity_rad_s[centres], data.acceleration_rad_s2[centres]
+        position_rad=data.position_rad[centres],
+        velocity_rad_s=data.velocity_rad_s[centres],
+        acceleration_rad_s2=data.acceleration_rad_s2[centres],
     )
-    return Excitation(motion, row_masks(model, data, conditioning)[1])
+    _, motor_use = row_masks(model, data, conditioning)
+    return Excitation(motion, motor_use)
 
 
 def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
@@ -119,16 +126,19 @@ def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
         noise_a: standard deviation of one row.
         lag_one: correlation ρ of a row's residual with the next, from 0 up to below 1.
     """
-    return np.asarray(noise_a * np.sqrt((1.0 + lag_one) / (1.0 - lag_one)))
+    variance_factor = (1.0 + lag_one) / (1.0 - lag_one)
+    return np.asarray(noise_a * np.sqrt(variance_factor))
 
 
 def visible_base(model: Model, motion: Motion) -> BaseParameters:
     """Return the base parameters that are identifiable from a motion."""
     # The dry friction of a joint at rest is undetermined (see the standstill mask).
-    columns = model.regressor(motion) * (motion.velocity_rad_s.T != 0.0)[:, None, :]
+    is_moving = motion.velocity_rad_s.T != 0.0
+    columns = model.regressor(motion) * is_moving[:, None, :]
     rows = columns.transpose(0, 2, 1).reshape(-1, columns.shape[1])
     triangle = np.asarray(np.linalg.qr(rows, mode="r"))
-    return base_parameters(triangle, tuple(column.name for column in model.columns))
+    names = tuple(column.name for column in model.columns)
+    return base_parameters(triangle, names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,14 +155,13 @@ class Design:
     @property
     def others(self) -> int:
         """Number of unknowns that are not gains."""
-        return len(self.base.independent) + sum(
-            len(payload.unknown) for payload in self.expectation.payloads
-        )
+        of_payloads = sum(len(payload.unknown) for payload in self.expectation.payloads)
+        return len(self.base.independent) + of_payloads
 
     @property
     def width(self) -> int:
         """Number of columns of base parameters and of a payload."""
-        return len(self.base.independent) + 10
+        return len(self.base.independent) + len(LINK_PARAMETERS)
 
     @property
     def size(self) -> int:
@@ -166,16 +175,17 @@ class Design:
         Of a redundant drive more columns, for `information_of`.
         """
         expected = self.expectation
-        flange = np.arange(expected.model.flange.start, expected.model.flange.stop)
+        model = expected.model
+        flange = np.arange(model.flange.start, model.flange.stop)
+        chosen = np.concatenate((self.base.independent, flange)).astype(np.intp)
         # What a payload adds to friction has columns here, and none in the runs without one
         # (`columns`).
-        columns = expected.model.regressor(excitation.motion, loaded=True)[
-            :, np.concatenate((self.base.independent, flange)).astype(np.intp)
-        ]
-        motors = np.tensordot(expected.model.drive_train.to_motor, columns, axes=1)
-        if expected.model.is_redundant:
+        columns = model.regressor(excitation.motion, loaded=True)[:, chosen]
+        motors = np.tensordot(model.drive_train.to_motor, columns, axes=1)
+        if model.is_redundant:
             return self._without_preload(excitation, motors)
-        motors *= excitation.use[:, None, :] / (expected.gains * expected.noise_a)[:, None, None]
+        unit = expected.gains * expected.noise_a
+        motors *= excitation.use[:, None, :] / unit[:, None, None]
         return np.asarray(motors)
 
     def _without_preload(self, excitation: Excitation, torque: FloatArray) -> FloatArray:
@@ -183,24 +193,28 @@ class Design:
         + n, k).
 
         The currents that are expected are those without preload: with it, gains become better
-        known, not worse.
+            known, not worse.
         """
         expected = self.expectation
         _, to_motors = expected.model.balance(excitation.motion)
-        transform = whitening_transform(
-            preload_directions(to_motors), expected.gains, expected.noise_a
-        )
-        transform *= np.all(excitation.use, axis=0).astype(np.float64)[:, None, None]
+        preload = preload_directions(to_motors)
+        transform = whitening_transform(preload, expected.gains, expected.noise_a)
+        all_move = np.all(excitation.use, axis=0).astype(np.float64)
+        transform *= all_move[:, None, None]
+        # Σ_j (T_D)_kij τ_jak of motor i, column a and row k
         columns = np.einsum("kij,jak->iak", transform, torque, optimize=True)
-        return np.concatenate((columns, torque, transform.transpose(1, 2, 0)), axis=1)
+        of_gains = transform.transpose(1, 2, 0)
+        return np.concatenate((columns, torque, of_gains), axis=1)
 
     def with_known_preload(self, whitened: FloatArray, use: BoolArray) -> FloatArray:
         """``whitened`` of a redundant drive if its preload were known:
         an equation for each motor, (n, b + 10, k).
         """
         expected = self.expectation
-        torque = whitened[:, self.width : 2 * self.width] * np.all(use, axis=0)
-        return np.asarray(torque / (expected.gains * expected.noise_a)[:, None, None])
+        all_move = np.all(use, axis=0)
+        torque = whitened[:, self.width : 2 * self.width] * all_move
+        unit = expected.gains * expected.noise_a
+        return np.asarray(torque / unit[:, None, None])
 
     def information(self, excitation: Excitation, payloads: Sequence[int | None]) -> FloatArray:
         """Information of one motion, repeated once with each of these payloads, shape (p, p)."""
@@ -221,18 +235,19 @@ class Design:
             return self._information_without_preload(whitened, payloads, blind)
         grams = whitened @ whitened.transpose(0, 2, 1)
         summed = grams.sum(axis=0)
+        others = self.others
         out = np.zeros((self.size, self.size))
-        gains = np.arange(self.others, self.size)
+        gains = np.arange(others, self.size)
         for payload in payloads:
-            place, source = self.columns(payload)
-            out[np.ix_(place, place)] += summed[np.ix_(source, source)]
-            torque = np.tile(self.expected(payload), (len(grams), 1))
+            unknowns, source = self.columns(payload)
+            out[np.ix_(unknowns, unknowns)] += summed[np.ix_(source, source)]
+            parameters = np.tile(self.expected(payload), (len(grams), 1))
             if blind is not None and payload is not None:
-                torque[blind] -= self.known(payload)
-            seen = np.einsum("nab,nb->na", grams, torque)
-            out[np.ix_(place, gains)] -= seen[:, source].T
-            out[gains, gains] += np.einsum("na,na->n", seen, torque)
-        out[self.others :, : self.others] = out[: self.others, self.others :].T
+                parameters[blind] -= self.known(payload)
+            products = np.einsum("nab,nb->na", grams, parameters)  # Wᵀ τ of each motor
+            out[np.ix_(unknowns, gains)] -= products[:, source].T
+            out[gains, gains] += np.einsum("na,na->n", products, parameters)  # τᵀ τ
+        out[others:, :others] = out[:others, others:].T
         return out
 
     def _information_without_preload(
@@ -240,67 +255,80 @@ class Design:
     ) -> FloatArray:
         """The same of a redundant drive, where a gain shows in the rows of all motors."""
         columns, torques, gains = np.split(whitened, [self.width, 2 * self.width], axis=1)
+        # JᵀJ: sums over motors n and rows k
         summed = np.einsum("nak,nbk->ab", columns, columns, optimize=True)
+        others = self.others
         out = np.zeros((self.size, self.size))
-        own = slice(self.others, None)
+        of_gains = slice(others, None)
         for payload in payloads:
-            place, source = self.columns(payload)
-            out[np.ix_(place, place)] += summed[np.ix_(source, source)]
+            unknowns, source = self.columns(payload)
+            out[np.ix_(unknowns, unknowns)] += summed[np.ix_(source, source)]
             torque = np.einsum("nck,c->nk", torques, self.expected(payload))
             if blind is not None and payload is not None:
                 torque[blind] -= self.known(payload) @ torques[blind]
-            shown = gains * torque
-            out[place, own] -= np.einsum("nak,njk->aj", columns[:, source], shown, optimize=True)
-            out[own, own] += np.einsum("nik,njk->ij", shown, shown, optimize=True)
-        out[self.others :, : self.others] = out[: self.others, self.others :].T
+            gain_columns = gains * torque
+            out[unknowns, of_gains] -= np.einsum(
+                "nak,njk->aj", columns[:, source], gain_columns, optimize=True
+            )
+            out[of_gains, of_gains] += np.einsum(
+                "nik,njk->ij", gain_columns, gain_columns, optimize=True
+            )
+        out[others:, :others] = out[:others, others:].T
         return out
 
     def expected(self, payload: int | None) -> FloatArray:
-        """Parameters for which the columns of ``whitened`` give the whole torque,
+        """Parameters for which the columns of ``whitened`` give the total torque,
         shape (b + 10,).
         """
         base = self.base.grouping @ self.expectation.parameters
-        if payload is None:
-            mounted = np.zeros(10)
-        else:
+        mounted = np.zeros(len(LINK_PARAMETERS))
+        if payload is not None:
             mounted = self.expectation.payloads[payload].parameters
         return np.concatenate((base, mounted))
 
     def known(self, payload: int) -> FloatArray:
         """Known part of ``expected`` for a payload, shape (b + 10,)."""
-        mounted = self.expectation.payloads[payload].parameters.copy()
-        mounted[list(self.expectation.payloads[payload].unknown)] = 0.0
-        return np.concatenate((np.zeros(len(self.base.independent)), mounted))
+        expected = self.expectation.payloads[payload]
+        mounted = expected.parameters.copy()
+        mounted[list(expected.unknown)] = 0.0
+        base = np.zeros(len(self.base.independent))
+        return np.concatenate((base, mounted))
 
     def columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
         """Unknowns of a run, and the columns of ``whitened`` that they belong to."""
-        base = len(self.base.independent)
-        place = list(range(base))
+        base = self.base.independent
         if payload is None:
-            payload_friction = set(self.expectation.model.loaded_friction_columns.tolist())
-            place = [
-                index for index in place if self.base.independent[index] not in payload_friction
-            ]
-        source = list(place)
-        if payload is not None:
-            unknown = self.expectation.payloads[payload].unknown
-            before = sum(len(other.unknown) for other in self.expectation.payloads[:payload])
-            place += range(base + before, base + before + len(unknown))
-            source += [base + index for index in unknown]
-        return np.array(place, dtype=np.intp), np.array(source, dtype=np.intp)
+            payload_friction = self.expectation.model.loaded_friction_columns.tolist()
+            chosen = [index for index, column in enumerate(base) if column not in payload_friction]
+            unknowns = np.array(chosen, dtype=np.intp)
+            return unknowns, unknowns
+        payloads = self.expectation.payloads
+        unknown = payloads[payload].unknown
+        before = sum(len(other.unknown) for other in payloads[:payload])
+        first = len(base) + before
+        base_columns = list(range(len(base)))
+        payload_unknowns = list(range(first, first + len(unknown)))
+        payload_columns = [len(base) + index for index in unknown]
+        return (
+            np.array(base_columns + payload_unknowns, dtype=np.intp),
+            np.array(base_columns + payload_columns, dtype=np.intp),
+        )
 
     def condition(self, information: FloatArray) -> float:
         """Condition number of the observation matrix W, rows weighted by their noise;
         inf for a column without rows.
 
         What a payload adds to friction is left out: in bare or in loaded runs alone it is no
-        unknown of its own.
+            separate unknown.
         """
         payload_friction = self.expectation.model.loaded_friction_columns
-        asked = np.flatnonzero(~np.isin(self.base.independent, payload_friction))
-        values = np.linalg.eigvalsh(information[np.ix_(asked, asked)])
-        if values[0] > 0.0:
-            return float(np.sqrt(values[-1] / values[0]))
+        is_payload_friction = np.isin(self.base.independent, payload_friction)
+        chosen = np.flatnonzero(~is_payload_friction)
+        values = np.linalg.eigvalsh(information[np.ix_(chosen, chosen)])
+        smallest = values[0]
+        largest = values[-1]
+        if smallest > 0.0:
+            return float(np.sqrt(largest / smallest))
         return float("inf")
 
     def std_percent(self, information: FloatArray) -> FloatArray:
@@ -308,29 +336,28 @@ class Design:
         inf where it is not identifiable.
         """
         scaled, scale = self._scaled(information)
-        last = self._factor_of_gains(scaled)
-        if last is None:
+        factor = self._factor_of_gains(scaled)
+        if factor is None:
             return self._std_of_singular(scaled) / scale
-        inverse = np.linalg.inv(last)
-        return np.asarray(100.0 * np.sqrt(np.einsum("ij,ij->j", inverse, inverse)) / scale)
+        inverse = np.linalg.inv(factor)
+        variance = np.einsum("ij,ij->j", inverse, inverse)  # diagonal of L⁻ᵀ L⁻¹
+        return np.asarray(100.0 * np.sqrt(variance) / scale)
 
     def rank(self, information: FloatArray) -> int:
         """How many of the n independent directions of ln g are known to UNSEEN_PERCENT.
 
         They are the eigenvectors of its covariance, of unit length: their errors are independent of
-        each other.
+            each other.
         """
         scaled, scale = self._scaled(information)
-        last = self._factor_of_gains(scaled)
-        if last is None:
-            alone = self._gains_alone(scaled)
+        factor = self._factor_of_gains(scaled)
+        if factor is None:
+            of_gains = self._gains_alone(scaled)
         else:
-            alone = last @ last.T
-        return int(
-            np.sum(
-                np.linalg.eigvalsh(alone * np.outer(scale, scale)) >= (100.0 / UNSEEN_PERCENT) ** 2
-            )
-        )
+            of_gains = factor @ factor.T
+        values = np.linalg.eigvalsh(of_gains * np.outer(scale, scale))
+        least = (100.0 / UNSEEN_PERCENT) ** 2
+        return int(np.sum(values >= least))
 
     def _scaled(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Information with ones on its diagonal, and the scale of the gains."""
@@ -346,9 +373,9 @@ class Design:
             factor = np.linalg.cholesky(scaled)
         except np.linalg.LinAlgError:
             return None
-        gains = slice(self.others, self.size)
-        if float(np.diag(factor).min()) < 1e-5:
+        if float(np.diag(factor).min()) < SMALLEST_PIVOT:
             return None
+        gains = slice(self.others, self.size)
         return np.asarray(factor[gains, gains])
 
     def _gains_alone(self, scaled: FloatArray) -> FloatArray:
@@ -358,18 +385,21 @@ class Design:
         others = slice(None, self.others)
         gains = slice(self.others, None)
         values, vectors = np.linalg.eigh(scaled[others, others])
-        kept = values > UNSEEN * values[-1]
-        onto = vectors[:, kept].T @ scaled[others, gains]
-        return np.asarray(scaled[gains, gains] - onto.T @ (onto / values[kept, None]))
+        is_seen = values > UNSEEN * values[-1]
+        projected = vectors[:, is_seen].T @ scaled[others, gains]
+        explained = projected.T @ (projected / values[is_seen, None])
+        return np.asarray(scaled[gains, gains] - explained)
 
     def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
         """Predict with unknowns that are not identifiable:
         they drop out, and gains that depend on them are inf.
         """
-        left, directions = np.linalg.eigh(self._gains_alone(scaled))
-        seen = left > UNSEEN
-        variance = (directions[:, seen] ** 2) @ (1.0 / left[seen])
-        variance[(directions[:, ~seen] ** 2).sum(axis=1) > 1e-6] = np.inf
+        values, directions = np.linalg.eigh(self._gains_alone(scaled))
+        squares = directions**2
+        is_seen = values > UNSEEN
+        variance = squares[:, is_seen] @ (1.0 / values[is_seen])
+        unseen_share = squares[:, ~is_seen].sum(axis=1)
+        variance[unseen_share > LARGEST_UNSEEN_SHARE] = np.inf
         return np.asarray(100.0 * np.sqrt(variance))
 
 
@@ -380,9 +410,11 @@ def rows_between_rests(conditioning: Conditioning) -> tuple[float, float]:
     outside.
     """
     filter_ = decimator(RATE_HZ, conditioning.decimation_cutoff_hz)
-    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
-    inside = int(np.searchsorted(weight, conditioning.standstill_share))
-    return filter_.factor / RATE_HZ, max(filter_.half - inside, 0) / RATE_HZ
+    weights = np.abs(filter_.taps)
+    share = np.cumsum(weights) / weights.sum()
+    at_rest = int(np.searchsorted(share, conditioning.standstill_share))
+    edge = max(filter_.half - at_rest, 0)
+    return filter_.factor / RATE_HZ, edge / RATE_HZ
 
 
 def nominal_expectation(
@@ -408,7 +440,8 @@ def nominal_expectation(
     loaded = links.copy()
     loaded[model.robot.carrier] += payload.parameters
     torque = nominal_torque_limits(model, urdf, loaded, fast_motion)
-    noise = NOISE_SHARE * (np.abs(model.drive_train.to_motor) * torque).max(axis=1) / np.abs(gains)
+    motor_torque = (np.abs(model.drive_train.to_motor) * torque).max(axis=1)
+    noise = NOISE_SHARE * motor_torque / np.abs(gains)
     expectation = Expectation(
         model=model,
         gains=gains,
@@ -423,17 +456,25 @@ def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
     """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them;
     else rods.
     """
-    bodies = () if urdf is None else read_urdf(urdf).bodies
-    if any(body.mass_kg > 0.0 for body in bodies):
-        return np.array([body.parameters for body in bodies]), True
-    links = []
-    for index in range(robot.joint_count):
+    if urdf is not None:
+        bodies = read_urdf(urdf).bodies
+        if any(body.mass_kg > 0.0 for body in bodies):
+            return np.array([body.parameters for body in bodies]), True
+    links: list[FloatArray] = []
+    for index, own in enumerate(robot.joints):
         offsets = [joint.translation_m for joint in robot.joints if joint.parent == index]
-        rod = offsets[0] if offsets else 0.1 * robot.joints[index].axis
-        slender = LINK_MASS_KG / 12.0 * (rod @ rod * np.eye(3) - np.outer(rod, rod))
-        thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
-        links.append(Body(LINK_MASS_KG, 0.5 * rod, slender + thick).parameters)
+        rod_m = 0.1 * own.axis
+        if offsets:
+            rod_m = offsets[0]
+        links.append(_rod(rod_m).parameters)
     return np.array(links), False
+
+
+def _rod(rod_m: FloatArray) -> Body:
+    """A rod of LINK_MASS_KG from the origin to a point."""
+    slender = LINK_MASS_KG / 12.0 * (rod_m @ rod_m * np.eye(3) - np.outer(rod_m, rod_m))
+    thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
+    return Body(LINK_MASS_KG, 0.5 * rod_m, slender + thick)
 
 
 def side_of_cube(mass_kg: float) -> float:
@@ -443,7 +484,7 @@ def side_of_cube(mass_kg: float) -> float:
 
 def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     """Return a steel cube of the weighed mass, one side away from where it is mounted;
-    known parameters are kept.
+    known parameters stay.
 
     It is off the axis of the joint that carries it, as the technician is asked to mount it: on the
     axis, gravity would have no lever.
@@ -451,13 +492,16 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     mass = payload.known.get("m", LINK_MASS_KG)
     side = side_of_cube(mass)
     axis = robot.joints[robot.carrier].axis
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    most_across = np.eye(3)[np.argmin(np.abs(axis))]
+    across = np.cross(axis, most_across)
     across /= np.linalg.norm(across)
-    centre = robot.mounting_m + side * (axis + 0.7 * across + 0.7 * np.cross(axis, across))
+    direction = axis + 0.7 * across + 0.7 * np.cross(axis, across)
+    centre = robot.mounting_m + side * direction
     cube = Body(mass, centre, mass * side**2 / 6.0 * np.eye(3))
-    guess = dict(zip(LINK_PARAMETERS, cube.parameters, strict=True))
-    parameters = np.array([payload.known.get(name, guess[name]) for name in LINK_PARAMETERS])
-    return ExpectedPayload(frozenset(payload.known), parameters)
+    parameters: list[float] = []
+    for name, guess in zip(LINK_PARAMETERS, cube.parameters, strict=True):
+        parameters.append(payload.known.get(name, guess))
+    return ExpectedPayload(frozenset(payload.known), np.array(parameters))
 
 
 def declared_efforts(model: Model, urdf: str | None) -> FloatArray:
@@ -483,12 +527,12 @@ def nominal_torque_limits(
         fast_motion: motion as fast as the limits allow.
     """
     columns = model.regressor(fast_motion)
-    rigid = np.concatenate(
-        [columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1
-    )
-    largest = np.abs(np.einsum("jck,c->jk", rigid, links.reshape(-1))).max(axis=1)
+    rigid = columns[:, model.link_columns.ravel()]
+    torque = np.einsum("jck,c->jk", rigid, links.reshape(-1))
+    largest = np.abs(torque).max(axis=1)
     declared = declared_efforts(model, urdf)
-    return np.where(np.isfinite(declared), declared, TORQUE_RESERVE * np.maximum(largest, 1e-3))
+    with_reserve = TORQUE_RESERVE * np.maximum(largest, 1e-3)
+    return np.where(np.isfinite(declared), declared, with_reserve)
 
 
 def nominal_parameters(
@@ -502,16 +546,13 @@ def nominal_parameters(
     and of drives with these limits of the joints, shape (c,).
     """
     parameters = np.zeros(len(model.columns))
-    joints = model.robot.axis_joints
-    for index, link in enumerate(links):
-        parameters[14 * index : 14 * index + 10] = link
-    for index, joint in enumerate(joints):
-        first = 14 * joint
-        parameters[first + 10] = ROTOR * torque_limit[index] / acceleration_limit[index]
-        parameters[first + 11] = VISCOUS_FRICTION * torque_limit[index] / velocity_limit[index]
-        parameters[first + 12] = DRY_FRICTION * torque_limit[index]
+    parameters[model.link_columns] = links
+    parameters[model.rotor_columns] = ROTOR * torque_limit / acceleration_limit
+    parameters[model.viscous_friction_columns] = VISCOUS_FRICTION * torque_limit / velocity_limit
+    parameters[model.dry_friction_columns] = DRY_FRICTION * torque_limit
     for number, motor in enumerate(model.drive_train.coupled):
-        first = 14 * len(links) + 3 * number
-        own = 14 * joints[motor]
-        parameters[first : first + 3] = parameters[own + 10 : own + 13]
+        # Ia, fv and fs of the motor's joint stand for Iam, fvm and fsm.
+        first = JOINT_COLUMNS * len(links) + COUPLED_COLUMNS * number
+        rotor = model.rotor_columns[motor]
+        parameters[first : first + COUPLED_COLUMNS] = parameters[rotor : rotor + COUPLED_COLUMNS]
     return parameters

@@ -99,16 +99,20 @@ class PlannedMoves:
                 f"move_s has {move_s.min():g} s; expected durations above 0 s; take "
                 "those of plan_moves"
             )
-        samples = rate_hz * float(move_s.sum() + dwell_s * len(move_s))
+        duration_s = float(move_s.sum() + dwell_s * len(move_s))
+        samples = rate_hz * duration_s
         if samples > MOST_SAMPLES:
             expected = f"at most {MOST_SAMPLES:.0e}; give a lower `rate_hz`, or fewer moves"
             raise ModelError(f"found {samples:.3g} samples at {rate_hz:g} Hz; expected {expected}")
         time_s = np.arange(0.0, self.duration_s, 1.0 / rate_hz)
-        begin_s = np.concatenate(([0.0], np.cumsum(self.move_s + self.dwell_s)[:-1]))
+        ends_s = np.cumsum(self.move_s + self.dwell_s)
+        begin_s = np.concatenate(([0.0], ends_s[:-1]))
         move = np.searchsorted(begin_s, time_s, side="right") - 1
         way_rad = np.diff(self.target_rad, axis=0)
-        share = np.minimum((time_s - begin_s[move]) / self.move_s[move], 1.0)
-        return time_s, _least_jerk(self.target_rad[move], way_rad[move], self.move_s[move], share)
+        own_s = self.move_s[move]
+        since_begin_s = time_s - begin_s[move]
+        share = np.minimum(since_begin_s / own_s, 1.0)
+        return time_s, _least_jerk(self.target_rad[move], way_rad[move], own_s, share)
 
 
 def _least_jerk(
@@ -124,9 +128,9 @@ def _least_jerk(
     speed = 30.0 * s**2 - 60.0 * s**3 + 30.0 * s**4
     acceleration = 60.0 * s - 180.0 * s**2 + 120.0 * s**3
     return Motion(
-        start_rad + way_rad * position,
-        way_rad * speed / duration_s,
-        way_rad * acceleration / duration_s**2,
+        position_rad=start_rad + way_rad * position,
+        velocity_rad_s=way_rad * speed / duration_s,
+        acceleration_rad_s2=way_rad * acceleration / duration_s**2,
     )
 
 
@@ -177,14 +181,15 @@ class _Search:
         None where a drive would not have the torque.
         """
         time_s = np.arange(0.5 * self.row_s, move_s, self.row_s)
-        if len(time_s) == 0:
+        rows = len(time_s)
+        if rows == 0:
             return None
-        each = (len(time_s), 1)
+        way_rad = end_rad - start_rad
         motion = _least_jerk(
-            np.tile(start_rad, each),
-            np.tile(end_rad - start_rad, each),
-            np.full(len(time_s), move_s),
-            time_s / move_s,
+            start_rad=np.tile(start_rad, (rows, 1)),
+            way_rad=np.tile(way_rad, (rows, 1)),
+            move_s=np.full(rows, move_s),
+            share=time_s / move_s,
         )
         expected = self.design.expectation
         if np.isfinite(self.effort).any():
@@ -192,11 +197,13 @@ class _Search:
             if shares.max() * EFFORT_MARGIN > 1.0:
                 return None
         # Rows whose filter window has a rest in it do not count (`ident.equations.rows`).
-        is_moving = (time_s > self.edge_s) & (time_s < move_s - self.edge_s)
-        moved = np.abs(end_rad - start_rad) > 0.0
+        is_after_rest = time_s > self.edge_s
+        is_before_rest = time_s < move_s - self.edge_s
+        is_moving = is_after_rest & is_before_rest
+        joint_moves = np.abs(way_rad) > 0.0
         train = expected.model.drive_train
         needed = (train.to_motor != 0.0) | (train.direction != 0.0)
-        motor_moves = np.array([moved[row].all() for row in needed])
+        motor_moves = np.array([joint_moves[joints].all() for joints in needed])
         use = motor_moves[:, None] & is_moving
         return self.design.information(Excitation(motion, use), RUNS)
 
@@ -210,7 +217,8 @@ class _Search:
         end_rad = rng.uniform(lower, upper)
         if start_rad is None:
             return end_rad
-        return np.asarray(start_rad + rng.uniform(SHORTEST_SHARE, 1.0) * (end_rad - start_rad))
+        share = rng.uniform(SHORTEST_SHARE, 1.0)
+        return np.asarray(start_rad + share * (end_rad - start_rad))
 
     def near_target(self, rng: np.random.Generator, target_rad: FloatArray) -> FloatArray:
         """A target near another one, within the limits."""
@@ -221,9 +229,9 @@ class _Search:
     def cost(self, information: FloatArray) -> float:
         """Nearly the largest predicted deviation [%]; inf where a gain does not show."""
         std_percent = self.design.std_percent(information)
-        if np.isfinite(std_percent).all():
-            return float(np.linalg.norm(std_percent, SHARPNESS))
-        return np.inf
+        if not np.isfinite(std_percent).all():
+            return np.inf
+        return float(np.linalg.norm(std_percent, SHARPNESS))
 
 
 def plan_moves(
@@ -242,9 +250,9 @@ def plan_moves(
     from limits and without a cell file.
 
     The moves are made twice: without load, and with the payload. Positions, velocities and
-    accelerations keep the limits on the whole way, targets with a margin; torques keep the efforts
-    of the URDF, where it has any. Obstacles and the arm itself are not known: look at the moves
-    before a robot makes them.
+    accelerations keep the limits all the way, targets with a margin; torques keep the efforts of
+    the URDF, where it has any. Obstacles and the arm itself are not known: look at the moves before
+    a robot makes them.
 
     Args:
         model: the declared model of a serial robot.
@@ -298,18 +306,27 @@ def plan_moves(
         raise ModelError(f"duration_s is {duration_s:g} s; expected {expected}")
     seed = require_count("seed", seed)
     exchanges = require_count("exchanges", exchanges)
-    search = _search_of(model, limits, payload, gains, urdf, conditioning or Conditioning())
+    if conditioning is None:
+        conditioning = Conditioning()
+    search = _search_of(model, limits, payload, gains, urdf, conditioning)
     rng = np.random.default_rng(seed)
-    draft = _improved(search, _random_moves(search, rng, duration_s), rng, duration_s, exchanges)
+    random_moves = _random_moves(search, rng, duration_s)
+    draft = _improved(search, random_moves, rng, duration_s, exchanges)
     predicted = search.design.std_percent(np.sum(draft.information, axis=0))
-    unseen = [model.robot.axes[axis].name for axis in np.flatnonzero(~np.isfinite(predicted))]
-    if unseen:
+    unseen = np.flatnonzero(~np.isfinite(predicted))
+    if len(unseen):
+        names = ", ".join(model.robot.axes[axis].name for axis in unseen)
         raise PlanUnfit(
-            found=f"gains that {len(draft.move_s)} moves do not show: {', '.join(unseen)}",
+            found=f"gains that {len(draft.move_s)} moves do not show: {names}",
             expected="moves that show every gain",
             remedy="allow a longer `duration_s` or wider `limits`, or give a payload with a mass",
         )
-    return PlannedMoves(np.array(draft.target_rad), np.array(draft.move_s), DWELL_S, predicted)
+    return PlannedMoves(
+        target_rad=np.array(draft.target_rad),
+        move_s=np.array(draft.move_s),
+        dwell_s=DWELL_S,
+        predicted_std_percent=predicted,
+    )
 
 
 def _search_of(
@@ -324,13 +341,11 @@ def _search_of(
     fast_motion = _fast_motion(limits)
     expected = nominal_payload(model.robot, payload)
     expectation, _ = nominal_expectation(model, urdf, gains, expected, limits, fast_motion)
-    effort = believable_efforts(
-        expectation, declared_efforts(model, urdf), fast_motion.position_rad, RUNS
-    )
+    declared = declared_efforts(model, urdf)
+    effort = believable_efforts(expectation, declared, fast_motion.position_rad, RUNS)
     row_s, edge_s = rows_between_rests(conditioning)
-    return _Search(
-        Design(expectation, visible_base(model, fast_motion)), limits, effort, row_s, edge_s
-    )
+    design = Design(expectation, visible_base(model, fast_motion))
+    return _Search(design, limits, effort, row_s, edge_s)
 
 
 def _fast_motion(limits: JointLimits) -> Motion:
@@ -351,7 +366,9 @@ def _move(
     """Duration and information of a move; None where it cannot be made."""
     move_s = search.fastest_s(start_rad, end_rad) / share
     information = search.information(start_rad, end_rad, move_s)
-    return None if information is None else (move_s, information)
+    if information is None:
+        return None
+    return move_s, information
 
 
 def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) -> _Draft:
@@ -363,17 +380,19 @@ def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) 
     tries = 0
     while tries < MAX_TRIES:
         tries += 1
-        target = search.random_target(rng, targets[-1])
+        start = targets[-1]
+        target = search.random_target(rng, start)
         share = float(rng.uniform(SLOWEST_SHARE, 1.0))
         # Slow limits make moves of hours: one that has no room ends the filling before its rows are
         # built.
-        if search.fastest_s(targets[-1], target) / share > duration_s:
+        if search.fastest_s(start, target) / share > duration_s:
             break
-        move = _move(search, targets[-1], target, share)
+        move = _move(search, start, target, share)
         if move is None:
             continue
         move_s, information = move
-        if sum(moves_s) + move_s + DWELL_S * (len(moves_s) + 1) > duration_s:
+        dwells_s = DWELL_S * (len(moves_s) + 1)
+        if sum(moves_s) + move_s + dwells_s > duration_s:
             break
         targets.append(target)
         shares.append(share)
@@ -393,16 +412,17 @@ def _improved(
     search: _Search, draft: _Draft, rng: np.random.Generator, duration_s: float, exchanges: int
 ) -> _Draft:
     """Exchange targets and speeds one at a time, and keep what lowers the deviations."""
-    least = search.cost(np.sum(draft.information, axis=0))
+    best = draft
+    least_cost = search.cost(np.sum(best.information, axis=0))
     for _ in range(exchanges):
-        proposal = _exchanged(search, draft, rng, duration_s)
+        proposal = _exchanged(search, best, rng, duration_s)
         if proposal is None or proposal.duration_s > duration_s:
             continue
         cost = search.cost(np.sum(proposal.information, axis=0))
-        if cost < least:
-            draft = proposal
-            least = cost
-    return draft
+        if cost < least_cost:
+            best = proposal
+            least_cost = cost
+    return best
 
 
 def _exchanged(
@@ -419,15 +439,21 @@ def _exchanged(
     information = list(draft.information)
     touched = [move for move in (changed - 1, changed) if 0 <= move < len(moves_s)]
     if kind is _Exchange.ANYWHERE:
-        targets[changed] = search.random_target(rng, targets[changed - 1] if changed else None)
+        before = None
+        if changed:
+            before = targets[changed - 1]
+        targets[changed] = search.random_target(rng, before)
     elif kind is _Exchange.NEAR:
         targets[changed] = search.near_target(rng, targets[changed])
     else:
         shares[touched[0]] = float(rng.uniform(SLOWEST_SHARE, 1.0))
     for move in touched:
-        if search.fastest_s(targets[move], targets[move + 1]) / shares[move] > duration_s:
+        start = targets[move]
+        end = targets[move + 1]
+        share = shares[move]
+        if search.fastest_s(start, end) / share > duration_s:
             return None
-        found = _move(search, targets[move], targets[move + 1], shares[move])
+        found = _move(search, start, end, share)
         if found is None:
             return None
         moves_s[move], information[move] = found

@@ -119,7 +119,10 @@ def slow_cause(verdict: GainVerdict, *, has_payload: bool, noise_ratio: float = 
         (not verdict.gravity_acts, SlowCause.INERTIA),
         (verdict.sources == (GainSource.COUPLING,), SlowCause.COUPLING),
     )
-    return next((cause for applies, cause in causes if applies), SlowCause.TIME)
+    for applies, cause in causes:
+        if applies:
+            return cause
+    return SlowCause.TIME
 
 
 def recorded_information(design: Design, runs: Runs) -> FloatArray:
