@@ -220,6 +220,8 @@ class Source:
     mass_kg: float | None = None  #: of it, as fitted; None where it was not declared
     #: how the log was made; None in calibrations of earlier versions
     recording: Recording | None = None
+    #: how it was mounted; None without load, and in calibrations of earlier versions
+    mounting: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -462,6 +464,7 @@ def calibration_of(
                 "fit",
                 payload=payload.name,
                 mass_kg=payload.known.get("m"),
+                mounting=payload.mounting,
             )
             for payload in found.system.payloads
         ),

@@ -56,8 +56,8 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
 
     Raises:
         ModelError: the calibration is of another robot.
-        DataUnfit: it does not know how the run's payload is mounted, or knows the payload with
-            another mass.
+        DataUnfit: it does not know how the run's payload is mounted, knows another payload on this
+            mounting, or knows the payload with another mass.
         EffectRefused: it holds an effect that does not exist.
     """
     gains = _gains(calibration, model)
@@ -259,10 +259,12 @@ def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -
         run: its name, for the error.
 
     Raises:
-        DataUnfit: the calibration was given another mass on this mounting.
+        DataUnfit: the calibration knows another payload on this mounting, or was given another
+            mass.
     """
     if payload is None:
         return None
+    _require_same_body(calibration, payload, run)
     own = mounted_parameters(calibration, payload.mounting)
     mass = own.get("m")
     weighed = payload.known.get("m")
@@ -275,6 +277,46 @@ def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -
     return replace(
         payload, known={name: value for name, value in payload.known.items() if name not in own}
     )
+
+
+def other_body(calibration: Calibration, payload: Payload) -> str:
+    """Say which payload a calibration knows on the mounting of another one;
+    empty where it knows none there, or the same by name.
+
+    What it identified on a mounting, first moments and inertia, is that of one body.
+
+    Args:
+        calibration: that is to predict.
+        payload: what a run carries.
+    """
+    if not mounted_parameters(calibration, payload.mounting):
+        return ""
+    on_mounting: set[str] = set()
+    for source in calibration.sources:
+        # Earlier versions did not write the mounting: any of their payloads may have been on it.
+        if source.payload is not None and source.mounting in {None, payload.mounting}:
+            on_mounting.add(source.payload)
+    if not on_mounting or payload.name in on_mounting:
+        return ""
+    return " or ".join(repr(name) for name in sorted(on_mounting))
+
+
+def _require_same_body(calibration: Calibration, payload: Payload, run: str) -> None:
+    """Refuse a payload on the mounting of another one.
+
+    Raises:
+        DataUnfit: the calibration knows another payload there.
+    """
+    known = other_body(calibration, payload)
+    if known:
+        raise DataUnfit(
+            run,
+            f"found payload {payload.name!r} on mounting {payload.mounting!r}; expected payload "
+            f"{known}, of which the calibration holds inertia and first moments on this mounting; "
+            "if it is the same body, give it the same name; if it is another one, fit a run with "
+            f"it on a mounting of its own, or weigh it and give all {len(LINK_PARAMETERS)} of its "
+            "parameters on a new mounting",
+        )
 
 
 def placed_effect(
@@ -361,12 +403,13 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
     None without load.
 
     Raises:
-        DataUnfit: the calibration does not know the mounting, or knows the payload with another
-            mass.
+        DataUnfit: the calibration does not know the mounting, knows another payload on it, or knows
+            the payload with another mass.
     """
     payload = data.payload
     if payload is None:
         return None
+    _require_same_body(calibration, payload, data.name)
     mountings = {
         name.partition(":")[2]
         for name in (one.name for one in calibration.parameters)

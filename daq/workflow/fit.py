@@ -262,15 +262,7 @@ class Reading:
                 self._torques.append(run.torque_channels)
             if self.cell.chain is not None and role == "fit":
                 self._positions.append(thinned(run))
-            if run.payload is None:
-                name = None
-                mass_kg = None
-            else:
-                name = run.payload.name
-                mass_kg = run.payload.known.get("m")
-            self.sources.append(
-                Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording)
-            )
+            self.sources.append(_source_of(run, role))
             yield run
 
     def torque_slopes(self) -> tuple[TorqueSlope | None, ...]:
@@ -286,6 +278,19 @@ class Reading:
         if self._positions:
             return estimate_geometry(model, self._positions)
         return None
+
+
+def _source_of(run: Run, role: str) -> Source:
+    """The entry of a calibration that names the log of a run."""
+    source = Source(run.name, run.digest, role, run.partial, recording=run.recording)
+    if run.payload is None:
+        return source
+    return replace(
+        source,
+        payload=run.payload.name,
+        mass_kg=run.payload.known.get("m"),
+        mounting=run.payload.mounting,
+    )
 
 
 _LOG = logging.getLogger("drivegain")

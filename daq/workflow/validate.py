@@ -64,6 +64,7 @@ from ident.prediction import (
     fitted_model,
     measured_torque,
     mounted_parameters,
+    other_body,
     placed_effect,
     predict_torque,
     standard_parameters,
@@ -195,7 +196,15 @@ def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
 
 def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
     """Why a calibration says nothing of a run with this payload; empty where it does."""
-    if payload is None or set(payload.known) == set(LINK_PARAMETERS):
+    if payload is None:
+        return ""
+    known = other_body(calibration, payload)
+    if known:
+        return (
+            f"payload {payload.name!r} is not predicted: on mounting {payload.mounting!r} the "
+            f"calibration knows {known}"
+        )
+    if set(payload.known) == set(LINK_PARAMETERS):
         return ""
     if "m" not in payload.known:
         return f"payload {payload.name!r} is not predicted: the log leaves its mass open"

@@ -152,6 +152,53 @@ def test_a_payload_of_another_mass_is_not_predicted(example: SimpleNamespace) ->
     ).all()
 
 
+def test_another_payload_on_a_known_mounting_is_not_predicted(example: SimpleNamespace) -> None:
+    """What the calibration holds of the mounting is the inertia of the disc, not of a box."""
+    found = example.main()
+    calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
+    disc_kg = example.DISC.known["m"]
+    for known in ({"m": 2.0}, {"m": disc_kg}, {}):
+        box = ident.Payload("box", mounting="flange", known=known)
+        motion = ident.planned(_slow_motion(), 100.0, box)
+        with pytest.raises(
+            ident.DataUnfit,
+            match=r"found payload 'box' on mounting 'flange'; expected payload 'disc', .*"
+            "the same name; .* a mounting of its own",
+        ):
+            ident.predict_torque(calibration, found.model, motion)
+    box_run = replace(
+        example.record(found.model, "box", example.DISC, 9),
+        payload=ident.Payload("box", "flange", {"m": disc_kg}),
+    )
+    with pytest.raises(ident.DataUnfit, match="found payload 'box' on mounting 'flange'"):
+        ident.external_torque(calibration, found.model, box_run)
+    with pytest.raises(ident.DataUnfit, match="found payload 'box' on mounting 'flange'"):
+        ident.prediction_band(calibration, found.model, [box_run])
+    # Weighing ignores what a run says of its payload.
+    assert ident.weigh(calibration, found.model, [box_run]).mass_kg == pytest.approx(
+        disc_kg, rel=0.1
+    )
+
+
+def test_two_payloads_keep_their_own_mountings(example: SimpleNamespace) -> None:
+    """A name that the calibration knows on another mounting is no name of this one's."""
+    found = example.main()
+    calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
+    elsewhere = ident.Source("earlier", "", "fit", payload="box", mass_kg=2.0, mounting="elbow")
+    both = replace(calibration, sources=(*calibration.sources, elsewhere))
+    box = ident.Payload("box", mounting="flange", known={"m": 2.0})
+    motion = ident.planned(_slow_motion(), 100.0, box)
+    with pytest.raises(ident.DataUnfit, match="expected payload 'disc', of which"):
+        ident.predict_torque(both, found.model, motion)
+    # Calibrations of earlier versions do not say which mounting a payload had.
+    without_mountings = tuple(replace(one, mounting=None) for one in both.sources)
+    earlier = replace(both, sources=without_mountings)
+    assert np.isfinite(ident.predict_torque(earlier, found.model, motion)).all()
+    only_disc = replace(earlier, sources=without_mountings[:1])
+    with pytest.raises(ident.DataUnfit, match="expected payload 'disc', of which"):
+        ident.predict_torque(only_disc, found.model, motion)
+
+
 def test_a_planned_motion_holds_numbers_of_one_shape() -> None:
     motion = _slow_motion()
     motion.velocity_rad_s[7, 1] = np.nan

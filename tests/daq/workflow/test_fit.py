@@ -82,6 +82,11 @@ def test_logs_become_sources_with_their_roles(
     assert [(source.name, source.role) for source in found.sources] == [
         ("run0", "fit"), ("run1", "fit"), ("run2", "fit"), ("run3", "holdout"),
     ]  # fmt: skip
+    assert [(source.payload, source.mounting) for source in found.sources] == [
+        (None, None) if run.payload is None else (run.payload.name, run.payload.mounting)
+        for run in (shelf.runs[source.name] for source in found.sources)
+    ]
+    assert any(source.mounting for source in found.sources)
     assert found.identification.holdout_error is not None
 
 

@@ -19,12 +19,12 @@ from daq.workflow.live_prediction import (
     Recent,
     predictor_of,
 )
-from daq.workflow.validate import conditioning_of
-from ident.calibration import AcceptedEffect, Calibration, Parameter
+from daq.workflow.validate import conditioning_of, unpredictable
+from ident.calibration import AcceptedEffect, Calibration, Parameter, Source
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_filter, row_masks
-from ident.model.bodies import Payload
+from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.prediction import predict_current
 from tests.daq.console.feeds import facts, predicting_calibration
 
@@ -167,6 +167,31 @@ def test_another_mass_than_that_of_the_calibration_is_refused(cell: Cell) -> Non
             calibration, replace(cell, payloads=(replace(weighed, mass_kg=mass_kg),)), run
         )
         assert remark in found and bool(found) == bool(remark)
+
+
+def test_another_payload_on_the_mounting_of_the_calibration_is_not_predicted(cell: Cell) -> None:
+    """A payload of the same mass, and one of which all is known: both are other bodies."""
+    of_disc = Parameter("mx:flange", 0.1, 0.01, "kg m")
+    source = Source("loaded", "a" * 64, "fit", payload="disc", mass_kg=4.59, mounting="flange")
+    calibration = predicting_calibration()
+    calibration = replace(
+        calibration, parameters=(*calibration.parameters, of_disc), sources=(source,)
+    )
+    weighed = replace(cell.payloads[0], name="box", mounting="flange", mass_kg=4.59)
+    run = replace(facts(cell, None), payload="box")
+    found, remark = predictor_of(calibration, replace(cell, payloads=(weighed,)), run)
+    assert found is None
+    assert "found payload 'box' on mounting 'flange'; expected payload 'disc'" in remark
+    known = {"m": 4.59, "mx": 0.2}
+    for name in LINK_PARAMETERS:
+        known.setdefault(name, 1.0 if name in {"Ixx", "Iyy", "Izz"} else 0.0)
+    for payload in (Payload("box", "flange", {"m": 4.59}), Payload("box", "flange", known)):
+        assert (
+            unpredictable(calibration, payload)
+            == "payload 'box' is not predicted: on mounting 'flange' the calibration knows 'disc'"
+        )
+    assert unpredictable(calibration, Payload("disc", "flange", {"m": 4.59})) == ""
+    assert unpredictable(calibration, Payload("box", "elbow", known)) == ""
 
 
 def test_what_the_calibration_does_not_know_is_not_predicted(cell: Cell) -> None:
