@@ -10,6 +10,10 @@ COMMANDS = {
     "`find_effects`": "`drivegain residual`",
     "`fixed_gains`": "`--gains fixed`",
     '`method="ml"`': "--method ml",
+    "test the order of the currents with `exchanged_channels`; ": "",  # each verb has done so
+    " (`exchanged_channels` tests it)": "",
+    # No verb takes an effect as an argument
+    ", or give the effect to `load_calibration(path, own_effects=[...])`": "",
     "`Run.payload` of each run": "`drivegain info` of each log",
     "`Run.payload`": "`record --payload NAME --mass KG`",
     "`CanopenNetwork.reset_faults`": "`drivegain scan CELL --reset-faults`",

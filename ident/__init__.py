@@ -71,6 +71,7 @@ if TYPE_CHECKING:  # the names of a module stand together
         Run as Run,
     )
     from ident.data.torque_channel import TorqueChannel as TorqueChannel
+    from ident.discovery.acceptance import accept_on_holdout as accept_on_holdout
     from ident.discovery.effect_verdict import (
         EffectVerdict as EffectVerdict,
         Judgement as Judgement,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from numbers import Real
 from types import UnionType
@@ -32,6 +32,12 @@ def as_array(
     """Convert an argument to finite numbers of a shape, any if empty;
     otherwise raise what ``refuse`` makes.
     """
+    if isinstance(values, Mapping):
+        keys = ", ".join(map(repr, values))
+        raise refuse(
+            f"{label} is a dictionary with the keys {keys:.60}; expected numbers, "
+            f"{meaning or 'in the order of the axes'}; write [{label}[name] for name in axes]"
+        )
     if values is not None:
         require_real(label, values, refuse, str(shape or "real numbers"))
     try:
@@ -172,11 +178,12 @@ def require_count(label: str, value: object, *, remedy: str = "give a number suc
 def takes(
     **kinds: type | UnionType,
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Make a function refuse arguments of another type by name, as a `ModelError`, before it runs.
+    """Make a function refuse arguments of another type by name, as a `ModelError`, before it runs;
+    likewise missing arguments, and those that it does not have.
 
     Args:
-        kinds: of the arguments by their names; others are not looked at. An argument that is left
-            out is not, either.
+        kinds: of the arguments by their names; the type of others is not looked at. Neither is one
+            that is left out.
     """
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
@@ -184,7 +191,14 @@ def takes(
 
         @wraps(function)
         def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            for name, value in signature.bind(*args, **kwargs).arguments.items():
+            try:
+                given = signature.bind(*args, **kwargs).arguments
+            except TypeError as error:
+                raise ModelError(
+                    f"the call of {function.__name__} does not fit: {error}; expected "
+                    f"{_call_of(function.__name__, signature)}; give its arguments by these names"
+                ) from error
+            for name, value in given.items():
                 if name in kinds and not isinstance(value, kinds[name]):
                     raise ModelError(
                         _of_another_kind(function.__name__, name, value, kinds[name], signature)
@@ -201,9 +215,27 @@ def _of_another_kind(
 ) -> str:
     expected = kind.__name__ if isinstance(kind, type) else str(kind)
     found = f"{name} of {function} is of type {type(value).__name__}"
-    return (
-        f"{found}; expected {_short(expected)}; call {function}({', '.join(signature.parameters)})"
-    )
+    if kind is np.random.Generator:
+        remedy = f"write {name}=np.random.default_rng(0)"
+    elif kind in {Sequence, Iterable}:
+        remedy = f"give a list, with one entry too: {name}=[...]"
+    else:
+        remedy = f"call {_call_of(function, signature)}"
+    return f"{found}; expected {_short(expected)}; {remedy}"
+
+
+def _call_of(function: str, signature: inspect.Signature) -> str:
+    """A call with the names of its arguments; those that may be left out are in brackets."""
+    needed: list[str] = []
+    optional: list[str] = []
+    for name, parameter in signature.parameters.items():
+        if parameter.default is inspect.Parameter.empty:
+            needed.append(name)
+        else:
+            optional.append(name)
+    if optional:
+        needed.append(f"[{', '.join(optional)}]")
+    return f"{function}({', '.join(needed)})"
 
 
 def _short(kind: str) -> str:

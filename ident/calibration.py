@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_kind, require_names
+from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
@@ -367,6 +367,7 @@ class Calibration:
         return np.asarray(lower @ lower.T)
 
 
+@takes()
 def calibration_of(
     found: Identification,
     axes: Sequence[str],

@@ -11,7 +11,7 @@ IdentificationError
 │   ├── ChannelsExchanged the currents of some axes are each other's
 │   ├── GeometryTurned    gravity, or the position of an axis, points elsewhere than declared
 │   ├── CurrentReversed   a current counts against the sign of its fixed gain
-│   ├── UnitsMistaken     all gains, or the payload's weight, are off by a factor such as 1000
+│   ├── UnitsMistaken     all gains, the payload's weight or positions are off by a factor such as 1000
 │   └── PayloadDiffers    a run carries another payload than it says
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data do not distinguish some unknowns
@@ -168,7 +168,9 @@ class CurrentReversed(ModelContradicted):
 
 
 class UnitsMistaken(ModelContradicted):
-    """All gains, or the payload's weight, are off by a factor such as 1000."""
+    """All gains, or the payload's weight, are off by a factor such as 1000,
+    or positions of an axis are degrees.
+    """
 
 
 class PayloadDiffers(ModelContradicted):
@@ -211,7 +213,11 @@ class PayloadUnseen(IdentificationError):
             f"expected some 1 %, and on one at most {100.0 * LARGEST_GAIN_STD:g} %: the runs "
             "declared loaded and those declared unloaded do not differ by the weight of the "
             "payload, or are positions not in rad, or columns in another order than the joints? "
-            + (hint or "was it mounted in every loaded run, and in no other? is its mass right?")
+            + (
+                hint
+                or "was it mounted in every loaded run, and in no other? is its mass right? where "
+                "one of several runs is the wrong one, a fit without it passes"
+            )
         )
         self.std_percent = std_percent
         self.runs = runs
@@ -239,10 +245,15 @@ class NotConverged(IdentificationError):
         step: float,
         likely_cause: str = "",
     ) -> None:
-        question = likely_cause or "are roles, payload mass, drive train, rad and axis order ok?"
+        remedy = likely_cause or (
+            "test the order of the currents with `exchanged_channels`; "
+            "look at `Run.payload` of each run, the payload's mass, the drive train, radians, and "
+            "the order of the columns"
+        )
         super().__init__(
-            f"{method} did not converge in {iterations} iterations: the cost went from "
-            f"{cost[0]:.6g} to {cost[-1]:.6g} and the last relative step was {step:.2g}; {question}"
+            f"found that {method} did not converge in {iterations} iterations: the cost went from "
+            f"{cost[0]:.6g} to {cost[-1]:.6g} and the last relative step was {step:.2g}; expected "
+            f"steps that fade; {remedy}"
         )
         self.method = method
         self.iterations = iterations
@@ -258,6 +269,10 @@ class EffectRefused(IdentificationError):
 
 class EffectImpossible(EffectRefused):
     """The data give a declared effect a coefficient that physics does not allow."""
+
+
+#: Predictions, weighing and export have no argument for it: the calibration carries the effect
+OR_GIVE_EFFECT = ", or give the effect to `load_calibration(path, own_effects=[...])`"
 
 
 class EffectNotInstalled(EffectRefused):
@@ -289,19 +304,17 @@ class EffectNotInstalled(EffectRefused):
             self.found = "no installed package that has it"
         if other:
             self.remedy = (
-                "install the one in place of the other, give the effect as an argument "
-                "(`own_effects`), or fit the logs again"
+                f"install the one in place of the other, or fit the logs again{OR_GIVE_EFFECT}"
             )
         elif installed:
             self.remedy = (
                 "add it to the entry points of the group drivegain.effects in the package's "
-                "pyproject.toml and install the package again, or give it as an argument "
-                "(`own_effects`)"
+                f"pyproject.toml and install the package again{OR_GIVE_EFFECT}"
             )
         elif package.startswith("module "):
             self.remedy = (
-                "give it as an argument (`own_effects`), or install it in a package with an entry "
-                "point of the group drivegain.effects"
+                "install it in a package with an entry point of the group drivegain.effects"
+                f"{OR_GIVE_EFFECT}"
             )
         else:
             self.remedy = "install this package, or fit the logs again without it"

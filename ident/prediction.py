@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from ident.arrays import FloatArray, as_array, takes
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
-from ident.effects.effect import ALL_AXES, PlacedEffect, at_joints, check_settings, columns_at
+from ident.effects.effect import (
+    ALL_AXES,
+    PlacedEffect,
+    at_joints,
+    check_settings,
+    columns_at,
+    setting_kind,
+)
 from ident.effects.geometry_corrections import (
     GeometryEffect,
     corrected_dataset,
@@ -371,7 +378,7 @@ def placed_effect(
         )
     check_settings(known, accepted.settings, axis, len(calibration.gains))
     # A file knows one kind of number; an order must be whole.
-    given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
+    given = {name: setting_kind(known, name)(value) for name, value in accepted.settings.items()}
     if given != accepted.settings:
         raise EffectRefused(
             f"effect {accepted.name!r} is given {accepted.settings}; these must be whole numbers"

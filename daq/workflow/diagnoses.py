@@ -585,6 +585,11 @@ by the effect that corrects it.
 HIDING_EXCHANGES = frozenset({"zero-off", "position-late", "gravity-tilted", CORRECTION_UNCLEAR})
 """Those of a wrong description, which may look like exchanged currents."""
 FIT_AGAIN = "then fit the same logs again, with the corrected file as `--cell`"
+#: No torque of a serial arm tells a length from a zero and the gains
+OR_A_LENGTH = (
+    "where the zero is known to be right, measure the lengths of the links in the URDF: a wrong "
+    "one looks like this"
+)
 SMALL_DELAY = "tenths of a millisecond are a filter of the drive, several milliseconds are a fault"
 INTO_THE_MODEL = "`drivegain residual` takes the delay into the model"
 
@@ -610,6 +615,8 @@ def _correction_diagnosis(
             expected = "positions whose zero is that of the URDF"
             remedy = zero_remedy(name, scale * values[0], scale * deviations[0], unit, described)
             remedy += f"; {FIT_AGAIN}"
+            if not model.robot.closures:
+                remedy += f"; {OR_A_LENGTH}"
         case LatePosition():
             found = f"the position of {name} {_late_text(values, deviations)}"
             expected = ONE_MOMENT

@@ -382,9 +382,15 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):
         raise refuse(f"{speeds} standstill speeds for {count} joints; give one a joint")
-    if samples < 3 or not _is_uniform(run.time_s):
+    if samples < 3:
+        raise refuse(f"found {samples} samples; expected at least 2 s of motion; record longer")
+    uneven = _uneven_times(run.time_s)
+    if uneven:
         raise refuse(
-            "the sampling times are not uniform; derivatives need a constant rate without gaps"
+            f"found sampling times that are not uniform: {uneven}; expected steps of one length, "
+            f"within {100.0 * LARGEST_JITTER:g} %, because derivatives need a constant rate; "
+            "resample to uniform times (`numpy.interp`), or cut the run at the gap and give each "
+            "part as a run"
         )
     if run.rate_hz < SLOWEST_HZ:
         between_s = (run.time_s[-1] - run.time_s[0]) / (samples - 1)
@@ -414,9 +420,21 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
         raise refuse(f"{long}; expected at least 2 s, and about 30 moves for one percent")
 
 
-def _is_uniform(time_s: FloatArray) -> bool:
-    """Whether times rise in steps of one length."""
-    steps = np.diff(time_s)
-    if np.any(steps <= 0):
-        return False
-    return bool(np.ptp(steps) <= LARGEST_JITTER * float(np.median(steps)))
+def _uneven_times(time_s: FloatArray) -> str:
+    """Say where times do not rise in steps of one length; empty where they do."""
+    steps_s = np.diff(time_s)
+    usual_s = float(np.median(steps_s))
+    backwards = np.flatnonzero(steps_s <= 0.0)
+    if len(backwards):
+        first = int(backwards[0])
+        return (
+            f"time_s does not rise from sample {first} ({time_s[first]:.6g} s) to the next one "
+            f"({time_s[first + 1]:.6g} s)"
+        )
+    if np.ptp(steps_s) <= LARGEST_JITTER * usual_s:
+        return ""
+    farthest = int(np.argmax(np.abs(steps_s - usual_s)))
+    return (
+        f"a step of {steps_s[farthest]:.4g} s behind sample {farthest} "
+        f"({time_s[farthest]:.6g} s), where the usual one is {usual_s:.4g} s"
+    )

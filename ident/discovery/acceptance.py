@@ -27,11 +27,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.arrays import takes
 from ident.discovery.before_after import error_on, squares_left
 from ident.discovery.candidates import ColumnCache
 from ident.discovery.effect_verdict import EffectVerdict, Judgement, judge_change
 from ident.discovery.error_change import ErrorChange, change_of_errors
-from ident.discovery.evidence import Evidence, with_effects
+from ident.discovery.evidence import Evidence, place_names, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.joining import UNFITTED, linearised
 from ident.discovery.loop import Step, end_search
@@ -41,6 +42,7 @@ from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import estimate_with
 
 
+@takes(start=Evidence, steps=Sequence, gates=Gates | None, rng=np.random.Generator | None)
 def accept_on_holdout(
     start: Evidence,
     steps: Sequence[Step],
@@ -53,8 +55,12 @@ def accept_on_holdout(
 ) -> tuple[Step, ...]:
     """Take out of the last model what held-out runs do not confirm.
 
+    The command line does this before it writes a calibration; `calibration_of` takes the steps that
+    this returns.
+
     Args:
-        start: the model that the search began with, with the effects that the cell declares.
+        start: the model that the search began with, with the effects that the cell declares. It
+            holds the held-out runs (`gather(..., holdout=...)`).
         steps: of `find_effects`, from there.
         gates: limits of the search.
         rng: of the bootstrap, by which what is left is tested again; one with the seed 0 when None.
@@ -74,7 +80,7 @@ def accept_on_holdout(
     found = steps[-1].after
     if len(found.effects) == found.declared:
         return tuple(steps)
-    names = axes or [joint.name for joint in start.model.robot.places]
+    names = place_names(start.model, axes)
     verdicts: dict[PlacedEffect, EffectVerdict] = {}
     judged_model = found
     bootstrap = rng or np.random.default_rng(0)

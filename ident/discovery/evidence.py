@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray, takes
+from ident.arrays import FloatArray, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import Demands, as_demanded, with_demand
@@ -32,6 +32,7 @@ from ident.equations.observation import Observation, observe, on_demanded_motion
 from ident.equations.reduction import reduce_built, regrouped
 from ident.equations.rows import rows_of
 from ident.equations.system import System
+from ident.errors import ModelError
 from ident.estimators.estimate import Estimate, Identification, RelativeError
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
@@ -112,11 +113,22 @@ def gather(
 ) -> Evidence:
     """Build the rows behind an identification from its runs and held-out runs,
     unless it has kept them.
+
+    Raises:
+        ModelError: no runs are given, and the identification has kept none; or an argument is of
+            another type.
+        DataUnfit: a run is unfit.
     """
     model = found.model
     conditioning = found.conditioning
     if found.gathered is None:
         trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
+        if not trained:
+            of_fit = ", ".join(found.system.runs)
+            raise ModelError(
+                f"gather was given no runs; expected those of the fit, {of_fit}, which it has not "
+                "kept; write gather(found, [bare, loaded])"
+            )
         datasets = (
             *trained,
             *(differentiate(run, model.drive_train, conditioning) for run in holdout),
@@ -132,6 +144,24 @@ def gather(
     )
     evidence._identification.append(found)
     return evidence
+
+
+def place_names(model: Model, axes: Sequence[str]) -> list[str]:
+    """Names of the places of effects (`Robot.places`) for messages.
+
+    Args:
+        model: of the robot.
+        axes: names of the axes, or of all places; those of the robot's joints when empty.
+
+    Raises:
+        ModelError: they are no list of names, or of another number.
+    """
+    robot = model.robot
+    own = [place.name for place in robot.places]
+    if not len(axes):
+        return own
+    require_names("axes", axes, None if len(axes) == len(own) else robot.axis_count)
+    return [*axes, *own[len(axes) :]]
 
 
 def with_effects(

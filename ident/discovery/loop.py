@@ -18,7 +18,7 @@ from ident.discovery.cables import propose_cables
 from ident.discovery.candidates import ColumnCache, SearchProblem
 from ident.discovery.choice import choice_covariance, is_small, scored_beside
 from ident.discovery.effect_verdict import EffectVerdict
-from ident.discovery.evidence import Evidence, with_effects, with_estimate
+from ident.discovery.evidence import Evidence, place_names, with_effects, with_estimate
 from ident.discovery.gates import (
     Gates,
     PartsLeftOut,
@@ -90,7 +90,8 @@ class Step:
     after: Evidence  #: the model with it
     #: what would have joined the model, but for parts left out or the joint fit
     set_aside: tuple[SetAside, ...] = ()
-    #: reason why the search ended here although the residual may call for more; else empty
+    #: Reason why the search ended here although the residual may call for more. Empty in every
+    #: other turn, the last one too, where nothing more has passed the gates.
     ended: str = ""
     #: σ of each gain [Nm/A] from the choice of the effects, contained in that of `after`, shape
     #: (m,); last turn only.
@@ -198,7 +199,7 @@ def find_effects(
         families = search_families(own_effects)
     else:
         families = (*families, *families_of(own_effects, "`own_effects`"))
-    names = axes or [joint.name for joint in start.model.robot.places]
+    names = place_names(start.model, axes)
     steps: list[Step] = []
     if mistakes is None:
         mistakes = _named_mistakes(start, rng, gates, own_effects) if geometry else ()

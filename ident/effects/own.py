@@ -25,6 +25,8 @@ from importlib.metadata import (
 )
 from itertools import chain
 
+import numpy as np
+
 from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
 from ident.effects.effect import Effect, GearSide, Reported, is_shipped, setting_kind, setting_range
 from ident.errors import EffectRefused
@@ -142,14 +144,15 @@ def families_of(effects: Iterable[object], where: str) -> tuple[Family, ...]:
             raise EffectRefused(
                 f"{where}: found {given}; expected objects of subclasses of `ident.Effect`"
             )
-        _check(effect, where)
-        family = families.setdefault(effect.name, [])
-        if family and type(family[0]) is not type(effect):
+        plain = _with_plain_settings(effect)
+        _check(plain, where)
+        family = families.setdefault(plain.name, [])
+        if family and type(family[0]) is not type(plain):
             raise EffectRefused(
-                f"{where}: found two classes of effects with the name {effect.name!r}; expected "
+                f"{where}: found two classes of effects with the name {plain.name!r}; expected "
                 "one name for each class"
             )
-        family.append(effect)
+        family.append(plain)
     return tuple(map(tuple, families.values()))
 
 
@@ -217,6 +220,19 @@ def _loaded(point: EntryPoint, where: str) -> Iterable[object]:
             f"{where}: found {found}; expected an effect; repair or remove the package"
         ) from error
     return loaded if isinstance(loaded, list | tuple) else (loaded,)
+
+
+def _with_plain_settings(effect: Effect) -> Effect:
+    """Return an effect with settings of numpy as numbers of Python,
+    which a calibration reads back.
+    """
+    plain: dict[str, float] = {}
+    for setting, value in effect.settings.items():
+        if isinstance(value, np.floating | np.integer):
+            plain[setting] = value.item()
+    if not plain:
+        return effect
+    return effect.with_settings(plain)
 
 
 def _check(effect: Effect, where: str) -> None:

@@ -271,8 +271,9 @@ def gain_diagnoses(
             (axes[axis],),
             f"a gain of {gain}, {ratio[axis]:.3g} times the nameplate",
             f"{range_text(GAIN_RANGE)} of {nameplate[axis]:.4g}, within {GAIN_SIGMAS:g} σ",
-            "is the nameplate of this axis, its gear ratio, the scale of its current or the "
-            "payload's mass wrong?",
+            "is the nameplate of this axis, its gear ratio, the scale of its current, the "
+            "payload's mass, or a length of the URDF wrong? measure the lengths: on a serial arm "
+            "no data show them",
         )
 
 

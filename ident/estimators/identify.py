@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_kind
+from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.data.run import Run, usual_conditioning
@@ -37,6 +37,7 @@ from ident.estimators.refusals import (
     require_plausible,
     require_seen_payload,
     require_signs,
+    require_travel,
     require_weight,
     with_channel_causes,
     with_unit_causes,
@@ -45,6 +46,7 @@ from ident.model.bodies import Payload
 from ident.model.model import Model
 
 
+@takes()
 def identify(
     model: Model,
     runs: Iterable[Run],
@@ -79,7 +81,8 @@ def identify(
             motor.
         RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses
             its gain's sign.
-        UnitsMistaken, CurrentReversed: with fixed gains.
+        UnitsMistaken: an axis moves so much farther than its joint in the URDF that its positions
+            are degrees or millimetres; or, as CurrentReversed, with fixed gains.
         CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
         CurrentConstant, ReadingsDamaged: see `ident.data.run_channels`.
         JointStill: a joint never moves in a run, and the fit has no usable number for that.
@@ -95,7 +98,9 @@ def identify(
     require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
     method = Method(method)
     known_gains = _known_gains(fixed_gains, model)
-    axes = axes or [joint.name for joint in model.robot.axes]
+    if axes is None:
+        axes = [joint.name for joint in model.robot.axes]
+    require_names("axes", axes, model.robot.axis_count)
     used = with_signed_currents(runs, model, conditioning, axes)
     instants: list[Instants] = []
     channels: list[RunChannels] = []
@@ -236,6 +241,7 @@ def noting_channels(
     """Yield runs, and note the faults of their channels; refuse those that cannot be used."""
     for data, pieces in built:
         channels = channels_of(model, data)
+        require_travel(channels, model, axes)
         require_usable_channels(channels, axes)
         noted.append(channels)
         yield data, pieces

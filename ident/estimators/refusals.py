@@ -64,6 +64,9 @@ SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs n
 #: Names of the friction of a joint or of its coupled motor
 FRICTION = re.compile(r"f[vs](m?)([0-9]+)\b")
 WIDEST_RANGE_RAD = 8.0 * np.pi  #: No arm's joint turns four times: cables go through it
+#: Times the travel of a joint that positions in its unit are never: limits of a URDF may be narrow
+TRAVEL_EXCESS = 3.0
+TRAVEL_TOLERANCE = 1.1  #: Likewise, of positions in the other unit
 LARGEST_CURRENT_A = 1000.0  #: A servo amplifier of a robot gives a tenth of it
 FRICTION_SIGMAS = 15.0  #: In the σ of independent rows, which is some three times too small
 WEIGHT_SIGMAS = 30.0  #: Likewise, for the weight of a payload
@@ -161,6 +164,39 @@ def with_unit_causes(
         if not cause:
             raise
         raise PayloadUnseen(error.std_percent, error.runs, cause) from error
+
+
+def require_travel(run: RunChannels, model: Model, axes: Sequence[str]) -> None:
+    """Refuse positions of an axis that go far beyond what its joint allows,
+    and fit in it as degrees or millimetres.
+
+    A joint without limits in its description is not judged.
+
+    Raises:
+        UnitsMistaken: for these axes.
+    """
+    for axis, joint in enumerate(model.robot.axes):
+        moved = float(run.range[axis])
+        if joint.travel is None or moved <= TRAVEL_EXCESS * joint.travel:
+            continue
+        if joint.kind is JointKind.REVOLUTE:
+            unit = "rad"
+            converted = float(np.radians(moved))
+            remedy = (
+                "are these degrees (give `numpy.radians` of this column), or the motor's angle "
+                "before the gear (divide it by the ratio)?"
+            )
+        else:
+            unit = "m"
+            converted = 1e-3 * moved
+            remedy = "are these millimetres (divide this column by 1000)?"
+        if converted <= TRAVEL_TOLERANCE * joint.travel:
+            raise UnitsMistaken(
+                f"run {run.run!r}, axis {axes[axis]}",
+                found=f"positions that move by {moved:.4g} {unit}",
+                expected=f"at most {joint.travel:.4g} {unit}, the travel of this joint in the URDF",
+                remedy=f"{remedy} if neither, correct the limits in the URDF",
+            )
 
 
 def unlikely_units(runs: Sequence[RunChannels], model: Model, axes: Sequence[str]) -> str:
@@ -284,9 +320,10 @@ def require_plausible(
             expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis "
             f"{LARGEST_AXIS_PERCENT:g} %, {LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller "
             "than its σ",
-            remedy="look for what contradicts the model: two channels exchanged or one reversed, a "
-            "wrong drive train, gravity or URDF, positions not in rad, a payload or drawing that "
-            "is not of the body that was mounted",
+            remedy="look for what contradicts the model: two channels exchanged"
+            " (`exchanged_channels` tests it)"
+            " or one reversed, a wrong drive train, gravity or URDF, positions not in rad, a "
+            "payload or drawing that is not of the body that was mounted",
         )
     parameters = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
     dry = [

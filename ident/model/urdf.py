@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
-from ident.arrays import FloatArray, require_kind
+from ident.arrays import FloatArray, require_kind, takes
 from ident.errors import ModelError
 from ident.model.bodies import Body
 from ident.model.pivots import cut_pivots
@@ -71,6 +71,7 @@ class LinkPair:
     directions: tuple[str, ...]
 
 
+@takes()
 def robot_from_urdf(
     urdf: str,
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81),
@@ -598,7 +599,20 @@ def _joint(element: Element, at: Place) -> Joint:
         rotation=at.rotation,
         translation_m=at.translation_m,
         axis=axis,
+        travel=_travel(element),
     )
+
+
+def _travel(element: Element) -> float | None:
+    """Travel of a joint by its limits [rad or m]; None where they say nothing."""
+    limit = element.find("limit")
+    if limit is None or element.get("type") == "continuous":
+        return None
+    try:
+        travel = float(limit.get("upper", "")) - float(limit.get("lower", ""))
+    except ValueError:
+        return None
+    return travel if 0.0 < travel < inf else None
 
 
 def _effort_limit(element: Element) -> float:

@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_count, require_kind, require_number
+from ident.arrays import FloatArray, as_array, require_count, require_kind, require_number, takes
 from ident.data.conditioning import Conditioning
 from ident.errors import ModelError, PlanUnfit
 from ident.model.bodies import Payload
@@ -234,6 +234,7 @@ class _Search:
         return float(np.linalg.norm(std_percent, SHARPNESS))
 
 
+@takes()
 def plan_moves(
     model: Model,
     limits: JointLimits,

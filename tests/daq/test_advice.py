@@ -12,7 +12,7 @@ from daq.advice import COMMANDS, for_command_line
 from daq.cli.failure import ErrorParts
 from drivers.canopen.emcy import remedy_of
 from drivers.errors import NodeMisplaced, ParametersMixed
-from ident.errors import PayloadMissing, PayloadUnseen
+from ident.errors import EffectNotInstalled, NotConverged, PayloadMissing, PayloadUnseen
 from ident.estimators.diagnosis import REMEDIES_OF_DISAGREEMENT
 from ident.estimators.method import Method
 
@@ -64,3 +64,23 @@ def test_a_payload_that_is_not_seen_is_looked_for_in_every_run_before_a_heavier_
     """A body that was mounted in the run without load hides it as well as a light one does."""
     remedy = ErrorParts.of(PayloadUnseen((40.0, 60.0), ("bare", "loaded"))).do
     assert remedy.index("what was mounted in each run") < remedy.index("a heavier payload")
+
+
+def test_no_verb_is_told_to_give_an_effect_as_an_argument() -> None:
+    for error in (
+        EffectNotInstalled("drag", "J2", "module drags"),
+        EffectNotInstalled("drag", "J2", "drags 0.2", installed="0.3"),
+        EffectNotInstalled("drag", "J2", "drags 0.2", other="others 1.0"),
+    ):
+        assert "own_effects" in str(error)
+        parts = ErrorParts.of(error)
+        assert "own_effects" not in parts.do
+        assert not parts.do.endswith((",", ", or"))
+
+
+def test_a_fit_that_does_not_settle_names_no_function() -> None:
+    error = NotConverged("ml", 27, (2.0, 1.0), 1e5)
+    assert "`exchanged_channels`; look at `Run.payload` of each run" in str(error)
+    said = ErrorParts.of(error).error
+    assert "exchanged_channels" not in said
+    assert "look at `drivegain info` of each log" in said

@@ -398,3 +398,91 @@ def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(
     )
     with pytest.raises(ident.ModelError, match=r"shapes \(3, 200\).*expected \(n_samples, 3\)"):
         ident.predict_torque(calibration, found.model, ident.planned(across, 100.0))
+
+
+def _columns(run: ident.Run, scale: list[float]) -> ident.Run:
+    return replace(run, position_rad=np.asarray(run.position_rad) * scale)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_axis_in_degrees_is_refused_by_the_limits_of_its_joint(
+    example: SimpleNamespace, axis: int
+) -> None:
+    model = ident.Model(
+        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    )
+    scale = [1.0, 1.0, 1.0]
+    scale[axis] = 180.0 / np.pi
+    runs = [
+        _columns(example.record(model, name, payload, seed), scale)
+        for name, payload, seed in (("bare", None, 1), ("loaded", example.DISC, 2))
+    ]
+    with pytest.raises(
+        ident.IdentificationError,
+        match=rf"run 'bare', axis J{axis + 1}: found positions that move by .* rad; expected at "
+        "most 6 rad, .* in the URDF; are these degrees .give `numpy.radians`",
+    ):
+        ident.identify(model, runs)
+
+
+def test_an_axis_without_limits_is_not_guessed_to_be_in_degrees(example: SimpleNamespace) -> None:
+    """A continuous joint may turn as far as it likes."""
+    urdf = example.URDF.replace('type="revolute"', 'type="continuous"')
+    assert urdf != example.URDF
+    robot = ident.robot_from_urdf(urdf)
+    assert [joint.travel for joint in robot.joints] == [None, None, None]
+    assert [joint.travel for joint in ident.robot_from_urdf(example.URDF).joints] == [6.0, 6.0, 6.0]
+
+
+def test_exchanged_currents_name_the_function_that_tests_their_order(
+    example: SimpleNamespace,
+) -> None:
+    model = ident.Model(
+        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    )
+    bare = example.record(model, "bare", None, 1)
+    loaded = example.record(model, "loaded", example.DISC, 2)
+    for order in ([1, 0, 2], [2, 1, 0]):
+        runs = [replace(run, current_a=run.current_a[:, order]) for run in (bare, loaded)]
+        with pytest.raises(
+            ident.IdentificationError, match=r"expected .*`exchanged_channels`"
+        ) as refused:
+            ident.identify(model, runs)
+        assert isinstance(refused.value, ident.NotConverged | ident.ModelContradicted)
+        named = ident.exchanged_channels(model, runs, ident.Conditioning(), ("J1", "J2", "J3"))
+        assert named is not None
+
+
+def test_held_out_runs_judge_the_effects_of_a_library_user(example: SimpleNamespace) -> None:
+    """As on the command line: what they do not confirm is not in the calibration."""
+    found = example.main()
+    model = found.model
+    runs = [
+        example.record(model, name, payload, seed)
+        for name, payload, seed in (("bare", None, 1), ("loaded", example.DISC, 2))
+    ]
+
+    def with_friction(run: ident.Run, friction_nm: float) -> ident.Run:
+        """Dry friction of J2 that changes with its position."""
+        current_a = np.array(run.current_a)
+        angle_rad = np.asarray(run.position_rad)[:, 1]
+        direction = np.sign(np.gradient(angle_rad))
+        gain_nm_a = example.TRUE_GAINS_NM_A[1]
+        current_a[:, 1] += friction_nm * direction * np.cos(angle_rad) / gain_nm_a
+        return replace(run, current_a=current_a)
+
+    fitted = [with_friction(run, 3.0) for run in runs]
+    held_out = example.record(model, "held out", example.DISC, 3)
+    again = ident.identify(model, fitted, axes=["J1", "J2", "J3"])
+    name = "position-friction"
+    for friction_nm, written in ((3.0, {name}), (0.0, set())):
+        unseen = with_friction(held_out, friction_nm)
+        evidence = ident.gather(again, fitted, holdout=[unseen])
+        steps = ident.find_effects(evidence, np.random.default_rng(0))
+        assert {placed.effect.name for placed in steps[-1].after.effects} == {name}
+        judged = ident.accept_on_holdout(evidence, steps)
+        assert {one.placed.effect.name for one in judged[-1].verdicts} == {name}
+        calibration = ident.calibration_of(
+            again, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A, steps=judged
+        )
+        assert {effect.name for effect in calibration.effects} == written

@@ -158,11 +158,20 @@ def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
 ) -> None:
     runs = [replace(run, position_rad=np.asarray(run.position_rad) * factors) for run in short]
     words = (
+        r"axis q\d: found positions that move by \d+\.?\d* rad; expected at most 6 rad, the travel "
+        r"of this joint in the URDF; are these degrees .*, or the motor's angle before the gear"
+    )
+    with pytest.raises(ident.IdentificationError, match=words):
+        ident.identify(small_truth.model, runs)
+    robot = small_truth.model.robot
+    joints = tuple(replace(joint, travel=None) for joint in robot.joints)
+    without_limits = replace(small_truth.model, robot=replace(robot, joints=joints))
+    words = (
         r"found q\d turning by \d+\.?\d* rad in run '\w+'; expected a joint's angle in rad: "
         r"are these degrees"
     )
     with pytest.raises(ident.IdentificationError, match=words):
-        ident.identify(small_truth.model, runs)
+        ident.identify(without_limits, runs)
 
 
 def test_a_range_or_current_of_a_robot_is_not_taken_for_other_units(
@@ -460,7 +469,8 @@ def test_a_run_in_the_place_of_data_or_of_a_band_is_named(arguments: dict[str, A
     model = arguments["model"]
     run = arguments["run"]
     with pytest.raises(
-        ident.ModelError, match="loaded of weigh is of type Run; expected Iterable; call weigh"
+        ident.ModelError,
+        match=r"loaded of weigh is of type Run; expected Iterable; give .*loaded=",
     ):
         lax.weigh(calibration, model, run)
     with pytest.raises(
@@ -515,3 +525,56 @@ def test_the_tolerance_of_a_payloads_mass_is_that_of_a_cell_file(
     assert body.mass_reference_std_kg == pytest.approx(0.02, rel=0.1)
     exact = ident.weigh(arguments["calibration"], small_truth.model, short[1:])
     assert exact.mass_reference_std_kg == 0.0
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "words"),
+    [
+        ("find_effects", ("evidence",), r"missing a required argument: 'rng'; .*\(start, rng, \["),
+        ("identify", ("model",), r"missing a required argument: 'runs'; .*identify\(model, runs, "),
+        ("calibration_of", ("found",), r"missing .*'axes'; .*\(found, axes, nameplate, \[units"),
+        ("plan_moves", ("model",), "missing .*'limits'; expected plan_moves"),
+        ("robot_from_urdf", (), "missing .*'urdf'; expected robot_from_urdf"),
+        ("gather", ("found",), r"given no runs; .*write gather\(found, \[bare, loaded\]\)"),
+    ],
+)
+def test_a_call_that_lacks_arguments_names_them_all(
+    arguments: dict[str, Any], function: str, given: tuple[str, ...], words: str
+) -> None:
+    values = [arguments.get(name) for name in given]
+    with pytest.raises(ident.ModelError, match=words):
+        getattr(lax, function)(*values)
+
+
+def test_an_argument_that_does_not_exist_is_named(arguments: dict[str, Any]) -> None:
+    with pytest.raises(ident.ModelError, match="unexpected keyword argument 'effects'; expected"):
+        lax.calibration_of(arguments["found"], ("J1",), [1.0], effects=[])
+
+
+def test_a_seed_in_the_place_of_a_generator_and_one_effect_are_corrected(
+    arguments: dict[str, Any],
+) -> None:
+    evidence = ident.gather(arguments["found"], arguments["runs"])
+    with pytest.raises(ident.ModelError, match=r"write rng=np\.random\.default_rng\(0\)"):
+        lax.find_effects(evidence, 0)
+    rng = np.random.default_rng(0)
+    one = ident.planned  # anything that is no list
+    with pytest.raises(ident.ModelError, match=r"give a list, with one .*: own_effects=\["):
+        lax.find_effects(evidence, rng, own_effects=one)
+    with pytest.raises(ident.ModelError, match="axes is the text 'ab'; expected a list of names"):
+        lax.find_effects(evidence, rng, axes="ab")
+    with pytest.raises(ident.ModelError, match="axes has 1 names; expected"):
+        lax.find_effects(evidence, rng, axes=["J1"])
+    with pytest.raises(ident.ModelError, match="axes is the text 'ab'; expected a list of names"):
+        lax.identify(evidence.model, arguments["runs"], axes="ab")
+
+
+def test_gains_by_name_are_told_how_to_become_a_list(arguments: dict[str, Any]) -> None:
+    axes = [joint.name for joint in arguments["model"].robot.axes]
+    by_name = dict.fromkeys(axes, 1.0)
+    with pytest.raises(
+        ident.ModelError, match=r"nameplate is a dictionary .*write \[nameplate\[name\] for name in"
+    ):
+        lax.calibration_of(arguments["found"], axes, by_name)
+    with pytest.raises(ident.ModelError, match=r"write \[fixed_gains\[name\] for name in axes"):
+        lax.identify(arguments["model"], arguments["runs"], fixed_gains=by_name)

@@ -58,7 +58,21 @@ def test_moves_part_where_all_joints_rest() -> None:
         ),
         (
             lambda run: replace(run, time_s=np.delete(np.arange(len(run.time_s) + 1) / 1000.0, 9)),
-            "not uniform",
+            r"not uniform: a step of 0\.002 s behind sample 8 \(0\.008 s\), where the usual one is "
+            r"0\.001 s; expected steps of one length, .*; resample .* or cut the run at the gap",
+        ),
+        (
+            lambda run: replace(run, time_s=np.where(run.time_s > 1.0, -1.0, 1.0) * run.time_s),
+            r"does not rise from sample 1000 \(1 s\) to the next one \(-1\.001 s\); expected",
+        ),
+        (
+            lambda run: replace(
+                run,
+                time_s=run.time_s[:2],
+                position_rad=run.position_rad[:2],
+                current_a=run.current_a[:2],
+            ),
+            "found 2 samples; expected at least 2 s of motion; record longer",
         ),
         (lambda _: _run(seconds=1.0), "at least 2 s"),
         (lambda _: _run(seconds=9.0, rate_hz=80.0), "needs more than 100 Hz"),

@@ -197,6 +197,19 @@ def test_what_is_no_usable_effect_is_refused(effects: Any, words: str) -> None:
         families_of(effects, "`own_effects`")
 
 
+def test_settings_of_numpy_are_numbers_of_python() -> None:
+    """As from `numpy.linspace`; a calibration writes and reads them as any other."""
+    ((effect, *_),) = families_of([SquareDrag(np.float64(2.0))], "`own_effects`")
+    assert effect == SquareDrag(2.0)
+    assert type(effect.settings["exponent"]) is float
+    ((single,),) = families_of([SquareDrag(np.float32(2.0))], "`own_effects`")  # type: ignore[arg-type]
+    assert type(single.settings["exponent"]) is float
+    ((whole,),) = families_of([Declaring(driver=np.int64(3))], "`own_effects`")  # type: ignore[arg-type]
+    assert type(whole.settings["driver"]) is int
+    with pytest.raises(ident.EffectRefused, match="expected a value of type float"):
+        families_of([SquareDrag(np.int64(2))], "`own_effects`")  # type: ignore[arg-type]
+
+
 def test_effects_of_one_name_are_one_family() -> None:
     drags = (SquareDrag(1.0), SquareDrag(2.0))
     assert families_of(drags, "here") == (drags,)
@@ -404,7 +417,9 @@ def test_a_package_that_is_not_there_is_named() -> None:
     error = ident.EffectNotInstalled("square-drag", "J2", "drag-one 0.3")
     assert (error.effect, error.axis, error.package) == ("square-drag", "J2", "drag-one 0.3")
     assert "install this package" in str(error)
-    assert "own_effects" in str(ident.EffectNotInstalled("square-drag", "J2", "module drags"))
+    of_module = ident.EffectNotInstalled("square-drag", "J2", "module drags")
+    # The functions that predict have no such argument: whoever reads the calibration gives it.
+    assert of_module.remedy.endswith("`load_calibration(path, own_effects=[...])`")
 
 
 def test_an_effect_of_the_package_that_a_calibration_names_is_used_in_any_version(
