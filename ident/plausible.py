@@ -55,6 +55,7 @@ deg/s², or mm].
 RATIO = (0.01, 1e7)
 SMALLEST_COUPLING = 1e-6  #: Any other number of its row, in the same unit
 LEAD_MM = (0.01, 1e4)  #: Travel of one turn of a screw or pinion
+TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
 GAIN = (1e-5, 1e7)  #: Size of a drive gain [Nm/A or N/A]
 RAW_GAIN = (1e-9, 1e9)  #: The same per unit of another current, such as thousandths or increments
 LIGHTEST_PAYLOAD_KG = 1e-3  #: Mass of a payload; lighter ones show no gain

@@ -122,7 +122,7 @@ def export_mjcf_verb(
     the full parameters of `fit --prior`; without them, the nearest physical bodies to the URDF (pip
     install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
     """
-    from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
+    from daq.report.mjcf_views import head_remarks, left_out_of, mjcf_report, mjcf_view
     from daq.workflow.full_choice import full_choice
     from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
@@ -132,6 +132,7 @@ def export_mjcf_verb(
     given, calibration = _described_by("export mjcf", cell, calibration, urdf)
     check_output(out, (calibration, given), FORMAT)
     known = read_calibration(calibration)
+    as_read = known
     _require_explained(known, calibration)
     if urdf is None:
         described = _of_cell(known, given)
@@ -147,6 +148,7 @@ def export_mjcf_verb(
     followed = choice.model.follow(random_states(choice.model, described.limits))
     effects = joint_effects(known, choice.model.robot)
     effects = replace(effects, left_out=(*effects.left_out, *described.missing))
+    effects_left_out = left_out_of(as_read, effects.left_out)
     source = MjcfSource(
         name=known.cell,
         model=choice.model,
@@ -158,12 +160,14 @@ def export_mjcf_verb(
         shapes=described.shapes,
         folder=out.parent,
         effects=effects,
-        remarks=tuple(head_remarks(known, choice, effects, described.shapes, software())),
+        remarks=tuple(
+            head_remarks(known, choice, effects, described.shapes, software(), effects_left_out)
+        ),
     )
     written = write_mjcf(source, followed.joints.position_rad)
     with replace_output(out):
         replace_file(out, written.content)
-    report = mjcf_report(known, choice, source, written, out, described.same)
+    report = mjcf_report(known, choice, source, written, out, described.same, effects_left_out)
     if json:
         print_json(report)
     else:

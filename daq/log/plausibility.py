@@ -33,6 +33,7 @@ from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.data.unsigned_current import require_signed_currents
 from ident.errors import CurrentUnsigned
+from ident.plausible import TEMPERATURES_C
 
 _LOG = logging.getLogger("drivegain")
 LARGEST_RAW = 2**31 - 1
@@ -45,7 +46,6 @@ SLOW_SHARE = 0.1
 the real rate may be ten times the declared one.
 """
 LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
-TEMPERATURES_C = (-60.0, 250.0)  #: Of a drive or a motor; kelvin above -23 °C are more
 VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
 STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
 

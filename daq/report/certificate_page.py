@@ -207,7 +207,7 @@ def _changes(certificate: Certificate) -> str:
 
 def _errors(calibration: Calibration) -> Iterator[str]:
     """Error of each axis and of all, before and after; NaN where it is not known."""
-    caption = "Share of the torque that the model leaves."
+    caption = "Error of the predicted torque, as a share of the measured torque."
     holdout = calibration.holdout_error_percent
     if holdout is None:
         drawing = _error_drawing(calibration, None, calibration.relative_error_percent)
@@ -273,14 +273,14 @@ def _effect(effect: AcceptedEffect, calibration: Calibration) -> str:
     before = percent_text(effect.error_before_percent)
     after = percent_text(effect.error_after_percent)
     has_holdout = any(source.role == "holdout" for source in calibration.sources)
-    data = "On moves left out in turn, which its choice has seen"
+    data = "on moves left out in turn, which its choice has seen"
     if has_holdout:
-        data = "On data that the fit has not used"
+        data = "on data that the fit has not used"
     name = accepted_text(effect, calibration)
     size = size_text(effect, calibration)
     text = paragraph(
-        f"{effect.axis} has {name}: {size}. {data}, the model without it leaves {before} % of the "
-        f"torque of {effect.axis}, with it {after} %."
+        f"{effect.axis} has {name}: {size}. Error of the predicted torque of {effect.axis} {data}: "
+        f"{before} % without this effect, {after} % with it."
     )
     if effect.package is not None:
         text += paragraph(f"The effect {effect.name!r} is one of {effect.package}.")

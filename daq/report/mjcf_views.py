@@ -4,7 +4,7 @@ and what it does not hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from daq.workflow.full_choice import FullChoice
 from daq.workflow.mjcf_effects import JointEffects
 from daq.workflow.mjcf_export import Mjcf, MjcfSource, joint_drive
 from daq.workflow.urdf_shapes import UrdfShapes
-from ident.calibration import Calibration
+from ident.calibration import AcceptedEffect, Calibration
 from ident.model.bodies import LOADED, body_of
 from ident.physical.drive_terms import drive_terms
 from ident.physical.full_parameters import RestsOn
@@ -77,6 +77,25 @@ class NotInMjcf(Report):
     unit: str
 
 
+class EffectCoefficient(Report):
+    """One coefficient of an effect."""
+
+    name: str
+    value: float
+    unit: str
+
+
+class EffectNotInMjcf(Report):
+    """Effect of the calibration that the model lacks, with its numbers."""
+
+    name: str
+    axis: str
+    package: str | None
+    """package that has it; null of one that drivegain ships"""
+    settings: dict[str, float]
+    coefficients: list[EffectCoefficient]
+
+
 class MjcfReport(Report):
     """`export mjcf`."""
 
@@ -99,6 +118,8 @@ class MjcfReport(Report):
     effects_at_joints: list[str]
     """effects that are in stiffness, damping and friction of their joint"""
     effects_left_out: list[str]
+    effects_not_in_mjcf: list[EffectNotInMjcf]
+    """the effects that are left out, with their settings and coefficients"""
     corrections_applied: list[str]
     """effects that correct the description:
     the joint frames or the gravity of the model are the corrected ones
@@ -119,6 +140,7 @@ def head_remarks(
     effects: JointEffects,
     shapes: UrdfShapes,
     software: str,
+    effects_left_out: Sequence[AcceptedEffect] = (),
 ) -> Iterator[str]:
     """Lines for the head of the model.
 
@@ -128,6 +150,7 @@ def head_remarks(
         effects: of it.
         shapes: of the robot's URDF.
         software: name and version.
+        effects_left_out: of the calibration, installed or not.
     """
     yield (
         f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 "
@@ -142,6 +165,10 @@ def head_remarks(
         yield f"By the prior, not measured: {', '.join(by_prior)}"
     if effects.left_out:
         yield f"Effects NOT in this model: {', '.join(effects.left_out)}"
+    for one in effects_left_out:
+        yield _effect_line(one)
+    if effects_left_out:
+        yield "Minus their torque at the joints, coefficients times columns, goes to qfrc_applied"
     mountings = _mountings(calibration)
     if mountings:
         yield f"Payloads NOT in this model: {', '.join(mountings)}"
@@ -156,6 +183,7 @@ def mjcf_report(
     written: Mjcf,
     out: Path,
     same_configuration: bool | None,
+    effects_left_out: Sequence[AcceptedEffect] = (),
 ) -> MjcfReport:
     """Return what a model that was written holds of a calibration, and what not.
 
@@ -167,6 +195,7 @@ def mjcf_report(
         out: its file.
         same_configuration: whether the cell file is that of the fit; None where the calibration
             does not name one.
+        effects_left_out: of the calibration, installed or not.
     """
     return MjcfReport.of(
         choice,
@@ -181,12 +210,40 @@ def mjcf_report(
         not_in_mjcf=[NotInMjcf.of(left) for left in written.left_over],
         effects_at_joints=source.effects.at_joints,
         effects_left_out=source.effects.left_out,
+        effects_not_in_mjcf=[_effect_entry(one) for one in effects_left_out],
         corrections_applied=source.effects.in_geometry,
         mountings_left_out=_mountings(calibration),
         closures_left_out=written.open_closures,
         meshes=sorted({str(shape.mesh) for shape in source.shapes.found if shape.mesh is not None}),
         shapes_left_out=source.shapes.left_out,
     )
+
+
+def left_out_of(calibration: Calibration, left_out: Sequence[str]) -> tuple[AcceptedEffect, ...]:
+    """The effects of a calibration that a model lacks.
+
+    Args:
+        calibration: as it was read.
+        left_out: their names, as `JointEffects.left_out` has them; behind the name of one that is
+            not installed stands its package.
+    """
+    found: list[AcceptedEffect] = []
+    for accepted in calibration.effects:
+        name = f"{accepted.name} on {accepted.axis}"
+        if any(one == name or one.startswith(f"{name} (of ") for one in left_out):
+            found.append(accepted)
+    return tuple(found)
+
+
+def _effect_line(effect: AcceptedEffect) -> str:
+    numbers = [f"{name} = {value:g}" for name, value in effect.settings.items()]
+    numbers += [f"{one.name} = {one.value:.6g} {one.unit}" for one in effect.coefficients]
+    return f"{effect.name} on {effect.axis}: {', '.join(numbers)}"
+
+
+def _effect_entry(effect: AcceptedEffect) -> EffectNotInMjcf:
+    coefficients = [EffectCoefficient.of(one) for one in effect.coefficients]
+    return EffectNotInMjcf.of(effect, coefficients=coefficients)
 
 
 def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:

@@ -35,6 +35,7 @@ from ident.errors import DataUnfit
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain
 from ident.model.robot import Motion
+from ident.plausible import TEMPERATURES_C
 
 STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the 95 % quantile of the joint's speed."""
@@ -264,6 +265,15 @@ def _temperature(
     temperature_c = np.asarray(values, dtype=np.float64)
     if temperature_c.shape != shape:
         raise refuse(f"temperature_c has shape {temperature_c.shape}; expected {shape}, {each}")
+    least, largest = TEMPERATURES_C
+    wrong = np.argwhere((temperature_c < least) | (temperature_c > largest))
+    if len(wrong):
+        sample, motor = wrong[0].tolist()
+        raise refuse(
+            f"found a temperature_c of {temperature_c[sample, motor]:g} in sample {sample}, motor "
+            f"{motor + 1}; expected {least:g} to {largest:g} °C, NaN for a motor without; convert "
+            "it to °C (kelvin less 273.15)"
+        )
     return temperature_c
 
 

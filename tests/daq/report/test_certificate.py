@@ -233,7 +233,7 @@ def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
     )
     texts = Reader(_page(sliding)).texts
     assert {"force [N]", "joint position [m]"} <= set(texts)
-    assert any(" N. On data" in text for text in texts)
+    assert any(" N. Error of the predicted torque of J2 on data" in text for text in texts)
     assert "torque [Nm]" in Reader(_page(made)).texts
 
 

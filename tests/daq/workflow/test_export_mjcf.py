@@ -389,6 +389,14 @@ def test_effects_are_listed_and_exactly_they_are_missing(
     exported = export(robot, tmp_path, capsys, calibration)
     assert exported.report["effects_left_out"] == ["load-friction on J3"]
     assert exported.report["mountings_left_out"] == ["flange-a"]
+    (listed,) = exported.report["effects_not_in_mjcf"]
+    assert listed["name"] == "load-friction"
+    assert listed["axis"] == "J3"
+    assert listed["package"] is None
+    assert listed["settings"] == {"speed_exponent": 0}
+    assert listed["coefficients"] == [{"name": coefficient.name, "value": 0.1, "unit": "1"}]
+    assert f"load-friction on J3: speed_exponent = 0, {coefficient.name} = 0.1 1" in exported.text
+    assert "goes to qfrc_applied" in exported.text
     assert "Effects NOT in this model: load-friction on J3" in exported.text
     assert "Payloads NOT in this model: flange-a" in exported.text
     for entry in exported.report["not_in_mjcf"]:
@@ -413,6 +421,9 @@ def test_an_effect_that_is_not_installed_is_listed_with_its_package(
         "ring-friction on J3 (of ring-effect 1.2.0, not installed)"
     ]
     assert "Effects NOT in this model: ring-friction on J3 (of ring-effect 1.2.0" in exported.text
+    (listed,) = exported.report["effects_not_in_mjcf"]
+    assert (listed["package"], listed["coefficients"][0]["value"]) == ("ring-effect 1.2.0", 0.1)
+    assert "ring-friction on J3: ring-friction coefficient 1 = 0.1 Nm" in exported.text
 
 
 def test_the_covariance_without_a_missing_effect_is_that_of_the_others() -> None:

@@ -14,11 +14,12 @@ import pytest
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.report.gains import encoder_text
-from daq.workflow.diagnoses import check_diagnoses
+from daq.workflow.diagnoses import _correction_diagnosis, check_diagnoses
 from daq.workflow.geometry_diagnoses import encoder_misfit_of, geometry_diagnoses
 from daq.workflow.zero_text import zero_decimals, zero_off_text
 from ident.discovery.geometry_check import GeometryCheck
 from ident.discovery.search import Finding
+from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import ZeroOffset
 from ident.estimators.geometry_estimate import GeometryEstimate, GeometryFinding
 from ident.model.geometry import GeometryKind, GeometryParameter
@@ -89,3 +90,15 @@ def test_a_zero_of_a_slide_is_in_millimetres() -> None:
 )
 def test_a_zero_has_the_decimals_that_its_deviation_leaves(std: float, decimals: int) -> None:
     assert zero_decimals(std) == decimals
+
+
+@pytest.mark.parametrize(("name", "is_serial"), [("demo", True), ("five-bar", False)])
+def test_a_zero_of_a_serial_arm_may_be_a_length(
+    checkout: Path, name: str, *, is_serial: bool
+) -> None:
+    """A closed chain has encoders that contradict a length; a serial arm has not."""
+    cell = load_cell(checkout / "configs" / "cells" / f"{name}.yaml")
+    placed = PlacedEffect(ZeroOffset(), 1)
+    said = _correction_diagnosis(placed, np.array([0.02]), np.array([0.001]), cell, model_of(cell))
+    assert said.name == "zero-off"
+    assert ("measure the lengths of the links in the URDF" in said.remedy) == is_serial

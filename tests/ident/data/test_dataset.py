@@ -74,6 +74,10 @@ def test_moves_part_where_all_joints_rest() -> None:
             ),
             "found 2 samples; expected at least 2 s of motion; record longer",
         ),
+        (
+            lambda run: replace(run, temperature_c=np.full(run.position_rad.shape, 300.0)),
+            "found a temperature_c of 300 in sample 0, motor 1; expected -60 to 250 °C, .*kelvin",
+        ),
         (lambda _: _run(seconds=1.0), "at least 2 s"),
         (lambda _: _run(seconds=9.0, rate_hz=80.0), "needs more than 100 Hz"),
     ],

@@ -217,6 +217,7 @@ def test_all_gains_must_be_off_alike(ratio: list[float]) -> None:
 def test_one_gain_off_its_nameplate(small_truth: Truth, clean: list[Run]) -> None:
     (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, 1.0, 5.0])))
     assert (found.name, found.axes) == ("gain-off-nameplate", ("J3",))
+    assert "or a length of the URDF wrong? measure the lengths" in found.remedy
 
 
 def test_torques_above_the_limits_of_the_urdf(small_truth: Truth, clean: list[Run]) -> None:
