@@ -44,6 +44,7 @@ from ident.discovery.joining import (
     refuted_by_structure,
 )
 from ident.discovery.known_mistakes import JoinedMistakes, join_mistakes
+from ident.discovery.own_settings import propose_own_settings
 from ident.discovery.resonance import gears_around, propose_resonances, refined_gear
 from ident.discovery.ripple import propose_orders
 from ident.discovery.rotor_search import propose_rotors
@@ -618,7 +619,8 @@ def _proposals(
     balanced = [placed.axis for placed in effects if isinstance(placed.effect, Counterbalance)]
     balancers = propose_balancers(search_problem, gates, families, balanced)
     cables = propose_cables(search_problem, gates, families)
-    found = (ripples, resonances, balancers, cables)
+    own_settings = propose_own_settings(search_problem, gates, families)
+    found = (ripples, resonances, balancers, cables, own_settings)
     own = {
         axis: tuple(f for one in found for f in one.get(axis, ()))
         for axis in {a for one in found for a in one}

@@ -28,6 +28,7 @@ GATES = Gates(draws=199)
 COSINE_NM = 9.0
 SINE_NM = -6.0
 LOBES = 2.7
+COARSE_LOBES = (1.5, 4.0, 9.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,20 @@ def test_it_is_found_where_it_is_and_its_setting_is_refined(
     )
     found = [values[column.name] for column in placed.columns]
     assert found == pytest.approx([COSINE_NM, SINE_NM], abs=1.0)
+
+
+def test_a_coarse_grid_is_refined_before_rivals_are_compared(
+    small: Evidence, small_truth: Truth
+) -> None:
+    """No value that is given is near the true one: terms without a name explain more than each."""
+    coarse = tuple(LobedFriction(lobes) for lobes in COARSE_LOBES)
+    steps = find_effects(
+        bent(small, small_truth, _lobed), np.random.default_rng(0), GATES, own_effects=coarse
+    )
+    (placed,) = steps[-1].after.effects
+    assert isinstance(placed.effect, LobedFriction)
+    assert placed.axis == 1
+    assert placed.effect.lobes == pytest.approx(LOBES, abs=0.1)
 
 
 def test_it_is_not_found_where_it_is_not(small: Evidence) -> None:
