@@ -345,8 +345,8 @@ def _actuators(source: MjcfSource, written: Mjcf) -> Iterator[MjcfActuator]:
 
 
 def _names_by_prior(choice: FullChoice) -> list[str]:
-    columns = zip(choice.model.columns, choice.basis, strict=True)
-    return [column.name for column, basis in columns if basis is RestsOn.PRIOR]
+    """Names of the parameters in the report that rest on the prior."""
+    return [one.name for one in _parameters(choice) if one.basis == RestsOn.PRIOR.value]
 
 
 def _mountings(calibration: Calibration) -> list[str]:

@@ -1,0 +1,30 @@
+"""What a model for MuJoCo says of the numbers that rest on the prior."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from daq.report.mjcf_views import _names_by_prior, _parameters
+from ident.model.bodies import LOADED
+from ident.model.model import Column
+from ident.physical.full_parameters import RestsOn
+
+
+def test_the_head_and_the_report_name_the_same_parameters() -> None:
+    """What a payload adds to friction is no part of the robot without one."""
+    columns = (
+        Column("m1", "kg"),
+        Column(f"fv1{LOADED}", "Nm/(rad/s)"),
+        Column("fv1", "Nm/(rad/s)"),
+    )
+    choice: Any = SimpleNamespace(
+        model=SimpleNamespace(columns=columns),
+        standard=np.ones(3),
+        basis=(RestsOn.PRIOR, RestsOn.PRIOR, RestsOn.DATA),
+        shares=np.array([1.0, 1.0, 0.0]),
+    )
+    assert [one.name for one in _parameters(choice)] == ["m1", "fv1"]
+    assert _names_by_prior(choice) == ["m1"]
