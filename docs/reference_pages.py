@@ -105,8 +105,22 @@ def schema_texts() -> dict[str, str]:
             **_schema(model),
             "title": title,
         }
+        _unwrap_descriptions(schema)
         texts[f"{name}.json"] = json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
     return texts
+
+
+def _unwrap_descriptions(node: Any) -> None:
+    """Make each description one paragraph: docstrings break their lines for an editor's sake."""
+    if isinstance(node, list):
+        for item in node:
+            _unwrap_descriptions(item)
+    elif isinstance(node, dict):
+        for key, item in node.items():
+            if key == "description" and isinstance(item, str):
+                node[key] = " ".join(item.split())
+            else:
+                _unwrap_descriptions(item)
 
 
 def lagging() -> dict[Path, str | None]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 
 def lagging_files(folder: Path) -> list[str]:
@@ -38,3 +41,25 @@ def test_a_page_and_a_schema_that_lag_behind_are_named(checkout: Path, tmp_path:
     (reference / "schemas" / "gone.json").write_text("{}\n")
     names = [Path(line).name for line in lagging_files(tmp_path)]
     assert names == ["gates.md", "error.json", "gone.json"]
+
+
+def _descriptions(node: Any) -> Iterator[str]:
+    if isinstance(node, list):
+        for item in node:
+            yield from _descriptions(item)
+    elif isinstance(node, dict):
+        for key, item in node.items():
+            if key == "description" and isinstance(item, str):
+                yield item
+            else:
+                yield from _descriptions(item)
+
+
+def test_a_description_in_a_schema_is_one_paragraph(checkout: Path) -> None:
+    """Editors show it as it is: a line end of the source, or a list, would break it."""
+    described: list[str] = []
+    for path in sorted((checkout / "docs/reference/schemas").glob("*.json")):
+        described += _descriptions(json.loads(path.read_text(encoding="utf-8")))
+    assert len(described) > 100
+    assert [text for text in described if " ".join(text.split()) != text] == []
+    assert [text for text in described if " - " in text] == []
