@@ -18,6 +18,8 @@ from ident.plausible import format_at_limit
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from daq.workflow.full_choice import FullChoice
+    from daq.workflow.mjcf_effects import MissingEffect
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
     from daq.workflow.urdf_shapes import UrdfShapes
     from ident.arrays import FloatArray
@@ -48,23 +50,17 @@ def export_urdf_verb(
 ) -> None:
     """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
 
-    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme
-    finds the nearest physical bodies (pip install 'drivegain[physical]'); the change of torque is
-    reported. A URDF holds no loops: of a closed chain it has the tree, and the closures are named.
+    Bodies are the full parameters of `fit --prior`; without them, a semidefinite programme finds
+    the nearest physical bodies to the URDF (pip install 'drivegain[physical]'). The change of
+    torque is reported. A URDF holds no loops: of a closed chain it has the tree, and the closures
+    are named.
     """
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
+    from daq.report.chosen_parameters import choice_remarks
     from daq.report.text import origin_text
     from daq.report.urdf_views import urdf_report, urdf_view
-    from daq.workflow.mjcf_effects import split_installed
-    from daq.workflow.urdf_export import (
-        FORMAT,
-        cell_limits,
-        parse_markup,
-        physical_robot,
-        update_urdf,
-    )
-    from daq.workflow.validate import on_cell
+    from daq.workflow.urdf_export import FORMAT, parse_markup, update_urdf
 
     given, calibration = _described_by("export urdf", cell, calibration, urdf)
     check_output(out, (calibration, given), FORMAT)
@@ -82,30 +78,25 @@ def export_urdf_verb(
             remedy="choose another name",
         )
     parse_markup(content, str(given))  # before any other reader sees it
-    declared = None if urdf is not None else _declared(known, given)
-    known, _ = split_installed(known)  # a URDF holds no effects
-    if declared is not None:
-        known, model = on_cell(known, declared)
-        limits = cell_limits(declared)
-        same = _is_same(known, declared)
-        content = declared.urdf.encode()  # held joints are fixed in it
+    if urdf is None:
+        described = _of_cell(known, given)
     else:
-        model, limits = _plain(content.decode("utf-8"))
-        same = None
-    require_packages(
-        "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+        described = _of_urdf(known, given)
+    known = described.calibration
+    choice = _choose(described)
+    updates = joint_updates(choice.robot)
+    remarks = (
+        f"Inertias by {software()} from {origin_text(known.cell, known.created)}",
+        *choice_remarks(choice),
     )
-    text = content.decode("utf-8")
-    with status("finding the nearest physical robot"):
-        robot = physical_robot(known, model, limits, text)
-    updates = joint_updates(robot)
-    provenance = f"Inertias by {software()} from {origin_text(known.cell, known.created)}"
-    updated = update_urdf(content, str(given), updates, provenance)
-    _write(updated, robot, out)
+    # Held joints are fixed in the URDF that was described.
+    updated = update_urdf(described.urdf.encode(), str(given), updates, ". ".join(remarks))
+    _write(updated, choice.robot, out)
+    missing = [str(effect) for effect in described.missing]
     if json:
-        print_json(urdf_report(known, robot, updates, updated, out, same))
+        print_json(urdf_report(known, choice, updates, updated, out, described.same, missing))
     else:
-        print_view(urdf_view(known, robot, updates, updated, same), out)
+        print_view(urdf_view(known, choice, updates, updated, described.same, missing), out)
 
 
 def export_mjcf_verb(
@@ -123,7 +114,6 @@ def export_mjcf_verb(
     install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
     """
     from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
-    from daq.workflow.full_choice import full_choice
     from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
     from daq.workflow.urdf_export import random_states
@@ -138,15 +128,11 @@ def export_mjcf_verb(
     else:
         described = _of_urdf(known, given)
     known = described.calibration
-    if known.full_parameters is None:
-        require_packages(
-            "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
-        )
-    with status("choosing the bodies"):
-        choice = full_choice(known, described.model, described.limits, described.urdf)
+    choice = _choose(described)
     followed = choice.model.follow(random_states(choice.model, described.limits))
     effects = joint_effects(known, choice.model.robot)
-    effects = replace(effects, left_out=(*effects.left_out, *described.missing))
+    missing = map(str, described.missing)
+    effects = replace(effects, left_out=(*effects.left_out, *missing))
     source = MjcfSource(
         name=known.cell,
         model=choice.model,
@@ -176,7 +162,7 @@ class _Described:
 
     #: without effects that are not installed, with the corrections that the cell still needs
     calibration: Calibration
-    missing: tuple[str, ...]  #: effects that are not installed
+    missing: tuple[MissingEffect, ...]  #: effects that are not installed
     model: Model
     limits: FloatArray  #: ranges in which torques are compared, shape (4, m)
     lower: FloatArray  #: least position of each axis, -inf without a limit, shape (m,)
@@ -248,6 +234,26 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
         shapes=shapes_of(urdf, path.parent),
         same=None,
     )
+
+
+def _choose(described: _Described) -> FullChoice:
+    """Choose the full parameters of a robot: the same for every kind of model.
+
+    Raises:
+        ModelError: the calibration is of another robot.
+        NotPhysical: no possible robot was found.
+        ConfigurationMissing: the bodies have to be found, and the solver is not installed.
+    """
+    from daq.workflow.full_choice import full_choice
+
+    known = described.calibration
+    if known.full_parameters is None:
+        require_packages(
+            "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+        )
+    missing = [effect.accepted for effect in described.missing]
+    with status("choosing the bodies"):
+        return full_choice(known, described.model, described.limits, described.urdf, missing)
 
 
 def _described_by(
