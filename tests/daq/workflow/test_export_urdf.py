@@ -26,12 +26,12 @@ from daq.workflow.full_choice import FullChoice, full_choice
 from daq.workflow.mjcf_effects import split_installed
 from daq.workflow.urdf_export import JointUpdate, cell_limits, update_urdf
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
-from ident.effects.effect import Abscissa, Column, Effect, Property
-from ident.effects.signals import Signals
+from ident.effects.effect import Effect, Property
+from ident.effects.signals import Abscissa, Signals
 from ident.estimators.estimate import RelativeError
 from ident.model.base import base_parameters
 from ident.model.bodies import Body
-from ident.model.model import DriveTrain, Model
+from ident.model.model import Column, DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
 from ident.physical.full_set import FullParameter, FullSet
 from ident.physical.physical import random_motion, urdf_links
@@ -500,7 +500,7 @@ class _SlidingFriction(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Return one column."""
-        return np.sign(signals.velocity_rad_s[axis])[None]
+        return np.asarray(np.sign(signals.velocity_rad_s[axis])[None])
 
 
 def _with_friction_of_a_package(calibration: Calibration, axis: str) -> Calibration:
