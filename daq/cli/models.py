@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from daq.workflow.full_choice import FullChoice
     from daq.workflow.mjcf_effects import MissingEffect
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
-    from daq.workflow.urdf_shapes import UrdfShapes
     from ident.arrays import FloatArray
     from ident.calibration import Calibration
     from ident.model.model import Model
@@ -117,6 +116,7 @@ def export_mjcf_verb(
     from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
     from daq.workflow.urdf_export import random_states
+    from daq.workflow.urdf_shapes import shapes_of
     from ident.model.urdf import read_urdf
 
     given, calibration = _described_by("export mjcf", cell, calibration, urdf)
@@ -130,6 +130,7 @@ def export_mjcf_verb(
     known = described.calibration
     choice = _choose(described)
     followed = choice.model.follow(random_states(choice.model, described.limits))
+    shapes = shapes_of(described.urdf, described.folder)
     effects = joint_effects(known, choice.model.robot)
     missing = map(str, described.missing)
     effects = replace(effects, left_out=(*effects.left_out, *missing))
@@ -141,10 +142,10 @@ def export_mjcf_verb(
         frames=read_urdf(described.urdf).links,
         lower=described.lower,
         upper=described.upper,
-        shapes=described.shapes,
+        shapes=shapes,
         folder=out.parent,
         effects=effects,
-        remarks=tuple(head_remarks(known, choice, effects, described.shapes, software())),
+        remarks=tuple(head_remarks(known, choice, effects, shapes, software())),
     )
     written = write_mjcf(source, followed.joints.position_rad)
     with replace_output(out):
@@ -168,7 +169,7 @@ class _Described:
     lower: FloatArray  #: least position of each axis, -inf without a limit, shape (m,)
     upper: FloatArray
     urdf: str
-    shapes: UrdfShapes
+    folder: Path  #: of the URDF, from where its meshes are found
     same: bool | None  #: whether the description is that of the fit; None where nothing says so
 
 
@@ -177,7 +178,6 @@ def _of_cell(calibration: Calibration, path: Path) -> _Described:
     from daq.config.cell_file import urdf_path
     from daq.workflow.mjcf_effects import split_installed
     from daq.workflow.urdf_export import cell_limits
-    from daq.workflow.urdf_shapes import shapes_of
     from daq.workflow.validate import on_cell
 
     cell = _declared(calibration, path)
@@ -193,7 +193,7 @@ def _of_cell(calibration: Calibration, path: Path) -> _Described:
         lower=limits[0] - limits[1],
         upper=limits[0] + limits[1],
         urdf=cell.urdf,
-        shapes=shapes_of(cell.urdf, urdf_path(path).parent),
+        folder=urdf_path(path).parent,
         same=same,
     )
 
@@ -205,7 +205,7 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
     from daq.config.yaml_file import read_yaml_bytes
     from daq.workflow.mjcf_effects import split_installed
     from daq.workflow.urdf_export import parse_markup
-    from daq.workflow.urdf_shapes import joint_ranges, shapes_of
+    from daq.workflow.urdf_shapes import joint_ranges
 
     content = read_yaml_bytes(path)
     parse_markup(content, str(path))  # before any other reader sees it
@@ -231,7 +231,7 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
         lower=bounds[:, 0],
         upper=bounds[:, 1],
         urdf=urdf,
-        shapes=shapes_of(urdf, path.parent),
+        folder=path.parent,
         same=None,
     )
 
