@@ -63,7 +63,7 @@ def faces_in_mujoco(path: Path, scale: tuple[float, ...] = WHOLE) -> int:
         mujoco.set_mju_user_warning(None)
 
 
-READ = {
+READ: dict[str, tuple[str | bytes, int]] = {
     "plain.obj": (CORNERS + FACES, 4),
     "windows.OBJ": ((CORNERS + FACES).replace("\n", "\r\n"), 4),
     "before.obj": (FACES + CORNERS, 4),
@@ -91,7 +91,7 @@ def test_a_mesh_that_mujoco_reads_is_taken(name: str, tmp_path: Path) -> None:
     assert faces_in_mujoco(path) == faces
 
 
-REFUSED = {
+REFUSED: dict[str, tuple[str | bytes, str]] = {
     "empty.obj": ("", "0 vertices"),
     "page.obj": ("<html>not found</html>", "0 vertices"),
     "three.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 vertices"),
