@@ -91,7 +91,7 @@ $(STAMP): requirements.lock pyproject.toml
 		exit 1; }
 	@[ -z "$(OTHER_PYTHON)" ] || [ ! -e $(VENV) ] || { \
 		echo "$(VENV) is of another interpreter than $(PYTHON) and is made again"; rm -rf $(VENV); }
-	@echo "setting up $(VENV), once: 1.4 GB of tools and locked packages"
+	@echo "setting up $(VENV), once: 1.6 GB of tools and locked packages"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV) >/dev/null 2>&1; } || { \
 		rm -rf $(VENV); $(PYTHON) -m venv --without-pip $(VENV) && \
 		$(PYTHON) -m pip --python $(BIN)/python install -qq pip; } || { \
