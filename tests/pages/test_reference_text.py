@@ -63,3 +63,21 @@ def test_a_description_in_a_schema_is_one_paragraph(checkout: Path) -> None:
     assert len(described) > 100
     assert [text for text in described if " ".join(text.split()) != text] == []
     assert [text for text in described if " - " in text] == []
+
+
+INERTIAL = {"Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz"}  #: Their section says it
+
+
+def test_every_key_of_a_cell_file_is_described(checkout: Path) -> None:
+    """By the comment beside the field of its class."""
+    text = (checkout / "docs/reference/schemas/cell.json").read_text(encoding="utf-8")
+    schema = json.loads(text)
+    bare: set[str] = set()
+    for section in (schema, *schema["$defs"].values()):
+        for key, field in section.get("properties", {}).items():
+            if "description" not in field:
+                bare.add(key)
+    assert bare == INERTIAL
+    page = (checkout / "docs/reference/cell-file.md").read_text(encoding="utf-8")
+    assert "| `bitrate_bit_s` | Of the bus \\[bit/s\\]. whole number" in page
+    assert "None to ignore it" not in page  # a cell file has null
