@@ -12,11 +12,12 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study mutation-study
+.PHONY: help setup demo figaroh test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study mutation-study
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
+	@echo "make figaroh  figaroh 1.0.2 in an environment of its own, 1 GB: with it, make test reads exported URDFs with figaroh"
 	@echo "make test-slow  searches, plans and sessions on whole simulated recordings; 15 minutes of processor time"
 	@echo "make test-processes  whole jobs: jobs that are killed, two buses, real recordings"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
@@ -90,7 +91,7 @@ $(STAMP): requirements.lock pyproject.toml
 		exit 1; }
 	@[ -z "$(OTHER_PYTHON)" ] || [ ! -e $(VENV) ] || { \
 		echo "$(VENV) is of another interpreter than $(PYTHON) and is made again"; rm -rf $(VENV); }
-	@echo "setting up $(VENV), once: 1.4 GB of tools and locked packages"
+	@echo "setting up $(VENV), once: 1.6 GB of tools and locked packages"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV) >/dev/null 2>&1; } || { \
 		rm -rf $(VENV); $(PYTHON) -m venv --without-pip $(VENV) && \
 		$(PYTHON) -m pip --python $(BIN)/python install -qq pip; } || { \
@@ -104,6 +105,10 @@ demo: setup
 
 test: check
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "not processes and not slow" --ignore tests/pages
+
+# Its Pinocchio is another one than ours.
+figaroh: setup
+	$(BIN)/python -m tests.bench.figaroh_environment
 
 test-slow: setup
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m "slow and not processes" --ignore tests/pages

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import wraps
@@ -53,6 +53,22 @@ def _is_whole(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_collection_of_texts(value: object) -> bool:
+    return (
+        isinstance(value, Collection)
+        and not isinstance(value, (str, bytes, Mapping))
+        and all(map(_is_text, value))
+    )
+
+
 A_PATH = ExpectedArgument("the path of a file, as Path or text", _is_path)
 A_FILE_TO_WRITE = ExpectedArgument(
     "the path of a file, and no folder, as Path or text", _is_file_to_write
@@ -64,7 +80,13 @@ A_MOMENT = ExpectedArgument("a datetime with its time zone", _is_moment, "write 
 A_WHOLE_NUMBER = ExpectedArgument("a whole number, zero or above", _is_whole)
 A_FLAG = ExpectedArgument("True or False", lambda value: isinstance(value, bool))
 A_FUNCTION = ExpectedArgument("a function", callable)
-A_TEXT = ExpectedArgument("a text", lambda value: isinstance(value, str))
+A_TEXT = ExpectedArgument("a text", _is_text)
+TEXTS = ExpectedArgument("a list of texts", _is_collection_of_texts, 'write ["Ada"]')
+BYTES = ExpectedArgument("bytes", lambda value: isinstance(value, bytes))
+A_PATH_OBJECT = ExpectedArgument(
+    "a pathlib.Path", lambda value: isinstance(value, Path), 'write Path("...")'
+)
+A_NUMBER = ExpectedArgument("a number", _is_number)
 A_LIST = ExpectedArgument(
     "a list",
     lambda value: isinstance(value, Sequence) and not isinstance(value, (str, bytes)),
@@ -75,6 +97,19 @@ A_LIST = ExpectedArgument(
 def of_kind(kind: type) -> ExpectedArgument:
     """Expect an object of a class."""
     return ExpectedArgument(kind.__name__, lambda value: isinstance(value, kind))
+
+
+def by_name(values: ExpectedArgument) -> ExpectedArgument:
+    """Expect a mapping from names to values of one kind."""
+
+    def is_met(value: object) -> bool:
+        return (
+            isinstance(value, Mapping)
+            and all(map(_is_text, value))
+            and all(map(values.is_met, value.values()))
+        )
+
+    return ExpectedArgument(f"a mapping from a name to {values.described}", is_met)
 
 
 def with_methods(described: str, *names: str) -> ExpectedArgument:
@@ -110,15 +145,36 @@ def checks_arguments(
         def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             for name, value in signature.bind(*args, **kwargs).arguments.items():
                 if name in expected and not expected[name].is_met(value):
-                    call = f"call {function.__name__}({', '.join(signature.parameters)})"
+                    taken = [one for one in signature.parameters if one not in {"cls", "self"}]
+                    call = f"call {function.__qualname__}({', '.join(taken)})"
                     raise argument_refused(
-                        f"{name} of {function.__name__}", value, expected[name], call
+                        f"{name} of {function.__qualname__}", value, expected[name], call
                     )
             return function(*args, **kwargs)
 
         return checked
 
     return decorate
+
+
+def require_fields(
+    label: str, thing: object, expected: Mapping[str, ExpectedArgument], call: str
+) -> None:
+    """Refuse an object with a field of another type: constructors only store.
+
+    Args:
+        label: of the object, for messages.
+        thing: whose fields are looked at.
+        expected: of its fields, by their names.
+        call: how to make the object.
+
+    Raises:
+        UsageError: a field is of another type; it is named.
+    """
+    for name, one in expected.items():
+        value = getattr(thing, name)
+        if not one.is_met(value):
+            raise argument_refused(f"{name} of {label}", value, one, call)
 
 
 def argument_refused(

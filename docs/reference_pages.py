@@ -9,16 +9,18 @@ each name to a function that returns Markdown.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import typer
 from pydantic import TypeAdapter
@@ -105,8 +107,22 @@ def schema_texts() -> dict[str, str]:
             **_schema(model),
             "title": title,
         }
+        _unwrap_descriptions(schema)
         texts[f"{name}.json"] = json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
     return texts
+
+
+def _unwrap_descriptions(node: Any) -> None:
+    """Make each description one paragraph: docstrings break their lines for an editor's sake."""
+    if isinstance(node, list):
+        for item in node:
+            _unwrap_descriptions(item)
+    elif isinstance(node, dict):
+        for key, item in node.items():
+            if key == "description" and isinstance(item, str):
+                node[key] = " ".join(item.split())
+            else:
+                _unwrap_descriptions(item)
 
 
 def lagging() -> dict[Path, str | None]:
@@ -252,7 +268,61 @@ def schema_list() -> str:
 
 
 def _schema(model: Any) -> dict[str, Any]:
-    return TypeAdapter(model).json_schema()
+    """The schema of a model, with the comments beside its fields (`#:`) as descriptions."""
+    schema: dict[str, Any] = TypeAdapter(model).json_schema()
+    classes: dict[str, type] = {}
+    _collect_classes(model, classes)
+    for name, section in [(schema.get("title", ""), schema), *schema.get("$defs", {}).items()]:
+        if name not in classes:
+            continue
+        comments = field_comments(classes[name])
+        for key, field in section.get("properties", {}).items():
+            if key in comments:
+                field.setdefault("description", comments[key])
+    return schema
+
+
+def _collect_classes(kind: Any, found: dict[str, type]) -> None:
+    """Collect the classes with fields that a type is made of, by name."""
+    for part in get_args(kind):
+        _collect_classes(part, found)
+    has_fields = is_dataclass(kind) or hasattr(kind, "model_fields")
+    if not inspect.isclass(kind) or not has_fields or kind.__name__ in found:
+        return
+    found[kind.__name__] = kind
+    for hint in get_type_hints(kind, include_extras=True).values():
+        _collect_classes(hint, found)
+
+
+def field_comments(kind: type) -> dict[str, str]:
+    """The comments `#:` behind or above the fields of a class and its bases, as sentences."""
+    comments: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not base.__module__.startswith(FRONT_DOORS):
+            continue
+        lines = inspect.cleandoc("\n" + inspect.getsource(base)).splitlines()
+        (tree,) = ast.parse("\n".join(lines)).body
+        for node in ast.iter_child_nodes(tree):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                text = _comment_of(lines, node)
+                if text:
+                    sentence = text[0].upper() + text[1:].rstrip(".") + "."
+                    comments[node.target.id] = re.sub(r"\bNone\b", "null", sentence)
+    return comments
+
+
+def _comment_of(lines: Sequence[str], node: ast.AnnAssign) -> str:
+    """The comment of a field, behind its last line or above its first; empty without one."""
+    last = lines[(node.end_lineno or node.lineno) - 1]
+    behind = last[node.end_col_offset :].partition("#:")[2].strip()
+    if behind:
+        return behind
+    above: list[str] = []
+    for line in reversed(lines[: node.lineno - 1]):
+        if not line.strip().startswith("#:"):
+            break
+        above.insert(0, line.strip().removeprefix("#:").strip())
+    return " ".join(above)
 
 
 def _sections(schema: dict[str, Any]) -> str:

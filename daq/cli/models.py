@@ -18,8 +18,9 @@ from ident.plausible import format_at_limit
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
+    from daq.workflow.full_choice import FullChoice
+    from daq.workflow.mjcf_effects import MissingEffect
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
-    from daq.workflow.urdf_shapes import UrdfShapes
     from ident.arrays import FloatArray
     from ident.calibration import Calibration
     from ident.model.model import Model
@@ -48,23 +49,17 @@ def export_urdf_verb(
 ) -> None:
     """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
 
-    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme
-    finds the nearest physical bodies (pip install 'drivegain[physical]'); the change of torque is
-    reported. A URDF holds no loops: of a closed chain it has the tree, and the closures are named.
+    Bodies are the full parameters of `fit --prior`; without them, a semidefinite programme finds
+    the nearest physical bodies to the URDF (pip install 'drivegain[physical]'). The change of
+    torque is reported. A URDF holds no loops: of a closed chain it has the tree, and the closures
+    are named.
     """
     from daq.config.cell_file import URDF, bundle
     from daq.config.yaml_file import read_yaml_bytes
+    from daq.report.chosen_parameters import choice_remarks
     from daq.report.text import origin_text
     from daq.report.urdf_views import urdf_report, urdf_view
-    from daq.workflow.mjcf_effects import split_installed
-    from daq.workflow.urdf_export import (
-        FORMAT,
-        cell_limits,
-        parse_markup,
-        physical_robot,
-        update_urdf,
-    )
-    from daq.workflow.validate import on_cell
+    from daq.workflow.urdf_export import FORMAT, parse_markup, update_urdf
 
     given, calibration = _described_by("export urdf", cell, calibration, urdf)
     check_output(out, (calibration, given), FORMAT)
@@ -82,30 +77,25 @@ def export_urdf_verb(
             remedy="choose another name",
         )
     parse_markup(content, str(given))  # before any other reader sees it
-    declared = None if urdf is not None else _declared(known, given)
-    known, _ = split_installed(known)  # a URDF holds no effects
-    if declared is not None:
-        known, model = on_cell(known, declared)
-        limits = cell_limits(declared)
-        same = _is_same(known, declared)
-        content = declared.urdf.encode()  # held joints are fixed in it
+    if urdf is None:
+        described = _of_cell(known, given)
     else:
-        model, limits = _plain(content.decode("utf-8"))
-        same = None
-    require_packages(
-        "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+        described = _of_urdf(known, given)
+    known = described.calibration
+    choice = _choose(described)
+    updates = joint_updates(choice.robot)
+    remarks = (
+        f"Inertias by {software()} from {origin_text(known.cell, known.created)}",
+        *choice_remarks(choice),
     )
-    text = content.decode("utf-8")
-    with status("finding the nearest physical robot"):
-        robot = physical_robot(known, model, limits, text)
-    updates = joint_updates(robot)
-    provenance = f"Inertias by {software()} from {origin_text(known.cell, known.created)}"
-    updated = update_urdf(content, str(given), updates, provenance)
-    _write(updated, robot, out)
+    # Held joints are fixed in the URDF that was described.
+    updated = update_urdf(described.urdf.encode(), str(given), updates, ". ".join(remarks))
+    _write(updated, choice.robot, out)
+    missing = [str(effect) for effect in described.missing]
     if json:
-        print_json(urdf_report(known, robot, updates, updated, out, same))
+        print_json(urdf_report(known, choice, updates, updated, out, described.same, missing))
     else:
-        print_view(urdf_view(known, robot, updates, updated, same), out)
+        print_view(urdf_view(known, choice, updates, updated, described.same, missing), out)
 
 
 def export_mjcf_verb(
@@ -123,10 +113,10 @@ def export_mjcf_verb(
     install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
     """
     from daq.report.mjcf_views import head_remarks, left_out_of, mjcf_report, mjcf_view
-    from daq.workflow.full_choice import full_choice
     from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
     from daq.workflow.urdf_export import random_states
+    from daq.workflow.urdf_shapes import shapes_of
     from ident.model.urdf import read_urdf
 
     given, calibration = _described_by("export mjcf", cell, calibration, urdf)
@@ -139,15 +129,12 @@ def export_mjcf_verb(
     else:
         described = _of_urdf(known, given)
     known = described.calibration
-    if known.full_parameters is None:
-        require_packages(
-            "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
-        )
-    with status("choosing the bodies"):
-        choice = full_choice(known, described.model, described.limits, described.urdf)
+    choice = _choose(described)
     followed = choice.model.follow(random_states(choice.model, described.limits))
+    shapes = shapes_of(described.urdf, described.folder)
     effects = joint_effects(known, choice.model.robot)
-    effects = replace(effects, left_out=(*effects.left_out, *described.missing))
+    missing = map(str, described.missing)
+    effects = replace(effects, left_out=(*effects.left_out, *missing))
     effects_left_out = left_out_of(as_read, effects.left_out)
     source = MjcfSource(
         name=known.cell,
@@ -157,12 +144,10 @@ def export_mjcf_verb(
         frames=read_urdf(described.urdf).links,
         lower=described.lower,
         upper=described.upper,
-        shapes=described.shapes,
+        shapes=shapes,
         folder=out.parent,
         effects=effects,
-        remarks=tuple(
-            head_remarks(known, choice, effects, described.shapes, software(), effects_left_out)
-        ),
+        remarks=tuple(head_remarks(known, choice, effects, shapes, software(), effects_left_out)),
     )
     written = write_mjcf(source, followed.joints.position_rad)
     with replace_output(out):
@@ -180,13 +165,13 @@ class _Described:
 
     #: without effects that are not installed, with the corrections that the cell still needs
     calibration: Calibration
-    missing: tuple[str, ...]  #: effects that are not installed
+    missing: tuple[MissingEffect, ...]  #: effects that are not installed
     model: Model
     limits: FloatArray  #: ranges in which torques are compared, shape (4, m)
     lower: FloatArray  #: least position of each axis, -inf without a limit, shape (m,)
     upper: FloatArray
     urdf: str
-    shapes: UrdfShapes
+    folder: Path  #: of the URDF, from where its meshes are found
     same: bool | None  #: whether the description is that of the fit; None where nothing says so
 
 
@@ -195,7 +180,6 @@ def _of_cell(calibration: Calibration, path: Path) -> _Described:
     from daq.config.cell_file import urdf_path
     from daq.workflow.mjcf_effects import split_installed
     from daq.workflow.urdf_export import cell_limits
-    from daq.workflow.urdf_shapes import shapes_of
     from daq.workflow.validate import on_cell
 
     cell = _declared(calibration, path)
@@ -211,7 +195,7 @@ def _of_cell(calibration: Calibration, path: Path) -> _Described:
         lower=limits[0] - limits[1],
         upper=limits[0] + limits[1],
         urdf=cell.urdf,
-        shapes=shapes_of(cell.urdf, urdf_path(path).parent),
+        folder=urdf_path(path).parent,
         same=same,
     )
 
@@ -223,7 +207,7 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
     from daq.config.yaml_file import read_yaml_bytes
     from daq.workflow.mjcf_effects import split_installed
     from daq.workflow.urdf_export import parse_markup
-    from daq.workflow.urdf_shapes import joint_ranges, shapes_of
+    from daq.workflow.urdf_shapes import joint_ranges
 
     content = read_yaml_bytes(path)
     parse_markup(content, str(path))  # before any other reader sees it
@@ -249,9 +233,29 @@ def _of_urdf(calibration: Calibration, path: Path) -> _Described:
         lower=bounds[:, 0],
         upper=bounds[:, 1],
         urdf=urdf,
-        shapes=shapes_of(urdf, path.parent),
+        folder=path.parent,
         same=None,
     )
+
+
+def _choose(described: _Described) -> FullChoice:
+    """Choose the full parameters of a robot: the same for every kind of model.
+
+    Raises:
+        ModelError: the calibration is of another robot.
+        NotPhysical: no possible robot was found.
+        ConfigurationMissing: the bodies have to be found, and the solver is not installed.
+    """
+    from daq.workflow.full_choice import full_choice
+
+    known = described.calibration
+    if known.full_parameters is None:
+        require_packages(
+            "physical parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
+        )
+    missing = [effect.accepted for effect in described.missing]
+    with status("choosing the bodies"):
+        return full_choice(known, described.model, described.limits, described.urdf, missing)
 
 
 def _described_by(

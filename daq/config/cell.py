@@ -69,11 +69,11 @@ class PacingMode(Enum):
 class UnnamedBus:
     """A bus, in the terms of python-can; host and port are those of a socketcand hub."""
 
-    interface: Name
-    channel: FileName
-    bitrate_bit_s: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
-    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
-    port: Annotated[int, Field(ge=1, le=65535)] = 29536
+    interface: Name  #: of python-can: socketcan, socketcand, virtual, or another
+    channel: FileName  #: of the interface, as can0
+    bitrate_bit_s: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000  #: of the bus [bit/s]
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"  #: of a socketcand hub
+    port: Annotated[int, Field(ge=1, le=65535)] = 29536  #: of a socketcand hub
 
     @property
     def kind(self) -> BusInterface:
@@ -85,7 +85,7 @@ class UnnamedBus:
 class Bus(UnnamedBus):
     """A bus with its name; the only bus of a cell is named after its channel."""
 
-    name: FileName
+    name: FileName  #: by which axes name their bus
 
 
 RECORDER = "recorder"
@@ -103,8 +103,10 @@ class Sync:
     RECORDER, KERNEL or the name of an axis.
     """
 
-    period_us: Annotated[int, Field(ge=250, le=1_000_000)]
+    period_us: Annotated[int, Field(ge=250, le=1_000_000)]  #: time between two samples [µs]
+    #: lockstep: the next SYNC follows the last answer; timed: by the clock
     pacing: PacingMode = PacingMode.TIMED
+    #: recorder, kernel (SocketCAN's broadcast manager), or the name of an axis
     producer: Name = RECORDER
 
 

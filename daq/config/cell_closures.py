@@ -25,9 +25,9 @@ Direction = Literal["x", "y", "z", "rx", "ry", "rz"]
 class ClosureModel(StrictModel):
     """Two links of the URDF whose frames coincide: the joint that closes a loop."""
 
-    name: Name
-    first: Name
-    second: Name
+    name: Name  #: of the closure, in messages and effects
+    first: Name  #: link of the URDF
+    second: Name  #: link whose frame coincides with that of the first
     directions: Annotated[
         tuple[Direction, ...],
         Field(

@@ -38,14 +38,19 @@ U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 class RobotModel(ChainModel):
     """The arm."""
 
+    #: file of the arm's geometry, relative to the cell file; its inertias are not used by a fit
     urdf: FileName
+    #: gravity in the base frame of the URDF, by which the mounting is told
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    #: by the maker [kg]; a heavier payload is refused as mistyped
     rated_payload_kg: Annotated[float, Field(gt=0, le=1e5)] | None = None
 
 
 class DriveTrainModel(StrictModel):
     """R, a row a motor."""
 
+    #: turns of each motor per turn of each joint, q_motor = R q_joint; a row a motor, in the order
+    #: of `axes`
     ratio: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1, max_length=32)]
 
 
@@ -74,20 +79,22 @@ def buses_of(declared: UnnamedBus | tuple[Bus, ...]) -> tuple[Bus, ...]:
 class IdentityModel(StrictModel):
     """Object 1018h; what is left out is not compared."""
 
-    vendor_id: U32
-    product_code: U32 | None = None
-    serial: U32 | None = None
+    vendor_id: U32  #: 1018:01 of the drive
+    product_code: U32 | None = None  #: 1018:02
+    serial: U32 | None = None  #: 1018:04; by it, two exchanged drives are noticed
 
 
 class LimitsModel(StrictModel):
     """Limits of a joint in degrees, or in mm for a prismatic joint."""
 
+    #: least and largest position of a revolute joint [deg]
     position_deg: tuple[float, float] | None = None
-    velocity_deg_s: Positive | None = None
-    acceleration_deg_s2: Positive | None = None
+    velocity_deg_s: Positive | None = None  #: largest speed of it [deg/s]
+    acceleration_deg_s2: Positive | None = None  #: largest acceleration of it [deg/s²]
+    #: least and largest position of a prismatic joint [mm]
     position_mm: tuple[float, float] | None = None
-    velocity_mm_s: Positive | None = None
-    acceleration_mm_s2: Positive | None = None
+    velocity_mm_s: Positive | None = None  #: largest speed of it [mm/s]
+    acceleration_mm_s2: Positive | None = None  #: largest acceleration of it [mm/s²]
 
     @model_validator(mode="after")
     def _check_unit(self) -> LimitsModel:
@@ -128,20 +135,25 @@ _GAIN_KEYS = ("nameplate_gain_nm_per_a", "nameplate_gain_n_per_a", "nameplate_ga
 class AxisModel(StrictModel):
     """One motor and its joint."""
 
-    name: Name
-    node_id: int | None = None
-    bus: Name | None = None
-    drive: Name | None = None
-    identity: IdentityModel | None = None
+    name: Name  #: of the axis, in messages, plans and the calibration
+    node_id: int | None = None  #: CANopen node of its drive
+    bus: Name | None = None  #: name of its bus; of several, each axis names one
+    drive: Name | None = None  #: drive profile: a shipped one, or a file relative to the cell file
+    identity: IdentityModel | None = None  #: of the drive, compared before anything moves
+    #: of the motor's encoder
     counts_per_revolution: Annotated[int, Field(gt=0, le=2**31)] | None = None
-    zero_offset_deg: float | None = None
-    zero_offset_mm: float | None = None
+    zero_offset_deg: float | None = None  #: added to the position of a revolute joint [deg]
+    zero_offset_mm: float | None = None  #: added to the position of a prismatic joint [mm]
+    #: travel of a prismatic joint per turn of screw or pinion [mm]; negative: left-handed
     lead_mm: float | None = None
+    #: gain by the data sheet of a revolute joint [Nm at the joint per A]
     nameplate_gain_nm_per_a: float | None = None
+    #: gain by the data sheet of a prismatic joint [N per A]
     nameplate_gain_n_per_a: float | None = None
-    nameplate_gain: float | None = None
+    nameplate_gain: float | None = None  #: gain by the data sheet in `gain_unit`
+    #: unit of `nameplate_gain`, where the current reference is not in A
     gain_unit: Annotated[str, Field(min_length=1, max_length=60)] | None = None
-    limits: LimitsModel
+    limits: LimitsModel  #: within which moves are planned
 
     @model_validator(mode="after")
     def _check_lead(self) -> AxisModel:
@@ -200,13 +212,15 @@ class PayloadModel(StrictModel):
     a URDF has it (xy = −∫xy dm).
     """
 
-    name: Name
-    mounting: Name
-    mass_kg: float
+    name: Name  #: of the body, in plans and logs
+    mounting: Name  #: name of the way in which it is mounted
+    mass_kg: float  #: as weighed [kg]
+    #: tolerance of that mass [kg]; σ of weighed bodies has it
     mass_tolerance_kg: Annotated[float, Field(ge=0)] = 0.0
-    centre_m: tuple[float, float, float] | None = None
+    centre_m: tuple[float, float, float] | None = None  #: centre of mass by a drawing [m]
+    #: inertia by a drawing, about the centre of mass [kg m²]
     inertia_kg_m2: tuple[float, float, float, float, float, float] | None = None
-    known: KnownModel | None = None
+    known: KnownModel | None = None  #: single parameters that are known, in place of a drawing
 
     @property
     def known_parameters(self) -> dict[str, float]:
@@ -231,7 +245,7 @@ class PayloadModel(StrictModel):
 class EffectModel(StrictModel):
     """An effect that the robot is known to have, and its settings where they are known."""
 
-    name: Name
+    name: Name  #: of the effect
     axis: Annotated[
         Name,
         Field(
@@ -239,6 +253,7 @@ class EffectModel(StrictModel):
             "and a closure's name."
         ),
     ]
+    #: values that are known, by their names; the others are searched
     settings: dict[str, float] = Field(default_factory=dict)
 
 
@@ -251,11 +266,17 @@ _CutOff = Annotated[float, Field(ge=CUTOFF_HZ[0], le=CUTOFF_HZ[1])]
 class ConditioningModel(StrictModel):
     """The filters."""
 
-    position_cutoff_hz: _CutOff = 40.0
+    position_cutoff_hz: _CutOff = 40.0  #: cut-off of the zero-phase low-pass of the positions [Hz]
+    #: order of that filter
     position_order: Annotated[int, Field(ge=FILTER_ORDER[0], le=FILTER_ORDER[1])] = 4
+    #: cut-off of the filter of all columns, behind which rows are decimated [Hz]
     decimation_cutoff_hz: _CutOff = 20.0
+    #: speed of each revolute joint below which it stands still, and its rows are left out [rad/s];
+    #: derived from each run where empty
     standstill_rad_s: tuple[Annotated[float, Field(ge=0, le=1e3)] | None, ...] = ()
+    #: the same of prismatic joints [mm/s]
     standstill_mm_s: tuple[Annotated[float, Field(ge=0, le=SPEED[1])] | None, ...] = ()
+    #: share of a row's filter window that may be standstill
     standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 
@@ -283,7 +304,7 @@ class PolicyModel(StrictModel):
             "beyond a limit."
         ),
     ] = Permission.REFUSED
-    apply: ApplyPolicy = DEFAULT_APPLY_POLICY
+    apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds of a write
 
 
 class CellModel(StrictModel):
@@ -292,21 +313,23 @@ class CellModel(StrictModel):
     reference: ClassVar[str] = "cell-file.md"
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.CELL
 
-    name: Name
-    robot: RobotModel
-    drive_train: DriveTrainModel
+    name: Name  #: of the cell, in logs, calibration and audit log
+    robot: RobotModel  #: the arm
+    drive_train: DriveTrainModel  #: how motors turn the joints
     hold: Annotated[
         dict[str, float],
         Field(description="Positions of joints that are no axes [deg; m if prismatic]."),
     ] = Field(default_factory=dict)
-    bus: Buses | None = None
-    sync: Sync | None = None
+    bus: Buses | None = None  #: one bus, or several with a name each
+    sync: Sync | None = None  #: how samples are timed
     closures: Annotated[
         tuple[ClosureModel, ...],
         Field(description="Where the loops of a closed chain close; none of a serial robot."),
     ] = ()
+    #: one for each motor
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
-    payloads: tuple[PayloadModel, ...] = ()
+    payloads: tuple[PayloadModel, ...] = ()  #: weighed bodies
+    #: what the robot is known to have beside rigid links and friction
     effects: tuple[EffectModel, ...] = ()
     friction_by_payload: Annotated[
         bool,
@@ -315,10 +338,10 @@ class CellModel(StrictModel):
             "friction that changes between bare and loaded runs does not become gain."
         ),
     ] = False
-    conditioning: ConditioningModel = ConditioningModel()
-    controller: Controller | None = None
-    workspace: WorkspaceSection | None = None
-    clearance: ClearanceSection | None = None
+    conditioning: ConditioningModel = ConditioningModel()  #: filters of the fit
+    controller: Controller | None = None  #: where gains are written
+    workspace: WorkspaceSection | None = None  #: room that the arm stays in
+    clearance: ClearanceSection | None = None  #: distances that moves keep
     target_sigma_percent: Annotated[
         float,
         Field(
@@ -327,9 +350,9 @@ class CellModel(StrictModel):
             le=10.0,
         ),
     ] = DEFAULT_TARGET_SIGMA_PERCENT
-    policy: PolicyModel = PolicyModel()
-    history: HistorySection = HistorySection()
-    recalibration: RecalibrationSection | None = None
+    policy: PolicyModel = PolicyModel()  #: what is allowed
+    history: HistorySection = HistorySection()  #: audit log and history
+    recalibration: RecalibrationSection | None = None  #: the scheduled job
 
     @property
     def axis_names(self) -> list[str]:

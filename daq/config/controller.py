@@ -31,7 +31,7 @@ class ControllerFormat(Enum):
 class GainKey:
     """Key of a current gain that is kept in another unit, or with another sign."""
 
-    key: FileName
+    key: FileName  #: of the number in the file
     factor: _Factor = 1.0  #: number in the file = gain × factor
 
 
@@ -39,9 +39,9 @@ class GainKey:
 class GainObject:
     """Object of a drive that holds its gain."""
 
-    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
-    subindex: Annotated[int, Field(ge=0, le=0xFF)] = 0
-    type: ParameterKind
+    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: of the object
+    subindex: Annotated[int, Field(ge=0, le=0xFF)] = 0  #: of the object
+    type: ParameterKind  #: how the drive holds the number
     factor: _Factor = 1.0  #: number in the drive = gain × factor
 
     @property

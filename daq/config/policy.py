@@ -131,8 +131,8 @@ class HistorySection:
     By default they are beside it, with its name.
     """
 
-    store: FileName | None = None
-    audit: FileName | None = None
+    store: FileName | None = None  #: SQLite file of an earlier version, which is migrated
+    audit: FileName | None = None  #: audit log
 
     def place(self, cell_file: Path, controller: str | None) -> HistoryPlace:
         """Resolve the file names; refuse a history that would replace the cell file or the

@@ -54,8 +54,8 @@ class Interlock:
 class SeededPlan:
     """`plan` of a run: moves planned from a seed."""
 
-    seed: Annotated[int, Field(ge=0)]
-    duration_s: Annotated[float, Field(ge=5, le=3600)] = 40.0
+    seed: Annotated[int, Field(ge=0)]  #: another seed gives other moves
+    duration_s: Annotated[float, Field(ge=5, le=3600)] = 40.0  #: of the run [s]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

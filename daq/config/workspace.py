@@ -34,19 +34,19 @@ class Clearance:
 class WorkspaceSection:
     """A box in the base frame in which everything on the link with the payload must stay."""
 
-    lower_m: Point
-    upper_m: Point
+    lower_m: Point  #: lower corner in the base frame
+    upper_m: Point  #: upper corner in the base frame
 
 
 @dataclass(frozen=True, slots=True)
 class CapsuleSection:
     """All points within a radius of a segment, in the frame of the named axis (or of the base)."""
 
-    name: Name
-    link: Name
-    from_m: Point
-    to_m: Point
-    radius_m: Annotated[float, Field(gt=0, le=10)]
+    name: Name  #: for messages
+    link: Name  #: axis whose frame the points are in, or base
+    from_m: Point  #: one end of the segment
+    to_m: Point  #: other end of the segment
+    radius_m: Annotated[float, Field(gt=0, le=10)]  #: around the segment [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +60,10 @@ class Obstacle(Box):
 class ClearanceSection:
     """Bodies to keep apart; without capsules the arm's shape is derived from its joint chain."""
 
+    #: least distance that moves keep [m]
     minimum_m: Annotated[float, Field(ge=0, le=1)] = DEFAULT_MINIMUM_M
-    capsules: Annotated[tuple[CapsuleSection, ...], Field(max_length=64)] = ()
-    obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=64)] = ()
+    capsules: Annotated[tuple[CapsuleSection, ...], Field(max_length=64)] = ()  #: shapes of the arm
+    obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=64)] = ()  #: bodies in the room
 
 
 def clearance_of(

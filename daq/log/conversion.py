@@ -28,7 +28,7 @@ from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
 from ident.data.unsigned_current import unsigned_currents
 from ident.model.model import DriveTrain
-from ident.plausible import format_at_limit
+from ident.plausible import TEMPERATURES_C, format_at_limit
 
 _LOG = logging.getLogger("drivegain")
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
@@ -350,15 +350,19 @@ def temperatures(log: Log) -> FloatArray | None:
     None in a log without any.
 
     It is interpolated between readings, and constant before the first and after the last; NaN for
-    an axis without.
+    an axis without. A reading that no motor has, such as of a broken sensor, is left out.
     """
     readings = readings_by_axis(log.readings, Quantity.TEMPERATURE)
     if not readings:
         return None
     time_ns = log.samples.time_ns
     found = np.full(log.samples.position_counts.shape, np.nan)
+    least, largest = TEMPERATURES_C
     for axis, (at_ns, values) in readings.items():
-        found[:, axis] = np.interp(time_ns - time_ns[0], at_ns - time_ns[0], values)
+        possible = (values >= least) & (values <= largest)
+        if np.any(possible):
+            at_possible_ns = at_ns[possible] - time_ns[0]
+            found[:, axis] = np.interp(time_ns - time_ns[0], at_possible_ns, values[possible])
     return found
 
 

@@ -19,6 +19,7 @@ from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import (
     Column,
+    CsvLayout,
     ImportDescription,
     KeptPart,
     PositionUnit,
@@ -671,7 +672,8 @@ def with_columns(
 
     Raises:
         TableUnfit: a file is of a format that is not read, or a temperature is sought in a bag.
-        ConfigurationInconsistent: torques are to be read from where the currents are.
+        ConfigurationInconsistent: torques are to be read from where the currents are, or a setting
+            is for files of another kind.
     """
     changed: dict[str, Section] = {}
     bags = set[str]()
@@ -696,8 +698,49 @@ def with_columns(
             files = tuple(file for file, _ in places)
         changed[key] = replace(section, file=files, columns=tuple(columns))
     whole = wanted.model_copy(update=changed)
+    _require_used_settings(whole, data)
     _check_torque(whole, bags)
     return whole
+
+
+BAG_SETTINGS = ("topic", "publisher", "rhythm")  #: Of an import description, for bags alone
+
+
+def _require_used_settings(wanted: ImportDescription, data: Path) -> None:
+    """Refuse settings of a kind of files that the description does not name:
+    nothing would read them.
+
+    Raises:
+        ConfigurationInconsistent: a topic, publisher or rhythm without a bag, or the layout of CSV
+            files without one.
+    """
+    for key, section in wanted.sections():
+        for setting in BAG_SETTINGS:
+            if getattr(section, setting, None) is not None:
+                _require_reader(wanted, data, read_bag, section.files, f"{key}.{setting}")
+    for setting in BAG_SETTINGS:
+        if getattr(wanted, setting) is not None:
+            _require_reader(wanted, data, read_bag, tuple(wanted.files()), setting)
+    if wanted.table != CsvLayout():
+        _require_reader(wanted, data, read_csv, tuple(wanted.files()), "table")
+
+
+_FILES_READ_BY: dict[Reader, str] = {read_bag: "a ROS bag", read_csv: "a CSV file"}
+
+
+def _require_reader(
+    wanted: ImportDescription, data: Path, reader: Reader, files: tuple[str, ...], setting: str
+) -> None:
+    """Refuse a setting that only one reader takes, where none of some files is read by it."""
+    if any(reader_of(data / file) is reader for file in files):
+        return
+    kind = _FILES_READ_BY[reader]
+    raise ConfigurationInconsistent(
+        f"import description {wanted.name!r}: {setting}",
+        found=f"a value, and no file that has it: {', '.join(files)}",
+        expected=f"`{setting}` only where a file is {kind}",
+        remedy=f"leave `{setting}` out, or name {kind}",
+    )
 
 
 def _of_all_axes(

@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 
+from daq.report.chosen_parameters import ChosenParameter, choice_remarks, chosen_parameters
 from daq.report.document import Report
 from daq.report.fit import Errors
 from daq.report.text import origin_text, plain_table, printable, terminal_text
@@ -19,7 +19,7 @@ from daq.workflow.mjcf_effects import JointEffects
 from daq.workflow.mjcf_export import Mjcf, MjcfSource, joint_drive
 from daq.workflow.urdf_shapes import UrdfShapes
 from ident.calibration import AcceptedEffect, Calibration
-from ident.model.bodies import LOADED, body_of
+from ident.model.bodies import body_of
 from ident.physical.drive_terms import drive_terms
 from ident.physical.full_parameters import RestsOn
 
@@ -53,18 +53,6 @@ class MjcfActuator(Report):
     """of the tendon, beside those of the joints"""
     damping: float
     friction: float
-
-
-class ChosenParameter(Report):
-    """Standard parameter of the bodies that were written."""
-
-    name: str
-    value: float
-    unit: str
-    basis: str
-    """`data` or `prior`: which of the two has the larger part in its variance"""
-    prior_share: float
-    """the prior's part, 0 to 1"""
 
 
 class NotInMjcf(Report):
@@ -156,13 +144,7 @@ def head_remarks(
         f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 "
         "or later."
     )
-    yield (
-        f"Bodies: {choice.chosen_by.value}; torque changed by "
-        f"{choice.torque_change_percent.total:.2g} %"
-    )
-    by_prior = _names_by_prior(choice)
-    if by_prior:
-        yield f"By the prior, not measured: {', '.join(by_prior)}"
+    yield from choice_remarks(choice)
     if effects.left_out:
         yield f"Effects NOT in this model: {', '.join(effects.left_out)}"
     for one in effects_left_out:
@@ -206,7 +188,7 @@ def mjcf_report(
         assumed_links=choice.assumed,
         joints=list(_joints(source)),
         actuators=list(_actuators(source, written)),
-        parameters=list(_parameters(choice)),
+        parameters=list(chosen_parameters(choice)),
         not_in_mjcf=[NotInMjcf.of(left) for left in written.left_over],
         effects_at_joints=source.effects.at_joints,
         effects_left_out=source.effects.left_out,
@@ -302,18 +284,6 @@ def mjcf_view(report: MjcfReport) -> Iterator[RenderableType]:
         )
 
 
-def _parameters(choice: FullChoice) -> Iterator[ChosenParameter]:
-    for number, column in enumerate(choice.model.columns):
-        if column.name.endswith(LOADED):
-            continue  # what a payload adds to friction is no part of the robot without one
-        yield ChosenParameter.of(
-            column,
-            value=float(choice.standard[number]),
-            basis=choice.basis[number].value,
-            prior_share=float(np.clip(choice.shares[number], 0.0, 1.0)),
-        )
-
-
 def _joints(source: MjcfSource) -> Iterator[MjcfJoint]:
     model = source.model
     terms = drive_terms(model, source.standard)
@@ -342,11 +312,6 @@ def _actuators(source: MjcfSource, written: Mjcf) -> Iterator[MjcfActuator]:
             damping=float(terms.damping.of_motors[axis]),
             friction=float(terms.dry_friction.of_motors[axis]),
         )
-
-
-def _names_by_prior(choice: FullChoice) -> list[str]:
-    """Names of the parameters in the report that rest on the prior."""
-    return [one.name for one in _parameters(choice) if one.basis == RestsOn.PRIOR.value]
 
 
 def _mountings(calibration: Calibration) -> list[str]:

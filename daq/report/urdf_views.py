@@ -4,16 +4,18 @@ and how far their torque is from the identified one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import RenderableType
 from rich.text import Text
 
+from daq.report.chosen_parameters import ChosenParameter, chosen_parameters, names_by_prior
 from daq.report.document import Figure, Report
 from daq.report.fit import Errors
 from daq.report.text import plain_table, printable, terminal_text
-from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+from daq.workflow.full_choice import ChosenBy, FullChoice
+from daq.workflow.urdf_export import JointUpdate, Updated
 from daq.workflow.validate import CORRECTIONS
 from ident.calibration import Calibration
 from ident.model.bodies import LOADED
@@ -60,11 +62,14 @@ class UrdfReport(Report):
     calibration: str | None
     """name of its cell; None without one"""
     same_configuration: bool | None
+    chosen_by: str
+    """where the bodies come from"""
     exact: bool
     torque_change_percent: Errors
     shifts: list[ShiftedParameter]
     margin: float
     joints: list[UrdfJoint]
+    parameters: list[ChosenParameter]
     merged_links: list[str]
     not_in_urdf: list[NotInUrdf]
     effects_left_out: list[str]
@@ -73,15 +78,23 @@ class UrdfReport(Report):
 
 def urdf_view(
     calibration: Calibration,
-    robot: PhysicalRobot,
+    choice: FullChoice,
     updates: dict[str, JointUpdate],
     updated: Updated,
     same_configuration: bool | None,
+    missing: Sequence[str] = (),
 ) -> Iterator[RenderableType]:
     """Bodies by link, the change of torque, and the identified parameters that a URDF cannot hold.
 
-    `same_configuration` says whether the cell file is that of the fit; None without a cell file.
+    Args:
+        calibration: that was exported, without the effects that are not installed.
+        choice: its full parameters.
+        updates: body and friction of each joint, by its name.
+        updated: the URDF that was written.
+        same_configuration: whether the cell file is that of the fit; None without a cell file.
+        missing: effects of the calibration that are not installed.
     """
+    parameters = choice.robot.parameters
     table = plain_table(
         ("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1)
     )
@@ -96,30 +109,13 @@ def urdf_view(
             f"{update.friction:.3g}",
         )
     yield table
-    if robot.parameters.exact:
-        yield "The torque of these bodies is exactly the identified one."
-    else:
-        change = robot.parameters.torque_change_percent
-        axes = ", ".join(f"{value:.2f}" for value in change.axes)
-        shown = robot.shifts[:_SHOWN_SHIFTS]
-        shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in shown)
-        yield (
-            "No physical robot has exactly the identified parameters; the torque of this one "
-            f"differs by {change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
-        )
-    if robot.prior.assumed:
-        joints = robot.parameters.model.robot.joints
-        names = ", ".join(joints[number].name for number in robot.prior.assumed)
-        yield printable(
-            f"The URDF has no possible inertia behind {names}; a ball was assumed where the data "
-            "have none."
-        )
+    yield from _choice_lines(choice)
     if updated.merged:
         yield printable(
             f"Merged into the moving link that carries them: {', '.join(updated.merged)}."
         )
     left_out = ["rotor inertias", "offsets"]
-    if robot.parameters.model.drive_train.coupled:
+    if parameters.model.drive_train.coupled:
         left_out.append("friction of coupled motors")
     corrected: list[str] = []
     for effect in calibration.effects:
@@ -128,7 +124,8 @@ def urdf_view(
             left_out.append(name)
         elif any(one.value != 0.0 for one in effect.coefficients):
             corrected.append(name)
-    left_out += [f"closure {closure.name}" for closure in robot.parameters.model.robot.closures]
+    left_out += missing
+    left_out += [f"closure {closure.name}" for closure in parameters.model.robot.closures]
     yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
     if corrected:
         text = (
@@ -144,20 +141,54 @@ def urdf_view(
         )
 
 
+def _choice_lines(choice: FullChoice) -> Iterator[RenderableType]:
+    """Say where the bodies come from, and how far their torque is from the identified one."""
+    robot = choice.robot
+    if robot.parameters.exact:
+        yield "The torque of these bodies is exactly the identified one."
+    else:
+        change = robot.parameters.torque_change_percent
+        axes = ", ".join(f"{value:.2f}" for value in change.axes)
+        shown = robot.shifts[:_SHOWN_SHIFTS]
+        shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in shown)
+        if choice.chosen_by is ChosenBy.NEAREST_BODIES:
+            subject = (
+                "No physical robot has exactly the identified parameters; the torque of this one"
+            )
+        else:
+            subject = "The torque of these bodies"
+        yield (
+            f"{subject} differs by {change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
+        )
+    parameters = list(chosen_parameters(choice))
+    by_prior = names_by_prior(choice)
+    yield printable(
+        f"Bodies: {choice.chosen_by.value}. {len(by_prior)} of {len(parameters)} parameters rest "
+        "on the prior."
+    )
+    if choice.assumed:
+        yield printable(
+            f"The URDF has no possible inertia behind {', '.join(choice.assumed)}; a ball was "
+            "assumed where the data have none."
+        )
+
+
 def urdf_report(
     calibration: Calibration,
-    robot: PhysicalRobot,
+    choice: FullChoice,
     updates: dict[str, JointUpdate],
     updated: Updated,
     out: Path,
     same_configuration: bool | None,
+    missing: Sequence[str] = (),
 ) -> UrdfReport:
     """Return the bodies of a URDF that was written, and what it does not hold of the calibration.
 
     Args:
-        calibration, robot, updates, updated, same_configuration: as in `urdf_view`.
+        calibration, choice, updates, updated, same_configuration, missing: as in `urdf_view`.
         out: the URDF.
     """
+    robot = choice.robot
     parameters = robot.parameters
     shifts = [
         ShiftedParameter.of(shift, physical=shift.realised, standard_deviations=shift.deviations)
@@ -165,21 +196,24 @@ def urdf_report(
     ]
     joints = []
     for number, update in enumerate(updates.values()):
-        joints.append(_joint(robot, number, update, updated))
+        joints.append(_joint(choice, number, update, updated))
     columns = zip(parameters.model.columns, parameters.standard, strict=True)
     not_in_urdf = [
         NotInUrdf.of(column, value=value) for column, value in columns if _is_of_motor(column.name)
     ]
     effects = [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
+    effects += missing
     closures = [closure.name for closure in parameters.model.robot.closures]
     return UrdfReport.of(
         parameters,
         urdf=out,
         calibration=calibration.cell or None,
         same_configuration=same_configuration,
+        chosen_by=choice.chosen_by.value,
         shifts=shifts,
         margin=MARGIN,
         joints=joints,
+        parameters=list(chosen_parameters(choice)),
         merged_links=updated.merged,
         not_in_urdf=not_in_urdf,
         effects_left_out=effects,
@@ -192,13 +226,13 @@ def _is_of_motor(name: str) -> bool:
     return name.startswith(("Ia", "off", "fvm", "fsm")) and not name.endswith(LOADED)
 
 
-def _joint(robot: PhysicalRobot, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:
-    name = robot.parameters.model.robot.joints[number].name
+def _joint(choice: FullChoice, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:
+    name = choice.model.robot.joints[number].name
     return UrdfJoint.of(
         update,
         update.body,
         name=name,
         link=updated.links[name],
-        smallest_eigenvalue=robot.parameters.eigenvalues[number],
-        prior_assumed=number in robot.prior.assumed,
+        smallest_eigenvalue=choice.robot.parameters.eigenvalues[number],
+        prior_assumed=name in choice.assumed,
     )

@@ -229,6 +229,7 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
     _check(document, model)
     urdf_path = path.parent / model.urdf
     urdf = urdf_text(read_yaml_bytes(urdf_path), str(urdf_path))
+    _refuse(document, list(_mimic_faults(urdf)))
     if model.closures:
         _refuse(document, list(_closed_chain_faults(model, urdf)))
     if payload is not None and payload not in model.payloads:
@@ -427,6 +428,24 @@ def _numbers(path: Location, value: object) -> Iterator[tuple[Location, float]]:
     elif isinstance(value, list | tuple):
         for index, inner in enumerate(value):
             yield from _numbers((*path, index), inner)
+
+
+def _mimic_faults(urdf: str) -> Iterator[Fault]:
+    """Find joints that follow another one: the plant would take each for a joint of its own."""
+    try:
+        root = ElementTree.fromstring(urdf)
+    except ElementTree.ParseError:
+        return  # the plant says so
+    for joint in root.iter("joint"):
+        mimic = joint.find("mimic")
+        if mimic is None or joint.get("type") == "fixed":
+            continue
+        yield Fault(
+            ("urdf",),
+            f"joint {joint.get('name')} with <mimic> of {mimic.get('joint')}",
+            "a URDF without <mimic>: describe the mechanism that couples the joints in `closures`, "
+            "or fix the joint",
+        )
 
 
 def _closed_chain_faults(model: SimulationModel, urdf: str) -> Iterator[Fault]:

@@ -8,21 +8,24 @@ identified torque (`physical_robot`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from daq.workflow.full_parameters import DEFAULT_TOLERANCE
-from daq.workflow.urdf_export import PhysicalRobot, physical_robot, random_states
+from daq.workflow.urdf_export import PhysicalRobot, Shift, identified_base, physical_robot
 from ident.arrays import FloatArray
-from ident.calibration import Calibration
+from ident.calibration import AcceptedEffect, Calibration
 from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError, relative_error
+from ident.model.bodies import pseudo_inertia
 from ident.model.model import Model
+from ident.physical.consistency import relative_to_prior
 from ident.physical.full_parameters import LinkPrior, RestsOn
 from ident.physical.full_set import FullSet
-from ident.physical.physical import EXACT
+from ident.physical.physical import PhysicalParameters, inertia_prior
 from ident.physical.prior_shares import prior_shares
 from ident.prediction import fitted_model, standard_parameters
 
@@ -38,14 +41,34 @@ class ChosenBy(Enum):
 class FullChoice:
     """Standard parameters of bodies that can exist."""
 
-    model: Model  #: with the calibration's corrections of the description
-    standard: FloatArray  #: χ_st without payload, shape (c,)
+    robot: PhysicalRobot  #: with these parameters
     shares: FloatArray  #: the prior's part in the variance of each, 0 to 1, shape (c,)
     chosen_by: ChosenBy
-    #: ‖Δτ‖/‖τ‖ against the torque of the base parameters, on random states [%].
-    torque_change_percent: RelativeError
-    #: joints with a link for which the URDF has no possible inertia, and a ball was taken
-    assumed: tuple[str, ...]
+
+    @property
+    def model(self) -> Model:
+        """The declared model with the calibration's corrections of the description."""
+        return self.robot.parameters.model
+
+    @property
+    def standard(self) -> FloatArray:
+        """χ_st without payload, shape (c,)."""
+        return self.robot.parameters.standard
+
+    @property
+    def torque_change_percent(self) -> RelativeError:
+        """‖Δτ‖/‖τ‖ against the torque of the base parameters, on random states [%]."""
+        return self.robot.parameters.torque_change_percent
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Joints with a link for which a ball was the prior, because the URDF has no possible
+        inertia; none where the prior is that of the fit.
+        """
+        if self.chosen_by is ChosenBy.PRIOR_OF_FIT:
+            return ()
+        joints = self.model.robot.joints
+        return tuple(joints[number].name for number in self.robot.prior.assumed)
 
     @property
     def basis(self) -> tuple[RestsOn, ...]:
@@ -55,11 +78,15 @@ class FullChoice:
     @property
     def exact(self) -> bool:
         """Whether the torque is that of the base parameters."""
-        return max(self.torque_change_percent.axes) <= 100.0 * EXACT
+        return self.robot.parameters.exact
 
 
 def full_choice(
-    calibration: Calibration, model: Model, limits: FloatArray, urdf: str
+    calibration: Calibration,
+    model: Model,
+    limits: FloatArray,
+    urdf: str,
+    missing: Sequence[AcceptedEffect] = (),
 ) -> FullChoice:
     """Choose all standard parameters of a calibration's robot.
 
@@ -70,6 +97,8 @@ def full_choice(
             shape (4, n).
         urdf: text of the cell's URDF, which is the prior where the calibration has no full
             parameters.
+        missing: effects of the calibration that were taken out of it because their packages are not
+            installed.
 
     Raises:
         ModelError: the calibration is of another robot.
@@ -78,28 +107,43 @@ def full_choice(
             installed.
     """
     found = calibration.full_parameters
-    assumed: tuple[str, ...] = ()
     if found is None:
-        robot = physical_robot(calibration, model, limits, urdf)
-        chosen_model = robot.parameters.model
-        standard = robot.parameters.standard
+        robot = physical_robot(calibration, model, limits, urdf, missing)
+        chosen_by = ChosenBy.NEAREST_BODIES
         shares = _shares_of_nearest(calibration, robot)
-        assumed = tuple(chosen_model.robot.joints[number].name for number in robot.prior.assumed)
     else:
         chosen_model = fitted_model(calibration, model)
         standard, shares = _of_full_set(found, chosen_model)
-    columns = chosen_model.regressor(random_states(chosen_model, limits))
-    identified = np.einsum("jck,c->jk", columns, standard_parameters(calibration, chosen_model))
-    realised = np.einsum("jck,c->jk", columns, standard)
-    every_row = np.ones(identified.shape, dtype=np.bool_)
-    return FullChoice(
-        model=chosen_model,
+        robot = _robot_of(standard, calibration, chosen_model, limits, urdf)
+        chosen_by = ChosenBy.PRIOR_OF_FIT
+    return FullChoice(robot, shares, chosen_by)
+
+
+def _robot_of(
+    standard: FloatArray, calibration: Calibration, model: Model, limits: FloatArray, urdf: str
+) -> PhysicalRobot:
+    """The robot of full parameters, shape (c,), and how far it is from the base parameters."""
+    base = identified_base(calibration, model, limits)
+    identified = np.einsum("jck,c->jk", base.columns, standard_parameters(calibration, model))
+    realised = np.einsum("jck,c->jk", base.columns, standard)
+    every_sample = np.ones(identified.shape, dtype=np.bool_)
+    prior = inertia_prior(urdf)
+    pseudo_inertias = np.array([pseudo_inertia(link) for link in prior.links])
+    factors = np.asarray(np.linalg.cholesky(pseudo_inertias), dtype=np.float64)
+    links = relative_to_prior(factors, standard[model.link_columns])
+    parameters = PhysicalParameters(
+        model=model,
         standard=standard,
-        shares=shares,
-        chosen_by=ChosenBy.NEAREST_BODIES if found is None else ChosenBy.PRIOR_OF_FIT,
-        torque_change_percent=relative_error(identified, realised, every_row),
-        assumed=assumed,
+        base=base.grouping,
+        identified=base.values,
+        realised=base.grouping.grouping @ standard,
+        torque_change_percent=relative_error(identified, realised, every_sample),
+        eigenvalues=np.asarray(np.linalg.eigvalsh(links)[:, 0], dtype=np.float64),
     )
+    shifts: tuple[Shift, ...] = ()
+    if not parameters.exact:
+        shifts = base.shifts(parameters.realised)
+    return PhysicalRobot(parameters, prior, shifts)
 
 
 def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, FloatArray]:

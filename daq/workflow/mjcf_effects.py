@@ -84,9 +84,21 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
     )
 
 
-def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, ...]]:
-    """Return a calibration without the effects of packages that are not installed,
-    and a name of each of those.
+@dataclass(frozen=True, slots=True)
+class MissingEffect:
+    """An effect of a calibration that no installed package has."""
+
+    accepted: AcceptedEffect
+    state: str  #: of its package, as `not installed`
+
+    def __str__(self) -> str:
+        """Name, axis and package."""
+        accepted = self.accepted
+        return f"{accepted.name} on {accepted.axis} (of {accepted.package}, {self.state})"
+
+
+def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[MissingEffect, ...]]:
+    """Return a calibration without the effects of packages that are not installed, and those.
 
     A model of a simulator holds no effect of another package, so none is needed to write it.
 
@@ -95,15 +107,13 @@ def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[str, .
             that had it.
     """
     installed: list[AcceptedEffect] = []
-    missing: list[str] = []
+    missing: list[MissingEffect] = []
     gone: set[str] = set()
     for accepted in calibration.effects:
         try:
             placed_effect(accepted, calibration)
         except EffectNotInstalled as error:
-            missing.append(
-                f"{accepted.name} on {accepted.axis} (of {accepted.package}, {error.state})"
-            )
+            missing.append(MissingEffect(accepted, error.state))
             gone |= {coefficient.name for coefficient in accepted.coefficients}
         else:
             installed.append(accepted)

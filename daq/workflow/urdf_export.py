@@ -14,10 +14,11 @@ from daq.errors import ControllerUnfit, SchemaMismatch
 from daq.formats.xml_document import Element, parse
 from daq.workflow.experiment import limits_of
 from ident.arrays import FloatArray
-from ident.calibration import Calibration
+from ident.calibration import AcceptedEffect, Calibration, Parameter
 from ident.effects.effect import Property
 from ident.effects.geometry_corrections import corrected_model
 from ident.errors import ModelError
+from ident.model.base import BaseParameters
 from ident.model.bodies import Body
 from ident.model.closed_chain import Assembly, assemble, follow
 from ident.model.model import Model
@@ -68,52 +69,110 @@ class PhysicalRobot:
     shifts: tuple[Shift, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class IdentifiedBase:
+    """Base parameters of a calibration, with weights of full precision."""
+
+    grouping: BaseParameters  #: for b base parameters
+    parameters: tuple[Parameter, ...]  #: of the calibration, in the order of the grouping
+    columns: FloatArray  #: the model's regressor of random states, shape (n, c, k)
+
+    @property
+    def values(self) -> FloatArray:
+        """Identified values, shape (b,)."""
+        return np.array([parameter.value for parameter in self.parameters])
+
+    def shifts(self, realised: FloatArray) -> tuple[Shift, ...]:
+        """List the changes to other base parameters, shape (b,), the largest first."""
+        found: list[Shift] = []
+        for parameter, after in zip(self.parameters, realised.tolist(), strict=True):
+            change = abs(after - parameter.value)
+            deviations = float("inf")
+            if parameter.std > 0.0:
+                deviations = change / parameter.std
+            leading = parameter.name.split(" ", 1)[0]
+            found.append(Shift(leading, parameter.value, after, deviations))
+        return tuple(sorted(found, key=lambda shift: -shift.deviations))
+
+
+def identified_base(calibration: Calibration, model: Model, limits: FloatArray) -> IdentifiedBase:
+    """Find the base parameters of a calibration's robot, without effects and payloads.
+
+    Args:
+        calibration: with base parameters.
+        model: of the same robot, with the calibration's corrections.
+        limits: ranges of random states, as of `ident.physical.physical.random_motion`, shape
+            (4, n).
+
+    Raises:
+        ModelError: the calibration is of another robot.
+    """
+    of_effects: set[str] = set()
+    for effect in calibration.effects:
+        of_effects.update(coefficient.name for coefficient in effect.coefficients)
+    known: dict[str, Parameter] = {}
+    for parameter in calibration.parameters:
+        is_of_payload = ":" in parameter.name or parameter.is_payload_friction
+        if not is_of_payload and parameter.name not in of_effects:
+            known[parameter.name] = parameter
+    columns = model.regressor(random_states(model, limits))
+    rows = columns.transpose(0, 2, 1).reshape(-1, columns.shape[1])
+    grouping = regroup(model, tuple(known), rows)
+    parameters = tuple(known[name] for name in grouping.names)
+    return IdentifiedBase(grouping, parameters, columns)
+
+
 def physical_robot(
-    calibration: Calibration, model: Model, limits: FloatArray, urdf: str
+    calibration: Calibration,
+    model: Model,
+    limits: FloatArray,
+    urdf: str,
+    missing: Sequence[AcceptedEffect] = (),
 ) -> PhysicalRobot:
     """The parameters of bodies that could exist and need the torques that the calibration says.
 
     Args:
         calibration: its gains, payloads and effects take no part; an axis with an accepted effect
             of friction may have any sign of fv and fs, because they are only a part of its
-            friction.
+            friction. So may one with an effect of another package, of whatever kind, whether the
+            package is installed or not: the bodies are the same on every computer.
         limits: ranges in which the torques are compared, as of
             `ident.physical.physical.random_motion`, shape (4, n).
+        urdf: with the prior of the bodies.
+        missing: effects of the calibration that were taken out of it because their packages are not
+            installed.
 
     Raises:
         ModelError: the calibration is of another robot.
         NotPhysical: no set was found.
     """
     model = corrected_model(model, corrections_of(calibration))
-    columns = model.regressor(random_states(model, limits))
-    of_effects = {
-        coefficient.name for effect in calibration.effects for coefficient in effect.coefficients
-    }
-    known = {
-        p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name
-    }
-    # A URDF has the robot without a payload.
-    known = {
-        name: parameter for name, parameter in known.items() if not parameter.is_payload_friction
-    }
-    base = regroup(model, tuple(known), columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
-    placed = [placed_effect(effect, calibration)[0] for effect in calibration.effects]
-    friction = frozenset(
-        one.axis for one in placed if one.effect.declares is Property.ODD_IN_VELOCITY
-    )
+    base = identified_base(calibration, model, limits)
     prior = inertia_prior(urdf)
-    values = np.array([known[name].value for name in base.names])
-    found = physical_parameters(model, base, values, columns, prior, friction)
-    shifts = []
+    friction = _axes_with_other_friction(calibration, missing)
+    found = physical_parameters(model, base.grouping, base.values, base.columns, prior, friction)
+    shifts: tuple[Shift, ...] = ()
     if not found.exact:
-        for name, before, after in zip(base.names, found.identified, found.realised, strict=True):
-            std = known[name].std
-            if std > 0.0:
-                deviations = float(abs(after - before) / std)
-            else:
-                deviations = float("inf")
-            shifts.append(Shift(name.split(" ", 1)[0], float(before), float(after), deviations))
-    return PhysicalRobot(found, prior, tuple(sorted(shifts, key=lambda shift: -shift.deviations)))
+        shifts = base.shifts(found.realised)
+    return PhysicalRobot(found, prior, shifts)
+
+
+def _axes_with_other_friction(
+    calibration: Calibration, missing: Sequence[AcceptedEffect]
+) -> frozenset[int]:
+    """Axes (from 0) on which fs and fv may be only a part of the friction."""
+    places = calibration.places
+    axes: set[int] = set()
+    for accepted in (*calibration.effects, *missing):
+        if accepted.package is None:
+            placed, _ = placed_effect(accepted, calibration)
+            if placed.effect.declares is Property.ODD_IN_VELOCITY:
+                axes.add(placed.axis)
+        elif accepted.axis in places:
+            axes.add(places.index(accepted.axis))
+        else:  # ALL_AXES
+            axes.update(range(len(calibration.gains)))
+    return frozenset(axes)
 
 
 def random_states(model: Model, limits: FloatArray) -> Motion:

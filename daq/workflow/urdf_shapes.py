@@ -19,15 +19,12 @@ from xml.etree.ElementTree import Element, fromstring
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from daq.workflow.mesh_files import ShapeUnreadable, check_mesh
 from ident.arrays import FloatArray
 
 PACKAGE_SCHEMES = ("package://", "model://")
 FILE_SCHEME = "file://"
 MESH_FORMATS = (".stl", ".obj", ".msh")  #: That MuJoCo reads
-STL_HEAD_BYTES = 84  #: Of a binary STL: 80 of text, 4 of the number of triangles
-STL_TRIANGLE_BYTES = 50
-LEAST_TRIANGLES = 2  #: In an STL that MuJoCo reads: one has three corners, and it wants four
-MOST_TRIANGLES = 200_000
 LIMITED_JOINTS = frozenset({"revolute", "prismatic"})
 
 
@@ -64,10 +61,6 @@ class UrdfShapes:
 
     found: tuple[UrdfShape, ...]
     left_out: tuple[str, ...]  #: shapes that cannot be carried over, each with its reason
-
-
-class ShapeUnreadable(Exception):
-    """A shape that is left out; its text is the reason."""
 
 
 def shapes_of(urdf: str, folder: Path) -> UrdfShapes:
@@ -122,16 +115,17 @@ def _shape(
         raise ShapeUnreadable(f"<{body.tag}>, which is none of {', '.join(kinds)}")
     kind = kinds[body.tag]
     rotation, translation_m = _origin(element)
+    size = _size(body, kind)
     mesh = None
     if kind is ShapeKind.MESH:
-        mesh = _mesh_file(body.get("filename", ""), folder)
+        mesh = _mesh_file(body.get("filename", ""), folder, size)
     return UrdfShape(
         link=link,
         is_collision=element.tag == "collision",
         kind=kind,
         rotation=rotation,
         translation_m=translation_m,
-        size=_size(body, kind),
+        size=size,
         mesh=mesh,
         colour=_colour(element, colours),
     )
@@ -166,7 +160,7 @@ def _origin(element: Element) -> tuple[FloatArray, FloatArray]:
     return rotation, np.array(_numbers(origin, "xyz", "0 0 0", 3))
 
 
-def _mesh_file(name: str, folder: Path) -> Path:
+def _mesh_file(name: str, folder: Path, scale: tuple[float, ...]) -> Path:
     """Return the file that a URDF names, where it exists and MuJoCo reads it."""
     path = next((place for place in _places(name, folder) if place.is_file()), None)
     if path is None:
@@ -176,8 +170,10 @@ def _mesh_file(name: str, folder: Path) -> Path:
         raise ShapeUnreadable(
             f"{path.name} is no {', '.join(MESH_FORMATS)}; convert it, and name it in the URDF"
         )
-    if ending == ".stl":
-        _check_stl(path)
+    try:
+        check_mesh(path, scale)
+    except OSError as error:
+        raise ShapeUnreadable(f"{path.name} cannot be read: {error.strerror}") from error
     return path.resolve()
 
 
@@ -196,24 +192,6 @@ def _places(name: str, folder: Path) -> Iterator[Path]:
         if parent.name == package:
             yield parent / rest
         yield parent / package / rest
-
-
-def _check_stl(path: Path) -> None:
-    """Refuse an STL of text, a cut one, and one of too many triangles:
-    MuJoCo refuses the whole model for it.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(STL_HEAD_BYTES)
-    triangles = int.from_bytes(head[-4:], "little")
-    if len(head) < STL_HEAD_BYTES or size != STL_HEAD_BYTES + STL_TRIANGLE_BYTES * triangles:
-        raise ShapeUnreadable(f"{path.name} is no binary STL, or was cut; save it as binary STL")
-    if not LEAST_TRIANGLES <= triangles <= MOST_TRIANGLES:
-        allowed = f"{LEAST_TRIANGLES} to {MOST_TRIANGLES}"
-        raise ShapeUnreadable(
-            f"{path.name} has {triangles} triangles, where {allowed} are read; save it with "
-            "fewer or more"
-        )
 
 
 def _named_colours(root: Element) -> Iterator[tuple[str, tuple[float, ...]]]:

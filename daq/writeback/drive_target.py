@@ -19,6 +19,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from daq.arguments import of_kind, require_fields
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
 from daq.config.yaml_file import DocumentKind, StrictModel
@@ -224,6 +225,11 @@ class DriveTarget:
         """The drives, as audit and history name them."""
         return drives_of(self.cell.name)
 
+    def check_fields(self) -> None:
+        """See `Target.check_fields`."""
+        call = "write DriveTarget(cell, network)"
+        require_fields("the DriveTarget", self, _DRIVE_TARGET_FIELDS, call)
+
     def plan(self, calibration: Calibration) -> DriveEdit:
         """See `Target.plan`.
 
@@ -386,6 +392,13 @@ class DriveTarget:
                 "been renamed (`drivegain history`)?",
             )
         return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
+
+
+_DRIVE_TARGET_FIELDS = {
+    "cell": of_kind(Cell),
+    "network": of_kind(CanopenNetwork),
+    "saving": of_kind(Saving),
+}
 
 
 def content_of(

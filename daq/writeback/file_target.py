@@ -18,6 +18,17 @@ from datetime import datetime
 from itertools import combinations
 from pathlib import Path
 
+from daq.arguments import (
+    A_NUMBER,
+    A_PATH,
+    A_PATH_OBJECT,
+    A_TEXT,
+    by_name,
+    checks_arguments,
+    of_kind,
+    optional,
+    require_fields,
+)
 from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
 from daq.errors import (
@@ -111,6 +122,7 @@ class FileTarget:
     cell: Cell | None = None  #: that the controller drives; None where nothing is compared with it
 
     @classmethod
+    @checks_arguments(cell=of_kind(Cell), file=optional(A_PATH))
     def of(cls, cell: Cell, file: Path | None = None) -> FileTarget:
         """The controller's file of a cell.
 
@@ -119,10 +131,13 @@ class FileTarget:
             file: another file than the one that the cell names.
 
         Raises:
+            UsageError: an argument is of another type.
             ConfigurationInconsistent: the cell names no controller file, or no keys in it.
         """
         controller = cell.controller
-        chosen = file or cell.controller_path
+        chosen = cell.controller_path
+        if file is not None:
+            chosen = Path(file)
         if controller is None or not controller.gains or chosen is None:
             raise ConfigurationInconsistent(
                 f"cell {cell.name!r}: controller",
@@ -142,6 +157,11 @@ class FileTarget:
             ControllerUnfit: a link that must not be followed.
         """
         return str(resolve_links(self.file))
+
+    def check_fields(self) -> None:
+        """See `Target.check_fields`."""
+        call = "write FileTarget.of(cell), or FileTarget(file, keys)"
+        require_fields("the FileTarget", self, _FILE_TARGET_FIELDS, call)
 
     def plan(self, calibration: Calibration) -> FileEdit:
         """See `Target.plan`."""
@@ -300,6 +320,15 @@ class FileTarget:
                     fsync_folder(target.parent)
             raise
         return Written(edit, backup)
+
+
+_FILE_TARGET_FIELDS = {
+    "file": A_PATH_OBJECT,
+    "keys": by_name(A_TEXT),
+    "format": optional(of_kind(ControllerFormat)),
+    "factors": by_name(A_NUMBER),
+    "cell": optional(of_kind(Cell)),
+}
 
 
 def _changed_since_recording(

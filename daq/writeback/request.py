@@ -14,6 +14,19 @@ from datetime import datetime
 from enum import Enum
 from pathlib import Path
 
+from daq.arguments import (
+    A_FLAG,
+    A_MOMENT,
+    A_NUMBER,
+    A_PATH_OBJECT,
+    A_TEXT,
+    BYTES,
+    TEXTS,
+    by_name,
+    of_kind,
+    optional,
+    require_fields,
+)
 from daq.config.policy import ApplyPolicy
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import CalibrationRefused, UsageError
@@ -46,6 +59,14 @@ class Request:
     file: Path | None = None
     content: bytes | None = None  #: bytes of that file as they were read; None without one
 
+    def check_fields(self) -> None:
+        """Refuse fields of another type.
+
+        Raises:
+            UsageError: there is one; it is named.
+        """
+        require_fields("the request", self, _REQUEST_FIELDS, "write Request(calibration, now)")
+
     @property
     def signed(self) -> bytes:
         """The bytes that a signature must cover."""
@@ -71,6 +92,19 @@ class Request:
                 for one in calibration.sources
             ],
         }
+
+
+_REQUEST_FIELDS = {
+    "calibration": of_kind(Calibration),
+    "now": A_MOMENT,
+    "policy": optional(of_kind(ApplyPolicy)),
+    "accepts_changed_configuration": A_FLAG,
+    "entered_kg": by_name(A_NUMBER),
+    "base": optional(A_TEXT),
+    "appliers": TEXTS,
+    "file": optional(A_PATH_OBJECT),
+    "content": optional(BYTES),
+}
 
 
 class GainOrigin(Enum):

@@ -21,7 +21,6 @@ from daq.arguments import (
     A_MOMENT,
     A_PATH,
     A_TEXT,
-    argument_refused,
     checks_arguments,
     of_kind,
     optional,
@@ -65,6 +64,13 @@ class Target(Protocol[E]):
     @property
     def subject(self) -> str:
         """The target, as audit and history name it."""
+
+    def check_fields(self) -> None:
+        """Refuse fields of another type.
+
+        Raises:
+            UsageError: there is one; it is named.
+        """
 
     def plan(self, calibration: Calibration) -> E:
         """Plan the change that a calibration makes; reads only.
@@ -148,7 +154,9 @@ class Proposal(Generic[E]):
         )
 
 
-A_TARGET = with_methods("a FileTarget or a DriveTarget", "plan", "plan_rollback", "write")
+A_TARGET = with_methods(
+    "a FileTarget or a DriveTarget", "check_fields", "plan", "plan_rollback", "write"
+)
 
 
 @checks_arguments(target=A_TARGET, request=of_kind(Request))
@@ -156,16 +164,13 @@ def propose(target: Target[E], request: Request) -> Proposal[E]:
     """Plan what a calibration changes in a target, and check every gate; reads only.
 
     Raises:
-        UsageError: the value of --base is no digest, or an argument is of another type.
+        UsageError: the value of --base is no digest, or an argument, or a field of one, is of
+            another type.
         ConfigurationInconsistent, CalibrationRefused, ControllerUnfit: see `Target.plan`.
         DriverError: from the drives.
     """
-    for name, expected in (("calibration", of_kind(Calibration)), ("now", A_MOMENT)):
-        value = getattr(request, name)
-        if not expected.is_met(value):
-            raise argument_refused(
-                f"{name} of the request", value, expected, "write Request(calibration, now)"
-            )
+    request.check_fields()
+    target.check_fields()
     edit = target.plan(request.calibration)
     refusals = check_gates(GateContext(request, edit, target.cell))
     return Proposal(target, request, edit, refusals)
@@ -221,7 +226,13 @@ def apply(
         raise
 
 
-@checks_arguments(target=A_TARGET, now=A_MOMENT, audit=optional(A_PATH), who=A_TEXT)
+@checks_arguments(
+    target=A_TARGET,
+    now=A_MOMENT,
+    audit=optional(A_PATH),
+    who=A_TEXT,
+    planned=optional(of_kind(Edit)),
+)
 def rollback(
     target: Target[E],
     now: datetime,
@@ -247,6 +258,7 @@ def rollback(
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
+    target.check_fields()
     asked = {"asked": "rollback"}
     recorder = _Recorder(audit, who, now, target.subject if planned is None else planned.subject)
     with recorder.refusals(asked):

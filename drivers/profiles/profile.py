@@ -60,12 +60,10 @@ class Mapping(Enum):
 class ScaleForm(Enum):
     """Known conversions from a raw number to ampere; each becomes a `CurrentScale`.
 
-    - PRODUCT: factor × objects.
-    - PER_MILLE: of a rated current in the drive [mA].
-    - FIXED_STEP: ampere per digit.
-    - DIGITS_OF_PEAK: digits of the drive's peak current, which the operator enters.
-    - DIGITS_OF_REPORTED_PEAK: the same, with the peak current in the drive [mA].
-    - SWITCHED_PER_MILLE: of the rated current or of it over √2, by an object.
+    PRODUCT: factor × objects. PER_MILLE: of a rated current in the drive [mA]. FIXED_STEP: ampere
+    per digit. DIGITS_OF_PEAK: digits of the drive's peak current, which the operator enters.
+    DIGITS_OF_REPORTED_PEAK: the same, with the peak current in the drive [mA]. SWITCHED_PER_MILLE:
+    of the rated current or of it over √2, by an object.
     """
 
     PRODUCT = "product"

@@ -256,8 +256,8 @@ def plan_moves(
     a robot makes them.
 
     Args:
-        model: the declared model of a serial robot.
-        limits: of the joints.
+        model: the declared model of a serial robot; joints may follow axes (`<mimic>`).
+        limits: of the axes; narrow enough for the joints that follow them.
         payload: that will be mounted, with its known mass.
         nameplate: gains by the data sheet, shape (n,); their sizes decide how clearly a torque
             shows.
@@ -287,10 +287,12 @@ def plan_moves(
         require_kind("urdf", urdf, str, "give the text of the file: Path(...).read_text()")
     if conditioning is not None:
         require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
-    if model.robot.is_constrained:
+    if model.robot.closures:
+        names = ", ".join(closure.name for closure in model.robot.closures)
         raise ModelError(
-            "the model is of a closed chain, or has joints that follow others: its reach is not "
-            "known here; expected a serial robot, each joint with a motor"
+            f"the model is of a closed chain (closures {names}): which positions its loops reach "
+            "is not known here; expected a serial robot, whose joints may follow axes; choose its "
+            "moves by hand"
         )
     count = model.robot.axis_count
     gains = as_array("nameplate", nameplate, (count,), "one per motor")

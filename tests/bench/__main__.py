@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from tests.bench.compiled import NotCompiled, compiled
+from tests.bench.figaroh_environment import figaroh_python
 from tests.bench.fleet import summary_text as fleet_text
 from tests.bench.log_reading import summary_text
 from tests.bench.start_up import start_up
@@ -30,8 +31,6 @@ from tests.bench.start_up import summary_text as start_up_text
 
 OUT = Path("out/bench")
 RESULT = Path("out/bench.json")
-FIGAROH_VENV = Path("out/bench-venv")
-FIGAROH = "figaroh==1.0.2"
 URDF = Path("configs/robots/tx40.urdf")
 LOGS = ("bare", "loaded")
 SAMPLES = 100_000
@@ -82,7 +81,7 @@ def main() -> int:
 
 
 def _comparison(repeats: int) -> dict[str, Any]:
-    python = _figaroh_python()
+    python = figaroh_python()
     data = OUT / "measurements.npz"
     _print_line(
         f"{SAMPLES} samples × 6 axes: rows of 84 standard parameters, base parameters, "
@@ -261,22 +260,6 @@ def _fleet(cells: int, repeats: int) -> dict[str, Any]:
     )
     _print_line(fleet_text(found))
     return found
-
-
-def _figaroh_python() -> Path:
-    """figaroh has an environment of its own: it brings another Pinocchio than ours."""
-    python = FIGAROH_VENV / "bin" / "python"
-    installed = FIGAROH_VENV / ".installed"
-    if not installed.exists() or installed.read_text() != FIGAROH:
-        _print_line(f"installing {FIGAROH} into {FIGAROH_VENV} (once)")
-        subprocess.run(
-            [sys.executable, "-m", "venv", "--without-pip", "--clear", str(FIGAROH_VENV)],
-            check=True,
-        )
-        install = [sys.executable, "-m", "pip", "--python", str(python), "install", "-qq", FIGAROH]
-        subprocess.run(install, check=True)
-        installed.write_text(FIGAROH)
-    return python
 
 
 def _json_of(command: list[str]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ one error of the service, which names the argument and what it takes.
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +13,9 @@ from typing import Any
 import pytest
 
 import daq
+from daq.writeback.request import Edit
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.parameters import Saving
 from tests.conftest import CHECKOUT
 from tests.daq.calibrations import demo_calibration
 
@@ -56,7 +60,13 @@ def _right_arguments() -> dict[str, dict[str, Any]]:
             "audit": Path("audit.jsonl"),
             "who": "Ada",
         },
-        "rollback": {"target": target, "now": NOW, "audit": Path("audit.jsonl"), "who": "Ada"},
+        "rollback": {
+            "target": target,
+            "now": NOW,
+            "audit": Path("audit.jsonl"),
+            "who": "Ada",
+            "planned": _stand_in(Edit),
+        },
     }
 
 
@@ -158,6 +168,100 @@ def test_no_list_is_too_little_checked() -> None:
 def test_a_request_of_other_things_is_refused(calibration: Any, now: Any, words: str) -> None:
     with pytest.raises(daq.UsageError, match=words):
         lax.propose(RIGHT["propose"]["target"], daq.Request(calibration, now))
+
+
+OTHER_FIELDS = (
+    ("policy", 3.0, "ApplyPolicy, or None"),
+    ("accepts_changed_configuration", "yes", "True or False"),
+    ("entered_kg", [1.0], "a mapping from a name to a number"),
+    ("entered_kg", {"disc": "12 kg"}, "a mapping from a name to a number"),
+    ("base", 12, "a text, or None"),
+    ("appliers", "Ada", "a list of texts"),
+    ("file", "calibration.yaml", "a pathlib.Path, or None"),
+    ("content", "text", "bytes, or None"),
+)
+
+
+@pytest.mark.parametrize(("name", "value", "expected"), OTHER_FIELDS)
+def test_a_field_of_a_request_of_another_type_is_named(
+    name: str, value: Any, expected: str
+) -> None:
+    request = daq.Request(CALIBRATION, NOW, **{name: value})
+    with pytest.raises(daq.UsageError) as caught:
+        daq.propose(RIGHT["propose"]["target"], request)
+    assert caught.value.subject == f"{name} of the request"
+    assert caught.value.expected == expected
+    fields = {one.name for one in dataclasses.fields(daq.Request)}
+    assert {name for name, *_ in OTHER_FIELDS} | {"calibration", "now"} == fields
+
+
+FILE_FIELDS = (
+    ("file", "controller.yaml", "a pathlib.Path"),
+    ("keys", ["gain1"], "a mapping from a name to a text"),
+    ("keys", {"J1": 3}, "a mapping from a name to a text"),
+    ("format", "yaml", "ControllerFormat, or None"),
+    ("factors", {"J1": "2"}, "a mapping from a name to a number"),
+    ("cell", "demo", "Cell, or None"),
+)
+DRIVE_FIELDS = (
+    ("cell", "demo", "Cell"),
+    ("network", "can0", "CanopenNetwork"),
+    ("saving", True, "Saving"),
+)
+
+
+def _target_with(kind: type, right: dict[str, Any], name: str, value: Any) -> Any:
+    assert {one.name for one in dataclasses.fields(kind)} == right.keys()
+    return kind(**{**right, name: value})
+
+
+@pytest.mark.parametrize(("name", "value", "expected"), FILE_FIELDS)
+def test_a_field_of_a_file_target_of_another_type_is_named(
+    name: str, value: Any, expected: str, tmp_path: Path
+) -> None:
+    assert {name for name, *_ in FILE_FIELDS} == RIGHT_FILE.keys()
+    _refuse(_target_with(daq.FileTarget, RIGHT_FILE, name, value), name, expected, "FileTarget")
+
+
+@pytest.mark.parametrize(("name", "value", "expected"), DRIVE_FIELDS)
+def test_a_field_of_a_drive_target_of_another_type_is_named(
+    name: str, value: Any, expected: str
+) -> None:
+    right = {
+        "cell": RIGHT["fit"]["cell"],
+        "network": _stand_in(CanopenNetwork),
+        "saving": Saving.KNOWN,
+    }
+    assert {name for name, *_ in DRIVE_FIELDS} == right.keys()
+    _refuse(_target_with(daq.DriveTarget, right, name, value), name, expected, "DriveTarget")
+
+
+RIGHT_FILE: dict[str, Any] = {
+    "file": Path("controller.yaml"),
+    "keys": {"J1": "gain1"},
+    "format": None,
+    "factors": {},
+    "cell": None,
+}
+
+
+def _refuse(target: Any, name: str, expected: str, kind: str) -> None:
+    """Neither a proposal nor a rollback takes the target."""
+    request = daq.Request(CALIBRATION, NOW)
+    for call in (lambda: daq.propose(target, request), lambda: daq.rollback(target, NOW)):
+        with pytest.raises(daq.UsageError) as caught:
+            call()
+        assert caught.value.subject == f"{name} of the {kind}"
+        assert caught.value.expected == expected
+
+
+def test_the_file_target_of_something_else_than_a_cell_is_refused() -> None:
+    cell = RIGHT["fit"]["cell"]
+    for arguments, name in ((("cell.yaml",), "cell"), ((cell, 3), "file")):
+        with pytest.raises(daq.UsageError) as caught:
+            lax.FileTarget.of(*arguments)
+        assert caught.value.subject == f"{name} of FileTarget.of"
+    assert lax.FileTarget.of(cell, "other.yaml").file == Path("other.yaml")
 
 
 def test_paths_may_be_texts(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from daq.errors import (
     first_few,
 )
 from daq.log.feed import FeedUnfit
-from daq.workflow.urdf_shapes import ShapeUnreadable
+from daq.workflow.mesh_files import ShapeUnreadable
 from drivers.canopen.sdo import TransferUnboundedError
 from drivers.errors import DriverError, SetupRefused
 from drivers.simulation.spec import SdoAbort

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import re
+import tomllib
+from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
-from docs.sizes import PAGE, closure, megabytes, table
+from docs.sizes import EXTRAS, PAGE, closure, megabytes, table
 
 ROW = re.compile(r"^\| (.+) \| (\d+) \|$", re.MULTILINE)
 ANOTHER_PYTHON = 0.25
@@ -31,6 +35,23 @@ def test_a_size_of_the_page_is_that_of_this_environment(
 ) -> None:
     added = closure(wanted.split()) - closure(without.split())
     assert shown_mb()[name] == pytest.approx(megabytes(added), rel=ANOTHER_PYTHON)
+
+
+def test_every_extra_has_a_size_and_a_use_on_the_page() -> None:
+    extras = {f"`{name}`" for name in EXTRAS}
+    sizes = {name.removesuffix(" adds") for name in shown_mb()}
+    assert extras <= sizes
+    uses = re.findall(r"^\| (`[a-z0-9]+`) \| `", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert set(uses) == extras
+
+
+def test_an_extra_is_in_the_lock_so_that_its_tests_run(checkout: Path) -> None:
+    lock = (checkout / "requirements.lock").read_text(encoding="utf-8")
+    locked = {canonicalize_name(name) for name in re.findall(r"(?m)^([\w.-]+)==", lock)}
+    project = tomllib.loads((checkout / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for extra, needed in project["optional-dependencies"].items():
+        for text in needed:
+            assert canonicalize_name(Requirement(text).name) in locked, extra
 
 
 def test_the_needs_of_needs_are_counted_and_extras_are_not() -> None:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from math import pi
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +24,10 @@ from daq.errors import (
     PositionImplausible,
     RunInvalid,
 )
-from daq.log.conversion import load_run, run_from_log, scaling, unwrapped
+from daq.log.conversion import load_run, run_from_log, scaling, temperatures, unwrapped
 from daq.log.metadata import AxisReadback, Readback, readback_of_drives
 from daq.log.reader import read_log
-from drivers.messages import CellEvent, EventKind, Sample
+from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
 from ident.errors import CurrentUnsigned
 from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
@@ -259,3 +261,19 @@ def test_a_current_without_its_sign_is_refused_by_axis(record: Recorder) -> None
 def test_a_current_with_its_sign_is_taken(record: Recorder) -> None:
     run, _ = load_run(record(bouncing(size=False)))
     assert len(run.time_s) == 3000
+
+
+def test_a_temperature_that_no_motor_has_is_left_out() -> None:
+    """The first sensor fails once, the second always, and the third axis has none."""
+    celsius = {0: (30.0, 6553.5, 32.0), 1: (-127.0, -127.0, -127.0)}
+    readings: list[SlowReading] = []
+    for axis, values in celsius.items():
+        for second, value in enumerate(values):
+            at_ns = START_NS + second * 10**9
+            readings.append(SlowReading(at_ns, axis, Quantity.TEMPERATURE, value))
+    time_ns = START_NS + np.array([0, 1, 2], dtype=np.int64) * 10**9
+    samples_of_log = SimpleNamespace(time_ns=time_ns, position_counts=np.zeros((3, 3)))
+    log: Any = SimpleNamespace(readings=readings, samples=samples_of_log)
+    nothing = [np.nan] * 3
+    expected = np.column_stack([[30.0, 31.0, 32.0], nothing, nothing])
+    np.testing.assert_allclose(temperatures(log), expected)

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.io import savemat
 
 from daq.cli import main
 from daq.config.cell import model_of
@@ -1503,3 +1504,62 @@ def test_a_reversed_axis_that_is_none_is_refused(
         section |= {"unit": "deg/s", "columns": [f"v{axis}" for axis in range(6)]}
     bench.describe(**{key: section})
     _refused(bench, capsys, 6, f"{key}.reversed", "J9", "some of J1, J2")
+
+
+def _with_setting(bench: Bench, key: str, value: object) -> None:
+    """A description with one more setting, of a section where the key has a dot."""
+    section, dot, setting = key.rpartition(".")
+    if not dot:
+        bench.describe(**{key: value})
+        return
+    sections: dict[str, dict[str, object]] = {
+        "position": {"columns": NAMES[:6], "unit": "deg", "side": "joint"},
+        "current": {"columns": NAMES[6:], "unit": "A"},
+        "velocity": {"columns": SPEEDS, "unit": "deg/s", "side": "joint"},
+        "torque": {"columns": SPEEDS, "side": "motor"},
+    }
+    bench.describe(**{section: {"file": "run.csv", **sections[section], setting: value}})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("topic", "/joint_states"),
+        ("publisher", 1),
+        ("rhythm", 2),
+        ("position.topic", "/joint_states"),
+        ("current.publisher", 2),
+        ("velocity.topic", "/joint_states"),
+        ("torque.publisher", 1),
+    ],
+)
+def test_a_setting_for_bags_is_refused_where_no_file_is_a_bag(
+    bench: Bench, key: str, value: object
+) -> None:
+    _with_setting(bench, key, value)
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        import_recording(bench.description, bench.data, bench.out, software="test")
+    assert caught.value.subject == f"import description 'run': {key}"
+    assert "run.csv" in caught.value.found
+    assert "a ROS bag" in caught.value.expected
+    assert bench.left == []
+
+
+def test_settings_for_bags_and_csv_are_refused_for_matlab(bench: Bench) -> None:
+    savemat(bench.data / "run.mat", {"q": bench.joint_deg, "i": bench.current_a})
+    position = {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"}
+    current = {"file": "run.mat", "columns": ["i"], "unit": "A"}
+    bench.describe(position=position, current=current)
+    assert bench.run() == 0
+    bench.out.unlink()
+    for setting, value, kind in (
+        ("topic", "/joint_states", "a ROS bag"),
+        ("table", {"delimiter": ";"}, "a CSV file"),
+        ("table", {"skip_rows": 4}, "a CSV file"),
+    ):
+        bench.describe(position=position, current=current, **{setting: value})
+        with pytest.raises(ConfigurationInconsistent, match=f"'run': {setting}: .*{kind}"):
+            import_recording(bench.description, bench.data, bench.out, software="test")
+    # The defaults may be spelled out: they ask for nothing.
+    bench.describe(position=position, current=current, table={"delimiter": ","}, topic=None)
+    assert bench.run() == 0

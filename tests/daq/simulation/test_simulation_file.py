@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import numpy as np
@@ -193,6 +194,26 @@ def test_a_serial_robot_has_no_key_of_a_closed_chain(checkout: Path, tmp_path: P
     )
     with pytest.raises(ConfigurationInconsistent, match="without closures"):
         load_simulation(path)
+
+
+@pytest.mark.parametrize("name", ["demo", "five-bar"])
+def test_a_joint_that_follows_another_is_refused_and_not_simulated_as_a_free_one(
+    name: str, checkout: Path, tmp_path: Path
+) -> None:
+    folder = checkout / "configs/simulation"
+    text = (folder / f"{name}.yaml").read_text()
+    found = re.search(r"(?m)^urdf: *(\S+)", text)
+    assert found is not None
+    urdf = (folder / found[1]).read_text()
+    first, last = re.findall(r'<joint name="([^"]+)" type="(?!fixed)', urdf)[::2][:2]
+    head, joint, tail = urdf.partition(f'<joint name="{last}"')
+    mimic = f'<mimic joint="{first}" multiplier="0.5"/></joint>'
+    (tmp_path / "mimic.urdf").write_text(head + joint + tail.replace("</joint>", mimic, 1))
+    (tmp_path / "cell.yaml").write_text(text.replace(found[1], "mimic.urdf"))
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        load_simulation(tmp_path / "cell.yaml")
+    assert f"joint {last} with <mimic> of {first}" in caught.value.found
+    assert "closures" in caught.value.expected
 
 
 def test_only_simulate_and_demo_import_the_truth(checkout: Path) -> None:

@@ -22,13 +22,18 @@ from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import SchemaMismatch
+from daq.workflow.full_choice import FullChoice, full_choice
+from daq.workflow.mjcf_effects import split_installed
 from daq.workflow.urdf_export import JointUpdate, cell_limits, update_urdf
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
+from ident.effects.effect import Effect, Property
+from ident.effects.signals import Abscissa, Signals
 from ident.estimators.estimate import RelativeError
 from ident.model.base import base_parameters
 from ident.model.bodies import Body
-from ident.model.model import DriveTrain, Model
+from ident.model.model import Column, DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
+from ident.physical.full_set import FullParameter, FullSet
 from ident.physical.physical import random_motion, urdf_links
 from tests.daq.robot_calibrations import robot_of
 from tests.ident.arms import GANTRY
@@ -432,3 +437,115 @@ def test_held_joints_are_fixed_in_the_exported_urdf(
     exported = pin.buildModelFromXML(out.read_text())
     assert list(exported.names)[1:] == [f"J{number}" for number in range(1, 7)]
     assert exported.existFrame("finger")
+
+
+def _full_set(model: Model, standard: FloatArray) -> FullSet:
+    """Full parameters of a fit, the mass of the base by the prior."""
+    parameters: list[FullParameter] = []
+    for column, value in zip(model.columns, standard.tolist(), strict=True):
+        basis = "data"
+        share = 0.1
+        if column.name == "m1":
+            basis = "prior"
+            share = 0.9
+        parameter = FullParameter(column.name, value, 0.1, column.unit, basis, share, None, None)
+        parameters.append(parameter)
+    return FullSet(
+        "arm.urdf", "a" * 64, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ()
+    )
+
+
+def test_full_parameters_of_the_fit_are_written_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other bodies than the nearest ones, with the same numbers as `export mjcf`, and without a
+    solver.
+    """
+    monkeypatch.setattr(daq.environment, "find_spec", lambda _: None)
+    robot = robot_of("kr270")
+    full = _full_set(robot.model, 1.01 * robot.standard)
+    file = robot.saved(tmp_path, replace(robot.calibration, full_parameters=full))
+    out = tmp_path / "robot.urdf"
+    assert _export(robot.cell_file, file, "--out", out, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["chosen_by"] == "full_parameters of the calibration"
+    assert [one["value"] for one in report["parameters"]] == [one.value for one in full.parameters]
+    assert [one["name"] for one in report["parameters"] if one["basis"] == "prior"] == ["m1"]
+    assert report["torque_change_percent"]["total"] == pytest.approx(1.0, abs=1e-6)
+    largest = max(report["shifts"], key=lambda shift: shift["standard_deviations"])
+    assert report["shifts"][0] == largest
+    for shift in report["shifts"]:
+        assert shift["physical"] == pytest.approx(1.01 * shift["identified"])
+    links = urdf_links(out.read_text())
+    expected = 1.01 * robot.standard[robot.model.link_columns]
+    np.testing.assert_allclose(links, expected, rtol=1e-9, atol=1e-9)
+    assert "full_parameters of the calibration" in out.read_text()
+    assert "By the prior, not measured: m1" in out.read_text()
+    model = tmp_path / "robot.xml"
+    words = [str(word) for word in (robot.cell_file, file, "--out", model, "--json")]
+    assert main(["export", "mjcf", *words]) == 0
+    assert json.loads(capsys.readouterr().out)["parameters"] == report["parameters"]
+    assert _export(robot.cell_file, file, "--out", out) == 0
+    assert "The torque of these bodies differs by 1 %" in capsys.readouterr().out
+
+
+class _SlidingFriction(Effect):
+    """τ = c sign(q̇): what fs has, too."""
+
+    name = "sliding-friction"
+    phrase = "sliding friction"
+    declares = Property.ODD_IN_VELOCITY
+    abscissa = Abscissa.VELOCITY
+    coefficients = (Column("coefficient", "Nm"),)
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Return one column."""
+        return np.asarray(np.sign(signals.velocity_rad_s[axis])[None])
+
+
+def _with_friction_of_a_package(calibration: Calibration, axis: str) -> Calibration:
+    number = 1 + [gain.axis for gain in calibration.gains].index(axis)
+    coefficient = Parameter(f"sliding-friction coefficient {number}", 1.0, 0.01, "Nm")
+    effect = AcceptedEffect(
+        "sliding-friction", axis, {}, (coefficient,), 6.1, 3.4, package="slides 1.2.0"
+    )
+    parameters = (*calibration.parameters, coefficient)
+    return replace(calibration, parameters=parameters, effects=(*calibration.effects, effect))
+
+
+def test_bodies_are_the_same_where_the_package_of_an_effect_is_not_installed(
+    tx40: tuple[Path, Path, FloatArray],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Beside an effect of friction fs may be negative, whether the effect can be computed or
+    not.
+    """
+    path, _, standard = tx40
+    cell = load_cell(path)
+    model = model_of(cell)
+    limits = cell_limits(cell)
+    negative = standard.copy()
+    negative[14 * 4 + 12] = -0.3  # fs5
+    plain = _calibration("tx40", model, limits, negative, cell.digest)
+    known = _with_friction_of_a_package(plain, "J5")
+
+    def choose(calibration: Calibration) -> FullChoice:
+        installed, missing = split_installed(calibration)
+        gone = [effect.accepted for effect in missing]
+        return full_choice(installed, model, limits, cell.urdf, gone)
+
+    with_package = choose(replace(known, own_effects=(_SlidingFriction(),)))
+    without = choose(known)
+    assert with_package.exact
+    np.testing.assert_array_equal(without.standard, with_package.standard)
+    assert not choose(plain).exact
+    file = tmp_path / "calibration.yaml"
+    save_calibration(known, file)
+    assert _export(path, file, "--out", tmp_path / "out.urdf", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["exact"]
+    assert report["effects_left_out"] == [
+        "load-friction on J3",
+        "sliding-friction on J5 (of slides 1.2.0, not installed)",
+    ]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from daq.cli.app import main
-from tests.bench.__main__ import FIGAROH_VENV
+from tests.bench.figaroh_environment import FIGAROH, FIGAROH_VENV, has_figaroh
 from tests.conftest import CHECKOUT
 from tests.daq.robot_calibrations import apart, robot_of
 
@@ -24,9 +24,13 @@ def test_the_torque_of_the_urdf_and_of_the_list_is_the_predicted_one(
     """figaroh takes rotors, friction and offsets as numbers beside the URDF;
     gravity is downwards for it.
     """
-    python = CHECKOUT / FIGAROH_VENV / "bin/python"
-    if not python.exists():
-        pytest.skip(f"no figaroh at {FIGAROH_VENV}: `make bench` makes its environment")
+    environment = CHECKOUT / FIGAROH_VENV
+    if not has_figaroh(environment):
+        pytest.skip(
+            f"no {FIGAROH} in {FIGAROH_VENV}, an environment of its own, because it brings another "
+            "Pinocchio than ours: `make figaroh` makes it, 1 GB"
+        )
+    python = environment / "bin/python"
     robot = robot_of(name)
     out = tmp_path / "robot.urdf"
     assert (

@@ -18,6 +18,7 @@ import ident
 from ident.arrays import FloatArray
 from ident.planning.effort import EFFORT_MARGIN, effort_shares
 from ident.planning.moves import _search_of
+from tests.ident.mechanisms import FIVE_BAR
 
 EXAMPLE = SimpleNamespace(
     **runpy.run_path(str(Path(__file__).parents[3] / "examples" / "gains_from_arrays.py"))
@@ -120,6 +121,44 @@ def test_a_fit_of_planned_moves_has_smaller_deviations_than_of_random_ones(
         )
         worst.append(float(np.max(found.estimate.gains_std / np.abs(found.estimate.gains))))
     assert worst[0] < worst[1]
+
+
+def _belted(payload: ident.Payload | None) -> tuple[ident.Model, FloatArray]:
+    """The example's arm, whose forearm a belt turns with the second joint, and its parameters."""
+    mimic = '<mimic joint="J2" multiplier="-0.8" offset="0.3"/></joint>'
+    head, joint, tail = EXAMPLE.URDF.partition('<joint name="J3"')
+    urdf = head + joint + tail.replace("</joint>", mimic, 1)
+    model = ident.Model(ident.robot_from_urdf(urdf), ident.DriveTrain(np.diag([100.0, 120.0])))
+    parameters = _parameters(model, payload)
+    follower = [14 * 2 + place for place in range(10, 14)]  # neither rotor nor friction of its own
+    parameters[follower] = 0.0
+    return model, parameters
+
+
+def test_a_robot_with_a_joint_that_follows_an_axis_is_planned_for_with_what_it_carries() -> None:
+    """The plan is good for a fit of that robot, and better than random moves."""
+    model, _ = _belted(None)
+    limits = ident.JointLimits([-2.9, -2.0], [2.9, 2.0], [3.0, 2.5], [12.0, 10.0])
+    gains = EXAMPLE.TRUE_GAINS_NM_A[:2]
+    nameplate = EXAMPLE.NAMEPLATE_NM_A[:2]
+    random = ident.plan_moves(model, limits, EXAMPLE.DISC, nameplate, exchanges=0)
+    plan = ident.plan_moves(model, limits, EXAMPLE.DISC, nameplate, exchanges=200)
+    assert plan.target_rad.shape[1] == 2
+    assert np.all(np.abs(plan.target_rad) <= limits.upper)
+    assert plan.predicted_std_percent.max() < 0.9 * random.predicted_std_percent.max()
+    runs: list[ident.Run] = []
+    for payload, seed in ((None, 1), (EXAMPLE.DISC, 2)):
+        time_s, motion = plan.motion(RATE_HZ)
+        _, parameters = _belted(payload)
+        torque_nm = np.einsum("jck,c->kj", model.regressor(motion), parameters)
+        noise_a = 0.05 * np.random.default_rng(seed).standard_normal(torque_nm.shape)
+        name = "bare" if payload is None else "loaded"
+        run = ident.Run(name, time_s, motion.position_rad, torque_nm / gains + noise_a, payload)
+        runs.append(run)
+    found = ident.identify(model, runs).estimate
+    assert np.all(np.abs(found.gains - gains) < 4.0 * found.gains_std)
+    found_percent = 100.0 * found.gains_std / np.abs(found.gains)
+    assert np.all(found_percent < plan.predicted_std_percent)
 
 
 def test_the_same_seed_gives_the_same_moves(model: ident.Model, plan: ident.PlannedMoves) -> None:
@@ -295,6 +334,12 @@ WRONG: list[tuple[str, Call, str]] = [
             [1, 1, 1],
         ),
         "found room for 0 moves in 40 s",
+    ),
+    (
+        "a closed chain",
+        lambda _: lax.plan_moves(FIVE_BAR.model, LIMITS, EXAMPLE.DISC, [1, 1]),
+        r"closed chain \(closures .*\): which positions its loops reach is not known here; "
+        "expected a serial robot",
     ),
     (
         "words",

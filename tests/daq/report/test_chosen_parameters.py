@@ -1,4 +1,4 @@
-"""What a model for MuJoCo says of the numbers that rest on the prior."""
+"""What an exported model says of the numbers that rest on the prior."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from daq.report.mjcf_views import _names_by_prior, _parameters
+from daq.report.chosen_parameters import chosen_parameters, names_by_prior
 from ident.model.bodies import LOADED
 from ident.model.model import Column
 from ident.physical.full_parameters import RestsOn
@@ -26,5 +26,5 @@ def test_the_head_and_the_report_name_the_same_parameters() -> None:
         basis=(RestsOn.PRIOR, RestsOn.PRIOR, RestsOn.DATA),
         shares=np.array([1.0, 1.0, 0.0]),
     )
-    assert [one.name for one in _parameters(choice)] == ["m1", "fv1"]
-    assert _names_by_prior(choice) == ["m1"]
+    assert [one.name for one in chosen_parameters(choice)] == ["m1", "fv1"]
+    assert names_by_prior(choice) == ["m1"]

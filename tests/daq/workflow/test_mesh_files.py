@@ -1,0 +1,154 @@
+"""Meshes that MuJoCo reads, and those for which it refuses a whole model:
+the same verdict as MuJoCo itself.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from daq.workflow.mesh_files import ShapeUnreadable, check_mesh
+
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+FACES = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+OTHER_BODY = "v 5 5 5\nv 6 5 5\nv 5 6 5\nv 5 5 6\nf 5 7 6\nf 5 6 8\nf 5 8 7\nf 6 7 8\n"
+POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+TRIANGLES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+WHOLE = (1.0, 1.0, 1.0)
+
+
+def stl(points: np.ndarray, triangles: np.ndarray = TRIANGLES) -> bytes:
+    """A binary STL."""
+    parts = [bytes(80), struct.pack("<I", len(triangles))]
+    for triangle in triangles:
+        parts.append(struct.pack("<12fH", 0, 0, 1, *points[triangle].ravel(), 0))
+    return b"".join(parts)
+
+
+def msh(points: np.ndarray, triangles: np.ndarray = TRIANGLES, normals: int = 0) -> bytes:
+    """A mesh of MuJoCo."""
+    counts = struct.pack("<4i", len(points), normals, 0, len(triangles))
+    of_normals = np.ones((normals, 3), "<f4").tobytes()
+    corners = np.asarray(points, "<f4").tobytes()
+    return counts + corners + of_normals + np.asarray(triangles, "<i4").tobytes()
+
+
+def moved(place: int, value: float) -> np.ndarray:
+    """The points with another first coordinate of one of them."""
+    points = POINTS.copy()
+    points[place, 0] = value
+    return points
+
+
+def faces_in_mujoco(path: Path, scale: tuple[float, ...] = WHOLE) -> int:
+    """Number of triangles that MuJoCo has of a mesh.
+
+    Raises:
+        ValueError: it refuses the model.
+    """
+    scales = " ".join(map(str, scale))
+    text = (
+        f'<mujoco><asset><mesh name="m" file="{path}" inertia="shell" scale="{scales}"/></asset>'
+        '<worldbody><geom type="mesh" mesh="m" contype="0" conaffinity="0" mass="0"/></worldbody>'
+        "</mujoco>"
+    )
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        return int(mujoco.MjModel.from_xml_string(text).nmeshface)
+    finally:
+        mujoco.set_mju_user_warning(None)
+
+
+READ: dict[str, tuple[str | bytes, int]] = {
+    "plain.obj": (CORNERS + FACES, 4),
+    "windows.OBJ": ((CORNERS + FACES).replace("\n", "\r\n"), 4),
+    "before.obj": (FACES + CORNERS, 4),
+    "back.obj": (CORNERS + "f -4 -2 -3\nf -4 -3 -1\nf -4 -1 -2\nf -3 -2 -1\n", 4),
+    "polygon.obj": ("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nf 1 2 3 4\nf 1 2 5\n", 3),
+    "named.obj": ("mtllib a.mtl\no arm\n" + CORNERS + "usemtl a\ns off\n" + FACES, 4),
+    "normals.obj": (CORNERS + "vn 0 0 1\nf 1//1 3//1 2//1\nf 1//-1 2//-1 4//-1\n", 2),
+    "texture.obj": (CORNERS + "vt 0 0\nvn 0 0 1\nf 1/1/1 3/1/1 2/1/1\nf 1/1/1 2/1/1 4/1/1\n", 2),
+    "flat.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n", 2),
+    "colours.obj": (CORNERS.replace("\n", " 1 0 0\n") + FACES, 4),
+    "line.obj": (CORNERS + FACES + "l 1 2\n", 4),
+    "plain.stl": (stl(POINTS), 4),
+    "plain.STL": (stl(POINTS, TRIANGLES[:2]), 2),
+    "plain.msh": (msh(POINTS), 4),
+    "normals.msh": (msh(POINTS, normals=4), 4),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_mesh_that_mujoco_reads_is_taken(name: str, tmp_path: Path) -> None:
+    content, faces = READ[name]
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    check_mesh(path, WHOLE)
+    assert faces_in_mujoco(path) == faces
+
+
+REFUSED: dict[str, tuple[str | bytes, str]] = {
+    "empty.obj": ("", "0 vertices"),
+    "page.obj": ("<html>not found</html>", "0 vertices"),
+    "three.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 vertices"),
+    "missing.obj": (CORNERS + FACES + "f 1 2 9\n", "vertices that it lacks"),
+    "zero.obj": (CORNERS + "f 0 1 2\n", "line 5"),
+    "word.obj": (CORNERS + FACES + "f 1 x 2\n", "line 9"),
+    "continued.obj": (CORNERS + "f 1 3 \\\n2\n" + FACES, "line 5"),
+    "nan.obj": (CORNERS + "v nan 0 0\n" + FACES, "no finite numbers"),
+    "one-point.obj": ("v 0 0 0\n" * 4 + FACES, "faces of 0 m²"),
+    "one-line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nv 3 0 0\n" + FACES, "faces of 0 m²"),
+    "flat.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n", "faces of 0 m²"),
+    "mixed.obj": (CORNERS + "vn 0 0 1\nf 1//1 3//1 2//1\n" + FACES, "without a normal"),
+    "normal.obj": (CORNERS + "vn 0 0 1\nf 1//9 3//9 2//9\n", "without a normal"),
+    "nan.stl": (stl(moved(0, np.nan)), "no finite numbers"),
+    "far.stl": (stl(moved(0, 1e38)), "no finite numbers"),
+    "one-point.stl": (stl(0.0 * POINTS), "1 vertices"),
+    "one-triangle.stl": (stl(POINTS, TRIANGLES[[0, 0]]), "3 vertices"),
+    "one-line.stl": (stl(np.outer(np.arange(4.0), np.ones(3))), "faces of 0 m²"),
+    "cut.stl": (stl(POINTS)[:-7], "was cut"),
+    "empty.msh": (b"", "no MSH"),
+    "cut.msh": (msh(POINTS)[:-4], "no MSH"),
+    "gmsh.msh": ("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n", "no MSH"),
+    "normals.msh": (msh(POINTS, normals=2), "no MSH"),
+    "missing.msh": (msh(POINTS, TRIANGLES + 6), "vertices that it lacks"),
+    "negative.msh": (msh(POINTS, TRIANGLES - 1), "vertices that it lacks"),
+    "nan.msh": (msh(moved(0, np.nan)), "no finite numbers"),
+    "one-point.msh": (msh(0.0 * POINTS), "faces of 0 m²"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_mesh_that_mujoco_refuses_is_named(name: str, tmp_path: Path) -> None:
+    content, reason = REFUSED[name]
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ShapeUnreadable) as caught:
+        check_mesh(path, WHOLE)
+    assert str(caught.value).startswith(f"{name} ")
+    assert reason in str(caught.value)
+    with pytest.raises(ValueError, match="Error"):
+        faces_in_mujoco(path)
+
+
+def test_an_obj_of_several_bodies_is_refused_because_mujoco_shows_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "arm.obj"
+    path.write_text("o upper\n" + CORNERS + FACES + "o lower\n" + OTHER_BODY)
+    assert faces_in_mujoco(path) == 4  # of 8
+    with pytest.raises(ShapeUnreadable, match="2 objects or groups, where only the first is read"):
+        check_mesh(path, WHOLE)
+
+
+def test_the_scale_decides_whether_a_mesh_has_an_area(tmp_path: Path) -> None:
+    path = tmp_path / "arm.obj"
+    path.write_text(CORNERS + FACES)
+    check_mesh(path, (1e-3, 1e-3, -1e-3))
+    tiny = (1e-8, 1e-8, 1e-8)
+    with pytest.raises(ShapeUnreadable, match="check its scale"):
+        check_mesh(path, tiny)
+    with pytest.raises(ValueError, match="area is too small"):
+        faces_in_mujoco(path, tiny)
