@@ -243,11 +243,13 @@ def foreign_recording(path: Path) -> LogForeign | None:
             return None
         return _foreign_beginning(path, bag.library)
     states = [topic for topic, has in topics.items() if has]
-    found = f"a bag of {bag.library or 'another program'} with " + (
-        f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}"
-        if states
-        else ", ".join(topics)
-    )
+    library = bag.library or "another program"
+    content = ", ".join(topics)
+    if states:
+        joints_listed = ", ".join(joints) or "no joint"
+        topics_listed = ", ".join(states)
+        content = f"joint states of {joints_listed} on {topics_listed}"
+    found = f"a bag of {library} with {content}"
     remedy = f"`drivegain import` reads bags with {JOINTS_SCHEMA}"
     if states:
         remedy = (
