@@ -287,9 +287,11 @@ class Cell:
     @property
     def wiring(self) -> tuple[tuple[Bus, tuple[CellAxis, ...]], ...]:
         """Each bus with its axes."""
-        return tuple(
-            (bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses
-        )
+        wiring = []
+        for bus in self.buses:
+            axes = [axis for axis in self.axes if axis.bus == bus.name]
+            wiring.append((bus, tuple(axes)))
+        return tuple(wiring)
 
     @property
     def axis_names(self) -> tuple[str, ...]:
