@@ -18,7 +18,7 @@ from ident.planning.excitation import Design
 from ident.planning.gain_verdict import verdicts
 from ident.planning.target import SlowCause, recorded_information, slow_cause
 
-HELP = {
+ADVICE_OF_CAUSE = {
     SlowCause.NO_PAYLOAD: "record blocks with the payload",
     SlowCause.PRELOAD: "let the platform shift and turn farther, by wider joint limits in the "
     "cell file",
@@ -104,4 +104,4 @@ def outlook_of(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> 
 
 def help_with(cause: SlowCause, axis: str) -> str:
     """Say what makes σ of a gain fall faster, beside more time; empty where nothing else does."""
-    return HELP[cause].format(axis=axis)
+    return ADVICE_OF_CAUSE[cause].format(axis=axis)
