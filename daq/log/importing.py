@@ -153,7 +153,9 @@ def import_recording(
         except BaseException:
             holdout.unlink()
             raise
-    remarks = [remark for file in files.values() for remark in file.remarks]
+    remarks: list[str] = []
+    for file in files.values():
+        remarks += file.remarks
     remarks += recorded.remarks
     remarks += fault_remarks(recorded.faults, recorded.used)
     return Imported(statistics, timing, tuple(remarks), of_holdout)
