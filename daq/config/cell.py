@@ -153,9 +153,7 @@ class WeighedPayload:
 
     @property
     def payload(self) -> Payload:
-        """The payload with its mass alone, as in a log and by default in the identification (paper,
-        case 4).
-        """
+        """The payload with its mass alone, as in a log and by default in a fit (paper, case 4)."""
         return Payload(self.name, self.mounting, {"m": self.mass_kg})
 
     @property

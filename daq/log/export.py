@@ -279,9 +279,7 @@ def _in_rows(
 
 @contextmanager
 def _csv(path: Path) -> Iterator[Write]:
-    """Write a header and rows with comma, decimal point and LF (RFC 4180 except for the end of
-    line).
-    """
+    """Write a CSV file with decimal points (RFC 4180, but lines end with LF)."""
     with path.open("x", encoding="utf-8", newline="\n") as stream:
         begun = False
 

@@ -175,8 +175,7 @@ class JointState:
 
 
 def joint_state_from_cdr(data: bytes) -> JointState:
-    """Decode a message (OMG CDR as DDS transports it:
-    four bytes of encapsulation, then the fields, each aligned).
+    """Decode a message of OMG CDR: four bytes of encapsulation, then the fields, each aligned.
 
     Raises:
         ValueError: it is not one, or ends early.

@@ -144,9 +144,7 @@ def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> st
 
 
 def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
-    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003° (to be added to its
-    position)`.
-    """
+    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003°`."""
     match one.parameter.kind:
         case GeometryKind.ZERO:
             axis = _axis_of(one.parameter, cell)

@@ -160,9 +160,7 @@ class PlanGoal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetBox:
-    """Least and largest joint positions that targets may have [rad;
-    m of a prismatic joint], shape (n,) each.
-    """
+    """Least and largest positions of targets [rad; m of a prismatic joint], shape (n,) each."""
 
     lower: FloatArray
     upper: FloatArray

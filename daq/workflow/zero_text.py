@@ -15,8 +15,7 @@ FEWEST_DECIMALS = 2
 
 
 def zero_off_text(name: str, value: float, std: float, unit: str) -> str:
-    """Say how far a zero is off: `the zero of J3 off by -2.00 ± 0.04° (to be added to its
-    position)`.
+    """Say how far a zero is off: `the zero of J3 off by -2.00 ± 0.04°`.
 
     Args:
         name: of the axis.

@@ -53,9 +53,7 @@ _CODES = {
 
 
 class Direction(Enum):
-    """Direction seen from the drive; the value is (communication index, mapping index,
-    first COB-ID).
-    """
+    """Direction seen from the drive: communication index, mapping index and first COB-ID."""
 
     TPDO = (0x1800, 0x1A00, 0x180)
     RPDO = (0x1400, 0x1600, 0x200)

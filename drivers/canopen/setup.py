@@ -525,9 +525,7 @@ class AxisSetup:
             self._link.pass_time()
 
     def _mode_remedy(self) -> str:
-        """Say what to do where the mode is refused, by the modes that the drive reports (6502h;
-        bit 0: this one).
-        """
+        """Say what to do where the mode is refused, by bit 0 of the reported modes (6502h)."""
         supported = self._access.read_optional(SUPPORTED_MODES, any_abort=True)
         if supported is None or supported & 1:
             return MODE_REMEDY
