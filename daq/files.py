@@ -180,8 +180,9 @@ def _links(file: Path) -> tuple[Path, ...]:
 
 
 def fsync_folder(folder: Path) -> None:
-    """Flush a folder: without it a new name in it may not survive a power cut (POSIX fsync,
-    open(2)).
+    """Flush a folder, so that a new name in it survives a power cut.
+
+    Source: POSIX fsync, open(2).
 
     Raises:
         OSError: from the file system.

@@ -167,10 +167,12 @@ class NodeMissing(DriverError):
     """Configured nodes do not answer."""
 
     def __init__(self, nodes: Sequence[Node], found: tuple[int, ...], waited_s: float) -> None:
+        silent = ", ".join(map(node_label, nodes))
+        answered = ", ".join(map(str, found)) or "none"
         super().__init__(
-            f"{', '.join(map(node_label, nodes))} did not answer within {waited_s:g} s (answered: "
-            f"{', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id; "
-            "a drive that was switched on just now answers once it has booted: try again then"
+            f"{silent} did not answer within {waited_s:g} s (answered: {answered}); check power, "
+            "wiring, bit rate and node id; a drive that was switched on just now answers once it "
+            "has booted: try again then"
         )
         self.node_ids = tuple(node if isinstance(node, int) else node.node_id for node in nodes)
         self.found = found
@@ -180,8 +182,9 @@ class NodeMisplaced(DriverError):
     """A node is heard on another bus than its own."""
 
     def __init__(self, node_id: int, expected: str, found: str, axis: str = "") -> None:
+        node = node_label(node_id, {node_id: axis})
         super().__init__(
-            f"{node_label(node_id, {node_id: axis})} is heard on bus {found}, the cell "
+            f"{node} is heard on bus {found}, the cell "
             f"configuration has it on bus {expected}: it is wired to the other bus, two amplifiers "
             "have that node id, or both CAN interfaces are on one wire; `drivers.scan` shows the "
             "nodes of each bus"
@@ -212,6 +215,13 @@ class ObjectAccessError(NodeError):
         self.abort_code = abort_code
 
 
+def _with_remedy(found: str, expected: str, remedy: str) -> str:
+    """Add to what was found what was expected, and what to do; nothing without a remedy."""
+    if not remedy:
+        return found
+    return f"{found}; expected {expected}; {remedy}"
+
+
 class SetupRefused(NodeError):
     """An amplifier is not the configured one, or cannot be set up for a recording.
 
@@ -222,7 +232,7 @@ class SetupRefused(NodeError):
     remedy: str = ""
 
     def __init__(self, node: Node, found: str, *, expected: str = "", remedy: str = "") -> None:
-        super().__init__(node, f"{found}; expected {expected}; {remedy}" if remedy else found)
+        super().__init__(node, _with_remedy(found, expected, remedy))
         self.found = f"{node_label(node)}: {found}"
         self.expected = expected
         self.remedy = remedy
@@ -260,9 +270,11 @@ class ParametersMixed(DriverError):
     """A write failed midway, and not every drive has its previous value again."""
 
     def __init__(self, restored: tuple[str, ...], problems: tuple[str, ...]) -> None:
+        drives = ", ".join(restored) or "no drive"
+        listed = "; ".join(problems)
         super().__init__(
             "the write failed midway; the previous values are restored in "
-            f"{', '.join(restored) or 'no drive'}, and NOT confirmed where {'; '.join(problems)}; "
+            f"{drives}, and NOT confirmed where {listed}; "
             "do not enable an axis before every drive has its previous value again"
         )
         self.restored = restored
@@ -313,7 +325,8 @@ class MotionRefused(DriverError):
     """
 
     def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:
-        super().__init__(f"found {found}; expected {expected}; {remedy}" if remedy else found)
+        text = f"found {found}" if remedy else found
+        super().__init__(_with_remedy(text, expected, remedy))
         self.found = found
         self.expected = expected
         self.remedy = remedy

@@ -39,22 +39,20 @@ class Move:
 
     def duration_s(self, start_counts: Sequence[int]) -> tuple[float, ...]:
         """Return the time that each axis needs from these positions."""
-        return tuple(
-            self.path(axis, start).duration_s if self.target_counts[axis] != start else 0.0
-            for axis, start in enumerate(start_counts)
-        )
+        durations_s = []
+        for axis, start in enumerate(start_counts):
+            if self.target_counts[axis] == start:
+                durations_s.append(0.0)
+            else:
+                durations_s.append(self.path(axis, start).duration_s)
+        return tuple(durations_s)
 
     def path(self, axis: int, start_counts: int) -> Trapezoid:
         """Return the way of one axis from a position, with the profile's whole numbers [counts]."""
-        start, end, velocity, acceleration = (
-            np.array([float(number)])
-            for number in (
-                start_counts,
-                self.target_counts[axis],
-                self.velocity_counts_s[axis],
-                self.acceleration_counts_s2[axis],
-            )
-        )
+        start = np.array([float(start_counts)])
+        end = np.array([float(self.target_counts[axis])])
+        velocity = np.array([float(self.velocity_counts_s[axis])])
+        acceleration = np.array([float(self.acceleration_counts_s2[axis])])
         return synchronised(start, end, velocity, acceleration)
 
 
@@ -83,21 +81,26 @@ def synchronised_move(
     start = np.asarray(start_counts, dtype=np.float64)
     target = np.asarray(target_counts, dtype=np.float64)
     # One count less than allowed leaves room for rounding up.
-    path = synchronised(
-        start,
-        target,
-        np.array([limit.velocity_counts_s - 1.0 for limit in limits]),
-        np.array([limit.acceleration_counts_s2 - 1.0 for limit in limits]),
-    )
+    velocity_limit = [limit.velocity_counts_s - 1.0 for limit in limits]
+    acceleration_limit = [limit.acceleration_counts_s2 - 1.0 for limit in limits]
+    path = synchronised(start, target, np.array(velocity_limit), np.array(acceleration_limit))
+    distances = np.abs(target - start)
+    speeds = np.abs(path.velocity)
     velocities = []
     accelerations = []
-    for distance, speed in zip(np.abs(target - start), np.abs(path.velocity), strict=True):
+    for distance, speed in zip(distances, speeds, strict=True):
         velocity = max(1, math.ceil(speed))
-        ramp_s = path.duration_s - distance / velocity
+        acceleration = 1
+        if distance > 0:
+            ramp_s = path.duration_s - distance / velocity
+            acceleration = max(1, round(velocity / ramp_s))
         velocities.append(velocity)
-        accelerations.append(max(1, round(velocity / ramp_s)) if distance > 0 else 1)
+        accelerations.append(acceleration)
     return Move(
-        tuple(map(int, target_counts)), tuple(velocities), tuple(accelerations), dwell_cycles
+        target_counts=tuple(map(int, target_counts)),
+        velocity_counts_s=tuple(velocities),
+        acceleration_counts_s2=tuple(accelerations),
+        dwell_cycles=dwell_cycles,
     )
 
 
@@ -132,25 +135,30 @@ def check_moves(
         where = f"move {number}"
         profiles = (move.target_counts, move.velocity_counts_s, move.acceleration_counts_s2)
         if any(len(column) != len(names) for column in profiles):
-            raise MotionRefused(
-                f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes"
-            )
+            lengths = tuple(map(len, profiles))
+            raise MotionRefused(f"{where}: has {lengths} values, the cell has {len(names)} axes")
         if move.dwell_cycles < 0:
             raise MotionRefused(f"{where}: dwells for {move.dwell_cycles} cycles")
         check_positions(f"{where} goes to", move.target_counts)
         for axis, limit in enumerate(permission.limits):
             if move.target_counts[axis] == here[axis]:
                 continue
-            for quantity, value, allowed in (
-                ("velocity", move.velocity_counts_s[axis], limit.velocity_counts_s),
-                ("acceleration", move.acceleration_counts_s2[axis], limit.acceleration_counts_s2),
-            ):
-                if not 0 < value <= allowed:
-                    raise MotionRefused(
-                        f"{where}: {names[axis]}: {quantity} {value}, allowed is above 0 up to "
-                        f"{allowed:g}"
-                    )
+            subject = f"{where}: {names[axis]}"
+            velocity = move.velocity_counts_s[axis]
+            acceleration = move.acceleration_counts_s2[axis]
+            _require_allowed(f"{subject}: velocity", velocity, limit.velocity_counts_s)
+            _require_allowed(f"{subject}: acceleration", acceleration, limit.acceleration_counts_s2)
         here = move.target_counts
+
+
+def _require_allowed(quantity: str, value: int, allowed: float) -> None:
+    """Refuse a velocity or an acceleration beyond its limit.
+
+    Raises:
+        MotionRefused: it is, or it is not above zero.
+    """
+    if not 0 < value <= allowed:
+        raise MotionRefused(f"{quantity} {value}, allowed is above 0 up to {allowed:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,31 +191,27 @@ class Trapezoid:
         return np.zeros_like(self.start)
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Position, velocity and acceleration at the given times, each of shape (len(time_s),
-        n).
-        """
-        t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)[:, None]
+        """Return position, velocity and acceleration at the given times, shape (k, n) each."""
+        asked_s = np.asarray(time_s, dtype=np.float64)[:, None]
+        t = np.clip(asked_s, 0.0, self.duration_s)
+        fall_s = self.duration_s - self.ramp_s
         rising = np.minimum(t, self.ramp_s)
-        falling = np.maximum(t - (self.duration_s - self.ramp_s), 0.0)
+        falling = np.maximum(t - fall_s, 0.0)
         acceleration = self.acceleration
         velocity = self.velocity
-        distance = (
-            0.5 * acceleration * rising**2
-            + velocity * (t - rising)
-            - 0.5 * acceleration * falling**2
-        )
+        # q − q₀ = ½ a t_r² + v (t − t_r) − ½ a t_f²
+        rise = 0.5 * acceleration * rising**2
+        fall = 0.5 * acceleration * falling**2
+        distance = rise + velocity * (t - rising) - fall
         speed = acceleration * (rising - falling)
-        inside = (np.asarray(time_s)[:, None] >= 0.0) & (
-            np.asarray(time_s)[:, None] < self.duration_s
-        )
-        phase = np.where(t < self.ramp_s, 1.0, 0.0) - np.where(
-            t > self.duration_s - self.ramp_s, 1.0, 0.0
-        )
-        return (
-            self.start + distance,
-            np.where(inside, speed, 0.0),
-            np.where(inside, acceleration * phase, 0.0),
-        )
+        is_moving = (asked_s >= 0.0) & (asked_s < self.duration_s)
+        is_rising = np.where(t < self.ramp_s, 1.0, 0.0)
+        is_falling = np.where(t > fall_s, 1.0, 0.0)
+        phase = is_rising - is_falling
+        position = self.start + distance
+        velocity_now = np.where(is_moving, speed, 0.0)
+        acceleration_now = np.where(is_moving, acceleration * phase, 0.0)
+        return position, velocity_now, acceleration_now
 
 
 def synchronised(
@@ -235,7 +239,8 @@ def synchronised(
     if not moving.any():
         return Trapezoid(start, end, 0.0, 0.0)
     # Normalised to the path 0..1, the slowest axis in velocity and in acceleration decides for all.
-    rate, ramp_rate = np.min(limits[:, moving] / distance[moving], axis=1).tolist()
+    rates = limits[:, moving] / distance[moving]
+    rate, ramp_rate = np.min(rates, axis=1).tolist()
     ramp_s = min(rate / ramp_rate, ramp_rate**-0.5)
     cruise_s = 1.0 / (ramp_rate * ramp_s)
     return Trapezoid(start, end, cruise_s + ramp_s, ramp_s)

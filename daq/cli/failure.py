@@ -263,11 +263,11 @@ class ErrorParts:
     def of(cls, error: Exception, verb: str = "") -> ErrorParts:
         """Take an error of `daq`, `drivers` or `ident` apart; `verb` is the one that raised it."""
         notes = getattr(error, "__notes__", ())
-        labelled = {
-            label: text
-            for label, _, text in (note.partition(": ") for note in notes)
-            if label in NOTES
-        }
+        labelled = {}
+        for note in notes:
+            label, _, text = note.partition(": ")
+            if label in NOTES:
+                labelled[label] = text
         subject, found, expected, remedy = map(for_command_line, _parts(error, verb))
         return cls(
             type(error).__name__,

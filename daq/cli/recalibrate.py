@@ -172,14 +172,14 @@ def schedule_verb(
             for unit in units:
                 replace_file(folder / unit.name, unit.text.encode())
     for unit in units:
+        path = folder / unit.name
+        typer.echo(f"Written: {path}" if yes else f"# {path}\n{unit.text}")
+    if yes:
+        typer.echo("Then:")
+    else:
         typer.echo(
-            f"Written: {folder / unit.name}" if yes else f"# {folder / unit.name}\n{unit.text}"
+            "Dry run, nothing was written. To write this, repeat the command with --yes; then:"
         )
-    typer.echo(
-        "Then:"
-        if yes
-        else "Dry run, nothing was written. To write this, repeat the command with --yes; then:"
-    )
     for command in next_commands(wanted, units[1], folder):
         typer.echo(f"  {command}")
 

@@ -157,12 +157,14 @@ def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
         and cell.sync.pacing is PacingMode.TIMED
     ):
         real = not all(bus.kind.is_simulated for bus in cell.buses)
-        error.add_note(
-            "hint: check the load of bus and computer, or use a longer `sync.period_us`"
-            if real
-            else "hint: a cell of `drivegain simulate` answers as fast as its computer can and "
-            "needs `sync.pacing: lockstep` in the cell file"
-        )
+        if real:
+            hint = "check the load of bus and computer, or use a longer `sync.period_us`"
+        else:
+            hint = (
+                "a cell of `drivegain simulate` answers as fast as its computer can and needs "
+                "`sync.pacing: lockstep` in the cell file"
+            )
+        error.add_note(f"hint: {hint}")
 
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -89,9 +90,8 @@ def scan_verb(
     absent = {node.node_id for node in listed if node.verdict == "missing"}
     missing = [_amplifier(axis) for axis in wiring.axes if axis.node_id in absent]
     if missing:
-        raise no_answer(
-            wiring, missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait
-        )
+        answered = tuple(node.node_id for node in chain.from_iterable(found.values()))
+        raise no_answer(wiring, missing, answered, wait)
     if (
         not json
         and declared is not None

@@ -9,6 +9,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -231,8 +232,10 @@ def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str,
     there: dict[str, frozenset[int]] = {}
     for one in options:
         channel, _, nodes = one.partition("=")
-        numbers = [int(node) for node in nodes.split(",") if node.isascii() and node.isdigit()]
-        if not channel or channel in there or not numbers or len(numbers) != nodes.count(",") + 1:
+        texts = nodes.split(",")
+        numbers = [int(node) for node in texts if node.isascii() and node.isdigit()]
+        is_new = bool(channel) and channel not in there
+        if not is_new or len(numbers) != len(texts):
             raise UsageError(
                 f"--bus {one}",
                 found="no CHANNEL=NODE,NODE,..., or a repeated channel",
@@ -240,12 +243,16 @@ def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str,
                 remedy="for example --bus can0=1,2,3 --bus can1=4,5,6",
             )
         there[channel] = frozenset(numbers)
-    everywhere = sorted(node for nodes in there.values() for node in nodes)
-    if everywhere != sorted(node_ids):
+    everywhere = sorted(chain.from_iterable(there.values()))
+    wanted = sorted(node_ids)
+    if everywhere != wanted:
+        given = " --bus ".join(options)
+        listed = ", ".join(map(str, everywhere))
+        all_nodes = ", ".join(map(str, wanted))
         raise UsageError(
-            f"--bus {' --bus '.join(options)}",
-            found=f"node {', '.join(map(str, everywhere))}",
-            expected=f"each node of the cell once: {', '.join(map(str, sorted(node_ids)))}",
+            f"--bus {given}",
+            found=f"node {listed}",
+            expected=f"each node of the cell once: {all_nodes}",
             remedy="list every node on its bus",
         )
     return there

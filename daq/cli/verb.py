@@ -208,16 +208,15 @@ class _VerbCommand(TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         for title in ("argument", "option"):
             params = [param for param in self.get_params(ctx) if param.param_type_name == title]
-            records = [
-                record
-                for record in (help_record(param, ctx) for param in params)
-                if record is not None
-            ]
+            records = []
+            for param in params:
+                record = help_record(param, ctx)
+                if record is not None:
+                    name, text = record
+                    records.append((name, text.replace("-", _HYPHEN)))
             if records:
                 with formatter.section(f"{title.capitalize()}s"):
-                    formatter.write_dl(
-                        [(name, text.replace("-", _HYPHEN)) for name, text in records]
-                    )
+                    formatter.write_dl(records)
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
         formatter.write_paragraph()

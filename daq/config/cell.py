@@ -155,9 +155,7 @@ class WeighedPayload:
 
     @property
     def payload(self) -> Payload:
-        """The payload with its mass alone, as in a log and by default in the identification (paper,
-        case 4).
-        """
+        """The payload with its mass alone, as in a log and by default in a fit (paper, case 4)."""
         return Payload(self.name, self.mounting, {"m": self.mass_kg})
 
     @property
@@ -289,9 +287,11 @@ class Cell:
     @property
     def wiring(self) -> tuple[tuple[Bus, tuple[CellAxis, ...]], ...]:
         """Each bus with its axes."""
-        return tuple(
-            (bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses
-        )
+        wiring = []
+        for bus in self.buses:
+            axes = [axis for axis in self.axes if axis.bus == bus.name]
+            wiring.append((bus, tuple(axes)))
+        return tuple(wiring)
 
     @property
     def axis_names(self) -> tuple[str, ...]:

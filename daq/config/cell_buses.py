@@ -65,7 +65,9 @@ class BusLoad:
         return self.mean <= LARGEST_MEAN and self.worst <= LARGEST_WORST
 
     def __str__(self) -> str:
-        return f"{100 * self.mean:.0f} % on average, {100 * self.worst:.0f} % at worst"
+        mean_percent = 100 * self.mean
+        worst_percent = 100 * self.worst
+        return f"{mean_percent:.0f} % on average, {worst_percent:.0f} % at worst"
 
 
 def frame_bits(data_bytes: int) -> int:
@@ -87,7 +89,8 @@ def usual_bits(data_bytes: int) -> float:
 
 def answer_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> float:
     """Return the longest time for SYNC and one answer of each axis [µs]."""
-    return 1e6 * (frame_bits(0) + sum(map(frame_bits, _answers(profiles)))) / bitrate_bit_s
+    answer_bits = sum(map(frame_bits, _answers(profiles)))
+    return 1e6 * (frame_bits(0) + answer_bits) / bitrate_bit_s
 
 
 def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: int) -> BusLoad:
@@ -101,8 +104,9 @@ def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: in
     period_bits = bitrate_bit_s * period_us * 1e-6
     cycle = _cycle_bits(profiles)
     setpoints = len(profiles) * usual_bits(_SETPOINT_BYTES[0])
+    steady = _steady_bits_s(profiles) / bitrate_bit_s
     return BusLoad(
-        mean=cycle / period_bits + _steady_bits_s(profiles) / bitrate_bit_s,
+        mean=cycle / period_bits + steady,
         worst=answer_us(profiles, bitrate_bit_s) / period_us,
         start=(cycle + setpoints) / period_bits,
     )
@@ -116,8 +120,9 @@ def shortest_period_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> 
     if left_bits_s <= 0:
         return None
     mean_us = 1e6 * _cycle_bits(profiles) / left_bits_s
+    worst_us = answer_us(profiles, bitrate_bit_s) / LARGEST_WORST
     # Rounding must not refuse a period that is exactly long enough.
-    return ceil(max(mean_us, answer_us(profiles, bitrate_bit_s) / LARGEST_WORST) - 1e-6)
+    return ceil(max(mean_us, worst_us) - 1e-6)
 
 
 def split_answers(profile: DriveProfile) -> bool:
@@ -138,7 +143,10 @@ _SETPOINT_BYTES = tuple(map(_bytes, SETPOINT_PDOS))
 
 def _answers(profiles: Sequence[DriveProfile]) -> tuple[int, ...]:
     """Return the data bytes of every frame that answers one SYNC."""
-    return tuple(_bytes(pdo) for profile in profiles for pdo in pack(_feedback(profile)))
+    data_bytes: list[int] = []
+    for profile in profiles:
+        data_bytes += map(_bytes, pack(_feedback(profile)))
+    return tuple(data_bytes)
 
 
 def _cycle_bits(profiles: Sequence[DriveProfile]) -> float:
@@ -149,9 +157,11 @@ def _steady_bits_s(profiles: Sequence[DriveProfile]) -> float:
     """Return the load of heartbeats (also the recorder's) and set-points,
     independent of the period [bit/s].
     """
-    heartbeats = (len(profiles) + 1) * usual_bits(1) * 1000.0 / HEARTBEAT_MS
+    nodes = len(profiles) + 1
+    heartbeats = nodes * usual_bits(1) * 1000.0 / HEARTBEAT_MS
     first, *others = map(usual_bits, _SETPOINT_BYTES)
-    return heartbeats + MOVES_PER_S * len(profiles) * (SETPOINTS * first + sum(others))
+    move_bits = SETPOINTS * first + sum(others)
+    return heartbeats + MOVES_PER_S * len(profiles) * move_bits
 
 
 SIMULATED = " or ".join(one.name for one in INTERFACES.values() if one.is_simulated)
@@ -167,19 +177,18 @@ def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterat
         return
     if len(model.buses) > 1 and model.sync.producer != RECORDER:
         expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
-        yield Fault(
-            ("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected
-        )
+        found = f"{model.sync.producer}, with {len(model.buses)} buses"
+        yield Fault(("sync", "producer"), found, expected)
     for drive in model.drives:
         refresh_us = profiles[drive].update_period_us
         if refresh_us > model.sync.period_us:
-            yield Fault(
-                ("sync", "period_us"),
-                f"{model.sync.period_us}, while drive {drive} refreshes its objects every "
-                f"{refresh_us} µs",
+            period_us = model.sync.period_us
+            found = f"{period_us}, while drive {drive} refreshes its objects every {refresh_us} µs"
+            expected = (
                 f"{refresh_us} or more: faster than that, samples repeat old values and motion "
-                "becomes a staircase",
+                "becomes a staircase"
             )
+            yield Fault(("sync", "period_us"), found, expected)
     for index, bus in enumerate(model.buses):
         if model.sync.pacing is PacingMode.TIMED:
             yield from _load_faults(model, model.sync.period_us, bus, profiles)
@@ -203,17 +212,20 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
     names = [bus.name for bus in model.buses]
     for index, name in enumerate(names):
         if names.count(name) > 1:
-            yield Fault(
-                ("bus", index, "name"), f"{name}, used {names.count(name)} times", "each name once"
-            )
-        if names.index(name) == index and not any(
-            model.bus_of(axis) == name for axis in model.axes
-        ):
+            found = f"{name}, used {names.count(name)} times"
+            yield Fault(("bus", index, "name"), found, "each name once")
+        has_axis = any(model.bus_of(axis) == name for axis in model.axes)
+        if names.index(name) == index and not has_axis:
             yield Fault(
                 _path(model, index),
                 f"bus {name} without an axis",
                 "an axis with this `bus`, or no such bus",
             )
+    yield from _node_faults(model, names)
+
+
+def _node_faults(model: CellModel, names: Sequence[str]) -> Iterator[Fault]:
+    """Find axes without a node or a bus of the cell, and nodes that are there twice."""
     used = Counter(axis.node_id for axis in model.axes if axis.node_id is not None)
     for index, axis in enumerate(model.axes):
         if model.buses:
@@ -225,27 +237,21 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
         where = ("axes", index, "bus")
         known = ", ".join(names)
         if model.bus_of(axis) is None and len(names) > 1:
-            yield Fault(
-                where, "nothing", f"the bus of its amplifier, because the cell has several: {known}"
-            )
+            expected = f"the bus of its amplifier, because the cell has several: {known}"
+            yield Fault(where, "nothing", expected)
         elif axis.bus is not None and axis.bus not in names:
-            yield Fault(
-                where,
-                f"{axis.bus}, which is no bus of this cell",
-                f"one of {known}" if names else "no `bus`",
-            )
+            expected = f"one of {known}" if names else "no `bus`"
+            yield Fault(where, f"{axis.bus}, which is no bus of this cell", expected)
         if axis.node_id is None:
             continue
         if not 1 <= axis.node_id <= 127:
             yield Fault(("axes", index, "node_id"), str(axis.node_id), "1 to 127 (CiA 301)")
         if used[axis.node_id] > 1:
-            several = (
-                (", on all buses together: a frame is known by its node id alone")
-                if len(names) > 1
-                else ""
-            )
+            expected = "each node once"
+            if len(names) > 1:
+                expected += ", on all buses together: a frame is known by its node id alone"
             found = f"{axis.node_id}, used {used[axis.node_id]} times"
-            yield Fault(("axes", index, "node_id"), found, f"each node once{several}")
+            yield Fault(("axes", index, "node_id"), found, expected)
 
 
 def _load_faults(
@@ -255,11 +261,10 @@ def _load_faults(
 
     In lockstep any can: the next SYNC waits for the answers.
     """
-    used = [
-        profiles[axis.drive]
-        for axis in model.axes
-        if axis.drive is not None and model.bus_of(axis) == bus.name
-    ]
+    used = []
+    for axis in model.axes:
+        if axis.drive is not None and model.bus_of(axis) == bus.name:
+            used.append(profiles[axis.drive])
     load = bus_load(used, bus.bitrate_bit_s, period_us)
     if load.allowed:
         return
@@ -269,16 +274,18 @@ def _load_faults(
         ways.append("the axes on more buses (`bus` as a list)")
     wide = sorted({profile.name for profile in used if split_answers(profile)})
     if wide:
-        ways.append(
-            f"position, current and statusword in one frame (drive {', '.join(wide)} needs two)"
-        )
-    yield Fault(
-        ("sync", "period_us"),
+        drives = ", ".join(wide)
+        ways.append(f"position, current and statusword in one frame (drive {drives} needs two)")
+    found = (
         f"{period_us}, with which SYNC, the answers of {len(used)} axes, heartbeats and moves load "
-        f"bus {bus.name} by {load} at {bus.bitrate_bit_s} bit/s",
-        f"at most {100 * LARGEST_MEAN:.0f} % on average and answers that fit between two SYNCs "
-        "at worst: " + ", or ".join(ways),
+        f"bus {bus.name} by {load} at {bus.bitrate_bit_s} bit/s"
     )
+    largest_percent = 100 * LARGEST_MEAN
+    expected = (
+        f"at most {largest_percent:.0f} % on average and answers that fit between two SYNCs "
+        "at worst: "
+    )
+    yield Fault(("sync", "period_us"), found, expected + ", or ".join(ways))
 
 
 def _where(bus: Bus) -> tuple[str | int, ...]:
@@ -306,11 +313,11 @@ def producer_faults(model: CellModel) -> Iterator[Fault]:
     if producer == KERNEL:
         if set(interfaces) != {SOCKETCAN.name}:
             expected = f"a bus of interface {SOCKETCAN.name}, whose broadcast manager sends it"
-            yield Fault(path, f"{KERNEL} on {' + '.join(interfaces) or 'no bus'}", expected)
+            listed = " + ".join(interfaces) or "no bus"
+            yield Fault(path, f"{KERNEL} on {listed}", expected)
     elif producer not in model.axis_names:
-        yield Fault(
-            path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(model.axis_names)})"
-        )
+        listed = ", ".join(model.axis_names)
+        yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({listed})")
 
 
 def cell_address(cell: Wired) -> CellAddress:
@@ -320,7 +327,9 @@ def cell_address(cell: Wired) -> CellAddress:
         ConfigurationInconsistent: the cell only imports recordings.
     """
     parts = bus_parts(cell)
-    return parts[0].address if len(parts) == 1 else drivers.SplitAddress(parts)
+    if len(parts) == 1:
+        return parts[0].address
+    return drivers.SplitAddress(parts)
 
 
 def bus_parts(cell: Wired) -> tuple[drivers.BusPart, ...]:
@@ -355,13 +364,16 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
     """Warn of buses on which the start of a move does not fit between two SYNCs."""
     if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
         return ()
-    return tuple(
-        f"{bus.name}: when all its axes start, set-points and answers take {100 * load.start:.0f} "
-        "% of a period, and a late answer makes the run invalid; a longer sync.period_us or a "
-        "second bus has room for them"
-        for bus, load in bus_loads(cell)
-        if load.start > 1.0
-    )
+    warnings = []
+    for bus, load in bus_loads(cell):
+        if load.start > 1.0:
+            start_percent = 100 * load.start
+            warnings.append(
+                f"{bus.name}: when all its axes start, set-points and answers take "
+                f"{start_percent:.0f} % of a period, and a late answer makes the run invalid; a "
+                "longer sync.period_us or a second bus has room for them"
+            )
+    return tuple(warnings)
 
 
 def polling_fits(cell: Cell) -> bool:
@@ -373,9 +385,8 @@ def polling_fits(cell: Cell) -> bool:
     """
     if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
         return True
-    return all(
-        load.worst + _sdo_share(cell.sync, bus) <= LARGEST_WORST for bus, load in bus_loads(cell)
-    )
+    loads = [load.worst + _sdo_share(cell.sync, bus) for bus, load in bus_loads(cell)]
+    return all(load <= LARGEST_WORST for load in loads)
 
 
 def polling_warnings(cell: Cell) -> tuple[str, ...]:
@@ -384,14 +395,12 @@ def polling_warnings(cell: Cell) -> tuple[str, ...]:
     """
     if cell.sync is None or polling_fits(cell):
         return ()
-    most = max(
-        (load.worst + _sdo_share(cell.sync, bus)) * cell.sync.period_us
-        for bus, load in bus_loads(cell)
-    )
+    loads = [load.worst + _sdo_share(cell.sync, bus) for bus, load in bus_loads(cell)]
+    most_us = max(load * cell.sync.period_us for load in loads)
+    period_us = 100 * ceil(most_us / 100)
     return (
         "no room for SDO between two SYNCs: the drives' torque is not logged, and their "
-        f"temperature only before and after the run; a sync.period_us of {100 * ceil(most / 100)} "
-        "has room",
+        f"temperature only before and after the run; a sync.period_us of {period_us} has room",
     )
 
 

@@ -97,9 +97,16 @@ def chain_of(
         return _followed_chain(robot, urdf)
     revolute = {name: radians(position) for name, position in robot.assembly_deg.items()}
     prismatic = {name: 1e-3 * position for name, position in robot.assembly_mm.items()}
-    pairs = (LinkPair(one.name, one.first, one.second, one.directions) for one in closures)
-    passive = tuple(joint for joint in read_urdf(urdf).joints if joint.name not in robot.motors)
-    chain = ClosedChain(tuple(pairs), robot.motors, robot.platform, revolute | prismatic, passive)
+    pairs = [LinkPair(one.name, one.first, one.second, one.directions) for one in closures]
+    joints = read_urdf(urdf).joints
+    passive = [joint for joint in joints if joint.name not in robot.motors]
+    chain = ClosedChain(
+        closures=tuple(pairs),
+        motors=robot.motors,
+        platform=robot.platform,
+        assembly_rad=revolute | prismatic,
+        passive_joints=tuple(passive),
+    )
     # Which closures are pivots does not depend on gravity.
     closed = robot_with(chain, urdf, STANDING)
     return replace(chain, pivots=closed.pivot_names)
@@ -110,7 +117,8 @@ def _followed_chain(robot: ChainModel, urdf: str) -> ClosedChain | None:
     followers = mimics_of(urdf)
     if not followers:
         return None
-    motors = tuple(joint.name for joint in read_urdf(urdf).joints if joint.name not in followers)
+    names = [joint.name for joint in read_urdf(urdf).joints]
+    motors = tuple(name for name in names if name not in followers)
     return ClosedChain((), motors, robot.platform, {}, ())
 
 
@@ -193,9 +201,8 @@ def chain_faults(
                 yield Fault(("robot", key, name), found, f"a {kind.value} joint")
     if {"motors", "mobility"} <= set(given) and not unknown:
         try:
-            assemble(
-                robot_with(chain_of(robot, closures, urdf), urdf, (0.0, 0.0, -9.81)), robot.mobility
-            )
+            chain = chain_of(robot, closures, urdf)
+            assemble(robot_with(chain, urdf, STANDING), robot.mobility)
         except ModelError as error:
             found, _, expected = str(error).partition("; expected ")
             yield Fault(
@@ -212,11 +219,11 @@ def _carrier_faults(robot: ChainModel, urdf: str) -> Iterator[Fault]:
     links = read_urdf(urdf).links
     moving = [name for name, place in links.items() if place.joint >= 0]
     if robot.platform not in moving:
+        found = f"{robot.platform!r}"
         if robot.platform in links:
-            found = f"{robot.platform!r}, which does not move"
-        else:
-            found = f"{robot.platform!r}"
-        yield Fault(("robot", "platform"), found, f"a link that moves: {', '.join(moving)}")
+            found += ", which does not move"
+        known = ", ".join(moving)
+        yield Fault(("robot", "platform"), found, f"a link that moves: {known}")
 
 
 def mechanism_faults(closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[Fault]:
@@ -237,7 +244,9 @@ def mechanism_faults(closures: tuple[ClosureModel, ...], urdf: str) -> Iterator[
     for joint in joints:
         leader = joint.find("{*}mimic")
         if leader is not None and joint.get("type") != "fixed":
-            found = f"joint {joint.get('name')} mimics {leader.get('joint')} in the URDF"
+            name = joint.get("name")
+            leader_name = leader.get("joint")
+            found = f"joint {name} mimics {leader_name} in the URDF"
             yield Fault(
                 ("robot", "urdf"),
                 found,

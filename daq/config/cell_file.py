@@ -96,18 +96,31 @@ def cell_from_bundle(
     members = {drive: f"{DRIVES}{drive}.yaml" for drive in model.drives}
     profiles: dict[str, DriveProfile] = {}
     for drive, member in members.items():
-        profiles[drive] = drive_from_text(_member(files, member, names), names.get(member, member))
+        content = _member(files, member, names)
+        profiles[drive] = drive_from_text(content, names.get(member, member))
     urdf = held_urdf(document, model, urdf)
     check(document, model, urdf, profiles, logged=file is None)
-    if model.controller is None:
-        controller = None
-    else:
-        controller = model.controller.file
     chain = chain_of(model.robot, model.closures, urdf)
     undriven = () if chain is None else chain.undriven_names
     places = [*model.axis_names, *undriven]
     mounted = platform_frame(model.robot, urdf)
-    used = (CELL, URDF, *members.values())
+    used = {name: files[name] for name in (CELL, URDF, *members.values())}
+    recorded = {
+        name: _canonical(name, content, names.get(name, name)) for name, content in used.items()
+    }
+    axes = [_axis(axis, model.bus_of(axis), profiles) for axis in model.axes]
+    payloads = [_payload(payload, mounted) for payload in model.payloads]
+    effects = [_effect(effect, places) for effect in model.effects]
+    joints = _joints(model, chain, urdf)
+    folder = None
+    history = None
+    recalibration = None
+    if file is not None:
+        folder = file.parent
+        controller = None if model.controller is None else model.controller.file
+        history = model.history.place(file, controller)
+        if model.recalibration is not None:
+            recalibration = model.recalibration.recalibration(file)
     return Cell(
         name=model.name,
         urdf=urdf,
@@ -115,29 +128,25 @@ def cell_from_bundle(
         ratio=ratio_of(model),
         buses=model.buses,
         sync=model.sync,
-        axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
-        payloads=tuple(_payload(payload, mounted) for payload in model.payloads),
+        axes=tuple(axes),
+        payloads=tuple(payloads),
         conditioning=_conditioning(model.conditioning),
         controller=model.controller,
         chain=chain,
         platform=model.robot.platform,
-        clearance=clearance_of(model.workspace, model.clearance, _joints(model, chain, urdf)),
-        effects=tuple(_effect(effect, places) for effect in model.effects),
-        folder=None if file is None else file.parent,
-        digest=digest({name: files[name] for name in used}),
-        recording_digest=digest(
-            {name: _canonical(name, files[name], names.get(name, name)) for name in used}
-        ),
+        clearance=clearance_of(model.workspace, model.clearance, joints),
+        effects=tuple(effects),
+        folder=folder,
+        digest=digest(used),
+        recording_digest=digest(recorded),
         motion=model.policy.motion,
         unguarded=model.policy.unguarded,
         recovery_motion=model.policy.recovery_motion,
         apply=model.policy.apply,
         friction_by_payload=model.friction_by_payload,
         target_sigma_percent=model.target_sigma_percent,
-        history=None if file is None else model.history.place(file, controller),
-        recalibration=None
-        if file is None or model.recalibration is None
-        else model.recalibration.recalibration(file),
+        history=history,
+        recalibration=recalibration,
     )
 
 
@@ -154,30 +163,32 @@ def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
     if not model.hold:
         return urdf
     try:
-        joints = {
-            joint.get("name", ""): joint
-            for joint in ElementTree.fromstring(urdf).findall("{*}joint")
-        }
-        prismatic = {name for name, joint in joints.items() if joint.get("type") == "prismatic"}
-        held = {name: at if name in prismatic else radians(at) for name, at in model.hold.items()}
+        robot = ElementTree.fromstring(urdf)
+        joints = {joint.get("name", ""): joint for joint in robot.findall("{*}joint")}
+        held = _held_positions(model, joints)
         fixed = hold_joints(urdf, held)
         faults = [*_hold_faults(model, held, joints)]
     except ElementTree.ParseError:
         return urdf  # the check of the robot says so
     except ModelError as error:
         found, _, expected = str(error).partition("; expected ")
-        faults = [
-            Fault(
-                ("hold",),
-                found,
-                expected or "joints of the URDF that are no axes, each with its position",
-            )
-        ]
+        if not expected:
+            expected = "joints of the URDF that are no axes, each with its position"
+        faults = [Fault(("hold",), found, expected)]
     if faults:
-        raise ConfigurationInconsistent(
-            **fault_texts(document, faults), remedy="correct the cell file"
-        )
+        texts = fault_texts(document, faults)
+        raise ConfigurationInconsistent(**texts, remedy="correct the cell file")
     return fixed
+
+
+def _held_positions(model: CellModel, joints: dict[str, ElementTree.Element]) -> dict[str, float]:
+    """Return the positions of the held joints [rad; m if prismatic]."""
+    held = {}
+    for name, position in model.hold.items():
+        joint = joints.get(name)
+        is_prismatic = joint is not None and joint.get("type") == "prismatic"
+        held[name] = position if is_prismatic else radians(position)
+    return held
 
 
 def _hold_faults(
@@ -196,27 +207,31 @@ def _hold_faults(
         if limit is None or kind == "continuous":
             continue
         try:
-            lower, upper = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+            lower = float(limit.get("lower", "0"))
+            upper = float(limit.get("upper", "0"))
         except ValueError:
             continue  # a held joint's limits are needed for this check alone
         margin = 0.01 * (upper - lower)
-        if lower < upper and not lower - margin <= position <= upper + margin:
+        is_inside = lower - margin <= position <= upper + margin
+        if lower < upper and not is_inside:
             if kind == "prismatic":
-                unit = 1.0
-                spelled = "m"
+                in_si = 1.0
+                unit = "m"
             else:
-                unit = radians(1.0)
-                spelled = "deg"
-            expected = f"{lower / unit:.4g} to {upper / unit:.4g} {spelled}, the limits in the URDF"
-            yield Fault(("hold", name), f"{model.hold[name]:g} {spelled}", expected)
+                in_si = radians(1.0)
+                unit = "deg"
+            limits = f"{lower / in_si:.4g} to {upper / in_si:.4g} {unit}"
+            found = f"{model.hold[name]:g} {unit}"
+            yield Fault(("hold", name), found, f"{limits}, the limits in the URDF")
 
 
 def digest(files: Mapping[str, bytes]) -> str:
     """Return the sha256 over names and contents, in the order of the names, hex."""
     total = hashlib.sha256()
     for name in sorted(files):
-        total.update(f"{name}\0{len(files[name])}\0".encode())
-        total.update(files[name])
+        content = files[name]
+        total.update(f"{name}\0{len(content)}\0".encode())
+        total.update(content)
     return total.hexdigest()
 
 
@@ -268,7 +283,8 @@ def _sources(path: Path) -> dict[str, Path]:
         profile = sources[f"{DRIVES}{drive}.yaml"] = drive_path(path.parent, drive)
         tree = parse_yaml(read_yaml_bytes(profile), str(profile)).tree
         # The schema is checked later
-        if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:
+        eds = tree.get("eds") if isinstance(tree, dict) else None
+        if isinstance(eds, str) and eds:
             sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
     return sources
 
@@ -306,10 +322,12 @@ def drive_path(folder: Path, drive: str) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    shipped = ", ".join(sorted(entry.stem for entry in candidates[-1].parent.glob("*.yaml")))
+    shipped_profiles = candidates[-1].parent.glob("*.yaml")
+    shipped = ", ".join(sorted(entry.stem for entry in shipped_profiles))
+    tried = ", ".join(map(str, candidates))
     raise ConfigurationMissing(
         f"drive profile {drive!r}",
-        found="no file " + ", ".join(map(str, candidates)),
+        found=f"no file {tried}",
         expected=f"a profile beside the cell, or a shipped one ({shipped})",
         remedy="correct the axis's `drive`, or write the profile",
     )
@@ -318,9 +336,10 @@ def drive_path(folder: Path, drive: str) -> Path:
 def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -> bytes:
     if member in files:
         return files[member]
+    available = ", ".join(sorted(files)) or "nothing"
     raise ConfigurationMissing(
         names.get(member, member),
-        found="only " + (", ".join(sorted(files)) or "nothing"),
+        found=f"only {available}",
         expected=f"{member} among the files of the cell",
         remedy="the log or bundle is incomplete; record or import it again",
     )
@@ -338,12 +357,16 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
         ampere = "A(actual)"
     else:
         ampere = "A"
+    identity = None
+    if model.identity is not None:
+        identity = Identity(**model.identity.model_dump())
+    lower, upper = limits.position
     return CellAxis(
         name=model.name,
         node_id=model.node_id,
         drive=model.drive,
         profile=profile,
-        identity=None if model.identity is None else Identity(**model.identity.model_dump()),
+        identity=identity,
         bus=bus,
         counts_per_revolution=model.counts_per_revolution,
         unit=unit,
@@ -351,7 +374,7 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
         nameplate_gain=gain,
         gain_unit=model.gain_unit or f"{force}/{ampere}",
         limits=Limits(
-            position=(unit.si * limits.position[0], unit.si * limits.position[1]),
+            position=(unit.si * lower, unit.si * upper),
             velocity=unit.si * limits.velocity,
             acceleration=unit.si * limits.acceleration,
         ),
@@ -365,10 +388,12 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
     millimetres = model.standstill_mm_s or (None,) * len(model.standstill_rad_s)
     radians = model.standstill_rad_s or (None,) * len(millimetres)
     rest = model.model_dump(exclude={"standstill_rad_s", "standstill_mm_s"})
-    speeds = (
-        MILLIMETRE.si * (along or 0.0) if about is None else about
-        for about, along in zip(radians, millimetres, strict=True)
-    )
+    speeds = []
+    for revolute_rad_s, prismatic_mm_s in zip(radians, millimetres, strict=True):
+        if revolute_rad_s is not None:
+            speeds.append(revolute_rad_s)
+        else:
+            speeds.append(MILLIMETRE.si * (prismatic_mm_s or 0.0))
     return Conditioning(**rest, standstill_rad_s=tuple(speeds))
 
 
@@ -378,11 +403,15 @@ def _joints(model: CellModel, chain: ClosedChain | None, urdf: str) -> dict[str,
     """
     if chain is None:
         return {name: index for index, name in enumerate(model.axis_names)}
-    index = {joint.name: number for number, joint in enumerate(read_urdf(urdf).joints)}
-    passive = {name: number for name, number in index.items() if name not in chain.motors}
-    return passive | {
-        name: index[motor] for name, motor in zip(model.axis_names, chain.motors, strict=True)
+    joint_names = [joint.name for joint in read_urdf(urdf).joints]
+    indices = {
+        joint_name: index
+        for index, joint_name in enumerate(joint_names)
+        if joint_name not in chain.motors
     }
+    for axis_name, motor in zip(model.axis_names, chain.motors, strict=True):
+        indices[axis_name] = joint_names.index(motor)
+    return indices
 
 
 def _effect(effect: EffectModel, places: Sequence[str]) -> DeclaredEffect:
@@ -410,7 +439,8 @@ def _in_joint_frame(
     upper = np.triu_indices(3)
     inertia = np.zeros((3, 3))
     inertia[upper] = about_centre_kg_m2
-    inertia = turned @ (inertia + np.triu(inertia, 1).T) @ turned.T
+    inertia += np.triu(inertia, 1).T  # symmetric
+    inertia = turned @ inertia @ turned.T
     return tuple(centre.tolist()), tuple(inertia[upper].tolist())
 
 
@@ -427,9 +457,12 @@ def drawn_parameters(
             the frame.
     """
     centre = np.array(centre_m)
-    known = dict(zip(("mx", "my", "mz"), (mass_kg * centre).tolist(), strict=True))
+    first_moments = mass_kg * centre
+    known = dict(zip(("mx", "my", "mz"), first_moments.tolist(), strict=True))
     if about_centre_kg_m2 is not None:
-        steiner = mass_kg * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        # I = I_c + m (c·c 1 − c cᵀ)
+        square = centre @ centre * np.eye(3)
+        steiner = mass_kg * (square - np.outer(centre, centre))
         inertia = np.array(about_centre_kg_m2) + steiner[np.triu_indices(3)]
         known |= dict(zip(LINK_PARAMETERS[:6], inertia.tolist(), strict=True))
     return known

@@ -366,7 +366,11 @@ class CellModel(StrictModel):
 
     def bus_of(self, axis: AxisModel) -> str | None:
         """Return the name of an axis's bus; the only bus of a cell need not be named."""
-        return axis.bus or (self.buses[0].name if len(self.buses) == 1 else None)
+        if axis.bus:
+            return axis.bus
+        if len(self.buses) == 1:
+            return self.buses[0].name
+        return None
 
     @property
     def drives(self) -> tuple[str, ...]:
@@ -375,8 +379,7 @@ class CellModel(StrictModel):
 
 
 def ratio_of(model: CellModel) -> FloatArray:
-    """Return R of q_motor = R q_joint (paper eq.
-    24), rad/rad, or rad/m for a prismatic joint, shape (n, n).
+    """Return R of q_motor = R q_joint (eq. 24) [rad/rad; rad/m if prismatic], shape (n, n).
 
     Where a prismatic axis has a `lead_mm`, its column is written in turns: one turn of screw or
     pinion moves the joint by the lead, so R = ratio · 2π / lead.
@@ -384,11 +387,14 @@ def ratio_of(model: CellModel) -> FloatArray:
     Raises:
         ValueError: the rows are not n of n numbers.
     """
-    lead_mm = [axis.lead_mm for axis in model.axes]
-    per_turn = np.array([1.0 if lead is None else 2.0 * pi / (1e-3 * lead) for lead in lead_mm])
-    return np.asarray(
-        np.array(model.drive_train.ratio, dtype=np.float64) * per_turn, dtype=np.float64
-    )
+    per_turn = []
+    for axis in model.axes:
+        if axis.lead_mm is None:
+            per_turn.append(1.0)
+        else:
+            per_turn.append(2.0 * pi / (1e-3 * axis.lead_mm))
+    ratio = np.array(model.drive_train.ratio, dtype=np.float64)
+    return np.asarray(ratio * np.array(per_turn), dtype=np.float64)
 
 
 def gain_joints(ratio: FloatArray) -> tuple[int, ...]:
@@ -396,7 +402,8 @@ def gain_joints(ratio: FloatArray) -> tuple[int, ...]:
     that of its reduction N.
     """
     # The rule of ident.model.model.DriveTrain.reduction.
-    return tuple(
-        motor if row[motor] != 0.0 else int(np.argmax(np.abs(row)))
-        for motor, row in enumerate(ratio)
-    )
+    joints = []
+    for motor, row in enumerate(ratio):
+        has_reduction = row[motor] != 0.0
+        joints.append(motor if has_reduction else int(np.argmax(np.abs(row))))
+    return tuple(joints)

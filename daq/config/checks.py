@@ -113,7 +113,9 @@ def check(
         faults += _frame_faults(model, urdf)
     if faults:
         is_of_urdf = any(fault.path == ("robot", "urdf") for fault in faults)
-        remedy = "correct the cell file" + (", or the URDF that it names" if is_of_urdf else "")
+        remedy = "correct the cell file"
+        if is_of_urdf:
+            remedy += ", or the URDF that it names"
         raise ConfigurationInconsistent(**fault_texts(document, faults), remedy=remedy)
 
 
@@ -125,13 +127,8 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     gravity = hypot(*model.robot.gravity_m_s2)
     if not GRAVITY_M_S2[0] < gravity < GRAVITY_M_S2[1]:
         found = f"{gravity:.4g} m/s² in all"
-        faults.append(
-            Fault(
-                ("robot", "gravity_m_s2"),
-                found,
-                f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth",
-            )
-        )
+        expected = f"{range_text(GRAVITY_M_S2)} m/s², as anywhere on Earth"
+        faults.append(Fault(("robot", "gravity_m_s2"), found, expected))
     axes = model.axis_names
     try:
         of_urdf = _urdf_faults(model, urdf)
@@ -143,10 +140,7 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         found, _, expected = str(error).partition("; expected ")
         # The place is that of the cell file, which only names it
         found = f"{model.robot.urdf}: {found}"
-        if expected:
-            expected = f"a URDF of an arm: {expected}"
-        else:
-            expected = "a URDF of an arm"
+        expected = f"a URDF of an arm: {expected}" if expected else "a URDF of an arm"
         if OTHER_JOINT in found:
             expected += "; `hold: {JOINT: POSITION}` fixes a joint that is no axis"
         return None, [*faults, Fault(("robot", "urdf"), found, expected)]
@@ -154,18 +148,14 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
     more = len(names) - len(axes)
     if more and model.closures:
         found = f"{len(names)} joints for {len(axes)} axes"
-        faults.append(
-            Fault(
-                ("robot", "motors"),
-                found,
-                f"the joint of each axis, in their order ({', '.join(axes)})",
-            )
-        )
+        expected = f"the joint of each axis, in their order ({', '.join(axes)})"
+        faults.append(Fault(("robot", "motors"), found, expected))
     elif more:
         expected = f"one for each moving joint of the URDF ({', '.join(names)})"
         if more > 0:
             others = [name for name in names if name not in axes]
-            held = ", ".join(f"{name}: 0.0" for name in others[-more:])
+            unmoved = others[-more:]
+            held = ", ".join(f"{name}: 0.0" for name in unmoved)
             expected += (
                 "; joints that are no axes are held at a position [deg; m if prismatic]: "
                 f"`hold: {{{held}}}`"
@@ -175,10 +165,8 @@ def _robot(model: CellModel, urdf: str) -> tuple[Robot | None, list[Fault]]:
         # Either the list has the wrong joint or the axis the wrong name; both cannot stay: an
         # effect may name either.
         if name in robot.passive_names:
-            found = (
-                f"{model.robot.motors[index]} as the joint of axis {name}, and joint {name} "
-                "without a motor"
-            )
+            joint = model.robot.motors[index]
+            found = f"{joint} as the joint of axis {name}, and joint {name} without a motor"
             expected = f"{name}, or another name of that axis (`axes[{index}].name`)"
             faults.append(Fault(("robot", "motors", index), found, expected))
     return robot, faults
@@ -190,9 +178,10 @@ def _urdf_faults(model: CellModel, urdf: str) -> list[Fault]:
     """
     if not urdf.strip():
         return [Fault(("robot", "urdf"), "an empty file", "a URDF of an arm")]
-    return [*mimic_faults(model.axis_names, urdf)] or [
-        *chain_faults(model.robot, model.closures, urdf)
-    ]
+    faults = [*mimic_faults(model.axis_names, urdf)]
+    if faults:
+        return faults
+    return [*chain_faults(model.robot, model.closures, urdf)]
 
 
 def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
@@ -223,7 +212,8 @@ def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
         first = first_leader(name, mimics).leader
         # Axes may have other names than their joints, so names count only where there are joints
         # without an axis.
-        if first not in leaders or (len(leaders) > len(axes) and first not in axes):
+        has_other_joints = len(leaders) > len(axes)
+        if first not in leaders or (has_other_joints and first not in axes):
             expected = (
                 f"`hold` of {first} if that is no axis, and {name} follows it; else an axis of "
                 f"{first}"
@@ -240,13 +230,14 @@ def _order_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         return
     for index, (axis, joint) in enumerate(zip(model.axes, driven, strict=True)):
         if axis.name != joint and axis.name in driven:
-            path = ("robot", "motors", index) if model.robot.motors else ("axes", index, "name")
+            path: Location = ("axes", index, "name")
+            if model.robot.motors:
+                path = ("robot", "motors", index)
             found = (
                 f"{joint} as the joint of axis {axis.name}, and {axis.name} as that of another axis"
             )
-            yield Fault(
-                path, found, f"{axis.name}, or another name of that axis (`axes[{index}].name`)"
-            )
+            expected = f"{axis.name}, or another name of that axis (`axes[{index}].name`)"
+            yield Fault(path, found, expected)
 
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
@@ -254,19 +245,19 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     ratio = model.drive_train.ratio
     n = len(model.axes)
     if len(ratio) != n or any(len(row) != n for row in ratio):
-        shape = (
-            f"{len(ratio)} rows of "
-            f"{', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
-        )
+        widths = sorted({len(row) for row in ratio})
+        listed = ", ".join(map(str, widths))
+        shape = f"{len(ratio)} rows of {listed} numbers"
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
         return
     implausible = False
     for motor, row in enumerate(np.abs(ratio_of(model)).tolist()):
-        if any(0.0 < one < SMALLEST_COUPLING for one in row) or (
-            any(row) and not within(max(row), RATIO)
-        ):
+        has_small_coupling = any(0.0 < number < SMALLEST_COUPLING for number in row)
+        has_other_reduction = any(row) and not within(max(row), RATIO)
+        if has_small_coupling or has_other_reduction:
             implausible = True
-            found = ", ".join(f"{number:g}" for number in ratio[motor])
+            numbers = [f"{number:g}" for number in ratio[motor]]
+            found = ", ".join(numbers)
             expected = (
                 f"a reduction of {RATIO[0]:g} to {RATIO[1]:g} rad/rad (rad/m), and no "
                 "smaller coupling than "
@@ -284,11 +275,13 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     if free is None or motors <= free:
         return
     for motor, row in enumerate(ratio):
-        others = [
-            model.axes[joint].name for joint in range(n) if joint != motor and row[joint] != 0.0
-        ]
+        others = []
+        for joint, axis in enumerate(model.axes):
+            if joint != motor and row[joint] != 0.0:
+                others.append(axis.name)
         if others:  # the rule of ident.model.model.Model
-            found = f"the motor of {model.axes[motor].name} also turns with {', '.join(others)}"
+            listed = ", ".join(others)
+            found = f"the motor of {model.axes[motor].name} also turns with {listed}"
             expected = f"zeros off the diagonal: {motors} motors for {free} degrees of freedom"
             yield Fault((*path, motor), found, expected)
 
@@ -298,15 +291,11 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
     names = Counter(model.axis_names)
     for index, axis in enumerate(model.axes):
         if names[axis.name] > 1:
-            yield Fault(
-                ("axes", index, "name"),
-                f"{axis.name}, used {names[axis.name]} times",
-                "each name once",
-            )
+            found = f"{axis.name}, used {names[axis.name]} times"
+            yield Fault(("axes", index, "name"), found, "each name once")
     if model.controller is not None:
-        on_a_bus = bool(model.buses) and all(
-            axis.node_id is not None and axis.drive for axis in model.axes
-        )
+        have_nodes = all(axis.node_id is not None and axis.drive for axis in model.axes)
+        on_a_bus = bool(model.buses) and have_nodes
         yield from controller_faults(model.controller, n, on_a_bus=on_a_bus)
     mountings = Counter(payload.mounting for payload in model.payloads)
     for index, payload in enumerate(model.payloads):
@@ -319,9 +308,11 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
             expected = "at most a tenth of the mass: it is in every gain"
             yield Fault(("payloads", index, "mass_tolerance_kg"), found, expected)
         if mountings[payload.mounting] > 1:
+            found = f"{payload.mounting}, used {mountings[payload.mounting]} times"
+            path = ("payloads", index, "mounting")
             yield Fault(
-                ("payloads", index, "mounting"),
-                f"{payload.mounting}, used {mountings[payload.mounting]} times",
+                path,
+                found,
                 "each mounting a name of its own: it denotes one body in one place",
             )
         if payload.inertia_kg_m2 is not None:
@@ -341,19 +332,19 @@ def _effect_faults(model: CellModel, robot: Robot | None, *, logged: bool) -> It
     undriven = () if robot is None else robot.undriven_names
     names = [*model.axis_names, *undriven]
     placed = [(effect.name, effect.axis) for effect in model.effects]
+    is_chain_unknown = bool(model.closures) and not undriven
     for index, effect in enumerate(model.effects):
-        if effect.axis not in names and not (model.closures and not undriven):
-            yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {', '.join(names)}")
+        if effect.axis not in names and not is_chain_unknown:
+            known = ", ".join(names)
+            yield Fault(("effects", index, "axis"), repr(effect.axis), f"one of {known}")
         elif placed.index((effect.name, effect.axis)) < index:
-            yield Fault(
-                ("effects", index),
-                f"{effect.name} on {effect.axis} twice",
-                "each effect once on an axis",
-            )
+            found = f"{effect.name} on {effect.axis} twice"
+            yield Fault(("effects", index), found, "each effect once on an axis")
         elif not logged and robot is not None and len(names) == len(robot.places):
-            found = place_effect(effect.name, names.index(effect.axis), effect.settings, robot)
-            if isinstance(found, Fault):
-                yield replace(found, path=("effects", index, *found.path))
+            place = names.index(effect.axis)
+            placed_effect = place_effect(effect.name, place, effect.settings, robot)
+            if isinstance(placed_effect, Fault):
+                yield replace(placed_effect, path=("effects", index, *placed_effect.path))
 
 
 def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
@@ -376,9 +367,8 @@ def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
 def _mass_faults(model: CellModel) -> Iterator[Fault]:
     """Find payloads that this robot cannot carry, and g beside kg."""
     rated_kg = model.robot.rated_payload_kg
-    lightest_kg = min(
-        (payload.mass_kg for payload in model.payloads if payload.mass_kg > 0), default=0.0
-    )
+    masses_kg = [payload.mass_kg for payload in model.payloads if payload.mass_kg > 0]
+    lightest_kg = min(masses_kg, default=0.0)
     for index, payload in enumerate(model.payloads):
         path = ("payloads", index, "mass_kg")
         found = f"{payload.mass_kg:g} kg"
@@ -443,14 +433,14 @@ def moment_faults(path: Location, inertia_kg_m2: Sequence[float]) -> Iterator[Fa
     if not max(map(abs, inertia_kg_m2)) < _OVERFLOWS:
         return  # `gyration_faults` refuses it
     xx, xy, xz, yy, yz, zz = inertia_kg_m2
-    least, middle, largest = np.linalg.eigvalsh(
-        np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    )
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    least, middle, largest = np.linalg.eigvalsh(inertia)
     margin = 1e-9 * abs(largest)
     if least < -margin or largest > least + middle + margin:
+        found = f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²"
         yield Fault(
             path,
-            f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
+            found,
             "those of a body about its centre of mass: none below 0, none above the sum of the "
             "other two",
         )
@@ -487,15 +477,14 @@ def _axis_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
         path: Location = ("axes", index)
         if index < len(joints):
             yield from _kind_faults(path, axis, joints[index])
-        yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis)
+        key = f"position_{axis.limits.unit.name}"
+        yield from _limit_faults((*path, "limits", key), axis)
         for unit, offset in axis.zero_offsets.items():
             farthest = _PLAUSIBLE[unit].farthest
             if abs(offset) > farthest:
-                yield Fault(
-                    (*path, f"zero_offset_{unit.name}"),
-                    f"{offset:g}",
-                    f"at most ±{farthest:g} {unit.name}",
-                )
+                key = f"zero_offset_{unit.name}"
+                expected = f"at most ±{farthest:g} {unit.name}"
+                yield Fault((*path, key), f"{offset:g}", expected)
     yield from _gain_faults(model, joints)
     yield from _standstill_faults(model, joints)
 
@@ -507,18 +496,12 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
     what = f"joint {joint.name} of the URDF is {joint.kind.value}"
     if written is not unit:
         name = unit.name
-        yield Fault(
-            (*path, "limits"),
-            f"limits in {written.name}, and {what}",
-            f"position_{name}, velocity_{name}_s and acceleration_{name}_s2",
-        )
+        expected = f"position_{name}, velocity_{name}_s and acceleration_{name}_s2"
+        yield Fault((*path, "limits"), f"limits in {written.name}, and {what}", expected)
     for other in axis.zero_offsets:
         if other is not unit:
-            yield Fault(
-                (*path, f"zero_offset_{other.name}"),
-                f"{other.name}, and {what}",
-                f"zero_offset_{unit.name}",
-            )
+            key = f"zero_offset_{other.name}"
+            yield Fault((*path, key), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
     if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
         yield Fault(
             (*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead"
@@ -533,9 +516,8 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         ((key, gain),) = axis.nameplate_gains.items()
         if not gain:
-            yield Fault(
-                ("axes", index, key), "0", "the nameplate gain of the data sheet, signed, not zero"
-            )
+            expected = "the nameplate gain of the data sheet, signed, not zero"
+            yield Fault(("axes", index, key), "0", expected)
         if index >= len(gained) or gained[index] >= len(joints):
             continue
         joint = joints[gained[index]]
@@ -545,12 +527,10 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
             key = "gain_unit"
             written = (axis.gain_unit or "").partition("/")[0].strip()
         if written in {"Nm", "N"} and written != force:
-            yield Fault(
-                ("axes", index, key),
-                f"a gain in {written}, and it acts on joint {joint.name}, which is "
-                f"{joint.kind.value}",
-                f"{force} per unit of the current reference",
-            )
+            kind = joint.kind.value
+            found = f"a gain in {written}, and it acts on joint {joint.name}, which is {kind}"
+            expected = f"{force} per unit of the current reference"
+            yield Fault(("axes", index, key), found, expected)
 
 
 def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
@@ -561,18 +541,12 @@ def _limit_faults(path: Location, axis: AxisModel) -> Iterator[Fault]:
     if lower >= upper:
         yield Fault(path, found, "the lower limit first")
     elif max(abs(lower), abs(upper)) > plausible.farthest:
-        yield Fault(
-            path,
-            found,
-            f"at most ±{plausible.farthest:g} {unit.name}; are these {plausible.too_far}?",
-        )
+        expected = f"at most ±{plausible.farthest:g} {unit.name}; are these {plausible.too_far}?"
+        yield Fault(path, found, expected)
     elif upper - lower < plausible.shortest:
-        yield Fault(
-            path,
-            found,
-            f"a range of at least {plausible.shortest:g} {unit.name}; are these "
-            f"{plausible.too_short}?",
-        )
+        smallest = f"{plausible.shortest:g} {unit.name}"
+        expected = f"a range of at least {smallest}; are these {plausible.too_short}?"
+        yield Fault(path, found, expected)
 
 
 def _range_faults(model: CellModel) -> Iterator[Fault]:
@@ -580,21 +554,22 @@ def _range_faults(model: CellModel) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         unit = axis.limits.unit.name
         ((key, gain),) = axis.nameplate_gains.items()
-        for where, value, bounds, shown in (
-            (("limits", f"velocity_{unit}_s"), axis.limits.velocity, SPEED, f" {unit}/s"),
-            (
-                ("limits", f"acceleration_{unit}_s2"),
-                axis.limits.acceleration,
-                ACCELERATION,
-                f" {unit}/s²",
-            ),
-            ((key,), abs(gain), RAW_GAIN if key == "nameplate_gain" else GAIN, " in size"),
-        ):
-            if value != 0.0 and not within(value, bounds):
-                found = f"{value:g}{shown}"
-                yield Fault(
-                    ("axes", index, *where), found, f"{bounds[0]:g} to {bounds[1]:g}{shown}"
-                )
+        path: Location = ("axes", index)
+        speed_path = (*path, "limits", f"velocity_{unit}_s")
+        yield from _outside(speed_path, axis.limits.velocity, SPEED, f"{unit}/s")
+        acceleration_path = (*path, "limits", f"acceleration_{unit}_s2")
+        acceleration = axis.limits.acceleration
+        yield from _outside(acceleration_path, acceleration, ACCELERATION, f"{unit}/s²")
+        gain_bounds = RAW_GAIN if key == "nameplate_gain" else GAIN
+        yield from _outside((*path, key), abs(gain), gain_bounds, "in size")
+
+
+def _outside(
+    path: Location, value: float, bounds: tuple[float, float], unit: str
+) -> Iterator[Fault]:
+    """Find a number outside its bounds; zero is another fault."""
+    if value != 0.0 and not within(value, bounds):
+        yield Fault(path, f"{value:g} {unit}", f"{bounds[0]:g} to {bounds[1]:g} {unit}")
 
 
 def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
@@ -602,28 +577,30 @@ def _si_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
     or no revolute axis with a range of some degrees.
     """
     limits = _urdf_limits(urdf)
-    of_urdf = dict(enumerate(limits.get(name) for name in model.robot.motors or limits))
-    ranges = [axis.limits.position for axis in model.axes if axis.limits.unit is DEGREE]
-    narrow = all(SHORTEST_DEG < upper - lower < SHORTEST_OF_ALL_DEG for lower, upper in ranges)
+    joint_names = model.robot.motors or limits
+    of_urdf = dict(enumerate(limits.get(name) for name in joint_names))
+    in_degrees = [axis.limits for axis in model.axes if axis.limits.unit is DEGREE]
+    ranges_deg = [limit.position[1] - limit.position[0] for limit in in_degrees]
+    narrow = all(SHORTEST_DEG < range_deg < SHORTEST_OF_ALL_DEG for range_deg in ranges_deg)
     for index, axis in enumerate(model.axes):
         lower, upper = axis.limits.position
         velocity = axis.limits.velocity
         unit = axis.limits.unit
         path = ("axes", index, "limits")
         in_si = of_urdf.get(index)
-        remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
+        multiply = f"multiply by {1.0 / unit.si:.3g}"
+        remedy = f"{unit.name}; {multiply}"
         where = (*path, f"position_{unit.name}")
         found = f"[{lower:g}, {upper:g}] {unit.name}"
-        if in_si is not None and _within_urdf(
-            (lower, upper), in_si.position, _PLAUSIBLE[unit].farthest * unit.si
-        ):
+        farthest_si = _PLAUSIBLE[unit].farthest * unit.si
+        if in_si is not None and _within_urdf((lower, upper), in_si.position, farthest_si):
             yield Fault(where, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
         elif narrow and unit is DEGREE:
             found += f", and on no axis a range of {SHORTEST_OF_ALL_DEG:g} deg"
-            yield Fault(
-                where, found, f"limits in deg; are these in rad? multiply by {1.0 / unit.si:.3g}"
-            )
-        if in_si is not None and abs(velocity - in_si.velocity) < 0.1 * in_si.velocity:
+            yield Fault(where, found, f"limits in deg; are these in rad? {multiply}")
+        if in_si is None:
+            continue
+        if abs(velocity - in_si.velocity) < 0.1 * in_si.velocity:
             found = f"{velocity:g} {unit.name}/s, the number of the URDF in {unit.si_name}/s"
             yield Fault((*path, f"velocity_{unit.name}_s"), found, remedy)
 
@@ -634,11 +611,18 @@ def _within_urdf(
     """Whether limits lie within those of the URDF as numbers, and fill most of them:
     their unit is then SI too.
     """
-    if in_si is None or not in_si[0] < in_si[1] or max(map(abs, in_si)) > farthest:
+    if in_si is None:
         return False
-    span = in_si[1] - in_si[0]
-    inside = written[0] > in_si[0] - 0.1 * span and written[1] < in_si[1] + 0.1 * span
-    return inside and written[1] - written[0] > 0.5 * span
+    lower, upper = in_si
+    if not lower < upper or max(abs(lower), abs(upper)) > farthest:
+        return False
+    span = upper - lower
+    written_lower, written_upper = written
+    begins_inside = written_lower > lower - 0.1 * span
+    ends_inside = written_upper < upper + 0.1 * span
+    if not begins_inside or not ends_inside:
+        return False
+    return written_upper - written_lower > 0.5 * span
 
 
 def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
@@ -650,26 +634,28 @@ def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fa
         "standstill_rad_s": model.conditioning.standstill_rad_s,
         "standstill_mm_s": model.conditioning.standstill_mm_s,
     }
-    units = [joint_unit(joint.kind) for joint in joints] or [
-        axis.limits.unit for axis in model.axes
-    ]
+    units = [joint_unit(joint.kind) for joint in joints]
+    if not units:
+        units = [axis.limits.unit for axis in model.axes]
     if not any(lists.values()):
         return
     keys = ["standstill_mm_s" if unit is MILLIMETRE else "standstill_rad_s" for unit in units]
-    short = [key for key, speeds in lists.items() if len(speeds) != n and (speeds or key in keys)]
+    short = []
+    for key, speeds in lists.items():
+        is_needed = bool(speeds) or key in keys
+        if is_needed and len(speeds) != n:
+            short.append(key)
     for key in short:
         expected = f"{n}, one for each axis (null in the other list)"
         yield Fault(("conditioning", key), f"{len(lists[key])} speeds", expected)
     if short:
         return
     for index, own in enumerate(keys[:n]):
-        if own == "standstill_mm_s":
-            kind = JointKind.PRISMATIC
-        else:
-            kind = JointKind.REVOLUTE
+        kind = JointKind.PRISMATIC if own == "standstill_mm_s" else JointKind.REVOLUTE
         for key, speeds in lists.items():
             if speeds and (speeds[index] is None) == (key == own):
-                found = f"{speeds[index]} for {model.axes[index].name}, which is {kind.value}"
+                name = model.axes[index].name
+                found = f"{speeds[index]} for {name}, which is {kind.value}"
                 if key == own:
                     expected = "a speed"
                 else:
@@ -692,11 +678,12 @@ def _urdf_limits(urdf: str) -> dict[str, _UrdfLimits | None]:
             limits[name] = None
             if limit is None:
                 continue
-            position = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
-            unlimited = joint.get("type") == "continuous"
-            limits[name] = _UrdfLimits(
-                None if unlimited else position, float(limit.get("velocity", "0"))
-            )
+            lower = float(limit.get("lower", "0"))
+            upper = float(limit.get("upper", "0"))
+            is_continuous = joint.get("type") == "continuous"
+            position = None if is_continuous else (lower, upper)
+            velocity = float(limit.get("velocity", "0"))
+            limits[name] = _UrdfLimits(position, velocity)
     except (ElementTree.ParseError, ValueError):
         return {}
     return limits

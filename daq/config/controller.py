@@ -109,15 +109,11 @@ def controller_faults(section: Controller, axes: int, *, on_a_bus: bool) -> Iter
         on_a_bus: whether every axis has a node id and a drive profile.
     """
     if section.gains and len(section.gains) != axes:
-        yield Fault(
-            ("controller", "gains"), f"{len(section.gains)} keys", f"{axes}, one for each axis"
-        )
+        found = f"{len(section.gains)} keys"
+        yield Fault(("controller", "gains"), found, f"{axes}, one for each axis")
     if section.objects and len(section.objects) != axes:
-        yield Fault(
-            ("controller", "objects"),
-            f"{len(section.objects)} objects",
-            f"{axes}, one for each axis",
-        )
+        found = f"{len(section.objects)} objects"
+        yield Fault(("controller", "objects"), found, f"{axes}, one for each axis")
     if section.objects and not on_a_bus:
         expected = "bus, and node_id and drive of each axis"
         yield Fault(("controller", "objects"), "objects of drives that no bus leads to", expected)
@@ -128,8 +124,5 @@ def controller_faults(section: Controller, axes: int, *, on_a_bus: bool) -> Iter
     for kind, values in factors.items():
         for index, factor in enumerate(values):
             if factor == 0.0 or not math.isfinite(factor):
-                yield Fault(
-                    ("controller", kind, index, "factor"),
-                    f"{factor:g}",
-                    "a factor that is not zero",
-                )
+                path = ("controller", kind, index, "factor")
+                yield Fault(path, f"{factor:g}", "a factor that is not zero")

@@ -119,12 +119,13 @@ class ScaleModel(SectionModel):
     def _form_and_keys(self) -> ScaleModel:
         given = self.model_fields_set - {"form"}
         wanted = SCALE_KEYS[self.form]
-        empty = {key for key in given if getattr(self, key) is None and key != "peak_current_a"}
-        if empty or given - wanted or wanted - given - {"objects"}:
-            raise ValueError(
-                f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing "
-                "else"
-            )
+        may_be_empty = {"peak_current_a"}
+        empty = {key for key in given - may_be_empty if getattr(self, key) is None}
+        unknown = given - wanted
+        missing = wanted - given - {"objects"}
+        if empty or unknown or missing:
+            keys = " and ".join(sorted(wanted))
+            raise ValueError(f"{keys} of a scale of form {self.form.value}, and nothing else")
         return self
 
     def built(self) -> CurrentScale | None:
@@ -146,7 +147,8 @@ class ScaleModel(SectionModel):
         entries = tuple(entry.built() for entry in objects)
         if self.switch is None:
             return CurrentScale(factor, entries, self.form)
-        return CurrentScale(factor, entries, self.form, self.switch.built(), (math.sqrt(0.5), 1.0))
+        switch = self.switch.built()
+        return CurrentScale(factor, entries, self.form, switch, (math.sqrt(0.5), 1.0))
 
 
 class RatedModel(SectionModel):
@@ -249,9 +251,11 @@ class DriveModel(StrictModel):
     @model_validator(mode="after")
     def _options_and_sources(self) -> DriveModel:
         for key in ("toggle_bit", "torque", "temperature"):
-            if self.facts is not None and (getattr(self, key) is None) != (
-                getattr(self.facts, key) is None
-            ):
+            if self.facts is None:
+                continue
+            is_given = getattr(self, key) is not None
+            has_source = getattr(self.facts, key) is not None
+            if is_given != has_source:
                 raise ValueError(f"{key} and facts.{key}, both or neither")
         if self.torque is not None and (self.rated is None or self.rated.torque is None):
             raise ValueError("torque with rated.torque, of which it is given in thousandths")

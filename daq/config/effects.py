@@ -32,11 +32,9 @@ def place_effect(
         return known
     unknown = sorted(set(settings) - set(known.settings))
     if unknown:
-        return Fault(
-            ("settings",),
-            f"settings {', '.join(unknown)}",
-            ", ".join(known.settings) or "no settings",
-        )
+        listed = ", ".join(unknown)
+        expected = ", ".join(known.settings) or "no settings"
+        return Fault(("settings",), f"settings {listed}", expected)
     # A file of an earlier version does not have them
     added = dict.fromkeys(known.added_settings, 0)
     full = {**known.settings, **added, **settings}
@@ -48,9 +46,11 @@ def place_effect(
         check_settings(known, full, place, robot.axis_count)
     except EffectRefused as error:
         return Fault(("settings",), str(error), "settings in their range")
-    effect = known.with_settings(
-        {setting: type(known.settings[setting])(value) for setting, value in full.items()}
-    )
+    typed = {}
+    for setting, value in full.items():
+        kind = type(known.settings[setting])
+        typed[setting] = kind(value)
+    effect = known.with_settings(typed)
     if not is_placeable(effect, place, robot):
         return Fault(
             ("axis",), "a place that this effect cannot have", _places(effect, place, robot)

@@ -99,11 +99,9 @@ def max_change_faults(policy: ApplyPolicy, axes: Collection[str]) -> Iterator[Fa
     """Find bounds for axes that the cell does not have: misspelt, they would bound nothing."""
     for name in policy.max_change:
         if name not in axes:
-            yield Fault(
-                ("policy", "apply", "max_change", name),
-                f"axis {name!r}",
-                f"one of {', '.join(axes)}",
-            )
+            known = ", ".join(axes)
+            path = ("policy", "apply", "max_change", name)
+            yield Fault(path, f"axis {name!r}", f"one of {known}")
 
 
 def policy_judged(cell_file: Path, key: str, path: Path) -> Path:
@@ -143,23 +141,25 @@ class HistorySection:
         """
         folder = cell_file.parent
         stem = cell_file.stem
-        store = policy_judged(
-            cell_file, "history.store", folder / (self.store or f"{stem}.history.sqlite")
-        )
+        store_name = self.store or f"{stem}.history.sqlite"
+        audit_name = self.audit or f"{stem}.audit.jsonl"
+        store = policy_judged(cell_file, "history.store", folder / store_name)
         for other in (cell_file, folder / (controller or cell_file.name)):
-            if str(store) == os.path.realpath(other) or (
-                store.exists() and other.exists() and store.samefile(other)
-            ):
+            if _is_same_file(store, other):
                 raise ConfigurationInconsistent(
                     f"{cell_file}: history.store",
                     found=f"the same file as {other}",
                     expected="a file of the history's own",
                     remedy="give it another name",
                 )
-        audit = policy_judged(
-            cell_file, "history.audit", folder / (self.audit or f"{stem}.audit.jsonl")
-        )
+        audit = policy_judged(cell_file, "history.audit", folder / audit_name)
         return HistoryPlace(store, audit)
+
+
+def _is_same_file(path: Path, other: Path) -> bool:
+    if str(path) == os.path.realpath(other):
+        return True
+    return path.exists() and other.exists() and path.samefile(other)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,9 +203,9 @@ def parse_public_key(text: str) -> PublicKey:
         ValueError: it is none.
     """
     lines = text.strip().splitlines()
-    algorithm, key_id, key = _LAYOUT.unpack(
-        decode_line(lines[-1] if lines else "", _LAYOUT.size, "a public key")
-    )
+    line = lines[-1] if lines else ""
+    content = decode_line(line, _LAYOUT.size, "a public key")
+    algorithm, key_id, key = _LAYOUT.unpack(content)
     if algorithm != KEY_ALGORITHM or len(lines) > 2:
         raise ValueError(f"a key of algorithm {algorithm!r}, or more than a key")
     return PublicKey(key_id, key)

@@ -246,10 +246,10 @@ def _differences_of_drives(
     differences = []
     for label, form, one, other in pairs:
         if one is not None and other is not None and one != other:
-            words = f"drive of {found.axis} with {label} "
-            differences.append(
-                RobotDifference(words + format(one, form), words + format(other, form))
-            )
+            drive = f"drive of {found.axis} with {label}"
+            found_id = format(one, form)
+            expected_id = format(other, form)
+            differences.append(RobotDifference(f"{drive} {found_id}", f"{drive} {expected_id}"))
     return differences
 
 
@@ -286,7 +286,8 @@ def mismatch_of_robot(calibration: Calibration, cell: Cell) -> Mismatch | None:
 
 
 def _sha256(content: object) -> str:
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+    text = json.dumps(content)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:
@@ -343,15 +344,14 @@ def _differing_axes(own: Sequence[CellAxis], given: Sequence[CellAxis]) -> list[
     """Name each key of the axes that differs, with its axes: `axes.limits (J1, J2)`."""
     sections = []
     for field in fields(CellAxis):
-        pairs = zip(own, given, strict=True)
-        differing = [
-            one.name
-            for one, other in pairs
-            if getattr(one, field.name) != getattr(other, field.name)
-        ]
+        differing = []
+        for one, other in zip(own, given, strict=True):
+            if getattr(one, field.name) != getattr(other, field.name):
+                differing.append(one.name)
         if differing:
             key = _KEYS.get(field.name, field.name)
-            sections.append(f"axes.{key} ({', '.join(differing)})")
+            names = ", ".join(differing)
+            sections.append(f"axes.{key} ({names})")
     return sections
 
 
@@ -360,7 +360,8 @@ def differing_zeros(sections: Sequence[str]) -> tuple[str, ...]:
     begin = f"axes.{_KEYS['zero_offset_rad']} ("
     for section in sections:
         if section.startswith(begin):
-            return tuple(section.removeprefix(begin).removesuffix(")").split(", "))
+            names = section.removeprefix(begin).removesuffix(")")
+            return tuple(names.split(", "))
     return ()
 
 
@@ -372,10 +373,12 @@ _KEYS = {"zero_offset_rad": "zero_offset", "profile": "drive profile", "unit": "
 
 def _joints(cell: Cell) -> tuple[str, ...]:
     """Return name and kind of every joint that moves."""
-    joints = tuple(f"{joint.name} ({joint.kind.value})" for joint in read_urdf(cell.urdf).joints)
+    robot = read_urdf(cell.urdf)
+    joints = tuple(f"{joint.name} ({joint.kind.value})" for joint in robot.joints)
     if cell.chain is None:
         return joints
-    return (*joints, f"with motors on {', '.join(cell.chain.motors)}")
+    motors = ", ".join(cell.chain.motors)
+    return (*joints, f"with motors on {motors}")
 
 
 def _mismatch_of_axes(name: str, axes: tuple[str, ...], given: Cell) -> Mismatch | None:
@@ -384,9 +387,9 @@ def _mismatch_of_axes(name: str, axes: tuple[str, ...], given: Cell) -> Mismatch
             f"a log of cell {name!r}", f"one of cell {given.name!r}, as in the given description"
         )
     if axes != given.axis_names:
-        return Mismatch(
-            f"axes {', '.join(axes)}", f"{', '.join(given.axis_names)}, as in the given description"
-        )
+        found = ", ".join(axes)
+        expected = ", ".join(given.axis_names)
+        return Mismatch(f"axes {found}", f"{expected}, as in the given description")
     return None
 
 
@@ -408,10 +411,14 @@ def _mismatch_of_drives(
 
     Where the description in the log has a serial number, that one is compared (`mismatch`).
     """
-    declared = (None,) * len(given.axes) if own is None else tuple(map(_serial, own.axes))
+    declared: tuple[int | None, ...] = (None,) * len(given.axes)
+    if own is not None:
+        declared = tuple(map(_serial, own.axes))
     for axis, in_log, recorded in zip(given.axes, declared, serials, strict=False):
         wanted = _serial(axis)
-        if in_log is None and recorded is not None and wanted is not None and recorded != wanted:
+        if in_log is not None or recorded is None or wanted is None:
+            continue
+        if recorded != wanted:
             found = f"serial number {recorded}, reported by the drive of axis {axis.name}"
             return Mismatch(found, f"{wanted}, as in the given description")
     return None
@@ -421,4 +428,6 @@ def _serial(axis: CellAxis) -> int | None:
     """Serial number that a description gives to the drive of an axis;
     None where it leaves it open.
     """
-    return None if axis.identity is None else axis.identity.serial
+    if axis.identity is None:
+        return None
+    return axis.identity.serial

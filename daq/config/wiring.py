@@ -117,15 +117,16 @@ def _wiring_alone(path: Path, refused: ConfigurationError) -> Wiring:
             continue  # the refusal names it
         taken.add(axis.node_id)
         profile, fault = _profile_of(path, axis.drive)
-        axes.append(
-            AxisWiring(axis.name, axis.node_id, bus, _identity_of(axis.identity), profile, fault)
-        )
+        identity = _identity_of(axis.identity)
+        axes.append(AxisWiring(axis.name, axis.node_id, bus, identity, profile, fault))
     of_profile = str(refused) in {axis.profile_fault for axis in axes}
     return Wiring(model.name, buses, tuple(axes), "" if of_profile else str(refused))
 
 
 def _is_node_id(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 127
+    if not isinstance(value, int) or isinstance(value, bool):
+        return False
+    return 1 <= value <= 127
 
 
 def _identity_of(value: Any) -> Identity | None:

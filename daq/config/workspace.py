@@ -82,14 +82,18 @@ def clearance_of(
         return None
     declared = clearance or ClearanceSection()
     links = {BASE_LINK: BASE, **joints}
+    box = None
+    if workspace is not None:
+        box = Box("workspace", workspace.lower_m, workspace.upper_m)
+    capsules = []
+    for capsule in declared.capsules:
+        link = links[capsule.link]
+        placed = Capsule(capsule.name, link, capsule.from_m, capsule.to_m, capsule.radius_m)
+        capsules.append(placed)
     return Clearance(
-        workspace=None
-        if workspace is None
-        else Box("workspace", workspace.lower_m, workspace.upper_m),
+        workspace=box,
         minimum_m=declared.minimum_m,
-        capsules=tuple(
-            Capsule(c.name, links[c.link], c.from_m, c.to_m, c.radius_m) for c in declared.capsules
-        ),
+        capsules=tuple(capsules),
         obstacles=declared.obstacles,
     )
 
@@ -106,7 +110,8 @@ def clearance_faults(
         yield from _box_faults(("clearance", "obstacles", index), obstacle)
     for index, capsule in enumerate(clearance.capsules):
         if capsule.link not in (BASE_LINK, *names):
-            expected = f"{BASE_LINK}, or the axis that moves it: {', '.join(names)}"
+            axes = ", ".join(names)
+            expected = f"{BASE_LINK}, or the axis that moves it: {axes}"
             yield Fault(("clearance", "capsules", index, "link"), capsule.link, expected)
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, cast, get_args, get_type_hints
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
@@ -168,7 +168,8 @@ class Document:
         while known not in self.lines and known:
             known = known[:-1]
         line = self.lines.get(known)
-        return f"{self.name}{f':{line}' if line else ''}: {yaml_text(path)}"
+        place = f"{self.name}:{line}" if line else self.name
+        return f"{place}: {yaml_text(path)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,17 +242,19 @@ def parse_yaml(text: bytes, name: str) -> Document:
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
+        line = _line(error.problem_mark or error.context_mark)
         raise YamlInvalid(
-            f"{name}:{_line(error.problem_mark or error.context_mark)}",
+            f"{name}:{line}",
             found=error.problem or error.context or "broken YAML",
             expected="one YAML document",
             remedy="mind indentation (spaces, no tabs), colons and quotes; is this the right file?",
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        kind = type(error).__name__
+        reason = str(error).splitlines()[0] if str(error) else "nesting too deep"
         raise YamlInvalid(
             name,
-            found=f"{type(error).__name__}: "
-            f"{str(error).splitlines()[0] if str(error) else 'nesting too deep'}",
+            found=f"{kind}: {reason}",
             expected="one YAML document in UTF-8",
             remedy="is this the right file?",
         ) from error
@@ -385,10 +388,9 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
         # is strict.
         return model.model_validate_json(json.dumps(document.tree), context=folder)
     except ValidationError as error:
+        page = ""
         if model.reference:
             page = f"; docs/reference/{model.reference} has every key"
-        else:
-            page = ""
         kind = kind_of_tree(document.tree)
         if model.document_kind is not None and kind not in (None, model.document_kind):
             raise SchemaMismatch(
@@ -398,22 +400,22 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
                 remedy=f"{IN_ORDER} (CELL comes first){page}",
             ) from error
         required = [name for name, field in model.model_fields.items() if field.is_required()]
-        if (
-            len(required) > 1
-            and isinstance(document.tree, dict)
-            and not document.tree.keys() & set(required)
-        ):
+        keys = list(document.tree) if isinstance(document.tree, dict) else required
+        if len(required) > 1 and not set(keys) & set(required):
+            listed = ", ".join(keys[:MAX_EXPLAINED]) or "no key"
+            expected = ", ".join(required)
             raise SchemaMismatch(
                 document.name,
-                found="a file of another kind, with "
-                f"{', '.join(list(document.tree)[:MAX_EXPLAINED]) or 'no key'}",
-                expected=f"a file with {', '.join(required)}",
+                found=f"a file of another kind, with {listed}",
+                expected=f"a file with {expected}",
                 remedy=f"{IN_ORDER} (CELL comes first){page}",
             ) from error
         items = error.errors(include_url=False)
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
         # A list counts as empty when its items are wrong; the faults inside say enough.
-        outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
+        outer = set[Location]()
+        for fault in faults:
+            outer.update(fault.path[:length] for length in range(len(fault.path)))
         remedy = f"correct the file{page}"
         if len(items) > len(faults):
             remedy += f" ({len(items) - len(faults)} more faults are not listed)"
@@ -431,7 +433,10 @@ def fault_texts(document: Document, faults: list[Fault]) -> dict[str, str]:
             "expected": only.expected,
         }
     new_line = "\n  "
-    texts = [f"{document.where(f.path)}: found {f.found}; expected {f.expected}" for f in faults]
+    texts = []
+    for fault in faults:
+        place = document.where(fault.path)
+        texts.append(f"{place}: found {fault.found}; expected {fault.expected}")
     listed = first_few(texts, MAX_SHOWN, separator=new_line)
     return {
         "subject": document.name,
@@ -442,7 +447,9 @@ def fault_texts(document: Document, faults: list[Fault]) -> dict[str, str]:
 
 def yaml_text(path: Location) -> str:
     """Write a path as axes[3].limits.velocity_deg_s (counted from 0)."""
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}"
     return text.lstrip(".") or "the whole file"
 
 
@@ -455,9 +462,10 @@ def _convert(
     line = node.start_mark.line + 1
     lines[path] = line
     if node.tag not in _TAGS:
+        tag = node.tag.removeprefix("tag:yaml.org,2002:")
         raise YamlInvalid(
             f"{name}:{line}: {yaml_text(path)}",
-            found=f"tag {node.tag.removeprefix('tag:yaml.org,2002:')}",
+            found=f"tag {tag}",
             expected="plain text, numbers, lists and mappings",
             remedy="remove the tag",
         )
@@ -468,27 +476,30 @@ def _convert(
                 key = loader.construct_object(key_node)
             else:
                 key = None
+            key_line = key_node.start_mark.line + 1
             if not isinstance(key, str):
                 raise YamlInvalid(
-                    f"{name}:{key_node.start_mark.line + 1}: {yaml_text(path)}",
+                    f"{name}:{key_line}: {yaml_text(path)}",
                     found=f"key {key_node.value!r}",
                     expected="a key that is text",
                     remedy="quote it if this is intended",
                 )
             if key in mapping:
+                first_line = lines[*path, key]
                 raise YamlInvalid(
-                    f"{name}:{key_node.start_mark.line + 1}: {yaml_text((*path, key))}",
-                    found=f"duplicate key {key!r}, first on line {lines[*path, key]}",
+                    f"{name}:{key_line}: {yaml_text((*path, key))}",
+                    found=f"duplicate key {key!r}, first on line {first_line}",
                     expected="each key once",
                     remedy="remove one of them",
                 )
             mapping[key] = _convert(loader, value_node, (*path, key), name, lines)
-            lines[*path, key] = key_node.start_mark.line + 1
+            lines[*path, key] = key_line
         return mapping
     if isinstance(node, yaml.SequenceNode):
-        return [
-            _convert(loader, child, (*path, i), name, lines) for i, child in enumerate(node.value)
-        ]
+        values = []
+        for index, child in enumerate(node.value):
+            values.append(_convert(loader, child, (*path, index), name, lines))
+        return values
     value = loader.construct_object(node)
     if isinstance(value, int) and value.bit_length() > MAX_BITS:
         raise YamlInvalid(
@@ -523,7 +534,7 @@ def _fault(item: Any, model: type[BaseModel]) -> Fault:
 
 
 def _show(value: Any) -> str:
-    kind = {
+    kinds = {
         str: "text",
         bool: "truth value",
         int: "integer",
@@ -531,8 +542,11 @@ def _show(value: Any) -> str:
         list: "list",
         dict: "mapping",
     }
+    kind = kinds.get(type(value), "nothing")
     text = json.dumps(value)
-    return f"{kind.get(type(value), 'nothing')} {text if len(text) <= 60 else text[:57] + '...'}"
+    if len(text) > 60:
+        text = f"{text[:57]}..."
+    return f"{kind} {text}"
 
 
 def _known_keys(model: type[BaseModel], path: Location) -> list[str]:
@@ -556,9 +570,8 @@ def _keys(section: type[Any]) -> dict[str, Any]:
 
 def _nested(annotation: Any) -> type[Any] | None:
     """Find the first section in an annotation such as `tuple[Section, ...] | None`."""
-    if isinstance(annotation, type) and (
-        dataclasses.is_dataclass(annotation) or issubclass(annotation, BaseModel)
-    ):
-        return annotation
+    is_class = isinstance(annotation, type)
+    if is_class and (dataclasses.is_dataclass(annotation) or issubclass(annotation, BaseModel)):
+        return cast("type[Any]", annotation)
     found = (_nested(argument) for argument in get_args(annotation))
     return next((section for section in found if section is not None), None)

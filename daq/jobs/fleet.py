@@ -203,7 +203,7 @@ and share a configuration that is read once.
 """
 
 #: Time without a result after which the workers are checked; a cell may well take longer
-LOOK_S = 30.0
+WORKER_CHECK_S = 30.0
 
 ProgressCallback = Callable[[int, int, str], None]  #: Done, total, and a remark
 Work = TypeVar("Work")
@@ -298,7 +298,7 @@ def each(
     running = {submit(piece): piece for piece in islice(waiting, pool.workers)}
     absent = 0
     while running:
-        done, _ = wait(running, LOOK_S, return_when=FIRST_COMPLETED)
+        done, _ = wait(running, WORKER_CHECK_S, return_when=FIRST_COMPLETED)
         # A worker that died may be restarting: it is gone when it is missing twice.
         is_absent = not done and not pool.present()
         absent = absent + 1

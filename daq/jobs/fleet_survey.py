@@ -146,14 +146,15 @@ def _store(address: str) -> tuple[Any, str]:
         # Untyped, and an optional dependency.
         store, path = import_module("fsspec.core").url_to_fs(address)
     except (ImportError, ValueError) as error:
-        bare = find_spec("fsspec") is None
+        if find_spec("fsspec") is None:
+            remedy = "pip install 'drivegain[fleet]'"
+        else:
+            remedy = "install what it names (for s3://: pip install s3fs)"
         raise ConfigurationMissing(
             address,
             found=str(error),
             expected="an address that fsspec can read with what is installed",
-            remedy="pip install 'drivegain[fleet]'"
-            if bare
-            else "install what it names (for s3://: pip install s3fs)",
+            remedy=remedy,
         ) from error
     return store, path
 

@@ -218,7 +218,7 @@ def _resumed_or_new(
     return sessions.resume(session, now)
 
 
-AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason
+STOP_RETRY_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason
 
 
 @contextmanager
@@ -238,7 +238,7 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
 
     def up(_number: int, _frame: FrameType | None) -> None:
         if stopping:
-            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+            signal.setitimer(signal.ITIMER_REAL, STOP_RETRY_S)
             return
         raise TimeBoundReached(
             "the job",

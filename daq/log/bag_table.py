@@ -123,7 +123,9 @@ def _sources(
     usual = _ColumnSource(wanted.topic, wanted.publisher)
     source_of: dict[Column, _ColumnSource] = {}
     for section in wanted.published():
-        own = _ColumnSource(section.topic or usual.topic, section.publisher or usual.publisher)
+        topic = section.topic or usual.topic
+        publisher = section.publisher or usual.publisher
+        own = _ColumnSource(topic, publisher)
         for file, column in section.places:
             parts = Path(file).parts
             if parts != path.parts[-len(parts) :]:
@@ -150,26 +152,25 @@ def _require_one_topic(path: Path, source: _ColumnSource, topics: dict[str, bool
         source: whose topic is sought.
         topics: those of the bag, and whether their joint states were read.
     """
-    used = [topic for topic, chosen in topics.items() if chosen and source.topic in {None, topic}]
+    used = []
+    for topic, has_been_read in topics.items():
+        if has_been_read and source.topic in {None, topic}:
+            used.append(topic)
     if not used:
+        found = "no message"
         if topics:
             found = f"topics {', '.join(topics)}"
-        else:
-            found = "no message"
-        raise _unfit(
-            path,
-            found,
-            f"{source.topic or 'a topic'} of type {JOINTS_SCHEMA}",
-            "is this the right bag?",
-        )
+        sought = source.topic or "a topic"
+        expected = f"{sought} of type {JOINTS_SCHEMA}"
+        raise _unfit(path, found, expected, "is this the right bag?")
     if len(used) > 1:
         remedy = (
             "choose one in the import description: `topic: NAME`; where positions and efforts are "
             "on different ones, `topic` under `position` and `current`"
         )
-        raise _unfit(
-            path, f"joint states on {len(used)} topics, {', '.join(used)}", "one topic", remedy
-        )
+        listed = ", ".join(used)
+        found = f"joint states on {len(used)} topics, {listed}"
+        raise _unfit(path, found, "one topic", remedy)
 
 
 def _joined(
@@ -196,8 +197,9 @@ def _joined(
             raise _not_joined(path, {one: stamps_ns[one] for one in (reference, source)})
     remarks: list[str] = []
     for source, table in parts.items():
-        is_shared = (stamps_ns[source] >= first_ns) & (stamps_ns[source] <= last_ns)
-        values |= {column: table.take((column,))[is_shared] for column in table.columns}
+        is_shared = _is_between(stamps_ns[source], first_ns, last_ns)
+        for column in table.columns:
+            values[column] = table.take((column,))[is_shared]
         remarks += table.remarks
         left_out = int(np.count_nonzero(~is_shared))
         if left_out:
@@ -214,15 +216,15 @@ def _joined(
             rows = keep.rows
         require_kept(path, len(shared_ns), rows)
     first_row, _, _ = rows.indices(len(shared_ns))
-    kept = np.hstack([values[column] for column in columns])[rows]
+    all_values = np.hstack([values[column] for column in columns])
+    kept = all_values[rows]
     clock = stamps_of_ns(shared_ns[rows].tolist())
-    stamps = None if time is None else clock
     return Table(
-        path,
-        columns,
-        kept,
-        digest_of(kept, clock),
-        stamps,
+        path=path,
+        columns=columns,
+        values=kept,
+        digest=digest_of(kept, clock),
+        stamps=None if time is None else clock,
         first_row=first_row,
         remarks=tuple(remarks),
     )
@@ -233,27 +235,33 @@ def _exact_ns(table: Table) -> IntArray:
     stamps = table.stamps
     if stamps is None:
         raise ValueError("a table without stamps")
-    return np.rint(1e9 * stamps.time_s).astype(np.int64) + stamps.first_ns
+    since_first_ns = np.rint(1e9 * stamps.time_s)
+    return since_first_ns.astype(np.int64) + stamps.first_ns
+
+
+def _is_between(stamps_ns: IntArray, first_ns: int, last_ns: int) -> BoolArray:
+    return np.asarray((stamps_ns >= first_ns) & (stamps_ns <= last_ns))
 
 
 def _between(stamps_ns: IntArray, first_ns: int, last_ns: int) -> IntArray:
-    return stamps_ns[(stamps_ns >= first_ns) & (stamps_ns <= last_ns)]
+    return stamps_ns[_is_between(stamps_ns, first_ns, last_ns)]
 
 
 def _not_joined(path: Path, stamps_ns: dict[_ColumnSource, IntArray]) -> TableUnfit:
     """Make the error for two sources without the same stamps."""
     described = []
     for source, own_ns in stamps_ns.items():
+        step_s = 0.0
         if len(own_ns) > 1:
             step_s = 1e-9 * float(np.median(np.diff(own_ns)))
-        else:
-            step_s = 0.0
-        described.append(f"{counted(len(own_ns), 'stamp')} each {step_s:.6g} s on {source}")
+        stamps = counted(len(own_ns), "stamp")
+        described.append(f"{stamps} each {step_s:.6g} s on {source}")
     first, second = stamps_ns.values()
     common = len(np.intersect1d(first, second))
+    both = " and ".join(described)
     return _unfit(
         path,
-        f"{' and '.join(described)}, {common} of them the same",
+        f"{both}, {common} of them the same",
         "messages of the same stamps",
         "nothing is interpolated between messages: record them with one stamp, or write each field "
         "to a CSV file with rows of the same instants, and name the files by `file` of `position` "
@@ -265,7 +273,9 @@ def _files(path: Path) -> list[Path]:
     """Files of a bag in their order; `path` itself if it is no folder."""
     if not path.is_dir():
         return [path]
-    files = [file for pattern in PATTERNS for file in path.glob(pattern)]
+    files: list[Path] = []
+    for pattern in PATTERNS:
+        files += path.glob(pattern)
     # A player leaves what it has unpacked beside the packed file.
     unpacked = {file.with_name(file.name + PACKED) for file in files}
     once = [file for file in files if file not in unpacked]
@@ -282,13 +292,19 @@ def _require_parts(folder: Path, files: list[Path]) -> None:
     """
     there = {file.name.removesuffix(PACKED) for file in files}
     named = _named_parts(folder / METADATA)
-    missing = [name for name in named if Path(name).name.removesuffix(PACKED) not in there]
+    missing = []
+    for name in named:
+        file_name = Path(name).name
+        if file_name.removesuffix(PACKED) not in there:
+            missing.append(name)
     # A person may have renamed a file.
     if missing and 0 < len(files) < len(named):
+        listed = ", ".join(missing)
+        files_named = counted(len(named), "file")
         raise TableUnfit(
             str(folder),
-            found=f"no {', '.join(missing)}, which {METADATA} names",
-            expected=f"all {counted(len(named), 'file')} of the bag",
+            found=f"no {listed}, which {METADATA} names",
+            expected=f"all {files_named} of the bag",
             remedy="copy the folder again; if the file was removed on purpose, take its name out "
             f"of {METADATA}",
         )
@@ -361,11 +377,12 @@ class _Publisher:
         """
         if self.node != other.node:
             return False
+        if self.fields != other.fields:
+            return False
         if self.channel != other.channel:
             is_apart = self.last_ns < other.first_ns or other.last_ns < self.first_ns
-            return is_apart and self.frame == other.frame and self.fields == other.fields
-        has_header = self.frame is not None and other.frame is not None
-        return not has_header and self.fields == other.fields
+            return is_apart and self.frame == other.frame
+        return self.frame is None or other.frame is None
 
     def __str__(self) -> str:
         fields = " and ".join(self.fields) or "no values"
@@ -377,10 +394,8 @@ class _Publisher:
         node = f"{self.node}, " if self.node else ""
         if self.channel > 1:
             node += f"channel {self.channel}, "
-        return (
-            f"{self.number}: {node}{fields} of {joints}, {frame}, "
-            f"{counted(self.messages, 'message')}"
-        )
+        messages = counted(self.messages, "message")
+        return f"{self.number}: {node}{fields} of {joints}, {frame}, {messages}"
 
 
 SEPARATE = (
@@ -450,11 +465,11 @@ class _Rows:
                     "each joint once",
                     "mend its publisher",
                 )
-            self._places[state.names] = [
-                (field, state.names.index(joint), column)
-                for column, (field, joint) in enumerate(self._columns)
-                if joint in state.names
-            ]
+            places = []
+            for column, (field, joint) in enumerate(self._columns):
+                if joint in state.names:
+                    places.append((field, state.names.index(joint), column))
+            self._places[state.names] = places
         if not self._places[state.names]:
             return  # joints of something else
         publisher = self._publisher_of(state, log_time_ns, topic)
@@ -513,7 +528,7 @@ class _Rows:
             stamp_ns = log_time_ns
         _require_possible(stamp_ns)
         row = self._begun.get(stamp_ns)
-        if row is None or any(self._present[row * width + column] for _, _, column in places):
+        if row is None or self._has_value(row, places):
             row = self._begun[stamp_ns] = len(self._stamp_ns)
             self._stamp_ns.append(stamp_ns)
             self._values.extend([0.0] * width)
@@ -521,16 +536,23 @@ class _Rows:
         for field, index, column in places:
             numbers: tuple[float, ...] = getattr(state, field)
             if index >= len(numbers):
-                found = (
-                    f"a message with {len(state.names)} names and {len(numbers)} values of {field}"
-                )
+                found = f"a message with {len(state.names)} names and {len(numbers)} values"
                 raise _unfit(
-                    self._path, found, "one value a joint", "does this controller publish it?"
+                    self._path,
+                    f"{found} of {field}",
+                    "one value a joint",
+                    "does this controller publish it?",
                 )
             self._values[row * width + column] = numbers[index]
             self._present[row * width + column] = 1
-        if all(self._present[row * width : (row + 1) * width]):
+        end = (row + 1) * width
+        if all(self._present[row * width : end]):
             del self._begun[stamp_ns]
+
+    def _has_value(self, row: int, places: list[tuple[str, int, int]]) -> bool:
+        """Whether a row has a value of these places already."""
+        start = row * len(self._columns)
+        return any(self._present[start + column] for _, _, column in places)
 
     def _require_one_publisher(self) -> None:
         """Refuse joints that several nodes publish, and fields that no node publishes.
@@ -557,35 +579,38 @@ class _Rows:
             if any(one.joints & other.joints & wanted for other in others):
                 sharing.append(one)
         if sharing:
-            fullest = self._fullest(sharing)
-            is_full = {field for field, _ in self._columns} <= set(fullest.fields)
-            choose = (
+            raise self._several_publishers(sharing)
+        for one in known:
+            lacking = []
+            for field, joint in self._columns:
+                if joint in one.joints and field not in one.fields:
+                    lacking.append(field)
+            if lacking:
+                field = lacking[0]
+                found = f"messages with {len(one.joints)} names and 0 values of {field}"
+                remedy = "does this controller publish it?"
+                if any(field in other.fields for other in self._publishers.values()):
+                    remedy = self._choice_of_each_field()
+                raise _unfit(self._path, found, "one value a joint", remedy)
+
+    def _several_publishers(self, sharing: list[_Publisher]) -> TableUnfit:
+        """Make the error for several publishers of the same joints."""
+        fullest = self._fullest(sharing)
+        fields = {field for field, _ in self._columns}
+        if fields <= set(fullest.fields):
+            remedy = (
                 f"choose one in the import description, as in `publisher: {fullest.number}`, or "
                 "record again without the others"
             )
-            raise _unfit(
-                self._path,
-                f"{len(sharing)} publishers of the same joints on one topic: "
-                f"{'; '.join(map(str, sharing))}",
-                "one publisher of each joint",
-                choose if is_full else self._choice_of_each_field(),
-            )
-        for one in known:
-            lacking = [
-                field
-                for field, joint in self._columns
-                if joint in one.joints and field not in one.fields
-            ]
-            if lacking:
-                found = f"messages with {len(one.joints)} names and 0 values of {lacking[0]}"
-                is_elsewhere = any(
-                    lacking[0] in other.fields for other in self._publishers.values()
-                )
-                if is_elsewhere:
-                    remedy = self._choice_of_each_field()
-                else:
-                    remedy = "does this controller publish it?"
-                raise _unfit(self._path, found, "one value a joint", remedy)
+        else:
+            remedy = self._choice_of_each_field()
+        listed = "; ".join(map(str, sharing))
+        return _unfit(
+            self._path,
+            f"{len(sharing)} publishers of the same joints on one topic: {listed}",
+            "one publisher of each joint",
+            remedy,
+        )
 
     def _choice_of_each_field(self) -> str:
         """Return the advice for positions and efforts of different publishers."""
@@ -597,7 +622,12 @@ class _Rows:
     def _fullest(self, publishers: list[_Publisher]) -> _Publisher:
         """Return the publisher with most of the fields that are read, then with most messages."""
         fields = {field for field, _ in self._columns}
-        return max(publishers, key=lambda one: (len(fields & set(one.fields)), one.messages))
+
+        def fields_and_messages(publisher: _Publisher) -> tuple[int, int]:
+            used = fields & set(publisher.fields)
+            return len(used), publisher.messages
+
+        return max(publishers, key=fields_and_messages)
 
     def table(
         self, columns: tuple[Column, ...], time: TimeColumn | None, part: KeptPart | None
@@ -611,7 +641,8 @@ class _Rows:
         self._decide(zero_is_a_time=self._zero_is_a_time is True)
         self._require_one_publisher()
         width = len(self._columns)
-        present = np.frombuffer(self._present, dtype=np.bool_).reshape(-1, width)
+        present = np.frombuffer(self._present, dtype=np.bool_)
+        present = present.reshape(-1, width)
         values = np.frombuffer(self._values).reshape(-1, width)
         stamp_ns = self._stamp_ns
         if self._rhythm is not None:
@@ -625,13 +656,14 @@ class _Rows:
         stamp_ns = stamp_ns[kept]
         is_number = present & ~np.isnan(values)
         self._require_joints(columns, present, is_number)
-        whole = np.flatnonzero(is_number.all(axis=1))
-        if whole.size:
-            inside = slice(whole[0], whole[-1] + 1)
+        is_complete = np.asarray(is_number.all(axis=1))
+        complete = np.flatnonzero(is_complete)
+        if complete.size:
+            inside = slice(complete[0], complete[-1] + 1)
         else:
             inside = slice(0, 1)
-        if not whole.size or len(whole) < len(is_number[inside]):
-            row = int(np.argmin(is_number[inside].all(axis=1))) + inside.start
+        if not is_complete[inside].all():
+            row = inside.start + int(np.argmin(is_complete[inside]))
             raise self._incomplete_row(columns, stamp_ns[row], present[row], is_number[row])
         remarks = self._remarks(present, is_number, inside)
         clock = stamps_of_ns(stamp_ns[inside])
@@ -641,11 +673,11 @@ class _Rows:
         digest = digest_of(values[inside], clock)
         first_row = kept.start + inside.start
         table = Table(
-            self._path,
-            columns,
-            values[inside],
-            digest,
-            stamps,
+            path=self._path,
+            columns=columns,
+            values=values[inside],
+            digest=digest,
+            stamps=stamps,
             first_row=first_row,
             remarks=remarks,
         )
@@ -660,11 +692,11 @@ class _Rows:
         found = interleaved(time_s)
         if found is None:
             return
+        first = f"1: {found.first} messages each {found.first_step_s:.6g} s"
+        second = f"2: {found.second} messages each {found.second_step_s:.6g} s between them"
         raise _unfit(
             self._path,
-            f"stamps of two publishers of the same joints: 1: {found.first} messages each "
-            f"{found.first_step_s:.6g} s; 2: {found.second} messages each "
-            f"{found.second_step_s:.6g} s between them",
+            f"stamps of two publishers of the same joints: {first}; {second}",
             "one publisher of each joint",
             "choose one in the import description, as in `rhythm: 1`; better, record again with "
             "one of the two nodes stopped, or give one of them another topic or `frame_id`",
@@ -715,40 +747,36 @@ class _Rows:
         self, columns: tuple[Column, ...], present: BoolArray, is_number: BoolArray
     ) -> None:
         """Refuse joints that no message has, and fields that are never a number."""
-        absent = [str(columns[number]) for number in np.flatnonzero(~present.any(axis=0))]
+        absent = _listed(columns, np.asarray(~present.any(axis=0)))
         if absent:
             found: set[str] = set()
             for names in self._places:
                 found.update(names)
-            joints = sorted(found)
-            raise _unfit(
-                self._path, f"joints {', '.join(joints) or 'none'}", f"those of {', '.join(absent)}"
-            )
-        empty = [str(columns[number]) for number in np.flatnonzero(~is_number.any(axis=0))]
+            joints = ", ".join(sorted(found)) or "none"
+            raise _unfit(self._path, f"joints {joints}", f"those of {absent}")
+        empty = _listed(columns, np.asarray(~is_number.any(axis=0)))
         if empty:
             remedy = "does this controller measure it? name a field that it publishes"
-            raise _unfit(
-                self._path, f"nan in every message for {', '.join(empty)}", "numbers", remedy
-            )
+            raise _unfit(self._path, f"nan in every message for {empty}", "numbers", remedy)
 
     def _incomplete_row(
         self, columns: tuple[Column, ...], stamp_ns: int, present: BoolArray, is_number: BoolArray
     ) -> TableUnfit:
         """Make the error for a row between complete ones that lacks joints, or numbers of them."""
         at = f"at {stamp_ns * 1e-9:.9f} s"
-        absent = [str(columns[number]) for number in np.flatnonzero(~present)]
+        absent = _listed(columns, ~present)
         if absent:
             return _unfit(
                 self._path,
-                f"no {', '.join(absent)} {at}",
+                f"no {absent} {at}",
                 "all joints in messages of the same stamp",
                 "messages are missing, or joints are stamped apart: record a topic that has all "
                 "joints in each message",
             )
-        empty = [str(columns[number]) for number in np.flatnonzero(~is_number)]
+        empty = _listed(columns, ~is_number)
         return _unfit(
             self._path,
-            f"nan for {', '.join(empty)} {at}",
+            f"nan for {empty} {at}",
             "numbers, but for the begin and the end of the bag",
             "samples are never invented: import what is before it and what is behind it by `keep`, "
             "as recordings of their own",
@@ -806,10 +834,11 @@ def interleaved(time_s: FloatArray) -> Interleaved | None:
         return None
     steps_s = np.diff(ordered_s)
     usual_s = float(np.median(steps_s))
-    if usual_s <= 0.0 or np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s) >= MOSTLY:
+    if usual_s <= 0.0 or _share_near(steps_s, usual_s) >= MOSTLY:
         return None
-    candidates_s = (float(np.median(steps_s[:-1] + steps_s[1:])), usual_s, float(steps_s.max()))
-    for step_s in candidates_s:
+    double_s = float(np.median(steps_s[:-1] + steps_s[1:]))
+    longest_s = float(steps_s.max())
+    for step_s in (double_s, usual_s, longest_s):
         for start in range(2):
             is_first = _even_row(ordered_s, step_s, start)
             first_s = ordered_s[is_first]
@@ -826,7 +855,11 @@ def interleaved(time_s: FloatArray) -> Interleaved | None:
                 in_order_of_messages = np.empty(len(order), dtype=np.bool_)
                 in_order_of_messages[order] = is_first
                 return Interleaved(
-                    len(first_s), first_step_s, len(second_s), second_step_s, in_order_of_messages
+                    first=len(first_s),
+                    first_step_s=first_step_s,
+                    second=len(second_s),
+                    second_step_s=second_step_s,
+                    is_first=in_order_of_messages,
                 )
     return None
 
@@ -837,7 +870,8 @@ def _even_row(time_s: FloatArray, step_s: float, start: int) -> BoolArray:
     is_in_row[start] = True
     last_s = time_s[start]
     for number in range(start + 1, len(time_s)):
-        if abs(time_s[number] - last_s - step_s) <= EVEN_SHARE * step_s:
+        late_s = time_s[number] - last_s - step_s
+        if abs(late_s) <= EVEN_SHARE * step_s:
             is_in_row[number] = True
             last_s = time_s[number]
     return is_in_row
@@ -854,7 +888,18 @@ def _share_of_usual_steps(time_s: FloatArray) -> float:
     usual_s = float(np.median(steps_s))
     if usual_s <= 0.0:
         return 0.0
-    return float(np.mean(np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s))
+    return _share_near(steps_s, usual_s)
+
+
+def _share_near(steps_s: FloatArray, usual_s: float) -> float:
+    """Share of the steps that are nearly the usual one."""
+    is_near = np.abs(steps_s - usual_s) <= EVEN_SHARE * usual_s
+    return float(np.mean(is_near))
+
+
+def _listed(columns: tuple[Column, ...], is_listed: BoolArray) -> str:
+    """Name some of the columns; empty without any."""
+    return ", ".join(str(columns[number]) for number in np.flatnonzero(is_listed))
 
 
 def _require_possible(time_ns: int) -> None:

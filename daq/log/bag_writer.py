@@ -84,22 +84,18 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
         )
     log = read_log(path)
     cell = log.head.cell(path)
-    if calibration is None:
-        found = None
-    else:
-        found = mismatch_of_calibration(calibration, cell)
-    if found is not None:
-        raise ConfigurationInconsistent(
-            str(path),
-            found=found.found,
-            expected=found.expected,
-            remedy="give a calibration of this cell",
-        )
-    if calibration is None:
-        ordered = []
-    else:
-        ordered = [gain.value for gain in calibration.gains]
-    messages = sorted(_messages(log, cell, ordered), key=lambda message: message[0])
+    gains = []
+    if calibration is not None:
+        mismatch = mismatch_of_calibration(calibration, cell)
+        if mismatch is not None:
+            raise ConfigurationInconsistent(
+                str(path),
+                found=mismatch.found,
+                expected=mismatch.expected,
+                remedy="give a calibration of this cell",
+            )
+        gains = [gain.value for gain in calibration.gains]
+    messages = sorted(_messages(log, cell, gains), key=lambda message: message[0])
     counts = Counter(topic for _, topic, _ in messages)
     first_ns = messages[0][0]
     last_ns = messages[-1][0]
@@ -110,9 +106,8 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
         try:
             with (unfinished / name).open("wb") as stream:
                 _write(Writer(stream, compression=CompressionType.ZSTD), messages)
-            (unfinished / "metadata.yaml").write_text(
-                _metadata(name, counts, first_ns, last_ns), encoding="utf-8"
-            )
+            metadata = _metadata(name, counts, first_ns, last_ns)
+            (unfinished / "metadata.yaml").write_text(metadata, encoding="utf-8")
             unfinished.rename(out)
         finally:
             shutil.rmtree(unfinished, ignore_errors=True)  # once renamed, it is gone
@@ -124,16 +119,17 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
     watch = MotionWatch(cell, log.head)
     watch.take(log.samples)
     verdict = watch.verdict(checks, log.statistics, lambda: (log.samples,))
-    return BagWritten(
-        dict(sorted(counts.items())), (last_ns - first_ns) * 1e-9, log.partial, *verdict
-    )
+    sorted_counts = dict(sorted(counts.items()))
+    duration_s = (last_ns - first_ns) * 1e-9
+    return BagWritten(sorted_counts, duration_s, log.partial, *verdict)
 
 
 def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[int, str, bytes]]:
     """Yield stamp [ns], topic and CDR bytes of every message."""
     samples = log.samples
     scale = scaling(cell, log.head.readback)
-    position = scale.joint_position(continuous_counts(samples.position_counts, log.head.readback))
+    counts = continuous_counts(samples.position_counts, log.head.readback)
+    position = scale.joint_position(counts)
     velocity = mean_velocity(position, samples.time_ns)
     current = samples.current_raw * scale.current_per_unit
     if len(gains):
@@ -143,12 +139,10 @@ def _messages(log: Log, cell: Cell, gains: Sequence[float]) -> Iterator[tuple[in
     prefix = joint_state_prefix(joint_names(cell))
     stamps = samples.time_ns.tolist()
     yield stamps[0], URDF_TOPIC, text_bytes(cell.urdf)
-    rows = zip(
-        stamps, position.tolist(), velocity.tolist(), effort.tolist(), current.tolist(), strict=True
-    )
-    for time_ns, *state, ampere in rows:
+    states = zip(position.tolist(), velocity.tolist(), effort.tolist(), strict=True)
+    for time_ns, state, current_a in zip(stamps, states, current.tolist(), strict=True):
         yield time_ns, JOINTS_TOPIC, joint_state_bytes(prefix, time_ns, *state)
-        yield time_ns, CURRENTS_TOPIC, currents_bytes(time_ns, ampere)
+        yield time_ns, CURRENTS_TOPIC, currents_bytes(time_ns, current_a)
     for event in log.events:
         yield event.time_ns, EVENTS_TOPIC, event_bytes(event)
     for reading in log.readings:
@@ -166,12 +160,17 @@ def mean_velocity(position: FloatArray, time_ns: IntArray) -> FloatArray:
     half_ns = round(0.5e9 * VELOCITY_S)
     last = len(time_ns) - 1
     index = np.arange(last + 1)
-    before = np.minimum(np.searchsorted(time_ns, time_ns - half_ns), np.maximum(index - 1, 0))
-    after = np.maximum(
-        np.searchsorted(time_ns, time_ns + half_ns, side="right") - 1, np.minimum(index + 1, last)
-    )
-    elapsed_s = np.maximum(time_ns[after] - time_ns[before], 1) * 1e-9
-    return np.asarray((position[after] - position[before]) / elapsed_s[:, None])
+    # At least from the sample before to the sample after
+    previous = np.maximum(index - 1, 0)
+    following = np.minimum(index + 1, last)
+    before = np.searchsorted(time_ns, time_ns - half_ns)
+    before = np.minimum(before, previous)
+    after = np.searchsorted(time_ns, time_ns + half_ns, side="right") - 1
+    after = np.maximum(after, following)
+    elapsed_ns = np.maximum(time_ns[after] - time_ns[before], 1)
+    elapsed_s = elapsed_ns * 1e-9
+    way = position[after] - position[before]
+    return np.asarray(way / elapsed_s[:, None])
 
 
 def joint_effort(cell: Cell, current: FloatArray, gains: Sequence[float]) -> FloatArray:
@@ -193,10 +192,10 @@ def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:
         if topic not in channels:
             schema = SCHEMA_OF[topic]
             if schema not in schemas:
-                schemas[schema] = writer.register_schema(
-                    schema, "ros2msg", DEFINITIONS[schema].encode()
-                )
-            metadata = {"offered_qos_profiles": "".join(f"{line}\n" for line in _qos(topic))}
+                definition = DEFINITIONS[schema].encode()
+                schemas[schema] = writer.register_schema(schema, "ros2msg", definition)
+            qos_lines = [f"{line}\n" for line in _qos(topic)]
+            metadata = {"offered_qos_profiles": "".join(qos_lines)}
             channels[topic] = writer.register_channel(topic, "cdr", schemas[schema], metadata)
         writer.add_message(channels[topic], time_ns, data, time_ns)
     writer.finish()
@@ -204,46 +203,54 @@ def _write(writer: Writer, messages: Sequence[tuple[int, str, bytes]]) -> None:
 
 def _qos(topic: str) -> list[str]:
     """Return the lines of the quality of service that a topic was offered with."""
-    kept = topic == URDF_TOPIC
-    forever = ["  {}:", "    sec: 9223372036", "    nsec: 854775807"]
+    if topic == URDF_TOPIC:
+        depth = 1
+        durability = _TRANSIENT_LOCAL
+    else:
+        depth = 10
+        durability = _VOLATILE
+    forever = ["    sec: 9223372036", "    nsec: 854775807"]
     return [
         f"- history: {_KEEP_LAST}",
-        f"  depth: {1 if kept else 10}",
+        f"  depth: {depth}",
         f"  reliability: {_RELIABLE}",
-        f"  durability: {_TRANSIENT_LOCAL if kept else _VOLATILE}",
-        *(line.format(key) for key in ("deadline", "lifespan") for line in forever),
+        f"  durability: {durability}",
+        "  deadline:",
+        *forever,
+        "  lifespan:",
+        *forever,
         f"  liveliness: {_AUTOMATIC}",
-        *(line.format("liveliness_lease_duration") for line in forever),
+        "  liveliness_lease_duration:",
+        *forever,
         "  avoid_ros_namespace_conventions: false",
     ]
 
 
 def _metadata(name: str, counts: Counter[str], first_ns: int, last_ns: int) -> str:
     """Return the text of `metadata.yaml`."""
-    span = [
-        f"nanoseconds: {last_ns - first_ns}",
-        f"nanoseconds_since_epoch: {first_ns}",
-        f"{sum(counts.values())}",
-    ]
+    duration = f"nanoseconds: {last_ns - first_ns}"
+    start = f"nanoseconds_since_epoch: {first_ns}"
+    message_count = sum(counts.values())
     lines = [
         "rosbag2_bagfile_information:",
         "  version: 5",
         "  storage_identifier: mcap",
         "  duration:",
-        f"    {span[0]}",
+        f"    {duration}",
         "  starting_time:",
-        f"    {span[1]}",
-        f"  message_count: {span[2]}",
+        f"    {start}",
+        f"  message_count: {message_count}",
         "  topics_with_message_count:",
     ]
     for topic, count in sorted(counts.items()):
+        qos_lines = [f"          {line}" for line in _qos(topic)]
         lines += [
             "    - topic_metadata:",
             f"        name: {topic}",
             f"        type: {SCHEMA_OF[topic]}",
             "        serialization_format: cdr",
             "        offered_qos_profiles: |",
-            *(f"          {line}" for line in _qos(topic)),
+            *qos_lines,
             f"      message_count: {count}",
         ]
     lines += [
@@ -254,9 +261,9 @@ def _metadata(name: str, counts: Counter[str], first_ns: int, last_ns: int) -> s
         "  files:",
         f"    - path: {name}",
         "      starting_time:",
-        f"        {span[1]}",
+        f"        {start}",
         "      duration:",
-        f"        {span[0]}",
-        f"      message_count: {span[2]}",
+        f"        {duration}",
+        f"      message_count: {message_count}",
     ]
     return "\n".join(lines) + "\n"

@@ -12,9 +12,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.config.import_description import ImportDescription, PositionUnit
+from daq.config.import_description import ImportDescription, PositionUnit, Section
 from daq.errors import TableUnfit
 from daq.log.conversion import unwrapped
 from daq.log.table import Table, section_place
@@ -36,10 +37,11 @@ class UsedRows:
 
     def place_of(self, fault: ChannelFault) -> str:
         """Name the number at which a fault begins, and its axis."""
-        section = (
-            self.wanted.position if fault.quantity is ChannelKind.POSITION else self.wanted.current
-        )
-        place = section_place(section, self.files, int(self.row[fault.first]), fault.axis)
+        section: Section = self.wanted.current
+        if fault.quantity is ChannelKind.POSITION:
+            section = self.wanted.position
+        row = int(self.row[fault.first])
+        place = section_place(section, self.files, row, fault.axis)
         return f"{place}, axis {self.cell.axes[fault.axis].name}"
 
 
@@ -66,22 +68,30 @@ def sound_columns(position: FloatArray, current: FloatArray, used: UsedRows) -> 
     is_counter = used.wanted.position.unit is PositionUnit.COUNTS
     read = position[used.row]
     if is_counter:
-        read = unwrapped(read.astype(np.int64).astype(np.int32)).astype(np.float64)
+        read = unwrapped(_as_counter(read)).astype(np.float64)
     own_current = current[used.row]
-    faults = find_faults(read, own_current, used.rate_hz, unit=used.wanted.position.unit.value)
+    unit = used.wanted.position.unit.value
+    faults = find_faults(read, own_current, used.rate_hz, unit=unit)
     require_mendable(faults, used, displaced=False)
     mended_position = position.copy()
     mended_position[used.row] = mended(read, faults, used.rate_hz, time=used.time_s)
     if is_counter:
         # The counter of 32 bits goes on at its other end.
-        mended_position = (
-            np.rint(mended_position).astype(np.int64).astype(np.int32).astype(np.float64)
-        )
+        mended_position = _as_counter(np.rint(mended_position)).astype(np.float64)
     mended_current = current.copy()
     mended_current[used.row] = mended(
-        own_current, faults, used.rate_hz, quantity=ChannelKind.CURRENT, time=used.time_s
+        own_current,
+        faults,
+        used.rate_hz,
+        quantity=ChannelKind.CURRENT,
+        time=used.time_s,
     )
     return SoundColumns(mended_position, mended_current, faults)
+
+
+def _as_counter(counts: FloatArray) -> NDArray[np.int32]:
+    """Return whole numbers as a counter of 32 bits has them."""
+    return counts.astype(np.int64).astype(np.int32)
 
 
 def require_mendable(faults: Sequence[ChannelFault], used: UsedRows, *, displaced: bool) -> None:
@@ -99,7 +109,10 @@ def require_mendable(faults: Sequence[ChannelFault], used: UsedRows, *, displace
     if refused is not None:
         place = used.place_of(refused)
         raise TableUnfit(
-            place, found=found(refused), expected=expected(refused), remedy=remedy(refused)
+            place,
+            found=found(refused),
+            expected=expected(refused),
+            remedy=remedy(refused),
         )
 
 
@@ -110,5 +123,6 @@ def fault_remarks(faults: Sequence[ChannelFault], used: UsedRows) -> Iterator[st
         faults: of the columns, all of them mended.
         used: the rows that are used.
     """
-    for one in faults:
-        yield f"{used.place_of(one)}: {found(one)}; {what_is_done(one)}"
+    for fault in faults:
+        place = used.place_of(fault)
+        yield f"{place}: {found(fault)}; {what_is_done(fault)}"

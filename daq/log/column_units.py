@@ -145,20 +145,24 @@ def expected_units(
         for _, column in _columns_here(path, wanted.velocity):
             yield Expected("velocity", column, _with_twin(velocity), None)
     for axis, column in _columns_here(path, wanted.current):
-        unit = wanted.current.unit
-        text = unit[axis] if isinstance(unit, tuple) and axis < len(unit) else unit
+        text = wanted.current.unit
+        if isinstance(text, tuple) and axis < len(text):
+            text = text[axis]
         if isinstance(text, str):
             yield Expected("current", column, (text,), _factor_of(wanted.current, axis))
     if wanted.torque is not None:
         for axis, column in _columns_here(path, wanted.torque):
-            yield Expected("torque", column, ("Nm", "N"), _factor_of(wanted.torque, axis))
+            factor = _factor_of(wanted.torque, axis)
+            yield Expected("torque", column, ("Nm", "N"), factor)
     if wanted.temperature is not None:
         for _, column in _columns_here(path, wanted.temperature):
             yield Expected("temperature", column, ("°C",), None)
 
 
 def _with_twin(unit: str) -> tuple[str, ...]:
-    return (unit, TWINS[unit]) if unit in TWINS else (unit,)
+    if unit in TWINS:
+        return (unit, TWINS[unit])
+    return (unit,)
 
 
 def _factor_of(section: ScaledColumns, axis: int) -> float | None:
@@ -197,28 +201,30 @@ def check_unit(place: str, stated: str, expected: Expected, *, in_name: bool = F
         TableUnfit: both units are known, and they contradict each other.
     """
     unit = column_unit_of(stated)
-    allowed = [column_unit_of(text) for text in expected.texts]
-    if unit is None or None in allowed:
+    if unit is None:
         return
-    if in_name and unit.kind not in {one.kind for one in allowed if one is not None}:
+    allowed = []
+    for text in expected.texts:
+        allowed_unit = column_unit_of(text)
+        if allowed_unit is None:
+            return
+        allowed.append(allowed_unit)
+    kinds = {allowed_unit.kind for allowed_unit in allowed}
+    if in_name and unit.kind not in kinds:
         return
-    if any(_agree(unit, one, expected) for one in allowed if one is not None):
+    if any(_agree(unit, allowed_unit, expected) for allowed_unit in allowed):
         return
-    has_factor = expected.factor is not None
-    if has_factor:
+    by_factor = ""
+    corrections = f"the unit of `{expected.key}`"
+    if expected.factor is not None:
         by_factor = f", with the factor {expected.factor:g}"
-    else:
-        by_factor = ""
-    if has_factor:
         corrections = f"the unit or `factor` of `{expected.key}`"
-    else:
-        corrections = f"the unit of `{expected.key}`"
+    place_of_unit = "the name of the column" if in_name else "the line of units"
     if expected.key in {"torque", "temperature"}:
         corrections = f"`{expected.key}`"
     raise TableUnfit(
         place,
-        found=f"unit {bare_unit(stated)!r} in "
-        f"{'the name of the column' if in_name else 'the line of units'}",
+        found=f"unit {bare_unit(stated)!r} in {place_of_unit}",
         expected=f"{expected.texts[0]!r}, the unit of `{expected.key}` in the import "
         f"description{by_factor}",
         remedy=f"if the file is right, correct {corrections} or the column there; if not, correct "
@@ -240,7 +246,9 @@ def _agree(unit: ColumnUnit, described: ColumnUnit, expected: Expected) -> bool:
 def name_unit(name: str) -> str | None:
     """Return what is in square brackets at the end of a column's name; None without them."""
     match = _IN_BRACKETS.search(name)
-    return None if match is None else match[1]
+    if match is None:
+        return None
+    return match[1]
 
 
 def check_units(
@@ -282,7 +290,9 @@ def _require_alike(place: str, in_line: str, in_name: str) -> None:
     """
     stated = column_unit_of(in_line)
     named = column_unit_of(in_name)
-    if stated is None or named is None or stated.kind != named.kind or stated == named:
+    if stated is None or named is None:
+        return
+    if stated.kind != named.kind or stated == named:
         return
     raise TableUnfit(
         place,
@@ -295,5 +305,8 @@ def _require_alike(place: str, in_line: str, in_name: str) -> None:
 
 def _index(column: Column, names: Sequence[str]) -> int | None:
     if isinstance(column, int):
-        return column - 1 if column <= len(names) else None
-    return names.index(column) if column in names else None
+        if column <= len(names):
+            return column - 1
+    elif column in names:
+        return names.index(column)
+    return None

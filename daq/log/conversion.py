@@ -62,11 +62,13 @@ class SiScaling:
         """
         size = np.abs(self.to_joint)
         moves = size > 1e-12 * size.max()
-        return np.asarray(~(~answered @ moves.T), dtype=np.bool_)
+        is_unknown = ~answered @ moves.T
+        return np.asarray(~is_unknown, dtype=np.bool_)
 
     def joint_position_of(self, counts: tuple[int, ...]) -> list[float]:
         """Convert one sample, for /joint_states."""
-        position: list[float] = self.joint_position(np.array(counts, dtype=np.int64)).tolist()
+        motor_counts = np.array(counts, dtype=np.int64)
+        position: list[float] = self.joint_position(motor_counts).tolist()
         return position
 
 
@@ -97,11 +99,14 @@ def scaling(cell: Cell, readback: Readback) -> SiScaling:
                 expected="it in the cell configuration, or a count in the log's readback",
                 remedy="add it to the cell file and record or import again",
             )
+    to_joint = np.asarray(np.linalg.inv(cell.ratio), dtype=np.float64)
+    offsets_rad = [axis.zero_offset_rad for axis in cell.axes]
+    currents_per_unit = [answer.current_per_unit for answer in readback.axes]
     return SiScaling(
         rad_per_count=np.array(angles),
-        to_joint=np.asarray(np.linalg.inv(cell.ratio), dtype=np.float64),
-        offset_rad=np.array([axis.zero_offset_rad for axis in cell.axes]),
-        current_per_unit=np.array([answer.current_per_unit for answer in readback.axes]),
+        to_joint=to_joint,
+        offset_rad=np.array(offsets_rad),
+        current_per_unit=np.array(currents_per_unit),
     )
 
 
@@ -157,14 +162,16 @@ def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
         declared = {(one.name, one.mounting): one.mass_kg for one in cell.payloads}
         mass_kg = declared.get((payload.name, payload.mounting))
         if mass_kg is not None:
-            run = replace(run, payload=replace(payload, known={**payload.known, "m": mass_kg}))
+            known = {**payload.known, "m": mass_kg}
+            run = replace(run, payload=replace(payload, known=known))
         elif correction is not None:
-            names = ", ".join(f"{name} on {mounting}" for name, mounting in declared)
+            names = [f"{name} on {mounting}" for name, mounting in declared]
+            payloads = ", ".join(names) or "it has none"
             raise LogsDiffer(
                 run.name,
                 found=f"payload {payload.name} on {payload.mounting}, which the given description "
                 "does not have",
-                expected=f"one of its payloads: {names or 'it has none'}",
+                expected=f"one of its payloads: {payloads}",
                 remedy="keep name and mounting of the payload; its mass and tolerance may be "
                 "corrected",
             )
@@ -176,6 +183,34 @@ def _corrected(run: Run, cell: Cell, correction: Correction | None) -> Run:
         corrected=correction.sections,
     )
     return replace(run, recording=recording)
+
+
+def _has_accepted_losses(log: Log, lossy: LossyLogs) -> bool:
+    """Return whether the log is used although it has lost samples; warn of one that is.
+
+    Raises:
+        RunInvalid: the recorder marked the log invalid, and it is not accepted.
+    """
+    if log.statistics.valid:
+        return False
+    reason = log.statistics.reason
+    only_losses = reports_only_losses(reason)
+    if lossy is LossyLogs.ACCEPTED and only_losses:
+        _LOG.warning(
+            "%s has lost %s: its samples are left out, and nothing of it is written back",
+            log.path,
+            reason,
+        )
+        return True
+    remedy = "record it again"
+    if only_losses:
+        remedy += "; or use it anyway with --accept-losses"
+    raise RunInvalid(
+        str(log.path),
+        found=f"a run that its recorder marked invalid ({reason or 'no reason given'})",
+        expected="a valid run",
+        remedy=remedy,
+    )
 
 
 def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> Run:
@@ -196,44 +231,18 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     name = log.path.stem
     samples = log.samples
     rate_hz = log.head.run.rate_hz
-    only_losses = reports_only_losses(log.statistics.reason)
-    accepted = lossy is LossyLogs.ACCEPTED and not log.statistics.valid and only_losses
-    if accepted:
-        _LOG.warning(
-            "%s has lost %s: its samples are left out, and nothing of it is written back",
-            log.path,
-            log.statistics.reason,
-        )
-    elif not log.statistics.valid:
-        raise RunInvalid(
-            str(log.path),
-            found="a run that its recorder marked invalid "
-            f"({log.statistics.reason or 'no reason given'})",
-            expected="a valid run",
-            remedy="record it again"
-            + ("; or use it anyway with --accept-losses" if only_losses else ""),
-        )
+    accepted = _has_accepted_losses(log, lossy)
     checks = SampleChecks(log.path)
     checks.take(samples)
     lost = checks.fault(rate_hz)
     if lost is not None:
         raise lost
     scale = scaling(cell, log.head.readback)
-    position_rad = scale.joint_position(
-        continuous_counts(samples.position_counts, log.head.readback)
-    )
+    motor_counts = continuous_counts(samples.position_counts, log.head.readback)
+    position_rad = scale.joint_position(motor_counts)
     limited = limit_active(cell, samples.statusword)
-    share = limited.mean(axis=0)
-    worst = int(np.argmax(share))
-    largest_percent = 100.0 * LARGEST_SATURATED
-    if 100.0 * share[worst] > largest_percent:
-        raise CurrentSaturated(
-            f"{log.path}, axis {cell.axes[worst].name}",
-            found=f"a limit active in {format_at_limit(100.0 * share[worst], largest_percent, 1)} "
-            "% of the samples",
-            expected=f"at most {largest_percent:g} %",
-            remedy="plan slower moves, or a smaller payload",
-        )
+    limited_percent = 100.0 * limited.mean(axis=0)
+    _require_current_below_limit(log, cell, limited_percent)
     answered = answers(samples.missing, len(cell.axes))
     valid = answered & ~limited
     current = samples.current_raw * scale.current_per_unit
@@ -244,37 +253,65 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     if fault is not None:
         raise fault
     run = log.head.run
-    drives = [axis.drive for axis in log.head.readback.axes]
+    cycles = samples.cycle - samples.cycle[0]
+    started_s = float(samples.time_ns[0]) * 1e-9
     converted = Run(
         name=name,
-        time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
+        time_s=cycles.astype(np.float64) / rate_hz,
         position_rad=position_rad,
         current_a=current,
         payload=run.payload,
         move=moves(log.events, samples.time_ns),
         digest=log.digest,
         valid=valid,
-        started_s=float(samples.time_ns[0]) * 1e-9 if run.has_clock else None,
+        started_s=started_s if run.has_clock else None,
         partial=log.partial or accepted,
         temperature_c=temperatures(log),
         torque_channels=torque_channels(log, cell, current, valid),
-        recording=Recording(
-            # An import without the time of day writes 0.
-            recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
-            entered_kg=run.entered_kg,
-            serials=tuple(map(_serial, drives)),
-            saturated_percent=tuple((100.0 * share).tolist()),
-            lost_cycles=log.statistics.lost_cycles,
-            missing=log.statistics.missing,
-            controller_sha256=run.controller_sha256,
-            operator=run.operator or None,
-        ),
+        recording=_recording_of(log, limited_percent),
     )
     if unsigned_currents(converted, cell.ratio).any():
         from ident.estimators.diagnosis import require_explained_currents  # noqa: PLC0415 - needs scipy, seldom
 
         require_explained_currents(converted, model_of(cell), cell.conditioning, cell.axis_names)
     return converted
+
+
+def _require_current_below_limit(log: Log, cell: Cell, limited_percent: FloatArray) -> None:
+    """Refuse a log with a limit active in too many samples of an axis.
+
+    Raises:
+        CurrentSaturated: a limit was active in more than LARGEST_SATURATED of them.
+    """
+    worst = int(np.argmax(limited_percent))
+    largest_percent = 100.0 * LARGEST_SATURATED
+    if limited_percent[worst] > largest_percent:
+        active_percent = format_at_limit(limited_percent[worst], largest_percent, 1)
+        raise CurrentSaturated(
+            f"{log.path}, axis {cell.axes[worst].name}",
+            found=f"a limit active in {active_percent} % of the samples",
+            expected=f"at most {largest_percent:g} %",
+            remedy="plan slower moves, or a smaller payload",
+        )
+
+
+def _recording_of(log: Log, limited_percent: FloatArray) -> Recording:
+    """Return what a log says of its recording."""
+    run = log.head.run
+    serials = [_serial(axis.drive) for axis in log.head.readback.axes]
+    recorded_s = None
+    if run.started_wall_ns:  # an import without the time of day writes 0
+        recorded_s = run.started_wall_ns * 1e-9
+    return Recording(
+        recorded_s=recorded_s,
+        entered_kg=run.entered_kg,
+        serials=tuple(serials),
+        saturated_percent=tuple(limited_percent.tolist()),
+        lost_cycles=log.statistics.lost_cycles,
+        missing=log.statistics.missing,
+        controller_sha256=run.controller_sha256,
+        operator=run.operator or None,
+    )
 
 
 def limit_active(cell: Cell, statusword: NDArray[np.uint16]) -> BoolArray:
@@ -288,14 +325,17 @@ def limit_active(cell: Cell, statusword: NDArray[np.uint16]) -> BoolArray:
         else:
             bit = axis.profile.saturation_bit
         masks.append(0 if bit is None else 1 << bit)
-    return np.asarray(statusword & np.array(masks, dtype=np.uint16) != 0, dtype=np.bool_)
+    limit_bits = statusword & np.array(masks, dtype=np.uint16)
+    return np.asarray(limit_bits != 0, dtype=np.bool_)
 
 
 def answers(missing: NDArray[np.uint32], axes: int) -> BoolArray:
     """Return whether each axis answered in each cycle, shape (k, n),
     from the bits of those that did not.
     """
-    return np.asarray(missing[:, None] >> np.arange(axes, dtype=np.uint32) & 1 == 0, dtype=np.bool_)
+    bits = np.arange(axes, dtype=np.uint32)
+    is_missing = missing[:, None] >> bits & 1
+    return np.asarray(is_missing == 0, dtype=np.bool_)
 
 
 def continuous_counts(position_counts: RawArray, readback: Readback) -> IntArray:
@@ -318,14 +358,13 @@ def moves(events: tuple[CellEvent, ...], time_ns: IntArray) -> IntArray | None:
     A move lasts until the next one starts, so the standstill between two moves belongs to the
     first. Samples before the first start belong to the first move.
     """
-    starts = sorted(
-        (event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START
-    )
+    starts = [(event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START]
     if not starts:
         return None
     number: IntArray
-    begin_ns, number = np.array(starts, dtype=np.int64).T
-    return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
+    begin_ns, number = np.array(sorted(starts), dtype=np.int64).T
+    begun = np.searchsorted(begin_ns, time_ns, side="right")
+    return number[np.maximum(begun - 1, 0)]
 
 
 def readings_by_axis(
@@ -341,7 +380,8 @@ def readings_by_axis(
     series = {}
     for axis, own in found.items():
         stamps, values = zip(*sorted(own), strict=True)
-        series[axis] = np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64)
+        stamps_ns = np.array(stamps, dtype=np.int64)
+        series[axis] = stamps_ns, np.array(values, dtype=np.float64)
     return series
 
 
@@ -355,15 +395,16 @@ def temperatures(log: Log) -> FloatArray | None:
     readings = readings_by_axis(log.readings, Quantity.TEMPERATURE)
     if not readings:
         return None
-    time_ns = log.samples.time_ns
-    found = np.full(log.samples.position_counts.shape, np.nan)
+    first_ns = log.samples.time_ns[0]
+    since_ns = log.samples.time_ns - first_ns
+    celsius = np.full(log.samples.position_counts.shape, np.nan)
     least, largest = TEMPERATURES_C
     for axis, (at_ns, values) in readings.items():
         possible = (values >= least) & (values <= largest)
         if np.any(possible):
-            at_possible_ns = at_ns[possible] - time_ns[0]
-            found[:, axis] = np.interp(time_ns - time_ns[0], at_possible_ns, values[possible])
-    return found
+            at_possible_ns = at_ns[possible] - first_ns
+            celsius[:, axis] = np.interp(since_ns, at_possible_ns, values[possible])
+    return celsius
 
 
 def torque_channels(
@@ -400,24 +441,29 @@ def torque_channels(
         inside = (row >= far) & (row + far < len(time_ns))
         row = row[inside]
         at_ns = at_ns[inside]
-        beside, before, after = (
-            (sums[:, last, axis] - sums[:, first, axis]) / (last - first)
-            for first, last in (
-                (row - half, row + half + 1),
-                (row - far, row - near),
-                (row + near + 1, row + far + 1),
-            )
+        axis_sums = sums[:, :, axis]
+        at_reading = _window_means(axis_sums, row - half, row + half + 1)
+        before = _window_means(axis_sums, row - far, row - near)
+        after = _window_means(axis_sums, row + near + 1, row + far + 1)
+        # Every sample of the three windows is valid.
+        usable = at_reading[1] + before[1] + after[1] == 3.0
+        nearby_a = 0.5 * (before[0] + after[0])
+        motor_torque_nm = values[inside][usable]
+        channel = TorqueChannel(
+            time_s=(at_ns[usable] - time_ns[0]) * 1e-9,
+            current_a=at_reading[0, usable],
+            nearby_a=nearby_a[usable],
+            torque_nm=float(reduction) * motor_torque_nm,
         )
-        whole = beside[1] + before[1] + after[1] == 3.0
-        channels.append(
-            TorqueChannel(
-                time_s=(at_ns[whole] - time_ns[0]) * 1e-9,
-                current_a=beside[0, whole],
-                nearby_a=0.5 * (before[0] + after[0])[whole],
-                torque_nm=float(reduction) * values[inside][whole],
-            )
-        )
+        channels.append(channel)
     return tuple(channels)
+
+
+def _window_means(sums: FloatArray, first: IntArray, end: IntArray) -> FloatArray:
+    """Return means over the rows from `first` up to `end`, shape (2, m), from the sums of all rows
+    before each, shape (2, k + 1).
+    """
+    return np.asarray((sums[:, end] - sums[:, first]) / (end - first))
 
 
 def check_limits(
@@ -441,7 +487,11 @@ def check_limits(
             column = position_rad[valid[:, index], index]
         lower, upper = axis.limits.position
         margin = LIMIT_MARGIN * (upper - lower)
-        if column.size and (column.min() < lower - margin or column.max() > upper + margin):
+        if not column.size:
+            continue
+        lowest = float(column.min())
+        highest = float(column.max())
+        if lowest < lower - margin or highest > upper + margin:
             unit = axis.unit
             if unit is DEGREE:
                 confused = "degrees were taken for radians"
@@ -451,24 +501,27 @@ def check_limits(
                 f"most likely {confused} (or counts for either); else check motor or joint side, "
                 "ratio and zero offset"
             )
-            least = lower - margin - float(column.min())
-            most = upper + margin - float(column.max())
+            least = lower - margin - lowest
+            most = upper + margin - highest
             if least <= most:  # as many as the joint can make, from another zero
                 if unit is DEGREE:
                     key = "zero_offset_deg"
                 else:
                     key = "zero_offset_mm"
+                smallest_move = least / unit.si
+                largest_move = most / unit.si
                 remedy = (
-                    f"most likely the zero is wrong: moved by {least / unit.si:+.0f} to "
-                    f"{most / unit.si:+.0f} {unit.name}, these positions are within the limits; "
+                    f"most likely the zero is wrong: moved by {smallest_move:+.0f} to "
+                    f"{largest_move:+.0f} {unit.name}, these positions are within the limits; "
                     f"correct `{key}` of {axis.name} in the cell file, or the zero in the "
                     "controller; else check motor or joint side, ratio and units"
                 )
+            lower_limit = lower / unit.si
+            lowest_found = lowest / unit.si
             raise PositionImplausible(
                 f"{name}, axis {axis.name}",
-                found=f"joint positions from {column.min() / unit.si:.5g} to "
-                f"{unit.spell(column.max())}",
-                expected=f"{lower / unit.si:.5g} to {unit.spell(upper)}, the limits in the cell "
+                found=f"joint positions from {lowest_found:.5g} to {unit.spell(highest)}",
+                expected=f"{lower_limit:.5g} to {unit.spell(upper)}, the limits in the cell "
                 "configuration",
                 remedy=remedy,
             )

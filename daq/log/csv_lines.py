@@ -58,7 +58,8 @@ class CsvLines:
 
     def field_place(self, row: int, index: int) -> str:
         """Name a field in a message: `run.csv:42, column i3`."""
-        return f"{self.row_place(row)}, column {self.names[index] if self.names else index + 1}"
+        column = self.names[index] if self.names else index + 1
+        return f"{self.row_place(row)}, column {column}"
 
     def row_place(self, row: int) -> str:
         """Name the line of a row in a message: `run.csv:42`."""
@@ -96,14 +97,13 @@ class CsvLines:
     def select_rows(self, rows: slice) -> CsvLines:
         """Return some of the rows."""
         first, _, _ = rows.indices(len(self.rows))
-        kept = self.rows[rows]
         return CsvLines(
-            self.path,
-            self.layout,
-            self.names,
-            kept,
-            self.line_numbers[rows],
-            self.first_row + first,
+            path=self.path,
+            layout=self.layout,
+            names=self.names,
+            rows=self.rows[rows],
+            line_numbers=self.line_numbers[rows],
+            first_row=self.first_row + first,
         )
 
 
@@ -125,8 +125,10 @@ def read_number(text: str, decimal: str) -> float:
     """Read a field; NaN if it is no number."""
     if "_" in text:  # Python reads 1_000, no other program does
         return math.nan
+    if decimal == ",":
+        text = text.replace(",", ".")
     try:
-        return float(text.replace(",", ".") if decimal == "," else text)
+        return float(text)
     except ValueError:
         return math.nan
 
@@ -156,11 +158,10 @@ def read_lines(
     # Unicode's.
     all_lines = [line.removesuffix("\n") for line in io.StringIO(text, newline=None)]
     file = _RawLines(path, wanted.table, all_lines)
-    named = [
-        column
-        for column in (*columns, *([] if time is None else [time.column]))
-        if isinstance(column, str)
-    ]
+    sought = list(columns)
+    if time is not None:
+        sought.append(time.column)
+    named = [column for column in sought if isinstance(column, str)]
     start, names = file.find_header(named)
     header_number = start
     units_line = file.units_line(start, names, columns, time)
@@ -174,11 +175,11 @@ def read_lines(
             f"line {start} was taken for the units of the columns: {file.excerpt(units_line)}"
         )
     end = file.end_of_rows(start)
-    footer = [number for number in range(end, len(file.lines)) if file.lines[number].strip()]
+    footer = [number for number in range(end, len(file.lines)) if not file.is_blank(number)]
     if footer:
-        remarks.append(
-            f"left out after the rows: {counted(len(footer), 'line')}, {file.excerpt(footer[0])}"
-        )
+        lines_left_out = counted(len(footer), "line")
+        excerpt = file.excerpt(footer[0])
+        remarks.append(f"left out after the rows: {lines_left_out}, {excerpt}")
     numbers, skipped = file.row_numbers(start, end, has_time=wanted.time is not None)
     remarks += skipped
     rows = slice(None) if wanted.keep is None else wanted.keep.rows
@@ -187,10 +188,12 @@ def read_lines(
     if not kept:
         raise _without_rows(file, start, len(numbers), wanted)
     file.check_quotes(kept)
-    rows_kept = tuple(file.lines[number].replace(MINUS, "-") for number in kept)
-    if any(MINUS in file.lines[number] for number in kept):
+    rows_as_read = [file.lines[number] for number in kept]
+    rows_kept = tuple(row.replace(MINUS, "-") for row in rows_as_read)
+    if any(MINUS in row for row in rows_as_read):
         remarks.append("the minus sign U+2212 was read as -")
-    lines = CsvLines(path, wanted.table, names, rows_kept, [number + 1 for number in kept], first)
+    line_numbers = [number + 1 for number in kept]
+    lines = CsvLines(path, wanted.table, names, rows_kept, line_numbers, first)
     _check_header(lines, header_number)
     _check_shape(lines, len(names))
     is_last = not footer and kept[-1] == end - 1
@@ -234,16 +237,23 @@ class _RawLines:
 
     def is_comment(self, number: int) -> bool:
         """Whether a line begins with the sign of a comment."""
-        signs = (
-            COMMENT_SIGNS if self.layout.comment is None else (*COMMENT_SIGNS, self.layout.comment)
-        )
+        signs: tuple[str, ...] = COMMENT_SIGNS
+        if self.layout.comment is not None:
+            signs = (*signs, self.layout.comment)
         return self.lines[number].lstrip().startswith(signs)
+
+    def is_blank(self, number: int) -> bool:
+        """Whether a line is empty, or has blanks only."""
+        return not self.lines[number].strip()
+
+    def is_skipped(self, number: int) -> bool:
+        """Whether a line is empty or a comment."""
+        return self.is_blank(number) or self.is_comment(number)
 
     def is_row(self, number: int) -> bool:
         """Whether a line has a number."""
-        return any(
-            math.isfinite(read_number(field, self.layout.decimal)) for field in self.fields(number)
-        )
+        numbers = (read_number(field, self.layout.decimal) for field in self.fields(number))
+        return any(map(math.isfinite, numbers))
 
     def find_header(self, named: Iterable[str]) -> tuple[int, tuple[str, ...]]:
         """Return the first line behind the header, and its names.
@@ -255,8 +265,9 @@ class _RawLines:
         wanted = set(named)
         first = start
         while first < len(self.lines):
-            is_skipped = not self.lines[first].strip() or self.is_comment(first)
-            if not is_skipped or (self.layout.header and self._is_header(first, wanted)):
+            if not self.is_skipped(first):
+                break
+            if self.layout.header and self._is_header(first, wanted):
                 break
             first += 1
         if not self.layout.header:
@@ -266,21 +277,21 @@ class _RawLines:
         names = self.fields(first)
         if not wanted <= set(names):
             bare = self._without_sign(first)
-            names = bare if wanted <= set(bare) else names
+            if wanted <= set(bare):
+                names = bare
         return first + 1, tuple(names)
 
     def _is_header(self, number: int, wanted: set[str]) -> bool:
-        if not self.lines[number].strip():
+        if self.is_blank(number):
             return False
-        has_names = bool(wanted) and (
-            wanted <= set(self.fields(number)) or wanted <= set(self._without_sign(number))
-        )
-        follows = (
-            number + 1 < len(self.lines)
-            and self.is_row(number + 1)
-            and not self.is_comment(number + 1)
-        )
-        return has_names or follows
+        if wanted:
+            has_names = wanted <= set(self.fields(number))
+            if has_names or wanted <= set(self._without_sign(number)):
+                return True
+        following = number + 1
+        if following >= len(self.lines):
+            return False
+        return self.is_row(following) and not self.is_comment(following)
 
     def _without_sign(self, number: int) -> list[str]:
         text = self.lines[number].lstrip()
@@ -295,9 +306,11 @@ class _RawLines:
         if number >= len(self.lines):
             return number
         text = self.lines[number].strip().strip('"')
-        if not text.lower().startswith("sep=") or len(text) > len("sep=x"):
+        is_delimiter_line = text.lower().startswith("sep=")
+        if not is_delimiter_line or len(text) > len("sep=x"):
             return number
-        stated = self.lines[number].strip(' "\r\n')[len("sep=") :]
+        bare = self.lines[number].strip(' "\r\n')
+        stated = bare[len("sep=") :]
         if stated and stated != self.layout.delimiter:
             raise TableUnfit(
                 f"{self.path}:{number + 1}",
@@ -317,9 +330,7 @@ class _RawLines:
         them, is a unit.
         """
         number = start
-        while number < len(self.lines) and (
-            not self.lines[number].strip() or self.is_comment(number)
-        ):
+        while number < len(self.lines) and self.is_skipped(number):
             number += 1
         if not names or number >= len(self.lines):
             return None
@@ -338,7 +349,7 @@ class _RawLines:
     def end_of_rows(self, start: int) -> int:
         """Return the line behind the last row: empty lines and comments after it are no rows."""
         end = len(self.lines)
-        while end > start and (not self.lines[end - 1].strip() or self.is_comment(end - 1)):
+        while end > start and self.is_skipped(end - 1):
             end -= 1
         return end
 
@@ -350,30 +361,30 @@ class _RawLines:
             start, end: first line behind the head, and behind the last row.
             has_time: stamps show where a recording goes on, so that an empty line says nothing.
         """
-        while start < end and (not self.lines[start].strip() or self.is_comment(start)):
+        while start < end and self.is_skipped(start):
             start += 1
-        sign = self.layout.comment
-        comments = [
-            number
-            for number in range(start, end)
-            if sign and self.lines[number].lstrip().startswith(sign)
-        ]
-        empty = [number for number in range(start, end) if not self.lines[number].strip()]
+        candidates = range(start, end)
+        comments = self._declared_comments(candidates)
+        empty = [number for number in candidates if self.is_blank(number)]
         remarks = []
         left_out = set(comments)
         if not has_time:
             self._require_no_commented_row(comments)
         if comments:
-            remarks.append(
-                f"left out, as `comment` says: {counted(len(comments), 'line')} among the rows"
-            )
-        is_doubled = len(empty) > 1 and all(
-            later - number == 2 for number, later in pairwise(empty)
-        )
-        if empty and (has_time or (is_doubled and 2 * len(empty) + 1 >= end - start)):
+            lines = counted(len(comments), "line")
+            remarks.append(f"left out, as `comment` says: {lines} among the rows")
+        if empty and (has_time or _is_every_other(empty, len(candidates))):
             left_out |= set(empty)
-            remarks.append(f"left out: {counted(len(empty), 'empty line')} among the rows")
-        return [number for number in range(start, end) if number not in left_out], remarks
+            lines = counted(len(empty), "empty line")
+            remarks.append(f"left out: {lines} among the rows")
+        return [number for number in candidates if number not in left_out], remarks
+
+    def _declared_comments(self, candidates: range) -> list[int]:
+        """Return the numbers of the lines that begin with the sign of the layout."""
+        sign = self.layout.comment
+        if not sign:
+            return []
+        return [number for number in candidates if self.lines[number].lstrip().startswith(sign)]
 
     def _require_no_commented_row(self, comments: Sequence[int]) -> None:
         """Refuse a row that is commented out:
@@ -387,10 +398,11 @@ class _RawLines:
             fields = split_fields(text, self.layout.delimiter)
             values = [read_number(field, self.layout.decimal) for field in fields]
             if len(values) > 1 and all(map(math.isfinite, values)):
+                excerpt = self.excerpt(number)
                 raise TableUnfit(
                     f"{self.path}:{number + 1}",
-                    found=f"{self.excerpt(number)}, a row of numbers that is commented out, at a "
-                    "rate without stamps",
+                    found=f"{excerpt}, a row of numbers that is commented out, at a rate without "
+                    "stamps",
                     expected="every sample, as `rate_hz` gives each row its time",
                     remedy="take the sign of the comment away, name a column of stamps by `time`, "
                     "or import what is before it and what is behind it by `keep`",
@@ -410,6 +422,14 @@ class _RawLines:
                     expected="quotes around whole fields, closed on the same line",
                     remedy="export the table without quotes, or without that column",
                 ) from error
+
+
+def _is_every_other(numbers: Sequence[int], count: int) -> bool:
+    """Whether every other of so many lines is one of these."""
+    if len(numbers) < 2:
+        return False
+    distances = {later - number for number, later in pairwise(numbers)}
+    return distances == {2} and 2 * len(numbers) + 1 >= count
 
 
 def _present_indices(columns: Sequence[Column], names: tuple[str, ...]) -> list[int]:
@@ -480,20 +500,23 @@ def _check_header(file: CsvLines, line_number: int) -> None:
     """
     names = file.names
     values = [file.to_number(name) for name in names]
-    is_counted = (
-        len(values) > 1
-        and values[0] in (0.0, 1.0)
-        and all(b - a == 1.0 for a, b in pairwise(values))
-    )
-    if values and np.isfinite(values).all() and not is_counted:
+    if values and np.isfinite(values).all() and not _are_counted(values):
+        first_names = ", ".join(names[:3])
+        more = " ..." if len(names) > 3 else ""
         raise TableUnfit(
             f"{file.path}:{line_number}",
-            found="a header of numbers, "
-            f"{', '.join(names[:3])}" + (" ..." if len(names) > 3 else ""),
+            found=f"a header of numbers, {first_names}{more}",
             expected="names of columns",
             remedy="if the file has no header, write `header: false` under `table` and columns as "
             "numbers from 1",
         )
+
+
+def _are_counted(values: Sequence[float]) -> bool:
+    """Whether numbers count columns, from 0 or from 1."""
+    if len(values) < 2 or values[0] not in (0.0, 1.0):
+        return False
+    return all(later - earlier == 1.0 for earlier, later in pairwise(values))
 
 
 def _check_shape(file: CsvLines, named: int) -> None:
@@ -501,7 +524,12 @@ def _check_shape(file: CsvLines, named: int) -> None:
     and a last row that was cut off.
     """
     counts = np.array([len(file.fields(row)) for row in file.rows])
-    usual = named or Counter(counts.tolist()).most_common(1)[0][0]
+    if named:
+        usual = named
+        source = "the header"
+    else:
+        [(usual, _)] = Counter(counts.tolist()).most_common(1)
+        source = "most lines"
     wrong = np.flatnonzero(counts != usual)
     for row in wrong.tolist():
         _require_row(file, row)
@@ -511,16 +539,21 @@ def _check_shape(file: CsvLines, named: int) -> None:
         raise TableUnfit(
             file.row_place(first),
             found=f"{counts[first]} columns",
-            expected=f"{usual}, as in {'the header' if named else 'most lines'}",
+            expected=f"{usual}, as in {source}",
             remedy="check the delimiter in the import description, and the export",
         )
-    if wrong.size or (not file.fields(file.rows[last])[-1] and file.fields(file.rows[0])[-1]):
+    first_end = file.fields(file.rows[0])[-1]
+    last_end = file.fields(file.rows[last])[-1]
+    lacks_last_field = first_end and not last_end
+    if wrong.size or lacks_last_field:
+        excerpt = file.rows[last][-EXCERPT_CHARACTERS:]
+        keep = _keep_to(file, last)
         raise TableUnfit(
             file.row_place(last),
-            found=f"a last line {file.rows[last][-EXCERPT_CHARACTERS:]!r} of {counts[last]} fields",
+            found=f"a last line {excerpt!r} of {counts[last]} fields",
             expected=f"{usual} complete fields",
             remedy="the file ends early; export or copy it again, or leave that line out by "
-            f"{_keep_to(file, last)}",
+            f"{keep}",
         )
 
 
@@ -529,30 +562,38 @@ def _require_row(file: CsvLines, row: int) -> None:
     a remark of the program that wrote it.
     """
     text = file.rows[row]
-    is_row = any(math.isfinite(file.to_number(field)) for field in file.fields(text))
+    numbers = (file.to_number(field) for field in file.fields(text))
+    is_row = any(map(math.isfinite, numbers))
     is_comment = text.lstrip().startswith(COMMENT_SIGNS)
+    has_letters = any(character.isalpha() for character in text)
     # A last line of one torn field may be the begin of a number.
-    is_torn = row == len(file.rows) - 1 and not any(character.isalpha() for character in text)
+    is_torn = row == len(file.rows) - 1 and not has_letters
     if (is_row and not is_comment) or is_torn:
         return
-    word = text.split()[0] if text.split() else ""
-    sign = next((one for one in COMMENT_SIGNS if word.startswith(one)), word[:4])
+    sign = _first_sign(text)
+    found = f"{text[:EXCERPT_CHARACTERS]!r}, a line that is no row of numbers"
+    leave_out = ""
     if sign:
         leave_out = f", or write `comment: {sign!r}` under `table` of the import description"
     else:
-        leave_out = ""
-    empty = "" if sign else "an empty line, "
-    if row:
-        parts = f"`keep: {{to_row: {file.first_row + row}}}`"
-    else:
-        parts = "`keep`"
+        found = f"an empty line, {found}"
+    parts = _keep_to(file, row) if row else "`keep`"
     raise TableUnfit(
         file.row_place(row),
-        found=f"{empty}{text[:EXCERPT_CHARACTERS]!r}, a line that is no row of numbers",
+        found=found,
         expected="rows of numbers alone, after the header",
         remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two "
         f"recordings, import what is before it by {parts}, and what is behind it by `from_row`",
     )
+
+
+def _first_sign(text: str) -> str:
+    """Return the sign of a comment that a line begins with, else its first characters."""
+    word, *_ = text.split() or [""]
+    for sign in COMMENT_SIGNS:
+        if word.startswith(sign):
+            return sign
+    return word[:4]
 
 
 def _keep_to(file: CsvLines, row: int) -> str:
@@ -568,15 +609,17 @@ def _check_last_number(file: CsvLines) -> None:
     values = np.array([file.to_number(end) for end in ends])
     decimals = [len(end.partition(file.layout.decimal)[2]) for end in ends]
     steps = np.abs(np.diff(values))
+    if not np.isfinite(values[:-1]).all():
+        return
     jumps = len(steps) > 1 and steps[-1] > LARGEST_JUMP * steps[:-1].max()
-    if np.isfinite(values[:-1]).all() and (
-        decimals[-1] < min(decimals[:-1]) or jumps or not math.isfinite(values[-1])
-    ):
+    lacks_decimals = decimals[-1] < min(decimals[:-1])
+    if lacks_decimals or jumps or not math.isfinite(values[-1]):
         last = len(file.rows) - 1
+        keep = _keep_to(file, last)
         raise TableUnfit(
             file.row_place(last),
             found=f"a last number {ends[-1]!r} without an end of line, after {ends[-2]!r}",
             expected="a number with all its digits",
             remedy="the file ends early: export or copy it again, or leave that line out by "
-            f"{_keep_to(file, last)}",
+            f"{keep}",
         )

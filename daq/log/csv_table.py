@@ -63,13 +63,23 @@ def read_csv(
             require_kept(path, len(lines.rows), rows)
             lines = lines.select_rows(rows)
             stamps = cut_stamps(stamps, rows)
-    beside = None
-    if time is None and wanted.time is not None and lines.names.count(str(wanted.time.column)) == 1:
-        beside, _ = _stamps_of(lines, wanted.time)
+    stamps_beside = None
+    if time is None and wanted.time is not None:
+        occurrences = lines.names.count(str(wanted.time.column))
+        if occurrences == 1:
+            stamps_beside, _ = _stamps_of(lines, wanted.time)
     values = _numbers(lines, columns)
     digest = sha256("\n".join(lines.rows).encode())
     return Table(
-        path, columns, values, digest, stamps, lines.line_numbers, lines.first_row, remarks, beside
+        path=path,
+        columns=columns,
+        values=values,
+        digest=digest,
+        stamps=stamps,
+        line_numbers=lines.line_numbers,
+        first_row=lines.first_row,
+        remarks=remarks,
+        stamps_beside=stamps_beside,
     )
 
 
@@ -81,17 +91,20 @@ def _stamps_of(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, ...
         case TimeUnit.CLOCK:
             return _times_of_day(file, time)
         case _:
-            return _stamps(file, time, _numbers(file, (time.column,))[:, 0])
+            values = _numbers(file, (time.column,))
+            return _stamps(file, time, values[:, 0])
 
 
 def _require_stamps(file: CsvLines, time: TimeColumn, stamps: Stamps) -> None:
     """Refuse a column of another quantity, which goes back again and again,
     and name those that go on as time does.
     """
-    back = int(np.count_nonzero(np.diff(stamps.time_s) < 0.0))
+    is_back = np.diff(stamps.time_s) < 0.0
+    back = int(np.count_nonzero(is_back))
     if back < LARGEST_BACK_SHARE * len(file.rows) or back < FEWEST_BACK:
         return
     candidates = [str(column) for column in _increasing(file)]
+    listed = ", ".join(candidates) or "none"
     if len(candidates) == 1:
         named = f"`time`: {{column: {candidates[0]}}}"
     else:
@@ -100,7 +113,7 @@ def _require_stamps(file: CsvLines, time: TimeColumn, stamps: Stamps) -> None:
         f"{file.path}, column {time.column}",
         found=f"numbers that go back at {back} of {len(file.rows)} rows: this is no column "
         "of stamps",
-        expected=f"a column that only grows; here: {', '.join(candidates) or 'none'}",
+        expected=f"a column that only grows; here: {listed}",
         remedy=f"correct {named} in the import description, or state `rate_hz` in its place",
     )
 
@@ -110,26 +123,33 @@ def _increasing(file: CsvLines) -> list[Column]:
     fields = [file.fields(row) for row in file.rows]
     found: list[Column] = []
     for index in range(len(fields[0])):
-        values = np.array([file.to_number(row[index]) for row in fields])
-        if np.isfinite(values).all() and (np.diff(values) > 0.0).all():
+        numbers = [file.to_number(row[index]) for row in fields]
+        values = np.array(numbers)
+        is_finite = np.isfinite(values).all()
+        if is_finite and (np.diff(values) > 0.0).all():
             found.append(file.names[index] if file.names else index + 1)
     return found
 
 
+def _check_reach(file: CsvLines, time: TimeColumn, seconds: FloatArray) -> None:
+    """Refuse stamps that no clock has, naming the line."""
+    check_reach(seconds, lambda row: f"{file.row_place(row)}, column {time.column}")
+
+
 def _stamps(file: CsvLines, time: TimeColumn, values: FloatArray) -> tuple[Stamps, tuple[str, ...]]:
     """Return the stamps of a column of numbers; those since 1970 are read again, digit by digit."""
-    check_reach(
-        values * time.unit.seconds, lambda row: f"{file.row_place(row)}, column {time.column}"
-    )
-    if abs(values[0]) * time.unit.seconds < ABSOLUTE_S:
-        time_s, remarks = without_wraps(values * time.unit.seconds, counter_wraps())
+    seconds = values * time.unit.seconds
+    _check_reach(file, time, seconds)
+    if abs(seconds[0]) < ABSOLUTE_S:
+        time_s, remarks = without_wraps(seconds, counter_wraps())
         if remarks:
             return stamps_of_numbers(time_s, TimeUnit.SECOND), remarks
         return stamps_of_numbers(values, time.unit), ()
     to_ns = Decimal(10) ** (9 - time.unit.digits)
     index = file.index(time.column)
     texts = (file.fields(row)[index].replace(",", ".") for row in file.rows)
-    return stamps_of_ns([round(Decimal(text) * to_ns) for text in texts]), ()
+    stamp_ns = [round(Decimal(text) * to_ns) for text in texts]
+    return stamps_of_ns(stamp_ns), ()
 
 
 def _dates(file: CsvLines, time: TimeColumn) -> Stamps:
@@ -141,7 +161,7 @@ def _dates(file: CsvLines, time: TimeColumn) -> Stamps:
     )
     stamp_ns = _texts_ns(file, time, _date_ns, expected, remedy)
     seconds = np.array([1e-9 * date_ns for date_ns in stamp_ns])
-    check_reach(seconds, lambda row: f"{file.row_place(row)}, column {time.column}")
+    _check_reach(file, time, seconds)
     return stamps_of_ns(stamp_ns)
 
 
@@ -158,7 +178,8 @@ def _times_of_day(file: CsvLines, time: TimeColumn) -> tuple[Stamps, tuple[str, 
     has_date = max(stamp_ns) >= DAY_NS
     # A date that goes back is a wrong clock, or another run
     wraps = () if has_date else (MIDNIGHT,)
-    time_s, remarks = without_wraps(np.array(since_ns) * 1e-9, wraps)
+    since_s = np.array(since_ns) * 1e-9
+    time_s, remarks = without_wraps(since_s, wraps)
     if remarks:
         return stamps_of_numbers(time_s, TimeUnit.SECOND), remarks
     return stamps_of_ns(since_ns), ()
@@ -198,8 +219,9 @@ def _clock_ns(text: str) -> int | None:
         days = datetime.fromisoformat(date).toordinal() if date else 0
     except ValueError:  # the 30th of February
         return None
-    whole_s = (int(hour) * 60 + int(minute)) * 60 + int(second)
-    return days * DAY_NS + whole_s * 10**9 + int(fraction.ljust(9, "0"))
+    minutes = int(hour) * 60 + int(minute)
+    whole_s = minutes * 60 + int(second)
+    return days * DAY_NS + whole_s * 10**9 + _fraction_ns(fraction)
 
 
 def _date_ns(text: str) -> int | None:
@@ -212,7 +234,12 @@ def _date_ns(text: str) -> int | None:
         second = int(datetime.fromisoformat(whole + zone).timestamp())
     except ValueError:  # the 30th of February
         return None
-    return second * 10**9 + int(fraction.ljust(9, "0"))
+    return second * 10**9 + _fraction_ns(fraction)
+
+
+def _fraction_ns(digits: str) -> int:
+    """Nanoseconds of the digits behind the point of a second."""
+    return int(digits.ljust(9, "0"))
 
 
 def _require_once(file: CsvLines, columns: Sequence[Column]) -> list[int]:
@@ -239,7 +266,8 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
     for row in file.rows:
         fields = file.fields(row)
         numbers.extend([file.to_number(fields[index]) for index in indices])
-    values = np.asarray(numbers).reshape(len(file.rows), len(indices))
+    shape = (len(file.rows), len(indices))
+    values = np.asarray(numbers).reshape(shape)
     wrong = np.argwhere(~np.isfinite(values))
     if wrong.size:
         number, column = wrong[0].tolist()
@@ -270,8 +298,9 @@ def _check_points(file: CsvLines, indices: list[int]) -> None:
         fields = file.fields(row)
         for index in indices:
             if "." in fields[index]:
+                place = file.field_place(number, index)
                 raise TableUnfit(
-                    file.field_place(number, index),
+                    place,
                     found=f"{fields[index]!r}, with a point",
                     expected="a number with a decimal comma alone, as `table` of the import "
                     "description has it",
@@ -285,27 +314,32 @@ def _check_thousands(file: CsvLines, index: int, values: FloatArray) -> None:
     """Refuse a column in which the decimal sign must group thousands:
     987 beside 1.234, and never 1.2 or 0.987.
     """
-    if np.abs(values).max() >= 1000.0 or not (values % 1.0).any():
+    has_decimals = (values % 1.0).any()
+    if np.abs(values).max() >= 1000.0 or not has_decimals:
         return
     thousands = 1000.0 * values
-    # More than three digits: most columns end here
-    if (np.abs(thousands - np.rint(thousands)) > 1e-6).any():
+    rest = np.abs(thousands - np.rint(thousands))
+    if (rest > 1e-6).any():  # more than three digits: most columns end here
         return
     texts = [file.fields(row)[index] for row in file.rows]
     sign = re.escape(file.layout.decimal)
     grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}{sign}\d{{3}}")
     plain = re.compile(r"[-+]?\d{1,3}")
-    first = next((number for number, text in enumerate(texts) if grouped.fullmatch(text)), None)
-    beside = next((text for text in texts if plain.fullmatch(text) and text.strip("+-0")), None)
-    if (
-        first is None
-        or beside is None
-        or not all(grouped.fullmatch(text) or plain.fullmatch(text) for text in texts)
-    ):
+    first_grouped = None
+    first_plain = None
+    for number, text in enumerate(texts):
+        if grouped.fullmatch(text):
+            if first_grouped is None:
+                first_grouped = number
+        elif not plain.fullmatch(text):
+            return
+        elif first_plain is None and text.strip("+-0"):
+            first_plain = text
+    if first_grouped is None or first_plain is None:
         return
     raise TableUnfit(
-        file.field_place(first, index),
-        found=f"{texts[first]!r} beside {beside!r}: three digits behind every "
+        file.field_place(first_grouped, index),
+        found=f"{texts[first_grouped]!r} beside {first_plain!r}: three digits behind every "
         f"{file.layout.decimal!r} of the column",
         expected="numbers whose thousands are not grouped",
         remedy="export them without grouping; if these are decimals, export all numbers with the "
@@ -323,11 +357,10 @@ def _remedy(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
         values: of the columns that are read, shape (k, n).
     """
     if file.layout.decimal == "." and re.fullmatch(r"[-+]?\d+,\d+", text):
+        advice = 'write `decimal: ","` under `table` in the import description'
         if text[-4:-3] == ",":
-            grouped = "; if commas group thousands, export the numbers without them"
-        else:
-            grouped = ""
-        return 'write `decimal: ","` under `table` in the import description' + grouped
+            advice += "; if commas group thousands, export the numbers without them"
+        return advice
     if row == 0 and not file.layout.header:
         return (
             "if this line is a header, write `header: true` under `table` in the import description"
@@ -343,20 +376,23 @@ def _remedy(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
 
 def _remedy_for_a_line(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
     """Advice for a row that has a field that is no finite number."""
-    if file.names and file.fields(file.rows[row]) == list(file.names):
+    fields = file.fields(file.rows[row])
+    if file.names and fields == list(file.names):
         before = file.first_row + row
         return (
             "the header is there once more: import what is before it by `keep: {to_row: "
             f"{before}}}`, and what is behind it by `keep: {{from_row: {before + 2}}}`"
         )
-    if row == 0 and set(file.names).intersection(file.fields(file.rows[row])):
+    if row == 0 and set(file.names).intersection(fields):
         return (
             "this is a second header, with the names in another order or with other names: nothing "
             "says which of the two is right; delete the wrong one from the file"
         )
-    if row == 0 and text.lower() not in MISSING and not any(np.isfinite(values[0])):
+    has_number = any(np.isfinite(values[0]))
+    if row == 0 and text.lower() not in MISSING and not has_number:
+        following = file.first_row + 2
         return (
             "if this line is no row (units, a second header), leave it out: `keep: {from_row: "
-            f"{file.first_row + 2}}}` in the import description"
+            f"{following}}}` in the import description"
         )
     return cut_advice(values, file.first_row)

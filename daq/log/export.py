@@ -70,7 +70,9 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     require_new_table(out, kind)
     # The first pass finds all damage and all moves; the second writes, a block at a time.
     reader, cell, verdict = judge_log(log)
-    blocks = tables(LogReader(log), cell, tuple(reader.events), tuple(reader.readings))
+    events = tuple(reader.events)
+    readings = tuple(reader.readings)
+    blocks = tables(LogReader(log), cell, events, readings)
     names, rows = write_table(out, kind, blocks)
     return Exported(names, rows, reader.partial, *verdict)
 
@@ -83,7 +85,8 @@ def require_new_table(out: Path, kind: TableFormat) -> None:
         ConfigurationMissing: the package for the format is missing; the message names the extra to
             install.
     """
-    if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
+    needs_pyarrow = kind is TableFormat.PARQUET
+    if needs_pyarrow and find_spec("pyarrow") is None:
         raise ConfigurationMissing(
             "Parquet",
             found="no package pyarrow",
@@ -164,7 +167,8 @@ def tables(
     for axis, name in enumerate(names):
         for quantity, by_axis in by_quantity.items():
             if axis in by_axis:
-                slow[f"{name}.{_SLOW_COLUMNS[quantity]}"] = by_axis[axis]
+                column = f"{name}.{_SLOW_COLUMNS[quantity]}"
+                slow[column] = by_axis[axis]
     for block, following in pairwise(chain(reader, (None,))):
         assert block is not None  # None follows the last one
         begin_ns = end_ns
@@ -172,31 +176,27 @@ def tables(
             end_ns = inf
         else:
             end_ns = int(following.time_ns[0])
-        scale = scaling(cell, reader.head.readback)
-        is_counter = np.array(
-            [axis.position_rad_per_count is None for axis in reader.head.readback.axes]
-        )
+        readback = reader.head.readback
+        scale = scaling(cell, readback)
+        is_counter = [axis.position_rad_per_count is None for axis in readback.axes]
         if last is None:
             first_ns = int(block.time_ns[0])
         counted = unwrapped(block.position_counts, last)
         last = block.position_counts[-1], counted[-1]
         counts = np.where(is_counter, counted, block.position_counts)
         joints = scale.joint_position(counts)
-        yield {
-            **_columns(
-                cell,
-                block,
-                counts,
-                joints,
-                scale.current_per_unit,
-                moves(events, block.time_ns),
-                first_ns,
-            ),
-            **{
-                name: _in_rows(block.time_ns, *found, begin_ns, end_ns)
-                for name, found in slow.items()
-            },
-        }
+        columns = _columns(
+            cell,
+            block,
+            counts,
+            joints,
+            scale.current_per_unit,
+            moves(events, block.time_ns),
+            first_ns,
+        )
+        for name, (reading_ns, values) in slow.items():
+            columns[name] = _in_rows(block.time_ns, reading_ns, values, begin_ns, end_ns)
+        yield columns
 
 
 def _columns(
@@ -208,28 +208,32 @@ def _columns(
     move: IntArray | None,
     first_ns: int,
 ) -> Columns:
+    if move is None:
+        move = np.full(len(block.cycle), -1, dtype=np.int64)
     columns: Columns = {
         "cycle": block.cycle,
         "time_ns": block.time_ns,
         "time_s": (block.time_ns - first_ns) * 1e-9,
-        "move": np.full(len(block.cycle), -1, dtype=np.int64) if move is None else move,
+        "move": move,
     }
     answered = answers(block.missing, len(cell.axes)).astype(np.uint8)
-    for index, (axis, name) in enumerate(zip(cell.axes, column_names(cell), strict=True)):
-        columns |= {
-            f"{name}.position_{axis.unit.si_name}": joints[:, index],
-            f"{name}.current_{current_unit(axis)}": block.current_raw[:, index] * per_unit[index],
-            f"{name}.motor_counts": counts[:, index],
-            f"{name}.current_raw": block.current_raw[:, index],
-            f"{name}.statusword": block.statusword[:, index],
-            f"{name}.answered": answered[:, index],
-        }
+    names = column_names(cell)
+    for index, axis in enumerate(cell.axes):
+        name = names[index]
+        current_raw = block.current_raw[:, index]
+        columns[f"{name}.position_{axis.unit.si_name}"] = joints[:, index]
+        columns[f"{name}.current_{current_unit(axis)}"] = current_raw * per_unit[index]
+        columns[f"{name}.motor_counts"] = counts[:, index]
+        columns[f"{name}.current_raw"] = current_raw
+        columns[f"{name}.statusword"] = block.statusword[:, index]
+        columns[f"{name}.answered"] = answered[:, index]
     return columns
 
 
 def current_unit(axis: CellAxis) -> str:
     """Unit of an axis' current reference, as the name of a column has it."""
-    unit = axis.gain_unit.partition("/")[2].strip() or "A"
+    _, _, denominator = axis.gain_unit.partition("/")
+    unit = denominator.strip() or "A"
     return re.sub(r"[^0-9A-Za-z%]+", "_", unit)
 
 
@@ -240,12 +244,12 @@ def column_names(cell: Cell) -> list[str]:
     Where that is an axis of the cell too, all names begin with their number.
     """
     plain = [re.sub(r"\W+", "_", name) for name in cell.axis_names]
-    numbered = [f"{name}{number}" for number, name in enumerate(plain, start=1)]
-    named = [
-        one if plain.count(one) == 1 else other for one, other in zip(plain, numbered, strict=True)
-    ]
-    if len(set(named)) == len(named):
-        return named
+    names = []
+    for number, name in enumerate(plain, start=1):
+        is_unique = plain.count(name) == 1
+        names.append(name if is_unique else f"{name}{number}")
+    if len(set(names)) == len(names):
+        return names
     return [f"{number}_{name}" for number, name in enumerate(plain, start=1)]
 
 
@@ -267,16 +271,15 @@ def _in_rows(
     """
     values = np.full(len(time_ns), np.nan)
     inside = (reading_ns >= begin_ns) & (reading_ns < end_ns)
-    row = np.searchsorted(time_ns, reading_ns[inside], side="right") - 1
-    values[np.maximum(row, 0)] = readings[inside]
+    following = np.searchsorted(time_ns, reading_ns[inside], side="right")
+    row = np.maximum(following - 1, 0)
+    values[row] = readings[inside]
     return values
 
 
 @contextmanager
 def _csv(path: Path) -> Iterator[Write]:
-    """Write a header and rows with comma, decimal point and LF (RFC 4180 except for the end of
-    line).
-    """
+    """Write a CSV file with decimal points (RFC 4180, but lines end with LF)."""
     with path.open("x", encoding="utf-8", newline="\n") as stream:
         begun = False
 
@@ -285,14 +288,19 @@ def _csv(path: Path) -> Iterator[Write]:
             if not begun:
                 stream.write(",".join(columns) + "\n")
                 begun = True
-            # repr of a float is the shortest text that reads back as the same number.
-            texts = [
-                ["" if isnan(value) else repr(value) for value in column.tolist()]
-                for column in columns.values()
-            ]
-            stream.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
+            texts = [_csv_fields(column) for column in columns.values()]
+            rows = zip(*texts, strict=True)
+            stream.writelines(",".join(row) + "\n" for row in rows)
 
         yield write
+
+
+def _csv_fields(column: NDArray[Any]) -> list[str]:
+    """Return the numbers of a column as texts, empty for NaN.
+
+    repr of a float is the shortest text that reads back as the same number.
+    """
+    return ["" if isnan(value) else repr(value) for value in column.tolist()]
 
 
 @contextmanager
@@ -306,9 +314,8 @@ def _parquet(path: Path) -> Iterator[Write]:
 
         def write(columns: Columns) -> None:
             nonlocal writer
-            table = arrow.table(
-                {name: np.ascontiguousarray(column) for name, column in columns.items()}
-            )
+            contiguous = {name: np.ascontiguousarray(column) for name, column in columns.items()}
+            table = arrow.table(contiguous)
             if writer is None:
                 writer = stack.enter_context(
                     parquet.ParquetWriter(stream, table.schema, compression="zstd")

@@ -83,10 +83,10 @@ class RunFacts:
     def scaling(self) -> SiScaling:
         """Factors from raw numbers to SI."""
         return SiScaling(
-            *map(
-                np.array,
-                (self.rad_per_count, self.to_joint, self.offset_rad, self.current_per_unit),
-            )
+            rad_per_count=np.array(self.rad_per_count),
+            to_joint=np.array(self.to_joint),
+            offset_rad=np.array(self.offset_rad),
+            current_per_unit=np.array(self.current_per_unit),
         )
 
 
@@ -188,16 +188,16 @@ def read_packet(packet: bytes, axes: int | None) -> Packet:
     """
     try:
         kind, number, samples, lost, missing, count = HEAD.unpack_from(packet)
-        message = rows = None
+        message = None
+        rows = None
         if kind == TEXT:
             message = _MESSAGE.validate_json(packet[HEAD.size :])
             fits = _fits(message, axes)
         else:
-            if axes is None:
-                rows = None
-            else:
+            fits = kind == SAMPLES
+            if axes is not None:
                 rows = np.frombuffer(packet, packet_dtype(axes), offset=HEAD.size)
-            fits = kind == SAMPLES and (rows is None or len(rows) == count > 0)
+                fits = fits and len(rows) == count > 0
     except (struct.error, ValueError) as error:
         raise FeedUnfit("it sends packets that this version does not understand") from error
     if not fits:
@@ -207,18 +207,16 @@ def read_packet(packet: bytes, axes: int | None) -> Packet:
 
 def _fits(message: Message, axes: int | None) -> bool:
     run = message.run
-    count = axes if run is None else len(run.axes)
-    lists: list[list[float]]
-    if run is None:
-        lists = []
-    else:
-        lists = [run.rad_per_count, run.current_per_unit, run.offset_rad]
-    matrix: list[list[float]] = [] if run is None else run.to_joint
-    return (
-        all(len(one) == count for one in (*lists, *matrix))
-        and (run is None or (len(matrix) == count and 0.0 < run.rate_hz < inf))
-        and all(event.axis is None or 0 <= event.axis < (count or 0) for event in message.events)
-    )
+    count = axes or 0
+    if run is not None:
+        count = len(run.axes)
+        if len(run.to_joint) != count or not 0.0 < run.rate_hz < inf:
+            return False
+        by_axis = [run.rad_per_count, run.current_per_unit, run.offset_rad, *run.to_joint]
+        if any(len(values) != count for values in by_axis):
+            return False
+    event_axes = [event.axis for event in message.events if event.axis is not None]
+    return all(0 <= axis < count for axis in event_axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,11 +336,10 @@ class Feed:
         names = self._names
         packets = socket.SOCK_SEQPACKET
         stream = socket.SOCK_STREAM
-        places = (
-            ((names.monitor, packets),)
-            if self._stop is None
-            else ((names.feed, packets), (names.stop, stream))
-        )
+        if self._stop is None:
+            places = [(names.monitor, packets)]
+        else:
+            places = [(names.feed, packets), (names.stop, stream)]
         try:
             for name, kind in places:
                 listener = socket.socket(socket.AF_UNIX, kind)

@@ -125,16 +125,18 @@ def import_recording(
     rate_hz = recorded.used.rate_hz
     digests = {name: file.digest for name, file in files.items()}
     started_ns, started_wall_ns, timing = _start(wanted, files, recorded.clock)
+    sources = ", ".join(f"{name} ({d[:12]})" for name, d in digests.items())
+    all_digests = repr(sorted(digests.items())).encode()
+    payload = _payload(wanted, cell)
     run = RunInfo(
-        run_id=f"import-{sha256(repr(sorted(digests.items())).encode())[:16]}",
+        run_id=f"import-{sha256(all_digests)[:16]}",
         rate_hz=rate_hz,
-        payload=_payload(wanted, cell),
+        payload=payload,
         operator=wanted.operator,
         software=software,
         started_wall_ns=started_wall_ns,
         started_monotonic_ns=started_wall_ns,
-        origin="imported as "
-        f"{wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
+        origin=f"imported as {wanted.name} from " + sources,
         timing=timing,
     )
     slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
@@ -152,7 +154,9 @@ def import_recording(
         except BaseException:
             holdout.unlink()
             raise
-    remarks = [remark for file in files.values() for remark in file.remarks]
+    remarks: list[str] = []
+    for file in files.values():
+        remarks += file.remarks
     remarks += recorded.remarks
     remarks += fault_remarks(recorded.faults, recorded.used)
     return Imported(statistics, timing, tuple(remarks), of_holdout)
@@ -164,17 +168,19 @@ def _require_name_of_holdout(wanted: ImportDescription, holdout: Path | None) ->
     """
     if (wanted.holdout is None) == (holdout is None):
         return
+    subject = f"import description {wanted.name!r}"
+    if holdout is None:
+        raise UsageError(
+            subject,
+            found="`holdout`, and no name for the log of that part",
+            expected="a name for the second log",
+            remedy="give `--holdout FILE`",
+        )
     raise UsageError(
-        f"import description {wanted.name!r}",
-        found="`holdout`, and no name for the log of that part"
-        if holdout is None
-        else "no `holdout`",
-        expected="a name for the second log"
-        if holdout is None
-        else "`holdout: {from_s: SECONDS}`, the begin of it",
-        remedy="give `--holdout FILE`"
-        if holdout is None
-        else f"add it to the description, or leave out {holdout}",
+        subject,
+        found="no `holdout`",
+        expected="`holdout: {from_s: SECONDS}`, the begin of it",
+        remedy=f"add it to the description, or leave out {holdout}",
     )
 
 
@@ -187,9 +193,10 @@ def _first_of_holdout(wanted: ImportDescription, from_s: float, rate_hz: float, 
     first = ceil(from_s * rate_hz - ROW_MARGIN)
     if FEWEST_ROWS <= first <= count - FEWEST_ROWS:
         return first
+    imported_s = count / rate_hz
     raise TableUnfit(
         f"import description {wanted.name!r}: holdout.from_s",
-        found=f"{from_s:g} s, of {count / rate_hz:.6g} s that are imported",
+        found=f"{from_s:g} s, of {imported_s:.6g} s that are imported",
         expected="a time in the recording, since its first sample",
         remedy="correct `holdout`",
     )
@@ -213,7 +220,9 @@ class _LogSamples:
             UsageError, OutputFailed: the log cannot be written.
         """
         step_ns = 1e9 / self.run.rate_hz
-        content = LogContent.of(self.cell, self._run_of(rows), self.files, self.kept.readback)
+        run = self._run_of(rows)
+        readback = self.kept.readback
+        content = LogContent.of(self.cell, run, self.files, readback)
         # A crash of an import loses no sample, so no clock is needed to flush in time.
         with LogWriter(
             out, content, self.kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False
@@ -224,9 +233,10 @@ class _LogSamples:
             for cycle, row in enumerate(rows):
                 time_ns = self.started_ns + round(row * step_ns)
                 log.readings(_readings(self.slow, row, time_ns))
-                log.write(
-                    Sample(cycle, time_ns, tuple(counts[cycle]), tuple(current_raw[cycle]), silent)
-                )
+                position = tuple(counts[cycle])
+                current = tuple(current_raw[cycle])
+                sample = Sample(cycle, time_ns, position, current, silent)
+                log.write(sample)
             log.conclude(valid=True)
         return log.statistics
 
@@ -300,7 +310,8 @@ def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) ->
         rate_hz = clock.timing.rate_hz
         row = clock.row
     assert rate_hz is not None  # load_import requires one of the two
-    used = UsedRows(row, None if clock is None else clock.time_s, rate_hz, wanted, files, cell)
+    time_s = None if clock is None else clock.time_s
+    used = UsedRows(row, time_s, rate_hz, wanted, files, cell)
     check_current(current, wanted, files)
     sound = sound_columns(position, current, used)
     kept = _converted(wanted, cell, position[row], current, clock)
@@ -334,21 +345,20 @@ def _converted(
     """Convert positions of the rows that are used, and currents of all rows."""
     counts, count_rad = _counts(wanted, cell, position, clock)
     factors = wanted.current.factors(cell.axis_names)
-    raw, unit = quantise(on_clock(current, clock) * np.array(factors))
-    readback = Readback(
-        tuple(
-            AxisReadback(
-                axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i])
-            )
-            for i, axis in enumerate(cell.axes)
-        )
-    )
+    scaled = on_clock(current, clock) * np.array(factors)
+    raw, unit = quantise(scaled)
+    axes = []
+    for index, axis in enumerate(cell.axes):
+        rad_per_count = None if count_rad is None else float(count_rad[index])
+        axes.append(AxisReadback(axis.name, float(unit[index]), rad_per_count))
+    readback = Readback(tuple(axes))
     scale = scaling(cell, readback)
     # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its
     # wraps.
-    joint_rad = scale.joint_position(
-        unwrapped(counts.astype(np.int32)) if count_rad is None else counts
-    )
+    continuous = counts
+    if count_rad is None:
+        continuous = unwrapped(counts.astype(np.int32))
+    joint_rad = scale.joint_position(continuous)
     return Converted(counts, raw, readback, scale, joint_rad)
 
 
@@ -356,15 +366,15 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     """Read every file of the description with the reader of its kind."""
     part = wanted.keep
     if part is not None and part.is_by_time and wanted.rate_hz is not None:
-        wanted = wanted.model_copy(
-            update={"keep": _part_of_rows(rows_at_rate(wanted.rate_hz, part))}
-        )
+        rows = rows_at_rate(wanted.rate_hz, part)
+        wanted = wanted.model_copy(update={"keep": _part_of_rows(rows)})
     read: dict[str, Table] = {}
     # The file with the stamps comes first: where times are kept, it says which rows of the others
     # these are.
     files = wanted.files()
     for name in sorted(files, key=lambda one: wanted.time is None or one != wanted.time.file):
-        if wanted.time is not None and wanted.time.file == name:
+        is_timed = wanted.time is not None and wanted.time.file == name
+        if is_timed:
             time = wanted.time
         else:
             time = None
@@ -372,22 +382,25 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
         table = reader_of(path)(path, wanted, files[name], time)
         read[name] = table
         if time is not None and part is not None and part.is_by_time:
-            rows = slice(table.first_row, table.first_row + len(table.values))
+            end = table.first_row + len(table.values)
+            rows = slice(table.first_row, end)
             wanted = wanted.model_copy(update={"keep": _part_of_rows(rows)})
     tables = {name: read[name] for name in files}
-    if len({len(file.values) for file in tables.values()}) > 1:
+    counts = {len(file.values) for file in tables.values()}
+    if len(counts) > 1:
+        paths = [str(file.path) for file in tables.values()]
+        row_counts = [f"{len(file.values)} rows in {name}" for name, file in tables.items()]
         raise TableUnfit(
-            ", ".join(str(file.path) for file in tables.values()),
-            found=" and ".join(
-                f"{len(file.values)} rows in {name}" for name, file in tables.items()
-            ),
+            ", ".join(paths),
+            found=" and ".join(row_counts),
             expected="as many in each",
             remedy="one of them ends early, or they are of different runs; export them again",
         )
     if wanted.time is not None:
         timed = tables[wanted.time.file]
         for name, table in tables.items():
-            tables[name] = replace(table, remarks=(*table.remarks, *compare_stamps(timed, table)))
+            remarks = (*table.remarks, *compare_stamps(timed, table))
+            tables[name] = replace(table, remarks=remarks)
     position = tables[wanted.position.files[0]]
     if len(position.values) < FEWEST_ROWS:
         raise TableUnfit(
@@ -420,10 +433,12 @@ def _slow(
         values = on_clock(section_values(torque, files), clock) * factors
         if torque.side is Side.JOINT:
             values = values @ np.linalg.inv(cell.ratio)  # τ_joint = Rᵀ τ_motor (eq. 24)
-        found.append((Quantity.TORQUE, max(1, round(rate_hz / TORQUE_HZ)), values))
+        every = max(1, round(rate_hz / TORQUE_HZ))
+        found.append((Quantity.TORQUE, every, values))
     if (temperature := wanted.temperature) is not None:
         values = on_clock(section_values(temperature, files), clock)
-        found.append((Quantity.TEMPERATURE, max(1, round(rate_hz / TEMPERATURE_HZ)), values))
+        every = max(1, round(rate_hz / TEMPERATURE_HZ))
+        found.append((Quantity.TEMPERATURE, every, values))
     return found
 
 
@@ -451,11 +466,17 @@ def _start(
     first_ns = file.stamps.first_ns
     if first_ns < 0:
         return 0, 0, clock.timing
-    return (
-        first_ns,
-        first_ns if first_ns in UNIX_NS else 0,
-        replace(clock.timing, started_s=first_ns * 1e-9),
-    )
+    timing = replace(clock.timing, started_s=first_ns * 1e-9)
+    # Stamps that count from some other start say nothing of the time of day.
+    wall_ns = first_ns if first_ns in UNIX_NS else 0
+    return first_ns, wall_ns, timing
+
+
+def _quantum_exponent(largest: float) -> int:
+    """Return the power of two whose multiples up to LARGEST_RAW reach a magnitude."""
+    if largest <= 1e-200:
+        return -30
+    return ceil(log2(largest / LARGEST_RAW))
 
 
 def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -469,9 +490,10 @@ def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
         quantum ≤ 2 / (2³¹ − 1) of the largest magnitude of the column.
     """
     largest = np.abs(values).max(axis=0)
-    exponent = [ceil(log2(top / LARGEST_RAW)) if top > 1e-200 else -30 for top in largest.tolist()]
-    quantum = np.ldexp(1.0, np.array(exponent))
-    return np.rint(values / quantum).astype(np.int64), quantum
+    exponents = [_quantum_exponent(top) for top in largest.tolist()]
+    quantum = np.ldexp(1.0, np.array(exponents))
+    raw = np.rint(values / quantum)
+    return raw.astype(np.int64), quantum
 
 
 def _counts(
@@ -488,7 +510,8 @@ def _counts(
         if not resampled:
             return position.astype(np.int64), None
         turn = np.array([axis.counts_per_revolution for axis in cell.axes], dtype=np.float64)
-        position = unwrapped(position.astype(np.int32)) * (2.0 * pi / turn)
+        motor_counts = unwrapped(position.astype(np.int32))
+        position = motor_counts * (2.0 * pi / turn)
     else:
         position = in_si(position, wanted.position, cell)
     if wanted.position.side is Side.JOINT:
@@ -507,7 +530,8 @@ def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
     ]
     if len(matches) == 1:
         return matches[0].payload
-    known = ", ".join(f"{p.name} at {p.mounting}" for p in cell.payloads) or "none"
+    described = [f"{p.name} at {p.mounting}" for p in cell.payloads]
+    known = ", ".join(described) or "none"
     raise ConfigurationInconsistent(
         f"import description {wanted.name!r}",
         found=f"payload {wanted.payload!r}"
@@ -545,48 +569,55 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
     _check_columns(wanted, description)
     for key, section in wanted.sections():
         if len(section.places) != n:
+            found = f"{len(section.places)} columns"
+            expected = f"{n}, one for each axis of cell {cell.name!r}"
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",
-                found=f"{len(section.places)} columns",
-                expected=f"{n}, one for each axis of cell {cell.name!r}",
+                found=found,
+                expected=expected,
                 remedy="correct the description, or choose the cell with --cell",
             )
-        others = [name for name in getattr(section, "reversed", ()) if name not in cell.axis_names]
+        reversed_axes = getattr(section, "reversed", ())
+        others = [name for name in reversed_axes if name not in cell.axis_names]
         if others:
+            axis_names = ", ".join(cell.axis_names)
             raise ConfigurationInconsistent(
                 f"{description}: {key}.reversed",
                 found=", ".join(others),
-                expected=f"some of {', '.join(cell.axis_names)}",
+                expected=f"some of {axis_names}",
                 remedy="name axes of the cell, or correct the cell with --cell",
             )
         if isinstance(section, ScaledColumns) and section.factors(cell.axis_names) is None:
+            axis_names = ", ".join(cell.axis_names)
             raise ConfigurationInconsistent(
                 f"{description}: {key}.factor",
                 found=str(section.factor),
-                expected=f"one for each of {', '.join(cell.axis_names)}",
+                expected=f"one for each of {axis_names}",
                 remedy="write a number for all axes, a list in their order, or a mapping from "
                 "their names",
             )
     units = wanted.current.units(cell.axis_names)
     if units is None:
+        axis_names = ", ".join(cell.axis_names)
         raise ConfigurationInconsistent(
             f"{description}: current.unit",
             found=str(wanted.current.unit),
-            expected=f"one for each of {', '.join(cell.axis_names)}",
+            expected=f"one for each of {axis_names}",
             remedy="write a unit for all axes, a list in their order, or a mapping from "
             "their names",
         )
     for axis, unit in zip(cell.axes, units, strict=True):
-        if axis.gain_unit not in {f"Nm/{unit}", f"N/{unit}"}:
+        known_units = {f"Nm/{unit}", f"N/{unit}"}
+        if axis.gain_unit not in known_units:
+            gain_current = axis.gain_unit.partition("/")[2]
             raise ConfigurationInconsistent(
                 f"{description}: current.unit",
                 found=f"{unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
-                expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
+                expected=f"current in {gain_current!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
-    if wanted.position.unit is PositionUnit.COUNTS and any(
-        a.counts_per_revolution is None for a in cell.axes
-    ):
+    has_counts = all(axis.counts_per_revolution is not None for axis in cell.axes)
+    if wanted.position.unit is PositionUnit.COUNTS and not has_counts:
         raise ConfigurationInconsistent(
             f"{description}: position.unit",
             found="counts, and axes without counts_per_revolution",
@@ -594,13 +625,15 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             remedy="add it to the cell file",
         )
     lengths = {PositionUnit.M, PositionUnit.MM, VelocityUnit.M, VelocityUnit.MM}
+    turning = [axis.name for axis in cell.axes if axis.unit is not MILLIMETRE]
     for key, moved in (("position", wanted.position), ("velocity", wanted.velocity)):
-        turning = [axis.name for axis in cell.axes if axis.unit is not MILLIMETRE]
-        if moved is not None and moved.unit in lengths and (turning or moved.side is Side.MOTOR):
+        if moved is None or moved.unit not in lengths:
+            continue
+        if turning or moved.side is Side.MOTOR:
+            turned = f"axis {turning[0]}" if turning else "a motor"
             raise ConfigurationInconsistent(
                 f"{description}: {key}.unit",
-                found=f"{moved.unit.value}, while "
-                f"{'axis ' + turning[0] if turning else 'a motor'} turns",
+                found=f"{moved.unit.value}, while {turned} turns",
                 expected="rad or deg (m or mm for the prismatic axes among them), or counts",
                 remedy="correct the unit; convert the columns of the file to it",
             )
@@ -631,7 +664,9 @@ def _source(place: tuple[str, Column], bags: Set[str]) -> tuple[Path, str]:
     """Return file and column, of a bag file and field."""
     file, column = place
     name = str(column)
-    return Path(file), name.partition(".")[0] if file in bags else name
+    if file in bags:
+        name = name.partition(".")[0]
+    return Path(file), name
 
 
 _HEADS: dict[bytes, Reader] = {
@@ -657,8 +692,10 @@ def reader_of(path: Path) -> Reader:
     if path.is_dir():
         return read_bag
     head = first_bytes(path)
-    by_content = next((reader for start, reader in _HEADS.items() if head.startswith(start)), None)
-    return by_content or _SUFFIXES.get(path.suffix.lower(), read_csv)
+    for start, reader in _HEADS.items():
+        if head.startswith(start):
+            return reader
+    return _SUFFIXES.get(path.suffix.lower(), read_csv)
 
 
 def with_columns(
@@ -681,10 +718,12 @@ def with_columns(
         readers = {file: reader_of(data / file) for file in section.files}
         bags |= {file for file, reader in readers.items() if reader is read_bag}
         if isinstance(section, TemperatureColumns) and bags.intersection(section.files):
+            fields = ", ".join(FIELDS)
+            path = data / section.files[0]
             raise TableUnfit(
-                str(data / section.files[0]),
+                str(path),
                 found="`temperature` from a ROS 2 bag",
-                expected=f"a file with temperatures; joint states have {', '.join(FIELDS)} alone",
+                expected=f"a file with temperatures; joint states have {fields} alone",
                 remedy="leave `temperature` out of the import description, or name a CSV or MATLAB "
                 "file with it",
             )
@@ -692,7 +731,9 @@ def with_columns(
         if len(places) == 1 < len(axis_names):
             places = _of_all_axes(places[0], readers, axis_names)
         field = key if key in FIELDS else "effort"
-        columns = [_of_field(column, field) if file in bags else column for file, column in places]
+        columns: list[Column] = []
+        for file, column in places:
+            columns.append(_of_field(column, field) if file in bags else column)
         files: str | tuple[str, ...] = section.file
         if isinstance(files, tuple):
             files = tuple(file for file, _ in places)
@@ -751,10 +792,12 @@ def _of_all_axes(
     """
     file, column = place
     if readers[file] is read_bag and column in FIELDS:
-        return tuple((file, f"{column}.{axis}") for axis in axis_names)
-    if readers[file] is read_mat:
-        return tuple((file, f"{column}.{number + 1}") for number in range(len(axis_names)))
-    return (place,)
+        names = list(axis_names)
+    elif readers[file] is read_mat:
+        names = [str(number) for number, _ in enumerate(axis_names, start=1)]
+    else:
+        return (place,)
+    return tuple((file, f"{column}.{name}") for name in names)
 
 
 def _of_field(column: Column, field: str) -> str:
@@ -772,13 +815,16 @@ def _check_torque(wanted: ImportDescription, bags: Set[str]) -> None:
     if wanted.torque is None:
         return
     read = {_source(place, bags) for place in wanted.current.places}
-    shared = dict.fromkeys(place for place in wanted.torque.places if _source(place, bags) in read)
+    repeated = [place for place in wanted.torque.places if _source(place, bags) in read]
+    shared = dict.fromkeys(repeated)
     if shared:
         names = dict.fromkeys(_source(place, bags)[1] for place in shared)
         files = dict.fromkeys(file for file, _ in shared)
+        columns = ", ".join(names)
+        sources = ", ".join(files)
         raise ConfigurationInconsistent(
             f"import description {wanted.name!r}: torque.columns",
-            found=f"{', '.join(names)} of {', '.join(files)}, which current is read from",
+            found=f"{columns} of {sources}, which current is read from",
             expected="the controller's own torque, in columns (of a bag: in a field) of its own",
             remedy="name those columns, or leave `torque` out; no fit needs it",
         )

@@ -95,19 +95,23 @@ def read_mat(
     file = _MatFile(path, _content(path))
     names = columns if time is None else (*columns, time.column)
     found = [file.column(name) for name in names]
-    if len({len(numbers) for numbers in found}) > 1:
+    lengths = [len(numbers) for numbers in found]
+    if len(set(lengths)) > 1:
+        described = [
+            f"{length} values in {name}" for name, length in zip(names, lengths, strict=True)
+        ]
         raise TableUnfit(
             str(path),
-            found=", ".join(
-                f"{len(numbers)} values in {name}"
-                for name, numbers in zip(names, found, strict=True)
-            ),
+            found=", ".join(described),
             expected="as many in each",
             remedy="are they of one run? the longer side of a matrix is taken for time",
         )
-    begun = [numbers.ctypes.data for numbers in found]  # they are views of what was read
-    if twice := [name for index, name in enumerate(names) if begun[index] in begun[:index]]:
-        raise repeated(path, twice[0], "under another name")
+    addresses = set[int]()
+    for name, numbers in zip(names, found, strict=True):
+        address = numbers.ctypes.data  # they are views of what was read
+        if address in addresses:
+            raise repeated(path, name, "under another name")
+        addresses.add(address)
     part = wanted.keep
     rows = slice(None) if part is None else part.rows
     require_kept(path, len(found[0]), rows)
@@ -115,14 +119,9 @@ def read_mat(
     remarks: tuple[str, ...] = ()
     if time is not None:
         stamps = found[-1][rows]
+        stamp_column = stamps.astype(np.float64)[:, None]
         require_finite(
-            Table(
-                path,
-                (time.column,),
-                stamps.astype(np.float64)[:, None],
-                "",
-                first_row=rows.start or 0,
-            )
+            Table(path, (time.column,), stamp_column, "", first_row=rows.start or 0),
         )
         clock, remarks = _stamps(path, stamps, time)
         if part is not None and part.is_by_time:
@@ -133,9 +132,8 @@ def read_mat(
     values = np.empty((end - first_row, len(columns)))
     for index in range(len(columns)):
         values[:, index] = found[index][rows]
-    table = Table(
-        path, columns, values, digest_of(values, clock), clock, first_row=first_row, remarks=remarks
-    )
+    digest = digest_of(values, clock)
+    table = Table(path, columns, values, digest, clock, first_row=first_row, remarks=remarks)
     return require_finite(table)
 
 
@@ -146,11 +144,11 @@ def _stamps(path: Path, values: NDArray[Any], time: TimeColumn) -> tuple[Stamps,
     check_reach(seconds, lambda row: f"{path}, row {row + 1}, column {time.column}")
     whole_s, remarks = without_wraps(seconds, counter_wraps())
     if remarks:
-        return stamps_of_numbers(whole_s, TimeUnit.SECOND), tuple(
-            f"{path.name}: {remark}" for remark in remarks
-        )
+        stamps = stamps_of_numbers(whole_s, TimeUnit.SECOND)
+        return stamps, tuple(f"{path.name}: {remark}" for remark in remarks)
     if values.dtype.kind in "iu":
-        return stamps_of_ns((values.astype(np.int64) * factor).tolist()), ()
+        stamp_ns = values.astype(np.int64) * factor
+        return stamps_of_ns(stamp_ns.tolist()), ()
     return stamps_of_numbers(values.astype(np.float64), time.unit), ()
 
 
@@ -164,12 +162,16 @@ def _content(path: Path) -> memoryview:
         content = read_regular(path, LARGEST_BYTES)
     except OSError as error:
         raise unreadable(path, error, "a MATLAB file (.mat) of at most 2 GB") from error
-    if content.startswith(MAGIC) and content[126:128] in (b"IM", b"MI"):
+    byte_order = content[126:128]
+    if content.startswith(MAGIC) and byte_order in (b"IM", b"MI"):
         return memoryview(content)
-    newer = b"\x89HDF\r\n" in content[: 512 + 8]
+    if b"\x89HDF\r\n" in content[: 512 + 8]:
+        found = "a MATLAB file of format 7.3 (HDF5)"
+    else:
+        found = f"first bytes {content[:20]!r}"
     raise TableUnfit(
         str(path),
-        found="a MATLAB file of format 7.3 (HDF5)" if newer else f"first bytes {content[:20]!r}",
+        found=found,
         expected="a MATLAB file of format 5, as `save -v7` writes it",
         remedy="in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables",
     )
@@ -186,10 +188,13 @@ class _Array:
 
     def __str__(self) -> str:
         size = "×".join(map(str, self.shape))
-        return _KINDS.get(
-            self.kind,
-            f"{size} struct" if self.kind == _STRUCT else size + " complex" * self.imaginary,
-        )
+        if self.kind in _KINDS:
+            return _KINDS[self.kind]
+        if self.kind == _STRUCT:
+            return f"{size} struct"
+        if self.imaginary:
+            return f"{size} complex"
+        return size
 
 
 class _MatFile:
@@ -197,7 +202,8 @@ class _MatFile:
 
     def __init__(self, path: Path, content: memoryview) -> None:
         self._path = path
-        self._order = "<" if bytes(content[126:128]) == b"IM" else ">"
+        is_little_endian = bytes(content[126:128]) == b"IM"
+        self._order = "<" if is_little_endian else ">"
         self._read: dict[str, NDArray[Any]] = {}
         try:
             self._variables = dict(self._found(content[_HEADER_BYTES:]))
@@ -212,8 +218,8 @@ class _MatFile:
         while at < len(data):
             kind, body, at = self._element(data, at)
             if kind == _COMPRESSED:
-                start = memoryview(zlib.decompressobj().decompress(body, _PEEK_BYTES))[8:]
-                name, array = self._head(start)
+                unpacked = zlib.decompressobj().decompress(body, _PEEK_BYTES)
+                name, array = self._head(memoryview(unpacked)[8:])
                 yield name, (array, body)
             elif kind == _MATRIX:
                 name, array = self._head(body)
@@ -228,10 +234,9 @@ class _MatFile:
             TableUnfit: it is not there, or holds no real numbers.
         """
         parts = str(column).split(".")
+        number = None
         if len(parts) > 1 and re.fullmatch("[0-9]{1,9}", parts[-1]):
             number = int(parts.pop())
-        else:
-            number = None
         name = ".".join(parts)
         if name not in self._read:
             try:
@@ -252,21 +257,7 @@ class _MatFile:
 
     def _numbers(self, name: str, parts: list[str]) -> NDArray[Any]:
         """Read the array of a variable or field, shape (k, columns)."""
-        known = {variable: array for variable, (array, _) in self._variables.items() if variable}
-        if parts[0] not in known:
-            raise self._unfit(f"no variable {parts[0]!r}", "one of " + _listed(known))
-        array = self._whole(parts[0])
-        if array.kind == _STRUCT and len(parts) == 2 and prod(array.shape) == 1:
-            fields = dict(self._fields(array))
-            if parts[1] not in fields:
-                raise self._unfit(f"no field {name!r}", f"one of {_listed(fields, parts[0] + '.')}")
-            array = fields[parts[1]]
-        elif array.kind == _STRUCT or len(parts) > 1:
-            found = f"{name}, where {parts[0]} is {array}"
-            raise self._unfit(
-                found,
-                "VARIABLE, or STRUCT.FIELD of one struct, and .NUMBER for a column of a matrix",
-            )
+        array = self._array(name, parts)
         if array.kind not in (*_FLOATS, *_INTEGERS) or array.imaginary:
             raise self._unfit(f"{name}, {array}", "real numbers")
         sides = [side for side in array.shape if side != 1]
@@ -275,17 +266,38 @@ class _MatFile:
                 f"{name} of size {array}", "a column for each axis, a row for each sample"
             )
         kind, data, _ = self._element(array.body, 0)
-        values = np.frombuffer(data, dtype=self._order + _TYPES.get(kind, "V1"))
+        element_type = _TYPES.get(kind, "V1")
+        values = np.frombuffer(data, dtype=self._order + element_type)
         if values.dtype.kind == "V" or len(values) != prod(sides):
             raise ValueError(f"{len(values)} numbers for {array}")
         table = values.reshape(sides[0], -1, order="F")
-        table = table if table.shape[0] >= table.shape[1] else table.T
-        exact = (
-            array.kind in _INTEGERS
-            and table.dtype.kind in "iu"
-            and (table.dtype != np.uint64 or table.max() < 2**63)
-        )
-        return table.astype(np.int64 if exact else np.float64)
+        if table.shape[0] < table.shape[1]:
+            table = table.T
+        is_integer = array.kind in _INTEGERS and table.dtype.kind in "iu"
+        if is_integer and (table.dtype != np.uint64 or table.max() < 2**63):
+            return table.astype(np.int64)
+        return table.astype(np.float64)
+
+    def _array(self, name: str, parts: list[str]) -> _Array:
+        """Find the array of a variable or of a field, by the parts of its name."""
+        known = {variable: array for variable, (array, _) in self._variables.items() if variable}
+        variable = parts[0]
+        if variable not in known:
+            raise self._unfit(f"no variable {variable!r}", "one of " + _listed(known))
+        array = self._whole(variable)
+        is_struct = array.kind == _STRUCT
+        if is_struct and len(parts) == 2 and prod(array.shape) == 1:
+            fields = dict(self._fields(array))
+            if parts[1] not in fields:
+                listed = _listed(fields, f"{variable}.")
+                raise self._unfit(f"no field {name!r}", f"one of {listed}")
+            return fields[parts[1]]
+        if is_struct or len(parts) > 1:
+            raise self._unfit(
+                f"{name}, where {variable} is {array}",
+                "VARIABLE, or STRUCT.FIELD of one struct, and .NUMBER for a column of a matrix",
+            )
+        return array
 
     def _whole(self, name: str) -> _Array:
         """Unpack a variable."""
@@ -293,8 +305,10 @@ class _MatFile:
         if packed is None:
             return array
         unpack = zlib.decompressobj()
-        (size,) = struct.unpack(self._order + "4xI", unpack.decompress(packed, 8))
-        if size > min(LARGEST_BYTES, SMALL_BYTES + LARGEST_RATIO * len(packed)):
+        tag = unpack.decompress(packed, 8)
+        (size,) = struct.unpack(self._order + "4xI", tag)
+        largest = min(LARGEST_BYTES, SMALL_BYTES + LARGEST_RATIO * len(packed))
+        if size > largest:
             raise ValueError(f"{len(packed)} bytes that unfold to {size}")
         body = unpack.decompress(unpack.unconsumed_tail, size)
         if len(body) < size:
@@ -310,7 +324,9 @@ class _MatFile:
             raise ValueError(f"names of {width} bytes")
         for start in range(0, len(names), width):
             _, body, at = self._element(array.body, at)
-            yield _text(names[start : start + width]), self._head(body)[1]
+            name = _text(names[start : start + width])
+            _, field = self._head(body)
+            yield name, field
 
     def _head(self, body: memoryview) -> tuple[str, _Array]:
         """Read name, class and dimensions of a matrix."""
@@ -324,19 +340,26 @@ class _MatFile:
             _, sides, at = self._element(body, at)
             shape = struct.unpack(f"{self._order}{len(sides) // 4}i", sides)
         _, name, at = self._element(body, at)
-        return _text(name), _Array(kind, shape, bool(word & _COMPLEX), body[at:])
+        is_complex = bool(word & _COMPLEX)
+        return _text(name), _Array(kind, shape, is_complex, body[at:])
 
     def _element(self, data: memoryview, at: int) -> tuple[int, memoryview, int]:
         """Return type and content of the element at an offset, and the offset of the next one."""
         kind, size = struct.unpack_from(self._order + "II", data, at)
         start = at + 8
-        following = at + 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+        following = start + size
+        if kind != _COMPRESSED:
+            following += -size % 8  # up to a multiple of 8 bytes
         # A small element: its size is in the upper half, its content in the second word
         if kind >> 16:
-            kind, size, start, following = kind & 0xFFFF, kind >> 16, at + 4, at + 8
-        if start + size > len(data):
+            size = kind >> 16
+            kind &= 0xFFFF
+            start = at + 4
+            following = at + 8
+        end = start + size
+        if end > len(data):
             raise ValueError(f"{len(data) - start} bytes of an element of {size}")
-        return kind, data[start : start + size], following
+        return kind, data[start:end], following
 
     def _unfit(self, found: str, expected: str) -> TableUnfit:
         remedy = (

@@ -175,8 +175,7 @@ class JointState:
 
 
 def joint_state_from_cdr(data: bytes) -> JointState:
-    """Decode a message (OMG CDR as DDS transports it:
-    four bytes of encapsulation, then the fields, each aligned).
+    """Decode a message of OMG CDR: four bytes of encapsulation, then the fields, each aligned.
 
     Raises:
         ValueError: it is not one, or ends early.
@@ -243,11 +242,13 @@ def foreign_recording(path: Path) -> LogForeign | None:
             return None
         return _foreign_beginning(path, bag.library)
     states = [topic for topic, has in topics.items() if has]
-    found = f"a bag of {bag.library or 'another program'} with " + (
-        f"joint states of {', '.join(joints) or 'no joint'} on {', '.join(states)}"
-        if states
-        else ", ".join(topics)
-    )
+    library = bag.library or "another program"
+    content = ", ".join(topics)
+    if states:
+        joints_listed = ", ".join(joints) or "no joint"
+        topics_listed = ", ".join(states)
+        content = f"joint states of {joints_listed} on {topics_listed}"
+    found = f"a bag of {library} with {content}"
     remedy = f"`drivegain import` reads bags with {JOINTS_SCHEMA}"
     if states:
         remedy = (

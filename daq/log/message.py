@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,9 +163,8 @@ def event_bytes(event: CellEvent) -> bytes:
     axis = WHOLE_CELL if event.axis is None else event.axis
     head = _EVENT.pack(_ENCAPSULATION, *divmod(event.time_ns, 1_000_000_000), axis)
     kind = _string(event.kind.value)
-    return (
-        head + kind + b"\0" * (-len(kind) % 4) + struct.pack("<I", event.code) + _string(event.text)
-    )
+    code = struct.pack("<I", event.code)
+    return head + kind + _padding(kind, 4) + code + _string(event.text)
 
 
 def event_from_bytes(data: bytes) -> CellEvent:
@@ -213,11 +212,21 @@ def _time_ns(seconds: int, nanoseconds: int) -> int:
     return seconds * 1_000_000_000 + nanoseconds
 
 
+def _padding(data: bytes | bytearray, alignment: int) -> bytes:
+    """Return the zeros that lead to the next multiple of so many bytes."""
+    return b"\0" * (-len(data) % alignment)
+
+
+def _length_bytes(values: Sized) -> bytes:
+    return struct.pack("<I", len(values))
+
+
 def _string(text: str) -> bytes:
     # Bytes of a file name that are no UTF-8 are in its text as lone surrogates; an error may name
     # such a file.
-    data = text.replace("\0", " ").encode("utf-8", "backslashreplace") + b"\0"
-    return struct.pack("<I", len(data)) + data
+    without_nul = text.replace("\0", " ")
+    data = without_nul.encode("utf-8", "backslashreplace") + b"\0"
+    return _length_bytes(data) + data
 
 
 def _string_from(data: bytes, start: int) -> tuple[str, int]:
@@ -236,9 +245,9 @@ def joint_state_prefix(names: Sequence[str]) -> bytes:
     """
     # The stamp before them is 8 bytes long, so alignment counts from here too.
     data = bytearray(_string(""))  # frame_id
-    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(names))
+    data += _padding(data, 4) + _length_bytes(names)
     for name in names:
-        data += b"\0" * (-len(data) % 4) + _string(name)
+        data += _padding(data, 4) + _string(name)
     return bytes(data)
 
 
@@ -275,9 +284,11 @@ def _doubles_bytes(time_ns: int, prefix: bytes, *sequences: Sequence[float]) -> 
     """Encode a stamp, other fields and sequences of float64, aligned;
     an empty one has no element to be aligned.
     """
-    data = bytearray(struct.pack("<iI", *divmod(time_ns, 1_000_000_000)) + prefix)
+    stamp = struct.pack("<iI", *divmod(time_ns, 1_000_000_000))
+    data = bytearray(stamp + prefix)
     for values in sequences:
-        data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(values))
+        data += _padding(data, 4) + _length_bytes(values)
         if len(values):
-            data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(values)}d", *values)
+            doubles = struct.pack(f"<{len(values)}d", *values)
+            data += _padding(data, 8) + doubles
     return _ENCAPSULATION + bytes(data)

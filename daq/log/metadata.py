@@ -92,9 +92,9 @@ class RunInfo:
     @property
     def has_clock(self) -> bool:
         """Whether the samples have the time at which they were taken, not only their order."""
-        return self.origin.startswith(RECORDED) or (
-            self.timing is not None and self.timing.started_s is not None
-        )
+        if self.origin.startswith(RECORDED):
+            return True
+        return self.timing is not None and self.timing.started_s is not None
 
     @property
     def role(self) -> Role:
@@ -147,7 +147,8 @@ class Loss(Enum):
 
 def loss_reason(counts: Mapping[Loss, int]) -> str:
     """Return the losses above zero as `RunStatistics.reason`; empty without any."""
-    return ", ".join(f"{count} {loss.value}" for loss, count in counts.items() if count)
+    losses = [f"{count} {loss.value}" for loss, count in counts.items() if count]
+    return ", ".join(losses)
 
 
 def reports_only_losses(reason: str) -> bool:
@@ -160,6 +161,8 @@ def reports_only_losses(reason: str) -> bool:
 def run_record(info: RunInfo) -> dict[str, str]:
     """Encode the metadata `drivegain.run`."""
     payload = info.payload or Payload("", "")
+    entered_kg = "" if info.entered_kg is None else repr(info.entered_kg)
+    timing = "" if info.timing is None else json.dumps(asdict(info.timing))
     return {
         "version": VERSION,
         "run_id": info.run_id,
@@ -175,9 +178,9 @@ def run_record(info: RunInfo) -> dict[str, str]:
         "wall_minus_monotonic_ns": str(info.wall_minus_monotonic_ns),
         "origin": info.origin,
         "speed": repr(info.speed),
-        "payload_entered_kg": "" if info.entered_kg is None else repr(info.entered_kg),
+        "payload_entered_kg": entered_kg,
         "controller_sha256": info.controller_sha256 or "",
-        "timing": "" if info.timing is None else json.dumps(asdict(info.timing)),
+        "timing": timing,
     }
 
 
@@ -196,7 +199,8 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
     payload = None
     if Role(record["role"]) is Role.LOADED:
         known = _validated(dict[str, FiniteFloat], record["payload_known"])
-        if not known.keys() <= set(LINK_PARAMETERS) or known.get("m", 1.0) <= 0.0:
+        is_known = known.keys() <= set(LINK_PARAMETERS)
+        if not is_known or known.get("m", 1.0) <= 0.0:
             raise ValueError(
                 f"known payload {record['payload_known']!r:.80}: expected parameters "
                 "with a mass above 0"
@@ -217,9 +221,10 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
     wall_ns = int(record["started_wall_ns"])
     monotonic_ns = int(record["started_monotonic_ns"])
     if wall_ns < 0 or wall_ns not in CLOCK_NS or monotonic_ns not in CLOCK_NS:
-        raise ValueError(
-            f"start times {record['started_wall_ns']!r:.40}, {record['started_monotonic_ns']!r:.40}"
-        )
+        wall = record["started_wall_ns"]
+        monotonic = record["started_monotonic_ns"]
+        raise ValueError(f"start times {wall!r:.40}, {monotonic!r:.40}")
+    timing = record.get("timing")
     return RunInfo(
         run_id=record["run_id"],
         rate_hz=rate_hz,
@@ -232,7 +237,7 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         speed=speed,
         entered_kg=float(entered) if entered else None,
         controller_sha256=record.get("controller_sha256") or None,
-        timing=_validated(Timing, timing) if (timing := record.get("timing")) else None,
+        timing=_validated(Timing, timing) if timing else None,
     )
 
 
@@ -268,10 +273,9 @@ def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
         "wall_minus_monotonic_ns": int(offset_ns) if offset_ns else None,
     }
     statistics = _validated(RunStatistics, json.dumps(tree))
-    if max(statistics.missing, default=0) > statistics.samples:
-        raise ValueError(
-            f"{max(statistics.missing)} answers missing in {statistics.samples} samples"
-        )
+    most_missing = max(statistics.missing, default=0)
+    if most_missing > statistics.samples:
+        raise ValueError(f"{most_missing} answers missing in {statistics.samples} samples")
     return statistics
 
 
@@ -281,11 +285,10 @@ def _validated(kind: type[T], data: str | bytes) -> T:
         return TypeAdapter(kind).validate_json(data, strict=True)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
+        place = ".".join(map(str, first["loc"])) or "the whole"
+        found = first["input"]
         expected = first["msg"].removeprefix("Input should be ")
-        raise ValueError(
-            f"{place or 'the whole'} is {first['input']!r:.40}, expected {expected}"
-        ) from error
+        raise ValueError(f"{place} is {found!r:.40}, expected {expected}") from error
 
 
 def sealed(record: Mapping[str, str]) -> dict[str, str]:
@@ -301,15 +304,15 @@ def unsealed(record: Mapping[str, str]) -> dict[str, str]:
         ValueError: the checksum does not match.
     """
     entries = {key: value for key, value in record.items() if key != SEAL}
-    if record.get(SEAL, _checksum(entries)) != _checksum(entries):
-        raise ValueError(
-            f"entries of checksum {_checksum(entries)}, sealed with {record[SEAL]!r:.40}"
-        )
+    checksum = _checksum(entries)
+    if record.get(SEAL, checksum) != checksum:
+        raise ValueError(f"entries of checksum {checksum}, sealed with {record[SEAL]!r:.40}")
     return entries
 
 
 def _checksum(record: Mapping[str, str]) -> str:
-    return f"{zlib.crc32(json.dumps(sorted(record.items())).encode()):08x}"
+    content = json.dumps(sorted(record.items())).encode()
+    return f"{zlib.crc32(content):08x}"
 
 
 _Quantum = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -345,12 +348,10 @@ def readback_of_drives(
         ampere_per_unit: result of CanopenNetwork.ampere_per_unit().
         answers: result of CanopenNetwork.readback(), by axis name.
     """
-    return Readback(
-        tuple(
-            AxisReadback(name, scale, drive=dict(answers[name]))
-            for name, scale in zip(names, ampere_per_unit, strict=True)
-        )
-    )
+    axes = []
+    for name, scale in zip(names, ampere_per_unit, strict=True):
+        axes.append(AxisReadback(name, scale, drive=dict(answers[name])))
+    return Readback(tuple(axes))
 
 
 def readback_bytes(readback: Readback) -> bytes:

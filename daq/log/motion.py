@@ -73,16 +73,17 @@ class _Samples:
 
     def after(self, before: _Samples) -> _Samples:
         """Return these samples behind others."""
-        return _Samples(
-            np.concatenate((before.position_counts, self.position_counts)),
-            np.concatenate((before.current_raw, self.current_raw)),
-            np.concatenate((before.missing, self.missing)),
-        )
+        position_counts = np.concatenate((before.position_counts, self.position_counts))
+        current_raw = np.concatenate((before.current_raw, self.current_raw))
+        missing = np.concatenate((before.missing, self.missing))
+        return _Samples(position_counts, current_raw, missing)
 
     def last(self, count: int) -> _Samples:
         """Return so many of the last samples."""
         return _Samples(
-            self.position_counts[-count:], self.current_raw[-count:], self.missing[-count:]
+            position_counts=self.position_counts[-count:],
+            current_raw=self.current_raw[-count:],
+            missing=self.missing[-count:],
         )
 
 
@@ -120,25 +121,27 @@ class MotionWatch:
         if self._tail is not None:
             samples = samples.after(self._tail)
         self._tail = samples.last(OVERLAP)
-        position_rad = self._scale.joint_position(
-            continuous_counts(samples.position_counts, self._readback)
-        )
-        speeds = np.abs(np.diff(position_rad, axis=0)) * self._rate_hz / self._limits
+        motor_counts = continuous_counts(samples.position_counts, self._readback)
+        position_rad = self._scale.joint_position(motor_counts)
+        step_rad = np.abs(np.diff(position_rad, axis=0))
+        speeds = step_rad * self._rate_hz / self._limits
         if speeds.size:
             self._fastest = max(self._fastest, float(speeds.max()))
         size = np.abs(block.current_raw.astype(np.float64))
+        usual = np.percentile(size, 99.0, axis=0)
         self._peak = np.maximum(self._peak, size.max(axis=0))
-        self._usual = np.minimum(self._usual, np.percentile(size, 99.0, axis=0))
+        self._usual = np.minimum(self._usual, usual)
         current = samples.current_raw.astype(np.float64)
         self._lowest = np.minimum(self._lowest, current.min(axis=0))
         self._highest = np.maximum(self._highest, current.max(axis=0))
         steps = np.abs(np.diff(current, axis=0))
-        self._current_step = np.maximum(self._current_step, steps.max(axis=0, initial=0.0))
+        largest_step = steps.max(axis=0, initial=0.0)
+        self._current_step = np.maximum(self._current_step, largest_step)
         if not self._is_faulty:
-            known = self._scale.joints_known(answers(samples.missing, len(self._limits)))
-            self._is_faulty = bool(
-                find_faults(position_rad, current, self._rate_hz, self._cell.ratio, known)
-            )
+            answered = answers(samples.missing, len(self._limits))
+            known = self._scale.joints_known(answered)
+            faults = find_faults(position_rad, current, self._rate_hz, self._cell.ratio, known)
+            self._is_faulty = bool(faults)
 
     def verdict(
         self,
@@ -155,10 +158,10 @@ class MotionWatch:
         """
         valid, reason = checks.verdict(self._rate_hz, statistics)
         outlier = self._peak > LARGEST_OUTLIER * self._usual
-        through = self._current_step > 0.5 * (self._highest - self._lowest)
-        is_suspected = (
-            self._is_faulty or self._fastest > SPEED_MARGIN or bool(np.any(outlier | through))
-        )
+        current_range = self._highest - self._lowest
+        lost_sign = self._current_step > 0.5 * current_range
+        is_fast = self._fastest > SPEED_MARGIN
+        is_suspected = self._is_faulty or is_fast or np.any(outlier | lost_sign)
         if not valid or not is_suspected:
             return valid, reason
         samples = joined(again())
@@ -191,7 +194,8 @@ def judge_log(path: Path) -> tuple[LogReader, Cell, tuple[bool, str]]:
             watch = MotionWatch(cell, reader.head)
         watch.take(block)
     assert watch is not None  # the reader refuses a log without samples
-    return reader, cell, watch.verdict(reader.checks, reader.statistics, lambda: LogReader(path))
+    verdict = watch.verdict(reader.checks, reader.statistics, lambda: LogReader(path))
+    return reader, cell, verdict
 
 
 class RecordedMotion:

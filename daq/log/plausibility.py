@@ -61,7 +61,8 @@ def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) 
         if isinstance(section, ScaledColumns):
             with np.errstate(over="ignore"):
                 values = values * np.array(section.factors(cell.axis_names))
-        wrong = np.argwhere(~((least <= values) & (values <= largest)))
+        is_inside = (least <= values) & (values <= largest)
+        wrong = np.argwhere(~is_inside)
         if wrong.size:
             row, column = wrong[0].tolist()
             raise TableUnfit(
@@ -77,7 +78,9 @@ def check_counts(
     position: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]
 ) -> None:
     """Refuse counts that are no whole numbers of 32 bits."""
-    wrong = np.argwhere((position != np.rint(position)) | (np.abs(position) > LARGEST_RAW))
+    is_broken = position != np.rint(position)
+    is_large = np.abs(position) > LARGEST_RAW
+    wrong = np.argwhere(is_broken | is_large)
     if wrong.size:
         row, column = wrong[0].tolist()
         raise TableUnfit(
@@ -105,8 +108,8 @@ def signed_counts(
     remarks = []
     for index, (_, column) in enumerate(wanted.position.places):
         counts = position[:, index]
-        is_unsigned = counts.min() >= 0.0 and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED
-        if is_unsigned:
+        is_positive = counts.min() >= 0.0
+        if is_positive and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED:
             signed[counts > LARGEST_RAW, index] -= LARGEST_UNSIGNED + 1.0
             remarks.append(
                 f"column {column}: counts of 32 bits without a sign, read as counts with one"
@@ -127,8 +130,16 @@ def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: 
     """
     if columns.unit not in {PositionUnit.DEG, PositionUnit.MM, VelocityUnit.DEG, VelocityUnit.MM}:
         return values
-    units = [axis.unit.si if columns.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
+    if columns.side is Side.JOINT:
+        units = [axis.unit.si for axis in cell.axes]
+    else:
+        units = [pi / 180.0 for _ in cell.axes]
     return values * np.array(units, dtype=np.float64)
+
+
+def _root_mean_square(values: FloatArray) -> FloatArray:
+    """Return the root mean square of each column, shape (n,)."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
 
 
 def check_velocity(
@@ -142,30 +153,40 @@ def check_velocity(
     """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S:
     it needs no derivative.
     """
-    if (velocity := wanted.velocity) is None:
+    velocity = wanted.velocity
+    if velocity is None:
         return
-    of_file = section_values(velocity, files) * counting_signs(velocity.reversed, cell.axis_names)
+    signs = counting_signs(velocity.reversed, cell.axis_names)
+    of_file = section_values(velocity, files) * signs
     stated = in_si(on_clock(of_file, clock), velocity, cell)
     if velocity.side is Side.MOTOR:
         stated = stated @ np.linalg.inv(cell.ratio).T
-    step = min(max(1, round(VELOCITY_WINDOW_S * rate_hz)), len(stated) - 1)
-    summed = np.cumsum(0.5 * (stated[1:] + stated[:-1]) / rate_hz, axis=0)
+    step = max(1, round(VELOCITY_WINDOW_S * rate_hz))
+    step = min(step, len(stated) - 1)
+    # ∫ v dt, by the trapezoidal rule
+    steps = 0.5 * (stated[1:] + stated[:-1]) / rate_hz
+    summed = np.cumsum(steps, axis=0)
     summed = np.vstack((np.zeros_like(stated[:1]), summed))
-    expected, moved = (values[step:] - values[:-step] for values in (summed, joint_rad))
-    still = np.array([STILL * axis.limits.velocity for axis in cell.axes]) * step / rate_hz
-    error, size = (np.sqrt(np.mean(values**2, axis=0)) for values in (expected - moved, moved))
-    for index in np.flatnonzero(error > velocity.tolerance * size + still).tolist():
+    expected = summed[step:] - summed[:-step]
+    moved = joint_rad[step:] - joint_rad[:-step]
+    still_speeds = [STILL * axis.limits.velocity for axis in cell.axes]
+    still = np.array(still_speeds) * step / rate_hz
+    error = _root_mean_square(expected - moved)
+    size = _root_mean_square(moved)
+    largest = velocity.tolerance * size + still
+    for index in np.flatnonzero(error > largest).tolist():
         way = moved[:, index]
         stated_way = expected[:, index]
-        ratio = float(way @ stated_way) / max(float(stated_way @ stated_way), 1e-300)
+        stated_square = max(float(stated_way @ stated_way), 1e-300)
+        ratio = float(way @ stated_way) / stated_square
+        error_percent = 100.0 * float(error[index]) / max(float(size[index]), 1e-300)
+        tolerance_percent = 100.0 * velocity.tolerance
         file, column = velocity.places[index]
         raise TableUnfit(
             f"{files[file].path}, column {column}, axis {cell.axes[index].name}",
             found=f"positions that move {ratio:.3g} times as fast as this velocity says, and "
-            "differ from it by "
-            f"{100.0 * float(error[index]) / max(float(size[index]), 1e-300):.3g} %",
-            expected="velocities that agree with the positions to "
-            f"{100.0 * velocity.tolerance:g} %",
+            f"differ from it by {error_percent:.3g} %",
+            expected=f"velocities that agree with the positions to {tolerance_percent:g} %",
             remedy="check `unit` and `side` of both, the order of their columns, and the rate or "
             "the unit of the time; or leave `velocity` out",
         )
@@ -187,11 +208,11 @@ def require_changing(
     for index, (file, column) in enumerate(wanted.current.places):
         is_constant = len(current) > 1 and not np.ptp(current[:, index])
         if is_constant and np.ptp(position[:, index]):
+            value = current[0, index]
+            number = f"{value:g}" if value else "zero"
             raise TableUnfit(
                 f"{files[file].path}, column {column}",
-                found=f"{current[0, index]:g} in every row"
-                if current[0, index]
-                else "zero in every row",
+                found=f"{number} in every row",
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )
@@ -257,7 +278,8 @@ def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) ->
         )
         raise found.error(TableUnfit, f"{name}, axis {cell.axes[found.axis].name}", remedy)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
-    share = float((fastest_speeds(joint_rad, rate_hz) / limits).max())
+    shares = fastest_speeds(joint_rad, rate_hz) / limits
+    share = float(shares.max())
     if share < SLOW_SHARE:
         _LOG.warning(
             "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the "
@@ -293,13 +315,13 @@ def check_steps(
         return
     row = found.row
     if clock is not None:
-        row = int(
-            clock.row[min(np.searchsorted(clock.time_s, clock.tick_s[row]), len(clock.row) - 1)]
-        )
+        following = np.searchsorted(clock.time_s, clock.tick_s[row])
+        row = int(clock.row[min(following, len(clock.row) - 1)])
+    place = section_place(wanted.position, files, row, found.axis)
+    axis_name = cell.axes[found.axis].name
     raise found.error(
         TableUnfit,
-        f"{section_place(wanted.position, files, row, found.axis)}, axis "
-        f"{cell.axes[found.axis].name}",
+        f"{place}, axis {axis_name}",
         "cut the recording there, by `keep` of the import description, or export it again; a "
         "column that wraps (at 360 degrees, at a turn of the motor, as a counter) has to be made "
         "continuous; in a bag, do two nodes publish the same joints on the topic?",
@@ -310,11 +332,10 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
     """Refuse runs without motion: radians taken for degrees shrink it 57 times,
     which limits do not reveal.
     """
-    ranges = [axis.limits.position[1] - axis.limits.position[0] for axis in cell.axes]
-    share = np.ptp(joint_rad, axis=0) / np.array(ranges)
-    still = [
-        axis.name for axis, range_share in zip(cell.axes, share, strict=True) if range_share == 0.0
-    ]
+    limits = np.array([axis.limits.position for axis in cell.axes])
+    ranges = limits[:, 1] - limits[:, 0]
+    share = np.ptp(joint_rad, axis=0) / ranges
+    still = [cell.axes[index].name for index in np.flatnonzero(share == 0.0)]
     if len(still) == len(cell.axes):
         raise PositionImplausible(
             name,
@@ -330,9 +351,10 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
             " and ".join(still),
         )
     if share.max() < SMALLEST_MOTION:
+        largest_percent = 100.0 * share.max()
         raise PositionImplausible(
             name,
-            found=f"motion over at most {100.0 * share.max():.2g} % of any joint's range",
+            found=f"motion over at most {largest_percent:.2g} % of any joint's range",
             expected=f"at least {100.0 * SMALLEST_MOTION:g} % on one joint",
             remedy="most likely radians were taken for degrees, or joint for motor side; correct "
             "the description",
@@ -351,7 +373,8 @@ def warn_of_unsigned(
         rate_hz: rate of the samples.
         cell: with drive train and names of the axes.
     """
-    run = Run(name, np.arange(len(joint_rad)) / rate_hz, joint_rad, current_a)
+    time_s = np.arange(len(joint_rad)) / rate_hz
+    run = Run(name, time_s, joint_rad, current_a)
     try:
         require_signed_currents(run, cell.ratio, cell.axis_names)
     except CurrentUnsigned as error:

@@ -4,7 +4,7 @@ without a Python loop over messages.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from enum import Enum
@@ -128,31 +128,34 @@ class SampleChecks:
             self._first_ns = int(block.time_ns[0])
         self.samples += len(block.cycle)
         self.widths.add(block.position_counts.shape[1])
-        if (missing := block.missing[block.missing != 0]).size:
-            self.missing += [
-                np.count_nonzero(missing >> np.uint32(axis) & 1) for axis in range(LARGEST_AXES)
-            ]
-        highest = np.maximum.accumulate(np.concatenate((self._highest, block.cycle)))
+        missing = block.missing[block.missing != 0]
+        if missing.size:
+            for axis in range(LARGEST_AXES):
+                is_missing = missing >> np.uint32(axis) & 1
+                self.missing[axis] += np.count_nonzero(is_missing)
+        cycles = np.concatenate((self._highest, block.cycle))
+        highest = np.maximum.accumulate(cycles)
         advance = np.diff(highest)
-        self.lost_cycles += sum(advance[advance > 1].tolist()) - int(np.count_nonzero(advance > 1))
+        jumps = advance[advance > 1].tolist()
+        self.lost_cycles += sum(jumps) - len(jumps)
         self._highest = highest[-1:]
-        cycle, time_ns = (
-            np.concatenate(pair)
-            for pair in zip(self._last, (block.cycle, block.time_ns), strict=True)
-        )
+        last_cycle, last_ns = self._last
+        cycle = np.concatenate((last_cycle, block.cycle))
+        time_ns = np.concatenate((last_ns, block.time_ns))
         self._last = cycle[-1:], time_ns[-1:]
         if len(cycle) < 2:
             return
         gaps = np.flatnonzero(np.diff(cycle) != 1)
         if gaps.size and not self._gaps:
-            self._first_gap = f"cycle {cycle[gaps[0] + 1]} after {cycle[gaps[0]]}"
+            before = gaps[0]
+            self._first_gap = f"cycle {cycle[before + 1]} after {cycle[before]}"
         self._gaps += gaps.size
         step_ns = np.diff(time_ns)
         for place in (int(np.argmin(step_ns)), int(np.argmax(step_ns))):
-            self._steps.setdefault(
-                int(step_ns[place]), f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}"
-            )
-        self._steps = {step: self._steps[step] for step in (min(self._steps), max(self._steps))}
+            cycles_of_step = f"cycle {cycle[place + 1]} {{}} after cycle {cycle[place]}"
+            self._steps.setdefault(int(step_ns[place]), cycles_of_step)
+        extremes_ns = (min(self._steps), max(self._steps))
+        self._steps = {step_ns: self._steps[step_ns] for step_ns in extremes_ns}
 
     @property
     def span_ns(self) -> int:
@@ -168,44 +171,32 @@ class SampleChecks:
         axes = len(head.readback.axes)
         missing = tuple(self.missing[:axes].tolist())
         widths = ", ".join(map(str, sorted(self.widths)))
-        foreign = max((reading.axis for reading in readings if reading.axis >= axes), default=None)
-        pairs = (
-            (self.samples > 0, "no samples", f"some on {SAMPLES_TOPIC}"),
-            (self.widths <= {axes}, f"samples of {widths} axes", f"{axes}, as in its readback"),
-            (
-                foreign is None,
-                f"a torque or temperature of axis {foreign}, counted from 0",
-                f"those of {axes} axes, as in its readback",
-            ),
-            (
-                self.samples == statistics.samples,
-                f"{self.samples} samples",
-                f"{statistics.samples}, as its recorder counted",
-            ),
-            (
-                self.lost_cycles == statistics.lost_cycles,
-                f"{self.lost_cycles} lost cycles",
-                f"{statistics.lost_cycles}, as its recorder counted",
-            ),
-            (
-                len(statistics.missing) == axes,
-                f"losses of {len(statistics.missing)} axes",
-                f"{axes}",
-            ),
-            (
-                missing == statistics.missing,
-                f"{list(missing)} missing answers of its axes",
-                f"{list(statistics.missing)}, as its recorder counted",
-            ),
-        )
-        for agrees, found, expected in pairs:
-            if not agrees:
-                remedy = (
-                    "another tool may have cut or changed the log; take the original, or "
-                    "record again"
-                )
-                return LogIncomplete(str(self._path), found=found, expected=expected, remedy=remedy)
-        return None
+        foreign_axes = [reading.axis for reading in readings if reading.axis >= axes]
+        if not self.samples:
+            found = "no samples"
+            expected = f"some on {SAMPLES_TOPIC}"
+        elif not self.widths <= {axes}:
+            found = f"samples of {widths} axes"
+            expected = f"{axes}, as in its readback"
+        elif foreign_axes:
+            found = f"a torque or temperature of axis {max(foreign_axes)}, counted from 0"
+            expected = f"those of {axes} axes, as in its readback"
+        elif self.samples != statistics.samples:
+            found = f"{self.samples} samples"
+            expected = f"{statistics.samples}, as its recorder counted"
+        elif self.lost_cycles != statistics.lost_cycles:
+            found = f"{self.lost_cycles} lost cycles"
+            expected = f"{statistics.lost_cycles}, as its recorder counted"
+        elif len(statistics.missing) != axes:
+            found = f"losses of {len(statistics.missing)} axes"
+            expected = f"{axes}"
+        elif missing != statistics.missing:
+            found = f"{list(missing)} missing answers of its axes"
+            expected = f"{list(statistics.missing)}, as its recorder counted"
+        else:
+            return None
+        remedy = "another tool may have cut or changed the log; take the original, or record again"
+        return LogIncomplete(str(self._path), found=found, expected=expected, remedy=remedy)
 
     def fault(self, rate_hz: float) -> DataError | None:
         """Return why no fit takes these samples:
@@ -226,15 +217,17 @@ class SampleChecks:
         step_ns = max(self._steps, key=lambda step_ns: abs(step_ns - period_ns))
         # Central differences assume evenly spaced samples.
         if abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns:
+            step_ms = step_ns * 1e-6
+            period_ms = period_ns * 1e-6
+            step = self._steps[step_ns].format(f"{step_ms:.4g} ms")
             return ClockImplausible(
                 path,
-                found=f"{self._steps[step_ns].format(f'{step_ns * 1e-6:.4g} ms')}, its most "
-                "uneven step",
-                expected=f"{period_ns * 1e-6:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
+                found=f"{step}, its most uneven step",
+                expected=f"{period_ms:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
                 remedy="SYNC came late: record again with less load on the computer, or with a "
                 "longer sync.period_us",
             )
-        stamped_hz = (self.samples - 1) * 1e9 / (int(self._last[1][0]) - self._first_ns)
+        stamped_hz = (self.samples - 1) * 1e9 / self.span_ns
         if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
             return ClockImplausible(
                 path,
@@ -340,12 +333,11 @@ class LogReader:
         start = 0
         try:
             for offset, chunk in self._sample_chunks(records):
-                if waiting and (
-                    chunk.dtype != waiting[0].dtype or sum(map(len, waiting)) >= BLOCK_SAMPLES
-                ):
+                if waiting and not _continues(waiting, chunk):
                     yield self._block(start, waiting)
                     waiting = []
-                start = start if waiting else offset
+                if not waiting:
+                    start = offset
                 waiting.append(chunk)
         except LogUnreadable:
             if waiting:  # undamaged samples before the damage
@@ -388,18 +380,15 @@ class LogReader:
             kind = "metadata"
             largest = LARGEST_METADATA
             size = sum(len(key) + len(value) for key, value in record.metadata.items())
+        entry = f"{kind} {record.name!r:.80}"
         if record.name in known:
-            raise self._file.corrupt(
-                offset, f"a second {kind} {record.name!r:.80}", "one of each name"
-            )
-        if len(self._attachments) + len(self._metadata) >= LARGEST_ENTRIES:
-            raise self._file.corrupt(
-                offset, f"more than {LARGEST_ENTRIES} attachments and metadata", "a log of a cell"
-            )
+            raise self._file.corrupt(offset, f"a second {entry}", "one of each name")
+        entries = len(self._attachments) + len(self._metadata)
+        if entries >= LARGEST_ENTRIES:
+            found = f"more than {LARGEST_ENTRIES} attachments and metadata"
+            raise self._file.corrupt(offset, found, "a log of a cell")
         if size > largest:
-            raise self._file.corrupt(
-                offset, f"{kind} {record.name!r:.80} of {size} bytes", f"at most {largest}"
-            )
+            raise self._file.corrupt(offset, f"{entry} of {size} bytes", f"at most {largest}")
 
     @property
     def digest(self) -> str:
@@ -440,22 +429,25 @@ class LogReader:
 
     def _block(self, offset: int, chunks: list[RecordArray]) -> SampleBlock:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
-        records = np.frombuffer(
-            b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype
-        )
+        content = b"".join([chunk.tobytes() for chunk in chunks])
+        records = np.frombuffer(content, dtype=chunks[0].dtype)
         axes = records["position_counts"].shape[1]
         lengths = np.stack([records[name] for name in ("positions", "currents", "statuswords")])
-        if (lengths != axes).any() or (records["encapsulation"] != ENCAPSULATION_WORD).any():
+        is_other_length = lengths != axes
+        is_other_encoding = records["encapsulation"] != ENCAPSULATION_WORD
+        if is_other_length.any() or is_other_encoding.any():
             raise self._file.corrupt(
                 offset, "samples of another layout", f"little-endian CDR of {axes} axes"
             )
-        if (records["seconds"] < 0).any() or (records["nanoseconds"] >= 1_000_000_000).any():
+        seconds = records["seconds"]
+        nanoseconds = records["nanoseconds"]
+        if (seconds < 0).any() or (nanoseconds >= 1_000_000_000).any():
             raise self._file.corrupt(
                 offset, "samples from before 1970 or of a second that is too long", "Unix time"
             )
         block = SampleBlock(
             cycle=records["cycle"].astype(np.uint64),
-            time_ns=records["seconds"].astype(np.int64) * 1_000_000_000 + records["nanoseconds"],
+            time_ns=seconds.astype(np.int64) * 1_000_000_000 + nanoseconds,
             position_counts=records["position_counts"].astype(np.int32),
             current_raw=records["current_raw"].astype(np.int32),
             statusword=records["statusword"].astype(np.uint16),
@@ -489,25 +481,35 @@ def read_log(path: Path | str) -> Log:
     reader = LogReader(path)
     samples = joined(reader)
     return Log(
-        path,
-        reader.digest,
-        reader.head,
-        samples,
-        tuple(reader.events),
-        tuple(reader.readings),
-        reader.statistics,
-        reader.partial,
+        path=path,
+        digest=reader.digest,
+        head=reader.head,
+        samples=samples,
+        events=tuple(reader.events),
+        readings=tuple(reader.readings),
+        statistics=reader.statistics,
+        partial=reader.partial,
     )
 
 
 def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:
     """Return all samples of a log, of one block at least, as one block."""
     waiting = list(blocks)
-    columns = {name: [getattr(block, name) for block in waiting] for name in SampleBlock.__slots__}
+    columns = {}
+    for name in SampleBlock.__slots__:
+        columns[name] = [getattr(block, name) for block in waiting]
     waiting.clear()  # so that a long log is not in memory twice
-    return SampleBlock(
-        **{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__}
-    )
+    joined_columns = {}
+    for name in SampleBlock.__slots__:
+        joined_columns[name] = np.concatenate(columns.pop(name))
+    return SampleBlock(**joined_columns)
+
+
+def _continues(waiting: Sequence[RecordArray], chunk: RecordArray) -> bool:
+    """Whether a chunk goes into the same block as those before it."""
+    if chunk.dtype != waiting[0].dtype:
+        return False
+    return sum(map(len, waiting)) < BLOCK_SAMPLES
 
 
 class LossyLogs(Enum):

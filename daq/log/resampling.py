@@ -71,7 +71,8 @@ class Clock:
         """
         if not self.timing.resampled:
             return values
-        return np.column_stack([np.interp(self.tick_s, self.time_s, column) for column in values.T])
+        resampled = [np.interp(self.tick_s, self.time_s, column) for column in values.T]
+        return np.column_stack(resampled)
 
 
 def on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
@@ -113,13 +114,12 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
             remedy="correct `column` and `unit` of `time` in the import description, or give "
             "rate_hz instead",
         )
-    timing = replace(
-        check_stamps(time_s),
-        rows=len(numbers),
-        duplicates=duplicates,
-        close=int(np.count_nonzero(~far)),
-    )
-    if not RATES_HZ[0] * (1.0 - EVEN) <= timing.rate_hz <= RATES_HZ[1] * (1.0 + EVEN):
+    close = int(np.count_nonzero(~far))
+    timing = check_stamps(time_s)
+    timing = replace(timing, rows=len(numbers), duplicates=duplicates, close=close)
+    lowest_hz = RATES_HZ[0] * (1.0 - EVEN)
+    highest_hz = RATES_HZ[1] * (1.0 + EVEN)
+    if not lowest_hz <= timing.rate_hz <= highest_hz:
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
             found=f"stamps at {timing.rate_hz:.4g} Hz with `unit: {wanted.unit.value}`",
@@ -130,8 +130,10 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
     _check_rate(table, wanted, time_s)
     if wanted.rate_hz is not None:
         timing = _at_rate(table, wanted, wanted.rate_hz, time_s, timing)
-    tick_s = np.arange(int(time_s[-1] * timing.rate_hz + EVEN) + 1) / timing.rate_hz
-    return Clock(row, time_s, np.minimum(tick_s, time_s[-1]), timing)
+    last_tick = int(time_s[-1] * timing.rate_hz + EVEN)
+    tick_s = np.arange(last_tick + 1) / timing.rate_hz
+    tick_s = np.minimum(tick_s, time_s[-1])
+    return Clock(row, time_s, tick_s, timing)
 
 
 def check_stamps(time_s: FloatArray) -> Timing:
@@ -148,16 +150,20 @@ def check_stamps(time_s: FloatArray) -> Timing:
     periods, usual_s = _periods(step_s)
     rate_hz = float(periods.sum() / time_s[-1])
     missing = round(float(periods.sum())) - len(step_s)
-    clock_s = np.concatenate(([0.0], np.cumsum(periods))) / rate_hz
+    clock_periods = np.concatenate(([0.0], np.cumsum(periods)))
+    clock_s = clock_periods / rate_hz
+    jitter_s = np.std(step_s - periods / rate_hz)
+    drift_s = np.abs(time_s - clock_s).max()
+    is_uniform = missing <= 0 and _is_uniform(time_s)
     return Timing(
         rows=len(time_s),
         rate_hz=rate_hz,
         usual_step_s=usual_s,
         longest_step_s=float(step_s.max()),
-        jitter_s=float(np.std(step_s - periods / rate_hz)),
-        drift_s=float(np.abs(time_s - clock_s).max()),
+        jitter_s=float(jitter_s),
+        drift_s=float(drift_s),
         missing=missing,
-        resampled=missing > 0 or not _is_uniform(time_s),
+        resampled=not is_uniform,
     )
 
 
@@ -167,8 +173,10 @@ def _periods(step_s: FloatArray) -> tuple[FloatArray, float]:
     """
     usual_s = float(np.median(step_s))
     periods = np.rint(step_s / usual_s)
-    whole = np.all((periods >= 1.0) & (np.abs(step_s / usual_s - periods) < NEAR))
-    return periods if whole else np.ones_like(step_s), usual_s
+    distance = np.abs(step_s / usual_s - periods)
+    if not np.all((periods >= 1.0) & (distance < NEAR)):
+        periods = np.ones_like(step_s)
+    return periods, usual_s
 
 
 def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
@@ -176,21 +184,23 @@ def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
     jitter and missing samples leave its mean over a window alone.
     """
     step_s = np.diff(time_s)
-    period_s = step_s / _periods(step_s)[0]
+    periods, _ = _periods(step_s)
+    period_s = step_s / periods
     width = max(SHORTEST_WINDOW, len(period_s) // RATE_WINDOWS)
     count = len(period_s) // width
     if count < 2:
         return
     windows = period_s[: count * width].reshape(count, width)
     mean_s = windows.mean(axis=1)
-    noise = (
-        RATE_NOISE * float(np.median(windows.std(axis=1))) / (np.sqrt(width) * float(mean_s.mean()))
-    )
-    if mean_s.max() / mean_s.min() - 1.0 > RATE_CHANGE + noise:
+    jitter_s = float(np.median(windows.std(axis=1)))
+    noise = RATE_NOISE * jitter_s / (np.sqrt(width) * float(mean_s.mean()))
+    change = mean_s.max() / mean_s.min() - 1.0
+    if change > RATE_CHANGE + noise:
+        slowest_hz = 1.0 / mean_s.max()
+        quickest_hz = 1.0 / mean_s.min()
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
-            found=f"stamps at {1.0 / mean_s.max():.4g} to {1.0 / mean_s.min():.4g} Hz in parts of "
-            "the recording",
+            found=f"stamps at {slowest_hz:.4g} to {quickest_hz:.4g} Hz in parts of the recording",
             expected=f"one rate, to {100.0 * RATE_CHANGE:g} %",
             remedy="if these are times of arrival, give rate_hz instead of time; else import the "
             "parts of one rate as recordings of their own",
@@ -203,15 +213,18 @@ def _is_uniform(time_s: FloatArray) -> bool:
     Rounding makes steps of two kinds, one unit of the digit apart, and moves every stamp by less
     than one unit.
     """
-    index = np.arange(len(time_s)) - 0.5 * (len(time_s) - 1)
+    middle = 0.5 * (len(time_s) - 1)
+    index = np.arange(len(time_s)) - middle
     period_s = float(index @ time_s / (index @ index))
     spread_s = float(np.ptp(time_s - period_s * index))
     if spread_s <= 2.0 * EVEN * period_s:
         return True
     for digit_s in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
         digits = time_s / digit_s
-        if np.all(np.abs(digits - np.rint(digits)) < 1e-3):
-            return bool(np.ptp(np.diff(np.rint(digits))) <= 1.0 and spread_s <= COARSE * digit_s)
+        whole = np.rint(digits)
+        if np.all(np.abs(digits - whole) < 1e-3):
+            has_two_steps = np.ptp(np.diff(whole)) <= 1.0
+            return bool(has_two_steps and spread_s <= COARSE * digit_s)
     return False
 
 
@@ -231,30 +244,31 @@ def _at_rate(
         )
     ahead = float(time_s[-1]) * abs(rate_hz - timing.rate_hz)  # periods at the last stamp
     drift_s = max(timing.drift_s, ahead / rate_hz)
-    return replace(
-        timing, rate_hz=rate_hz, drift_s=drift_s, resampled=timing.resampled or ahead >= 0.5
-    )
+    resampled = timing.resampled or ahead >= 0.5
+    return replace(timing, rate_hz=rate_hz, drift_s=drift_s, resampled=resampled)
 
 
 def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArray:
     """Return which rows are not the row before once more, shape (k,)."""
     assert table.stamps is not None
     step_s = np.diff(table.stamps.time_s)
-    repeated = (step_s == 0.0) & np.all(numbers[1:] == numbers[:-1], axis=1)
-    if (wrong := (step_s <= 0.0) & ~repeated).any():
+    has_equal_numbers = np.all(numbers[1:] == numbers[:-1], axis=1)
+    repeated = (step_s == 0.0) & has_equal_numbers
+    wrong = (step_s <= 0.0) & ~repeated
+    if wrong.any():
         row = int(np.argmax(wrong)) + 1
         back_s = -float(step_s[row - 1])
-        raise TableUnfit(
-            table.place(row, wanted.column),
-            found=f"a stamp {back_s:.6g} s before that of the row above"
-            if back_s
-            else "the stamp of the row above, with other numbers",
-            expected="stamps that increase",
-            remedy="were two recordings joined? import each by `keep` of the import description"
-            if back_s
-            else "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of "
-            "time; in a bag, do two nodes publish the same joints on the topic?",
-        )
+        if back_s:
+            found = f"a stamp {back_s:.6g} s before that of the row above"
+            remedy = "were two recordings joined? import each by `keep` of the import description"
+        else:
+            found = "the stamp of the row above, with other numbers"
+            remedy = (
+                "delete the row that is wrong; if the stamps are coarse, give rate_hz instead of "
+                "time; in a bag, do two nodes publish the same joints on the topic?"
+            )
+        place = table.place(row, wanted.column)
+        raise TableUnfit(place, found=found, expected="stamps that increase", remedy=remedy)
     return np.concatenate(([True], ~repeated))
 
 
@@ -263,13 +277,16 @@ def _check_gaps(
 ) -> None:
     """Refuse gaps: nothing is known of the motion in them."""
     step_s = np.diff(time_s)
-    gaps = np.flatnonzero(step_s > wanted.largest_gap_periods * timing.usual_step_s * (1.0 + EVEN))
+    longest_s = wanted.largest_gap_periods * timing.usual_step_s * (1.0 + EVEN)
+    gaps = np.flatnonzero(step_s > longest_s)
     if gaps.size:
         first = int(gaps[0])
+        found = f"{step_s[first]:.6g} s after the sample before"
+        if len(gaps) > 1:
+            found += f", and {len(gaps) - 1} more gaps"
         raise TableUnfit(
             table.place(int(row[first + 1]), wanted.column),
-            found=f"{step_s[first]:.6g} s after the sample before"
-            + (f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""),
+            found=found,
             expected=f"at most {wanted.largest_gap_periods:g} times the usual "
             f"{timing.usual_step_s:.6g} s",
             remedy="samples are missing: import the parts before and after it as two recordings, "

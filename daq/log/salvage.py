@@ -87,7 +87,8 @@ def salvage(
     head = reader.head
     cell = head.cell(damaged)
     scale = scaling(cell, head.readback)
-    run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
+    origin = f"{head.run.origin}; salvaged from {damaged.name}"
+    run = replace(head.run, origin=origin)
     content = LogContent.of(cell, run, head.files, head.readback)
     # A crash loses only this new file, so no clock is needed to flush in time.
     with LogWriter(
@@ -95,9 +96,13 @@ def salvage(
     ) as log:
         _copy(reader, chain((first,), blocks), log, cell, progress)
     size = damaged.stat().st_size
-    damage = "" if reader.damage is None else f"{reader.damage.subject}: {reader.damage.found}"
-    left_out = 0 if reader.damage is None else size - reader.whole_bytes
-    return Salvaged(out, log.statistics, log.statistics.samples / run.rate_hz, left_out, damage)
+    damage = ""
+    bytes_left_out = 0
+    if reader.damage is not None:
+        damage = f"{reader.damage.subject}: {reader.damage.found}"
+        bytes_left_out = size - reader.whole_bytes
+    duration_s = log.statistics.samples / run.rate_hz
+    return Salvaged(out, log.statistics, duration_s, bytes_left_out, damage)
 
 
 def _copy(
@@ -107,7 +112,8 @@ def _copy(
     cell: Cell,
     progress: Callable[[int], None],
 ) -> None:
-    known_events = known_readings = 0
+    known_events = 0
+    known_readings = 0
     axes = len(cell.axes)
     watch = MotionWatch(cell, reader.head)
     for block in chain(blocks, (None,)):  # events and readings may follow the last samples
@@ -115,7 +121,8 @@ def _copy(
             log.event(event)
         known_events = len(reader.events)
         fresh = reader.readings[known_readings:]
-        if foreign := {reading.axis for reading in fresh if reading.axis >= axes}:
+        foreign = {reading.axis for reading in fresh if reading.axis >= axes}
+        if foreign:
             surplus = f"a torque or temperature of axis {max(foreign)}, counted from 0"
             raise _foreign(reader.path, surplus, f"those of {axes} axes")
         log.readings(fresh)
@@ -128,34 +135,47 @@ def _copy(
         watch.take(block)
         columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
         for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
-            log.write(
-                Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing)
+            sample = Sample(
+                cycle=cycle,
+                time_ns=time_ns,
+                position_counts=tuple(position),
+                current_raw=tuple(current),
+                statusword=tuple(statusword),
+                missing=missing,
             )
+            log.write(sample)
         progress(log.statistics.samples)
     if reader.concluded:
-        contradiction = reader.contradiction
-        found = (
-            []
-            if contradiction is None
-            else [f"{contradiction.found}; expected {contradiction.expected}"]
-        )
-        found = (
-            [reader.statistics.reason or "no reason given"]
-            if not reader.statistics.valid
-            else found
-        )
-    else:  # no verdict of the recorder: that of the losses and faults in samples and events
-        counted = log.statistics
-        found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
-        found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
-        found += [
-            f"{event.kind.value} ({event.text})"
-            for event in reader.events
-            if event.kind not in _HARMLESS
-        ][:3]
-    judged = RunStatistics(0, 0, (), valid=not found, reason=", ".join(found))
+        faults = _faults_of_recorder(reader)
+    else:
+        faults = _faults_of_samples(reader, log.statistics)
+    judged = RunStatistics(0, 0, (), valid=not faults, reason=", ".join(faults))
     verdict = watch.verdict(reader.checks, judged, lambda: LogReader(reader.path).until_damage())
     log.conclude(*verdict, partial=True)
+
+
+def _faults_of_recorder(reader: LogReader) -> list[str]:
+    """Return why the recorder's own verdict, or what contradicts it, makes a log invalid."""
+    if not reader.statistics.valid:
+        return [reader.statistics.reason or "no reason given"]
+    contradiction = reader.contradiction
+    if contradiction is None:
+        return []
+    return [f"{contradiction.found}; expected {contradiction.expected}"]
+
+
+def _faults_of_samples(reader: LogReader, statistics: RunStatistics) -> list[str]:
+    """Return the losses and the first three faults in samples and events,
+    where the recorder left no verdict.
+    """
+    faults = []
+    if statistics.lost_cycles:
+        faults.append(f"{statistics.lost_cycles} cycles lost")
+    if any(statistics.missing):
+        faults.append(f"{sum(statistics.missing)} missing answers")
+    harmful = [event for event in reader.events if event.kind not in _HARMLESS]
+    faults += [f"{event.kind.value} ({event.text})" for event in harmful[:3]]
+    return faults
 
 
 def _foreign(path: Path, found: str, expected: str) -> LogIncomplete:

@@ -60,12 +60,14 @@ class Table:
 
     def take(self, columns: Sequence[Column]) -> FloatArray:
         """Return some of the columns, shape (k, len(columns))."""
-        return self.values[:, [self.columns.index(column) for column in columns]]
+        indices = [self.columns.index(column) for column in columns]
+        return self.values[:, indices]
 
     def place(self, row: int, column: Column) -> str:
         """Name a number in a message: `run.csv:42, column i3`."""
         if self.line_numbers is None:
-            return f"{self.path}, row {self.first_row + row + 1}, column {column}"
+            row_of_file = self.first_row + row + 1
+            return f"{self.path}, row {row_of_file}, column {column}"
         return f"{self.path}:{self.line_numbers[row]}, column {column}"
 
 
@@ -86,21 +88,22 @@ def compare_stamps(timed: Table, other: Table) -> tuple[str, ...]:
     """
     mine = timed.stamps
     others = other.stamps_beside
-    if (
-        mine is None
-        or others is None
-        or len(mine.time_s) != len(others.time_s)
-        or len(mine.time_s) < 2
-    ):
+    if mine is None or others is None:
         return ()
-    half_step_s = 0.5 * float(np.median(np.diff(mine.time_s)))
-    apart = np.flatnonzero(np.abs(mine.time_s - others.time_s) > half_step_s)
+    count = len(mine.time_s)
+    if count != len(others.time_s) or count < 2:
+        return ()
+    usual_step_s = float(np.median(np.diff(mine.time_s)))
+    half_step_s = 0.5 * usual_step_s
+    distance_s = np.abs(mine.time_s - others.time_s)
+    apart = np.flatnonzero(distance_s > half_step_s)
     if apart.size:
         row = int(apart[0])
+        other_s = others.time_s[row]
+        timed_s = mine.time_s[row]
         raise TableUnfit(
             other.place(row, "time"),
-            found=f"{others.time_s[row]:.6g} s since its first row, and {mine.time_s[row]:.6g} s "
-            f"in {timed.path.name}",
+            found=f"{other_s:.6g} s since its first row, and {timed_s:.6g} s in {timed.path.name}",
             expected="rows of the same instants in both files",
             remedy="a row is missing in one of them, or they are of different runs; export "
             "them again",
@@ -219,18 +222,20 @@ def cut_advice(values: FloatArray, first_row: int) -> str:
     """
     sound = np.asarray(np.isfinite(values).all(axis=1))
     first = int(np.argmax(sound)) if sound.any() else 0
-    last = len(sound) - int(np.argmax(sound[::-1]))
+    unsound_at_end = int(np.argmax(sound[::-1]))
+    last = len(sound) - unsound_at_end
     if not sound[first:last].all():
         last = first + int(np.argmin(sound[first:last]))
     ends = []
     if first > 0:
-        ends.append(f"from_row: {first_row + first + 1}")
+        from_row = first_row + first + 1
+        ends.append(f"from_row: {from_row}")
     if last < len(sound):
         ends.append(f"to_row: {first_row + last}")
+    setting = "`keep`"
     if ends and sound.any():
-        setting = f"`keep: {{{', '.join(ends)}}}`"
-    else:
-        setting = "`keep`"
+        both = ", ".join(ends)
+        setting = f"`keep: {{{both}}}`"
     cut = f"cut the recording there, by {setting} of the import description"
     return f"samples are never invented: {cut}, or export it again"
 
@@ -239,8 +244,9 @@ def rows_in_time(stamps: Stamps, part: KeptPart) -> slice:
     """Return the rows of the times that are kept."""
     from_s = part.from_s or 0.0
     to_s = inf if part.to_s is None else part.to_s
-    is_inside = (stamps.time_s >= from_s - TIME_MARGIN_S) & (stamps.time_s <= to_s + TIME_MARGIN_S)
-    inside = np.flatnonzero(is_inside)
+    is_begun = stamps.time_s >= from_s - TIME_MARGIN_S
+    is_before_end = stamps.time_s <= to_s + TIME_MARGIN_S
+    inside = np.flatnonzero(is_begun & is_before_end)
     if not inside.size:
         return slice(0, 0)
     return slice(int(inside[0]), int(inside[-1]) + 1)
@@ -268,10 +274,12 @@ def require_kept(path: Path, count: int, rows: slice) -> None:
 
 def rows_at_rate(rate_hz: float, part: KeptPart) -> slice:
     """Return the rows of the times that are kept, where a rate is stated in the place of stamps."""
-    first = ceil((part.from_s or 0.0) * rate_hz - ROW_MARGIN)
+    from_s = part.from_s or 0.0
+    first = ceil(from_s * rate_hz - ROW_MARGIN)
     if part.to_s is None:
         return slice(first, None)
-    return slice(first, floor(part.to_s * rate_hz + ROW_MARGIN) + 1)
+    last = floor(part.to_s * rate_hz + ROW_MARGIN)
+    return slice(first, last + 1)
 
 
 def cut_stamps(stamps: Stamps, rows: slice) -> Stamps:
@@ -279,7 +287,8 @@ def cut_stamps(stamps: Stamps, rows: slice) -> Stamps:
     time_s = stamps.time_s[rows]
     if not time_s.size:
         return Stamps(time_s, stamps.first_ns)
-    return Stamps(time_s - time_s[0], stamps.first_ns + round(float(time_s[0]) * 1e9))
+    later_ns = round(float(time_s[0]) * 1e9)
+    return Stamps(time_s - time_s[0], stamps.first_ns + later_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,10 +303,9 @@ def counter_wraps() -> tuple[Wrap, ...]:
     """Return how counters of 16 and 32 bits wrap, of any unit of time."""
     found: list[Wrap] = []
     for unit in (TimeUnit.SECOND, TimeUnit.MILLISECOND, TimeUnit.MICROSECOND, TimeUnit.NANOSECOND):
-        found += [
-            Wrap(2.0**bits * unit.seconds, f"a counter of {bits} bits in {unit.value} that wraps")
-            for bits in COUNTER_BITS
-        ]
+        for bits in COUNTER_BITS:
+            name = f"a counter of {bits} bits in {unit.value} that wraps"
+            found.append(Wrap(2.0**bits * unit.seconds, name))
     return tuple(found)
 
 
@@ -330,7 +338,8 @@ def without_wraps(time_s: FloatArray, wraps: Sequence[Wrap]) -> tuple[FloatArray
             whole_s = np.where(is_back, step_s + wrap.period_s, step_s)
             times = counted(int(np.count_nonzero(is_back)), "time")
             remark = f"stamps begin anew {times}: taken as {wrap.name}, and made continuous"
-            return np.concatenate((time_s[:1], time_s[0] + np.cumsum(whole_s))), (remark,)
+            later_s = time_s[0] + np.cumsum(whole_s)
+            return np.concatenate((time_s[:1], later_s)), (remark,)
     return time_s, ()
 
 
@@ -338,5 +347,6 @@ def digest_of(values: FloatArray, stamps: Stamps | None) -> str:
     """Return the sha256 of rows that are no text, hex."""
     rows = hashlib.sha256(values.tobytes())
     if stamps is not None:
-        rows.update(f"{stamps.first_ns}".encode() + stamps.time_s.tobytes())
+        rows.update(f"{stamps.first_ns}".encode())
+        rows.update(stamps.time_s.tobytes())
     return rows.hexdigest()

@@ -248,6 +248,9 @@ def info_report(path: Path) -> InfoReport:
     clock_step_s = None
     if statistics.wall_minus_monotonic_ns is not None:
         clock_step_s = (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9
+    started = None
+    if run.started_wall_ns:
+        started = datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC)
     return InfoReport.of(
         run,
         statistics,
@@ -267,9 +270,7 @@ def info_report(path: Path) -> InfoReport:
         valid=valid,
         reason=reason,
         events=[event for event in reader.events if event.kind not in _ROUTINE],
-        started=datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC)
-        if run.started_wall_ns
-        else None,
+        started=started,
         wall_minus_monotonic_s=run.wall_minus_monotonic_ns * 1e-9,
         wall_clock_step_s=clock_step_s,
         attachments={name: len(data) for name, data in sorted(head.files.items())},

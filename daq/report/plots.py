@@ -34,8 +34,7 @@ from ident.estimators.estimate import relative_error
 def draw_fit(
     fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path
 ) -> None:
-    """Draw the torques of a held-out run (paper Fig.
-    2), the residual before and after each effect, and the gains.
+    """Draw the torques of a held-out run, the residual by effect, and the gains (paper Fig. 2).
 
     `truth` is the true gain by axis, for a simulated cell only.
 

@@ -768,9 +768,7 @@ def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[
 
 
 def error_change_text(before_percent: float, after_percent: float) -> str:
-    """Describe the change of an error: `falls from 6.9 to 2.8 %`, `falls slightly,
-    from 2.4 to 2.3 %`.
-    """
+    """Describe the change of an error: `falls slightly, from 2.4 to 2.3 %`."""
     before = f"{before_percent:.1f}"
     after = f"{after_percent:.1f}"
     if before == after:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.workflow.experiment import CheckedScene, paths_of
+from daq.workflow.experiment import CheckedScene, PlannedMove, paths_of
 from daq.workflow.plan import Plan, TargetBox
 from ident.arrays import FloatArray
 from ident.model.robot import poses
@@ -52,11 +52,9 @@ class AcceptedRoom:
         capsules = scene.checker.scene.capsules
         lower_m = _corner(self.reach.lower_m - SLACK_M)
         upper_m = _corner(self.reach.upper_m + SLACK_M)
-        bounded = replace(
-            scene.checker.scene,
-            workspace=Box("the reach of the moves that were accepted", lower_m, upper_m),
-            confined=tuple(index for index, capsule in enumerate(capsules) if capsule.link != BASE),
-        )
+        reach = Box("the reach of the moves that were accepted", lower_m, upper_m)
+        moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
+        bounded = replace(scene.checker.scene, workspace=reach, confined=tuple(moving))
         return replace(scene, checker=Checker(scene.checker.robot, bounded))
 
 
@@ -68,17 +66,24 @@ def accepted_room(cell: Cell, scene: CheckedScene, plans: Sequence[Plan]) -> Acc
         scene: of the cell.
         plans: that an operator has looked at, one or more.
     """
-    moves = [move for plan in plans for move in plan.moves]
+    moves: list[PlannedMove] = []
+    for plan in plans:
+        moves += plan.moves
     targets = np.array([move.target_rad for move in moves])
     box = TargetBox(targets.min(axis=0), targets.max(axis=0))
     speed = max(move.velocity for move in moves)
     acceleration = max(move.acceleration for move in moves)
     checker = scene.checker
     is_declared = checker.scene.workspace is not None
-    if is_declared or not any(capsule.link != BASE for capsule in checker.scene.capsules):
+    has_moving_shape = any(capsule.link != BASE for capsule in checker.scene.capsules)
+    if is_declared or not has_moving_shape:
         return AcceptedRoom(box, speed, acceleration, None)
-    paths = [path for plan in plans for path in paths_of(cell, plan.moves)]
-    postures = [path.at(np.linspace(0.0, path.duration_s, STEPS))[0] for path in paths]
+    postures = []
+    for plan in plans:
+        for path in paths_of(cell, plan.moves):
+            time_s = np.linspace(0.0, path.duration_s, STEPS)
+            position, _, _ = path.at(time_s)
+            postures.append(position)
     reach = extent(checker, placed(checker, np.concatenate(postures)))
     return AcceptedRoom(box, speed, acceleration, reach)
 
@@ -93,9 +98,12 @@ def placed(checker: Checker, position: FloatArray) -> FloatArray:
     capsules = checker.scene.capsules
     at = poses(checker.robot, checker.joints(position))
     frame = [capsule.link + 1 for capsule in capsules]
-    ends = np.array([(capsule.start_m, capsule.end_m) for capsule in capsules]).reshape(-1, 1, 2, 3)
-    origin = at.origin_m[frame].swapaxes(0, 1)[:, :, None]
-    return np.asarray(np.einsum("ckij,cxej->kcei", at.rotation[frame], ends) + origin)
+    ends = np.array([(capsule.start_m, capsule.end_m) for capsule in capsules])
+    ends = ends.reshape(-1, 1, 2, 3)
+    origin = at.origin_m[frame].swapaxes(0, 1)
+    # p_kce = R_ck end_ce + o_kc
+    turned = np.einsum("ckij,cxej->kcei", at.rotation[frame], ends)
+    return np.asarray(turned + origin[:, :, None])
 
 
 def extent(checker: Checker, ends_m: FloatArray) -> Extent:
@@ -110,10 +118,14 @@ def extent(checker: Checker, ends_m: FloatArray) -> Extent:
     if not moving.any():
         return Extent(np.zeros(3), np.zeros(3), 0.0)
     ends = ends_m[:, moving]
-    radius_m = np.array([capsule.radius_m for capsule in capsules])[moving, None]
-    lower = (ends - radius_m[..., None]).min(axis=(0, 1, 2))
-    upper = (ends + radius_m[..., None]).max(axis=(0, 1, 2))
-    return Extent(lower, upper, float((np.hypot(ends[..., 0], ends[..., 1]) + radius_m).max()))
+    radii_m = np.array([capsule.radius_m for capsule in capsules])
+    radius_m = radii_m[moving, None]
+    lowest = ends - radius_m[..., None]
+    highest = ends + radius_m[..., None]
+    lower = lowest.min(axis=(0, 1, 2))
+    upper = highest.max(axis=(0, 1, 2))
+    from_axis_m = np.hypot(ends[..., 0], ends[..., 1]) + radius_m
+    return Extent(lower, upper, float(from_axis_m.max()))
 
 
 def _corner(point_m: FloatArray) -> tuple[float, float, float]:

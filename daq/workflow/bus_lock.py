@@ -80,14 +80,23 @@ def taken_of(
     """
     try:
         lines = [line for line in locks.read_text().splitlines() if " FLOCK " in line]
-        held = {int(line.split()[-3].rpartition(":")[2]) for line in lines}
+        locked_inodes = set(map(_inode, lines))
         where = folder or _shared_folder()
-        files = {bus: where / lock_name(bus) for bus in buses}
-        return tuple(
-            bus for bus, file in files.items() if file.exists() and file.stat().st_ino in held
-        )
+        taken = []
+        for bus in dict.fromkeys(buses):
+            file = where / lock_name(bus)
+            if file.exists() and file.stat().st_ino in locked_inodes:
+                taken.append(bus)
+        return tuple(taken)
     except (OSError, ValueError, IndexError):
         return ()
+
+
+def _inode(line: str) -> int:
+    """Return the inode of a line of /proc/locks: `1: FLOCK ADVISORY WRITE 7 08:01:42 0 EOF`."""
+    device_and_inode = line.split()[-3]
+    _, _, inode = device_and_inode.rpartition(":")
+    return int(inode)
 
 
 def require_untaken(buses: Iterable[AnyBus], folder: Path | None = None) -> None:
@@ -116,7 +125,9 @@ def lock_name(bus: AnyBus) -> str:
         parts += [_address(bus), str(bus.port)]
     elif bus.kind.is_of_process:
         parts.append(str(os.getpid()))
-    return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
+    escaped = [re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts]
+    name = "-".join(escaped)
+    return f"drivegain-{name}.lock"
 
 
 def _address(bus: AnyBus) -> str:
@@ -133,9 +144,9 @@ def _address(bus: AnyBus) -> str:
     for *_, where in found:
         address = ip_address(str(where[0]))
         # One of IPv4 within IPv6 (::ffff:10.0.0.7) is that of IPv4.
-        addresses.append(
-            (address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address
-        )
+        if isinstance(address, IPv6Address):
+            address = address.ipv4_mapped or address
+        addresses.append(address)
     address = min(addresses, key=lambda one: (one.version, str(one)))
     # Who connects to the unspecified address comes to this machine, as by a loopback address.
     if address.is_loopback or address.is_unspecified:

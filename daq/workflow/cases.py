@@ -15,7 +15,7 @@ from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
 from daq.workflow.diagnoses import fixed_gains_of, named_causes, nameplate_of
-from daq.workflow.fit import Fit, Reading, calibration_of, judged, refuse_effects
+from daq.workflow.fit import Fit, LogLoader, calibration_of, judged, refuse_effects
 from ident.calibration import Calibration, Parameter, PayloadMass, Source, factor_of
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System, require_distinct
@@ -89,7 +89,7 @@ def reduce_logs(
             others.
         UsageError: the cell declares effects.
     """
-    reading = Reading.of(logs, cell)
+    reading = LogLoader.of(logs, cell)
     refuse_effects(reading.cell, "--known, --cases")
     model = model_of(reading.cell)
     conditioning = reading.cell.conditioning

@@ -539,14 +539,14 @@ def drift_diagnosis(
     name = axes[placed.axis]
     match placed.effect:
         case ZeroOffset():
-            found = (
-                f"{_zero_text(placed.axis, name, drift.values, drift.deviations, model)} since "
-                "the calibration"
-            )
+            zero = _zero_text(placed.axis, name, drift.values, drift.deviations, model)
+            found = f"{zero} since the calibration"
             expected = "the zero of the calibration"
             remedy = "reference the axis again, or calibrate anew"
         case LatePosition():
-            size = f"{1e3 * drift.values[0]:+.2f} ± {1e3 * drift.deviations[0]:.2f} ms"
+            late_ms = 1e3 * drift.values[0]
+            std_ms = 1e3 * drift.deviations[0]
+            size = f"{late_ms:+.2f} ± {std_ms:.2f} ms"
             found = f"the position of {name} late by {size} more than in the calibration"
             expected = ONE_MOMENT
             remedy = "look for what delays this encoder alone"
@@ -674,14 +674,18 @@ def _zero_text(
 def _late_text(values: FloatArray, deviations: FloatArray) -> str:
     """By how much something is late or early, with σ."""
     late = "late" if values[0] > 0.0 else "early"
-    return f"{late} by {1e3 * abs(values[0]):.2f} ± {1e3 * deviations[0]:.2f} ms"
+    size_ms = 1e3 * abs(values[0])
+    std_ms = 1e3 * deviations[0]
+    return f"{late} by {size_ms:.2f} ± {std_ms:.2f} ms"
 
 
 def _turn_text(values: FloatArray, deviations: FloatArray) -> str:
     """Angle of a turn of gravity with σ."""
     angle = float(np.linalg.norm(values))
     std = float(np.linalg.norm(values * deviations)) / max(angle, 1e-12)
-    return f"{np.degrees(angle):.2f} ± {np.degrees(std):.2f}°"
+    angle_deg = np.degrees(angle)
+    std_deg = np.degrees(std)
+    return f"{angle_deg:.2f} ± {std_deg:.2f}°"
 
 
 def vector_text(vector: FloatArray) -> str:
@@ -689,7 +693,8 @@ def vector_text(vector: FloatArray) -> str:
     of gravity, a digit of the last place is 0.006°.
     """
     rounded = np.round(vector, 3) + 0.0  # no minus before a zero
-    return f"[{', '.join(f'{entry:.3f}' for entry in rounded)}]"
+    entries = ", ".join(f"{entry:.3f}" for entry in rounded)
+    return f"[{entries}]"
 
 
 WHY_HIDDEN = {
@@ -717,16 +722,16 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: R
     hidden: dict[ZeroHiddenBy, list[str]] = {}
     for axis in check.hidden_zeros:
         hidden.setdefault(zero_hidden_by(robot, axis), []).append(axes[axis])
-    parts = [
-        f"of {', '.join(hidden[cause])}: {WHY_HIDDEN[cause]}"
-        for cause in ZeroHiddenBy
-        if cause in hidden
-    ]
+    parts = []
+    for cause in ZeroHiddenBy:
+        if cause in hidden:
+            names = ", ".join(hidden[cause])
+            parts.append(f"of {names}: {WHY_HIDDEN[cause]}")
     if parts:
-        said.append(f"Zeros that are not seen here: {'; '.join(parts)}.")
+        causes = "; ".join(parts)
+        said.append(f"Zeros that are not seen here: {causes}.")
     if check.hidden_pairs:
-        pairs = ", ".join(
-            f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs
-        )
-        said.append(f"Not seen here where both zeros are off, one against the other: {pairs}.")
+        pairs = [f"{axes[first]} with {axes[second]}" for first, second in check.hidden_pairs]
+        listed = ", ".join(pairs)
+        said.append(f"Not seen here where both zeros are off, one against the other: {listed}.")
     return " ".join(said)

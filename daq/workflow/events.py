@@ -55,11 +55,13 @@ def notice_of(kind: EventKind, code: int, axis: str | None, text: str) -> EventN
     remedy = REMEDIES.get(kind, "")
     if kind is EventKind.EMCY:
         remedy = explain_error_code(code).remedy
+    if axis is not None:
+        text = re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text)
     return EventNotice(
         axis=axis,
         kind=kind.value,
         code=code,
-        text=text if axis is None else re.sub(rf"^{re.escape(axis)}( \(node \d+\))?: ", "", text),
+        text=text,
         remedy=remedy,
         alarm=kind in ALARMING,
     )

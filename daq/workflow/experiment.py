@@ -38,11 +38,15 @@ from ident.planning.limits import JointLimits
 def limits_of(cell: Cell) -> JointLimits:
     """Return the limits that a cell declares."""
     limits = [axis.limits for axis in cell.axes]
+    lower = [one.position[0] for one in limits]
+    upper = [one.position[1] for one in limits]
+    velocity = [one.velocity for one in limits]
+    acceleration = [one.acceleration for one in limits]
     return JointLimits(
-        lower=[one.position[0] for one in limits],
-        upper=[one.position[1] for one in limits],
-        velocity=[one.velocity for one in limits],
-        acceleration=[one.acceleration for one in limits],
+        lower=lower,
+        upper=upper,
+        velocity=velocity,
+        acceleration=acceleration,
     )
 
 
@@ -83,9 +87,10 @@ class CheckedScene:
             )
         lines = [shape, f"clearance: {1000 * scene.minimum_m:.0f} mm"]
         if self.together:
-            pairs = ", ".join(f"{first} and {second}" for first, second in self.together)
+            pairs = [f"{first} and {second}" for first, second in self.together]
+            listed = ", ".join(pairs)
             lines.append(
-                f"not checked against each other, as they touch in nearly every posture: {pairs}"
+                f"not checked against each other, as they touch in nearly every posture: {listed}"
             )
         if not scene.boxes and scene.workspace is None:
             lines.append(
@@ -104,46 +109,51 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         side = side_of_cube(mass_kg)
         axis = robot.joints[last].axis
         at = robot.mounting_m
+        begin = _point(at + side * axis)
+        end = _point(at + 2.0 * side * axis)
         capsules = (
             *capsules,
-            Capsule(PAYLOAD, last, _point(at + side * axis), _point(at + 2.0 * side * axis), side),
+            Capsule(PAYLOAD, last, begin, end, side),
         )
     links = [capsule.link for capsule in capsules]
     parents = [robot.joints[link].parent if link != BASE else None for link in links]
-    found = []
+    candidates = []
     for second in range(len(capsules)):
         for first in range(second):
-            if (
-                links[first] not in (links[second], parents[second])
-                and parents[first] != links[second]
-            ):
-                found.append((first, second))
-    candidates = tuple(found)
+            is_same = links[first] == links[second]
+            is_joined = links[first] == parents[second] or parents[first] == links[second]
+            if not is_same and not is_joined:
+                candidates.append((first, second))
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(
-        capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m
+        capsules,
+        tuple(candidates),
+        declared.obstacles,
+        declared.workspace,
+        confined,
+        declared.minimum_m,
     )
     limits = limits_of(cell)
-    postures = np.random.default_rng(0).uniform(
-        limits.lower, limits.upper, (POSTURES, len(cell.axes))
-    )
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
     # Of a guessed shape, a pair that never keeps the distance belongs together as one that always
     # touches does.
     is_guessed = [not declared.capsules or capsule.name == PAYLOAD for capsule in capsules]
-    margin_m = [0.5 * declared.minimum_m if guessed else 0.0 for guessed in is_guessed]
-    grown = [
-        replace(one, radius_m=one.radius_m + more_m)
-        for one, more_m in zip(capsules, margin_m, strict=True)
-    ]
-    apart = Checker(robot, replace(everything, capsules=tuple(grown))).apart(postures) > ALWAYS
-    pairs = tuple(pair for pair, kept in zip(candidates, apart, strict=True) if kept)
-    together = tuple(
-        (capsules[a].name, capsules[b].name)
-        for (a, b), kept in zip(candidates, apart, strict=True)
-        if not kept
-    )
-    scene = replace(everything, pairs=pairs)
-    return CheckedScene(Checker(robot, scene), not declared.capsules, together)
+    grown = []
+    for capsule, guessed in zip(capsules, is_guessed, strict=True):
+        margin_m = 0.5 * declared.minimum_m if guessed else 0.0
+        grown.append(replace(capsule, radius_m=capsule.radius_m + margin_m))
+    grown_scene = replace(everything, capsules=tuple(grown))
+    apart = Checker(robot, grown_scene).apart(postures) > ALWAYS
+    pairs = []
+    together = []
+    for (first, second), is_apart in zip(candidates, apart, strict=True):
+        if is_apart:
+            pairs.append((first, second))
+        else:
+            together.append((capsules[first].name, capsules[second].name))
+    scene = replace(everything, pairs=tuple(pairs))
+    return CheckedScene(Checker(robot, scene), not declared.capsules, tuple(together))
 
 
 def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
@@ -156,9 +166,8 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
     """
     if robot.is_constrained:
         return ()
-    radius = LINK_RADIUS * max(
-        sum(float(np.linalg.norm(joint.translation_m)) for joint in robot.joints), 0.1
-    )
+    lengths_m = [float(np.linalg.norm(joint.translation_m)) for joint in robot.joints]
+    radius = LINK_RADIUS * max(sum(lengths_m), 0.1)
     capsules = []
     for joint in robot.joints:
         length = float(np.linalg.norm(joint.translation_m))
@@ -210,14 +219,13 @@ class Experiment:
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
         motion = _joined(parts)
-        use = np.concatenate(
-            [self._use(path, time) for path, time in zip(paths, times, strict=True)], axis=1
-        )
+        uses = [self._use(path, time) for path, time in zip(paths, times, strict=True)]
+        use = np.concatenate(uses, axis=1)
         ends = np.cumsum([len(time) for time in times])
-        slices = tuple(
-            slice(end - len(time), end) for end, time in zip(ends.tolist(), times, strict=True)
-        )
-        return Excitation(motion, use), slices
+        slices = []
+        for end, time in zip(ends.tolist(), times, strict=True):
+            slices.append(slice(end - len(time), end))
+        return Excitation(motion, use), tuple(slices)
 
     def informations(self, paths: Sequence[Trapezoid], thinning: int = 1) -> list[FloatArray]:
         """Information of each move with everything that is mounted in turn,
@@ -227,10 +235,11 @@ class Experiment:
             return []
         excitation, slices = self.excitation(paths, thinning)
         whitened = self.design.whitened(excitation)
-        return [
-            thinning * self.design.information_of(whitened[:, :, part], self.mounted)
-            for part in slices
-        ]
+        informations = []
+        for part in slices:
+            information = self.design.information_of(whitened[:, :, part], self.mounted)
+            informations.append(thinning * information)
+        return informations
 
     def effort_shares(self, paths: Sequence[Trapezoid]) -> FloatArray:
         """Largest expected torque of each axis on each way, over its limit; shape (ways, n).
@@ -240,7 +249,8 @@ class Experiment:
         if not paths or not np.isfinite(self.effort).any():
             return np.zeros((len(paths), len(self.effort)))
         times = [_torque_times(path) for path in paths]
-        motion = _joined([path.at(time) for path, time in zip(paths, times, strict=True)])
+        motions = [path.at(time) for path, time in zip(paths, times, strict=True)]
+        motion = _joined(motions)
         shares = effort_shares(self.design.expectation, self.effort, motion, self.mounted)
         of_ways = shares.reshape(len(self.effort), len(paths), -1)
         return np.asarray(of_ways.max(axis=2).T)
@@ -253,17 +263,21 @@ class Experiment:
         # On a trapezoid a joint is slowest at the ends of a row's window.
         early = path.at(time_s - self.edge_s)[1].T
         late = path.at(time_s + self.edge_s)[1].T
-        standstill = np.array(self.cell.conditioning.standstill_rad_s or (0.0,) * len(early))[
-            :, None
-        ]
-        moving = np.minimum(np.abs(early), np.abs(late)) > standstill
-        turned = (
-            np.minimum(np.abs(train.direction @ early), np.abs(train.direction @ late)) > standstill
-        )
-        needed = (np.abs(train.to_motor) > 0) | (np.abs(train.direction) > 0)
-        use = np.stack(
-            [moving[needed[motor]].all(axis=0) & turned[motor] for motor in range(len(moving))]
-        )
+        declared_rad_s = self.cell.conditioning.standstill_rad_s or (0.0,) * len(early)
+        standstill = np.array(declared_rad_s)[:, None]
+        slowest = np.minimum(np.abs(early), np.abs(late))
+        moving = slowest > standstill
+        motor_early = np.abs(train.direction @ early)
+        motor_late = np.abs(train.direction @ late)
+        turned = np.minimum(motor_early, motor_late) > standstill
+        is_moved = np.abs(train.to_motor) > 0
+        is_loaded = np.abs(train.direction) > 0
+        needed = is_moved | is_loaded
+        uses = []
+        for motor, has_turned in enumerate(turned):
+            all_moving = moving[needed[motor]].all(axis=0)
+            uses.append(all_moving & has_turned)
+        use = np.stack(uses)
         if self.design.expectation.model.is_redundant:
             use &= use.all(axis=0)
         return use
@@ -281,10 +295,11 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     """
     found = [declared for declared in cell.payloads if payload in (None, declared.name)]
     if not found:
+        known = ", ".join(declared.name for declared in cell.payloads)
         raise ConfigurationInconsistent(
             f"payloads of cell {cell.name!r}",
             found="none" if payload is None else f"no payload {payload!r}",
-            expected=", ".join(declared.name for declared in cell.payloads) or "a weighed payload",
+            expected=known or "a weighed payload",
             remedy="gains show only beside a known mass: give a declared name, or weigh a body and "
             "declare it under `payloads`",
         )
@@ -298,10 +313,12 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         model, cell.urdf, gains, expected, limits, fast_motion
     )
     scene = scene_of(cell, model.robot, mounted.mass_kg)
+    source = "from the URDF" if from_urdf else "guessed"
+    noise_percent = 100 * NOISE_SHARE
     remarks = (
         f"payload: {mounted.name}, {mounted.mass_kg:g} kg",
-        f"masses of the links: {'from the URDF' if from_urdf else 'guessed'}",
-        f"noise: {100 * NOISE_SHARE:g} % of each motor's current at its torque limit, correlation "
+        f"masses of the links: {source}",
+        f"noise: {noise_percent:g} % of each motor's current at its torque limit, correlation "
         f"{LAG_ONE:g} from row to row",
         *scene.remarks,
     )
@@ -374,7 +391,8 @@ def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
     parts = []
     for start, end in pairwise(targets):
         path = synchronised(start, end, limits.velocity, limits.acceleration)
-        parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
+        shares = np.linspace(0.02, 0.98, 24)
+        parts.append(path.at(shares * path.duration_s))
     return _joined(parts)
 
 
@@ -389,7 +407,8 @@ def _allowed(
     """Positions of a closed chain that can be reached one after the other, shape (count, m)."""
     found = [checker.home]
     while len(found) <= count:
-        found.append(towards(checker, found[-1], rng.uniform(lower, upper), lower, upper))
+        posture = rng.uniform(lower, upper)
+        found.append(towards(checker, found[-1], posture, lower, upper))
     return np.array(found[1:])
 
 
@@ -435,9 +454,9 @@ def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
 
 def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
     """From the first target to the end of the last dwell [s]."""
-    return float(
-        sum(path.duration_s for path in paths_of(cell, moves)) + sum(move.dwell_s for move in moves)
-    )
+    motion_s = sum(path.duration_s for path in paths_of(cell, moves))
+    dwell_s = sum(move.dwell_s for move in moves)
+    return float(motion_s + dwell_s)
 
 
 SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
@@ -457,15 +476,14 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     checker = experiment.scene.checker
     limits = limits_of(cell)
     low, high = limits.targets()
-    sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
+    rng = np.random.default_rng(0)
+    sampled = rng.uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.is_constrained:
-        sampled = _allowed(checker, np.random.default_rng(0), low, high, EXTRA_POSTURES // 15)
+        rng = np.random.default_rng(0)
+        sampled = _allowed(checker, rng, low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
-    if checker.robot.is_constrained:
-        ends_of = _swing_of_chain
-    else:
-        ends_of = _swing
+    ends_of = _swing_of_chain if checker.robot.is_constrained else _swing
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
         """There and back in the first few postures in which that is clear."""
@@ -493,9 +511,11 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     for axis, (name, joint) in enumerate(zip(names, robot.axis_joints, strict=True)):
         # Distance of the link with the payload from the axis; of a prismatic one, from the axis'
         # own frame [m].
-        way = at.origin_m[robot.carrier + 1] - at.origin_m[joint + 1]
+        carrier_m = at.origin_m[robot.carrier + 1]
+        way = carrier_m - at.origin_m[joint + 1]
         if robot.joints[joint].kind is not JointKind.PRISMATIC:
-            way = np.cross(at.rotation[joint + 1] @ robot.joints[joint].axis, way)
+            axis_of_joint = at.rotation[joint + 1] @ robot.joints[joint].axis
+            way = np.cross(axis_of_joint, way)
         lever = np.linalg.norm(way, axis=1)
         stretched = clear[np.argsort(-lever, kind="stable")]
         folded = clear[np.argsort(lever, kind="stable")]

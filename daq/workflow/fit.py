@@ -158,10 +158,11 @@ class Fit:
     @property
     def recordings(self) -> Recordings:
         """The logs of the fit, for what is looked for in them."""
+        gains_fixed = self.identification.estimate.gains_fixed
         return Recordings(
             self.logs,
             self.read,
-            self.identification.estimate.gains_fixed,
+            gains_fixed,
             self.channels_as_wired,
             described=self.cell,
         )
@@ -197,7 +198,7 @@ class Undecided(Enum):
         return cls.JOIN if write else cls.LEFT_OUT
 
 
-class Reading:
+class LogLoader:
     """Logs of one cell, read one after the other, and their sources."""
 
     def __init__(
@@ -215,7 +216,7 @@ class Reading:
     @classmethod
     def of(
         cls, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED
-    ) -> Reading:
+    ) -> LogLoader:
         """Begin with the first log, whose cell is that of all unless another description is given.
 
         Raises:
@@ -239,10 +240,12 @@ class Reading:
             else:
                 run, cell = self._read(log)
             if cell.digest != self.cell.digest:
+                digest = cell.digest[:12]
+                expected_digest = self.cell.digest[:12]
                 raise LogsDiffer(
                     str(log),
-                    found=f"cell {cell.name!r}, configuration {cell.digest[:12]}",
-                    expected=f"cell {self.cell.name!r}, configuration {self.cell.digest[:12]}, as "
+                    found=f"cell {cell.name!r}, configuration {digest}",
+                    expected=f"cell {self.cell.name!r}, configuration {expected_digest}, as "
                     "in the first log",
                     remedy="fit logs of one cell and one configuration, or name the right one "
                     "with --cell",
@@ -251,9 +254,10 @@ class Reading:
             # By its samples: a file that was rewritten is the same recording still.
             content = sha256(run.position_rad.tobytes() + run.current_a.tobytes())
             if content in self._seen:
+                first_log = self._seen[content]
                 raise LogRepeated(
                     str(log),
-                    found=f"the same recording as {self._seen[content]}",
+                    found=f"the same recording as {first_log}",
                     expected="every recording once, in the fit or held out",
                     remedy="name other logs",
                 )
@@ -267,7 +271,8 @@ class Reading:
 
     def torque_slopes(self) -> tuple[TorqueSlope | None, ...]:
         """Slope of each axis's own torque over the runs of the fit; empty without such torques."""
-        return tuple(torque_slope(channels) for channels in zip(*self._torques, strict=True))
+        by_axis = zip(*self._torques, strict=True)
+        return tuple(torque_slope(channels) for channels in by_axis)
 
     def geometry(self, model: Model) -> GeometryFinding | None:
         """What the encoders of the runs of the fit say of the geometry of a model.
@@ -394,20 +399,22 @@ def fit(
     held_out = [Path(log) for log in holdout]
 
     def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
-        reading = Reading.of(used, cell, lossy)
+        reading = LogLoader.of(used, cell, lossy)
         declared = reading.cell
         effects = declared_effects(declared)
         if method is Method.IV:
             refuse_effects(declared, "--method iv")
         model = model_of(declared)
+        fixed_gains = nameplate_of(declared) if gains_fixed else None
+        needs_rows = keep_rows or bool(effects) or is_checked((*used, *unseen))
         result = identify(
             model,
             reading.runs(used, "fit"),
             declared.conditioning,
             holdout=reading.runs(unseen, "holdout"),
             method=method,
-            fixed_gains=nameplate_of(declared) if gains_fixed else None,
-            keep_rows=keep_rows or bool(effects) or is_checked((*used, *unseen)),
+            fixed_gains=fixed_gains,
+            keep_rows=needs_rows,
             judge=not effects,
             axes=declared.axis_names,
         )
@@ -451,7 +458,8 @@ def contradicting_log(logs: Sequence[Path], fit_of: Callable[[Sequence[Path]], F
             rest = fit_of([other for other in logs if other != log]).estimate
         except IdentificationError:
             continue
-        std = 100.0 * float(np.max(rest.gains_std / np.abs(rest.gains)))
+        shares = rest.gains_std / np.abs(rest.gains)
+        std = 100.0 * float(np.max(shares))
         return (
             f"without {log} they do (σ at most {std:.1f} %): was the payload of that run "
             "declared as it was?"
@@ -563,12 +571,13 @@ def _with_description_after_search(closed: Fit) -> Fit:
     # Gravity and hidden zeros stay those of the fit, and what it did not tell apart from a
     # correction that the search has made. Mistakes and their company are those of the final model.
     unclear = [alike for alike in description.alike if any(map(alike.contain, after.effects))]
+    alike = (*unclear, *beside.alike)
     kept = replace(
         beside,
         gravity=description.gravity,
         hidden_zeros=description.hidden_zeros,
         hidden_pairs=description.hidden_pairs,
-        alike=(*unclear, *beside.alike),
+        alike=alike,
     )
     return replace(closed, description=kept)
 
@@ -582,7 +591,8 @@ def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     found: list[Diagnosis] = []
     has_searched = any(not step.declared for step in fitted.steps)
     if has_searched:
-        found += correction_diagnoses(fitted.steps[-1].after, fitted.cell, fitted.description)
+        last = fitted.steps[-1]
+        found += correction_diagnoses(last.after, fitted.cell, fitted.description)
         found += open_correction_diagnoses(fitted.steps, fitted.cell, fitted.description)
     if fitted.description is not None:
         found += check_diagnoses(fitted.description, fitted.cell, fitted.identification.model)
@@ -720,14 +730,12 @@ def _with_uncertain_geometry(found: Fit) -> Fit:
     if covariance is None:
         return found
     unknowns = found.identification.estimate.unknowns
-    return replace(
-        found,
-        identification=with_geometry_covariance(found.identification, covariance),
-        steps=tuple(
-            replace(step, after=evidence_with_geometry(step.after, covariance, unknowns))
-            for step in found.steps
-        ),
-    )
+    identification = with_geometry_covariance(found.identification, covariance)
+    steps = []
+    for step in found.steps:
+        evidence = evidence_with_geometry(step.after, covariance, unknowns)
+        steps.append(replace(step, after=evidence))
+    return replace(found, identification=identification, steps=tuple(steps))
 
 
 def _with_geometry_of_encoders(start: Fit) -> Fit:
@@ -741,11 +749,14 @@ def _with_geometry_of_encoders(start: Fit) -> Fit:
     model = model_of(cell)
     effects = declared_effects(cell)
     described = start.identification.estimate
+    fitted_runs = (start.read(log)[0] for log in start.logs)
+    holdout_runs = (start.read(log)[0] for log in start.holdout)
+    changed_model = model_with_geometry(model, finding.changes)
     result = identify(
-        model_with_geometry(model, finding.changes),
-        (start.read(log)[0] for log in start.logs),
+        changed_model,
+        fitted_runs,
         cell.conditioning,
-        holdout=(start.read(log)[0] for log in start.holdout),
+        holdout=holdout_runs,
         method=described.method,
         fixed_gains=fixed_gains_of(described),
         keep_rows=True,
@@ -755,11 +766,12 @@ def _with_geometry_of_encoders(start: Fit) -> Fit:
     covariance = geometry_covariance(result, model, finding)
     steps = with_effects_of_cell(result, effects, cell.place_names)
     last = steps[-1].after.identification if steps else result
+    paper = None if described.gains_fixed else tls(last.system)
     return replace(
         start,
         identification=result,
         steps=steps,
-        paper=None if described.gains_fixed else tls(last.system),
+        paper=paper,
         geometry_covariance=covariance,
         description=None,  # it was tested in the described geometry
     )
@@ -784,31 +796,30 @@ def check_holdout(fitted: Fit) -> None:
         before = declared[-1]
     else:
         before = without_effects(after, fitted.identification.estimate)
-    if after.holdout is None or after.effects == before.effects:
+    if before.holdout is None or after.holdout is None or after.effects == before.effects:
         return
     change = compare_on_holdout(before, before, after)
     harm = change.harm("held-out runs")
     if not harm:
         return
     weights_nm_a = before.estimate.gains
-    first, last = (
-        error_on(rows, one.estimate).relative(weights_nm_a).total
-        for one in (before, after)
-        if (rows := one.holdout) is not None
-    )
+    first = error_on(before.holdout, before.estimate).relative(weights_nm_a).total
+    last = error_on(after.holdout, after.estimate).relative(weights_nm_a).total
     unseen = after.datasets[len(after.fit_runs) :]
     cold = [one.name for one in unseen if one.temperature_c is None]
-    needed = cold and any(
-        placed.effect.name == TemperatureFriction.name for placed in after.effects
-    )
+    effect_names = {placed.effect.name for placed in after.effects}
+    added = after.effects[after.declared :]
+    names = [placed.name_among(fitted.cell.place_names) for placed in added]
+    moves = change.total.moves
+    found = f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
+    if cold and TemperatureFriction.name in effect_names:
+        runs = ", ".join(cold)
+        found += f"; {runs} has no temperature, on which an effect depends"
     raise EffectsRefuted(
-        ", ".join(
-            placed.name_among(fitted.cell.place_names) for placed in after.effects[after.declared :]
-        ),
-        found=f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
-        + (f"; {', '.join(cold)} has no temperature, on which an effect depends" if needed else ""),
-        expected=f"no rise by more than its noise over their {change.total.moves} independent "
-        f"blocks of moves; {harm}",
+        ", ".join(names),
+        found=found,
+        expected=f"no rise by more than its noise over their {moves} independent blocks of moves; "
+        f"{harm}",
         remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record "
         "more runs for the fit (or pass --accept-worse-holdout to `drivegain residual`)",
     )
@@ -827,12 +838,14 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
     influences = (
         one.weighed_to(tolerance_kg.get(one.payload, 0.0)) for one in predicting.payload_mass
     )
+    nameplate_error = _nameplate_error(fitted)
+    created_text = created.isoformat(timespec="seconds")
     return replace(
         predicting,
         payload_mass=tuple(influences),
-        created=created.isoformat(timespec="seconds"),
+        created=created_text,
         software=software(),
-        nameplate_holdout_error_percent=_nameplate_error(fitted),
+        nameplate_holdout_error_percent=nameplate_error,
         diagnoses=fitted.diagnoses,
     )
 
@@ -840,20 +853,23 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
 def _calibration(fitted: Fit) -> Calibration:
     """Make what a calibration predicts with."""
     cell = fitted.cell
+    nameplates = [axis.nameplate_gain for axis in cell.axes]
+    units = [axis.gain_unit for axis in cell.axes]
     found = identified_calibration(
         fitted.identification,
         cell.axis_names,
-        [axis.nameplate_gain for axis in cell.axes],
-        units=[axis.gain_unit for axis in cell.axes],
+        nameplates,
+        units=units,
         robot=cell.name,
         steps=fitted.steps,
     )
+    misfit = encoder_misfit_of(fitted.geometry, cell, applied=fitted.is_corrected)
     return replace(
         with_described(found, cell),
         sources=fitted.sources,
         configuration_sha256=cell.digest,
         recording_configuration_sha256=cell.recording_digest,
-        encoder_misfit=encoder_misfit_of(fitted.geometry, cell, applied=fitted.is_corrected),
+        encoder_misfit=misfit,
         robot=calibrated_robot(cell),
     )
 
@@ -875,10 +891,12 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     except (IdentificationError, np.linalg.LinAlgError):
         return None
     axes = held.relative_error(unseen).axes
-    gains = np.concatenate((final.estimate.gains, np.zeros(len(held.parameters) + 1)))
+    not_gains = np.zeros(len(held.parameters) + 1)
+    gains = np.concatenate((final.estimate.gains, not_gains))
     size = unseen.joints.square_sum(gains)
     moved = size > 0.0
-    left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
+    share = np.array(axes) / 100.0
+    left = np.where(moved, (share) ** 2 * size, 0.0)
     return RelativeError(axes, of_squares(size, left).total)
 
 
@@ -898,9 +916,9 @@ def declared_effects(cell: Cell) -> tuple[PlacedEffect, ...]:
     for declared in cell.effects:
         found = place_effect(declared.name, declared.axis, declared.settings, robot)
         if isinstance(found, Fault):
+            place = cell.place_names[declared.axis]
             raise ConfigurationInconsistent(
-                f"effects of cell {cell.name!r}: {declared.name} on "
-                f"{cell.place_names[declared.axis]}",
+                f"effects of cell {cell.name!r}: {declared.name} on {place}",
                 found=found.found,
                 expected=found.expected,
                 remedy="correct the cell file",
@@ -916,9 +934,8 @@ def refuse_effects(cell: Cell, option: str) -> None:
         UsageError: the cell declares effects.
     """
     if cell.effects:
-        names = ", ".join(
-            f"{effect.name} on {cell.place_names[effect.axis]}" for effect in cell.effects
-        )
+        placed = [f"{effect.name} on {cell.place_names[effect.axis]}" for effect in cell.effects]
+        names = ", ".join(placed)
         raise UsageError(
             option,
             found=f"a cell that declares effects: {names}",
@@ -942,16 +959,19 @@ def with_effects_of_cell(
         return ()
     estimate = start.estimate
     by_ml = by_likelihood(estimate, start.system)
+    evidence = replace(gather(start), estimate=by_ml)
+    rng = np.random.default_rng(BOOTSTRAP_SEED)
     steps = with_declared(
-        replace(gather(start), estimate=by_ml),
+        evidence,
         effects,
-        np.random.default_rng(BOOTSTRAP_SEED),
+        rng,
         axes=axes,
     )
     after = steps[-1].after
     if estimate.method is not Method.ML:
         after = with_declared_again(after, estimate)
-        steps = (*steps[:-1], replace(steps[-1], after=after))
+        last = replace(steps[-1], after=after)
+        steps = (*steps[:-1], last)
     error = after.estimate.relative_error(after.identification.system)
     require_plausible(after.estimate, error, axes[: len(estimate.gains)])
     return steps

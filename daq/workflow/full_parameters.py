@@ -4,6 +4,7 @@ the inertias of a URDF, and how far they may be off.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterator
 
@@ -67,18 +68,18 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     of_links[final.model.link_columns] = links
     gains: tuple[GainWithPrior, ...] = ()
     if not final.estimate.gains_fixed:
-        gains = tuple(
-            GainWithPrior(axis, float(value), float(std))
-            for axis, value, std in zip(cell.axis_names, found.gains, found.gains_std, strict=True)
-        )
+        values = zip(cell.axis_names, found.gains.tolist(), found.gains_std.tolist(), strict=True)
+        gains = tuple(GainWithPrior(axis, value, std) for axis, value, std in values)
     check = found.check
     is_mass_seen = bool(np.isfinite(check.mass_ratio_std))
     joints = [joint.name for joint in final.model.robot.joints]
+    digest = hashlib.sha256(urdf.encode()).hexdigest()
+    parameters = tuple(_parameters(found, of_links))
     return FullSet(
         urdf=name,
-        urdf_sha256=hashlib.sha256(urdf.encode()).hexdigest(),
+        urdf_sha256=digest,
         tolerance=tolerance,
-        parameters=tuple(_parameters(found, of_links)),
+        parameters=parameters,
         gains=gains,
         bounded=found.bounded,
         chi_square=check.chi_square,
@@ -124,7 +125,9 @@ def contradictions(check: PriorCheck, joints: list[str]) -> Iterator[str]:
             f"by the data, the links together are {_weight(check.mass_ratio, check.mass_ratio_std)}"
         )
     for link in check.wrong_links:
-        weight = _weight(float(check.link_ratios[link]), float(check.link_ratio_stds[link]))
+        ratio = float(check.link_ratios[link])
+        std = float(check.link_ratio_stds[link])
+        weight = _weight(ratio, std)
         yield f"by the data, the link of joint {joints[link]} is {weight}"
     if check.is_misfit:
         yield (
@@ -145,15 +148,18 @@ def _weight(ratio: float, std: float) -> str:
 def _parameters(found: FullParameters, of_links: FloatArray) -> Iterator[FullParameter]:
     for number, name in enumerate(found.names):
         has_prior = bool(np.isfinite(of_links[number]))
+        prior = float(of_links[number]) if has_prior else None
+        prior_std = float(found.prior_std[number]) if has_prior else None
+        prior_share = float(np.clip(found.prior_share[number], 0.0, 1.0))
         yield FullParameter(
             name=name,
             value=float(found.standard[number]),
             std=float(found.standard_std[number]),
             unit=found.units[number],
             basis=found.basis[number].value,
-            prior_share=float(np.clip(found.prior_share[number], 0.0, 1.0)),
-            prior=float(of_links[number]) if has_prior else None,
-            prior_std=float(found.prior_std[number]) if has_prior else None,
+            prior_share=prior_share,
+            prior=prior,
+            prior_std=prior_std,
         )
 
 
@@ -165,30 +171,31 @@ def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> Fl
         raise ConfigurationInconsistent(
             name, found=str(error), expected="a URDF", remedy="give another file as --prior"
         ) from error
-    differences = [
-        mine.name
-        for mine, other in zip(joints, found.joints, strict=False)
-        if not _is_same(mine, other)
-    ]
+    differences = []
+    for mine, other in zip(joints, found.joints, strict=False):
+        if not _is_same(mine, other):
+            differences.append(mine.name)
     if len(joints) != len(found.joints):
         differences = [f"{len(found.joints)} moving joints"]
     if differences:
+        listed = ", ".join(differences)
+        joint_names = ", ".join(joint.name for joint in joints)
         raise ConfigurationInconsistent(
             name,
-            found=f"another robot: {', '.join(differences)}",
+            found=f"another robot: {listed}",
             expected=f"the {len(joints)} joints of cell {cell.name!r} at the same places, "
-            f"{', '.join(joint.name for joint in joints)}",
+            f"{joint_names}",
             remedy="give the URDF of this robot, with the inertias of its CAD model",
         )
-    without = [
-        joint.name
-        for joint, body in zip(joints, found.bodies, strict=True)
-        if not _is_body(body.mass_kg, body.inertia_kg_m2)
-    ]
+    without = []
+    for joint, body in zip(joints, found.bodies, strict=True):
+        if not _is_body(body.mass_kg, body.inertia_kg_m2):
+            without.append(joint.name)
     if without:
+        names = ", ".join(without)
         raise UsageError(
             name,
-            found=f"no possible inertia for the links of {', '.join(without)}",
+            found=f"no possible inertia for the links of {names}",
             expected="a positive mass and an inertia with the triangle inequality for each "
             "moving link",
             remedy="give a URDF with the inertias of the CAD model as --prior",
@@ -199,17 +206,17 @@ def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> Fl
 def _is_same(mine: Joint, other: Joint) -> bool:
     if mine.kind is not other.kind or mine.parent != other.parent:
         return False
-    places = (
-        (mine.rotation, other.rotation),
-        (mine.translation_m, other.translation_m),
-        (mine.axis, other.axis),
-    )
-    return all(np.allclose(one, another, rtol=0.0, atol=_SAME_PLACE) for one, another in places)
+    same_place = functools.partial(np.allclose, rtol=0.0, atol=_SAME_PLACE)
+    if not same_place(mine.rotation, other.rotation):
+        return False
+    if not same_place(mine.translation_m, other.translation_m):
+        return False
+    return same_place(mine.axis, other.axis)
 
 
 def _is_body(mass_kg: float, inertia_kg_m2: FloatArray) -> bool:
     """Whether mass and inertia about the centre of mass are those of a body,
     one that is not flat or thin.
     """
-    moments = np.linalg.eigvalsh(inertia_kg_m2)
-    return mass_kg > 0.0 and float(moments[0] + moments[1]) > float(moments[2])
+    smallest, middle, largest = np.linalg.eigvalsh(inertia_kg_m2).tolist()
+    return mass_kg > 0.0 and smallest + middle > largest

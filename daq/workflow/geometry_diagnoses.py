@@ -78,21 +78,26 @@ def geometry_diagnoses(
         return
     texts = [_correction_text(one, cell) for one in finding.causes]
     remedies = [_remedy(one, cell) for one in finding.causes]
-    several = len(finding.causes) > 1
-    ambiguous = ""
+    if len(finding.causes) > 1:
+        name = SEVERAL
+        explains = "explain together"
+    else:
+        name = NAMES[finding.causes[0].parameter.kind]
+        explains = "explains alone"
+    causes = " and ".join(texts)
+    found = f"{misfit}, which {causes} {explains}"
     if finding.alternatives:
-        others = [
-            _explanation_text(other, cell) for other in finding.alternatives[:_SHOWN_ALTERNATIVES]
-        ]
-        ambiguous = f" (not distinguishable from {'; '.join(others)})"
+        alternatives = finding.alternatives[:_SHOWN_ALTERNATIVES]
+        others = "; ".join(_explanation_text(other, cell) for other in alternatives)
+        found += f" (not distinguishable from {others})"
+    correct = ", and ".join(remedies)
     yield Diagnosis(
-        name=SEVERAL if several else NAMES[finding.causes[0].parameter.kind],
+        name=name,
         runs=(),
         axes=tuple(_axes_of(finding.causes, cell)),
-        found=f"{misfit}, which {' and '.join(texts)} "
-        f"{'explain together' if several else 'explains alone'}{ambiguous}",
+        found=found,
         expected=expected,
-        remedy=f"{', and '.join(remedies)}; {used}",
+        remedy=f"{correct}; {used}",
     )
 
 
@@ -106,7 +111,10 @@ def _misfit_unit(model: Model) -> str:
 
 def misfit_text(misfit: float, unit: str) -> str:
     """Write a misfit [unit] in thousandths."""
-    return f"{1e3 * misfit:.2g} {'mrad' if unit == ANGLE else f'thousandths ({unit})'}"
+    thousandths = f"{1e3 * misfit:.2g}"
+    if unit == ANGLE:
+        return f"{thousandths} mrad"
+    return f"{thousandths} thousandths ({unit})"
 
 
 def _axes_of(corrections: Sequence[GeometryEstimate], cell: Cell) -> Iterator[str]:
@@ -136,9 +144,7 @@ def _explanation_text(corrections: Sequence[GeometryEstimate], cell: Cell) -> st
 
 
 def _correction_text(one: GeometryEstimate, cell: Cell) -> str:
-    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003° (to be added to its
-    position)`.
-    """
+    """Say how far a number is off: `the zero of M2 off by -0.102 ± 0.003°`."""
     match one.parameter.kind:
         case GeometryKind.ZERO:
             axis = _axis_of(one.parameter, cell)

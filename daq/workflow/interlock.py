@@ -35,11 +35,10 @@ class Finished:
     said: str  #: the end of what it said, or why it did not run
 
     def __str__(self) -> str:
-        if self.code is None:
-            ended = "no exit code"
-        else:
-            ended = f"exit code {self.code}"
-        return f"{ended}{f' ({self.said})' if self.said else ''}"
+        ended = "no exit code" if self.code is None else f"exit code {self.code}"
+        if not self.said:
+            return ended
+        return f"{ended} ({self.said})"
 
 
 #: Runs a command with further arguments in a folder
@@ -74,9 +73,8 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
             if isinstance(error, subprocess.TimeoutExpired):
                 return Finished(None, f"not ended within {command.timeout_s:g} s")
             raise
-    return Finished(
-        process.returncode, said.decode("utf-8", errors="replace").strip()[-MAX_OUTPUT_CHARACTERS:]
-    )
+    text = said.decode("utf-8", errors="replace").strip()
+    return Finished(process.returncode, text[-MAX_OUTPUT_CHARACTERS:])
 
 
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:

@@ -17,6 +17,7 @@ and as large for slow moves as for fast ones.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -91,36 +92,39 @@ class Recent:
         """Take the newest rows."""
         new = [column[np.isfinite(column)] for column in rows.residual.T]
         old = self._moving or [np.zeros(0)] * len(new)
-        self._moving = [np.concatenate(pair)[-self._kept :] for pair in zip(old, new, strict=True)]
+        all_moving = map(np.concatenate, zip(old, new, strict=True))
+        self._moving = [moving[-self._kept :] for moving in all_moving]
         self._last = rows
 
     def axes(self) -> list[RecentCurrent]:
         """Return the current of each motor; empty without rows."""
         if self._last is None:
             return []
-        found = []
-        for predicted, left, band, moving in zip(
-            self._last.predicted[-1],
-            self._last.residual[-1],
-            self._last.band,
-            self._moving,
-            strict=True,
-        ):
+        currents = []
+        for index, moving in enumerate(self._moving):
+            predicted = float(self._last.predicted[-1][index])
+            residual = float(self._last.residual[-1][index])
+            band = float(self._last.band[index])
+            share = 0.0
+            residual_rms = None
             if len(moving):
                 share = float(np.mean(np.abs(moving) > band))
-            else:
-                share = 0.0
-            found.append(
-                RecentCurrent(
-                    measured=float(predicted + left) if np.isfinite(left) else None,
-                    predicted=float(predicted) if np.isfinite(predicted) else None,
-                    band=float(band) if np.isfinite(band) else None,
-                    residual_rms=float(np.sqrt(np.mean(moving**2))) if len(moving) else None,
-                    outside_share=share,
-                    conspicuous=share > 0.5 and len(moving) >= self._least,
-                )
+                residual_rms = float(np.sqrt(np.mean(moving**2)))
+            current = RecentCurrent(
+                measured=_finite(predicted + residual),
+                predicted=_finite(predicted),
+                band=_finite(band),
+                residual_rms=residual_rms,
+                outside_share=share,
+                conspicuous=share > 0.5 and len(moving) >= self._least,
             )
-        return found
+            currents.append(current)
+        return currents
+
+
+def _finite(value: float) -> float | None:
+    """Return a number, None for one that is unknown (NaN or infinite)."""
+    return value if math.isfinite(value) else None
 
 
 class Predictor:
@@ -172,29 +176,35 @@ class Predictor:
         Raises:
             IdentificationError: the calibration cannot predict this motion.
         """
-        edges = [0, *(np.flatnonzero(np.diff(cycle) != 1) + 1).tolist(), len(cycle)]
-        parts = [
-            self._take(int(cycle[begin]), position_rad[begin:end], current[begin:end])
-            for begin, end in pairwise(edges)
-            if end > begin
-        ]
-        return [part for part in parts if part is not None]
+        gaps = np.flatnonzero(np.diff(cycle) != 1) + 1
+        edges = [0, *gaps.tolist(), len(cycle)]
+        complete = []
+        for begin, end in pairwise(edges):
+            if end <= begin:
+                continue
+            rows = self._take(int(cycle[begin]), position_rad[begin:end], current[begin:end])
+            if rows is not None:
+                complete.append(rows)
+        return complete
 
     def _take(
         self, cycle: int, position_rad: FloatArray, current: FloatArray
     ) -> PredictedRows | None:
-        if cycle != self._cycle + len(self._position) or not len(self._position):
+        following = self._cycle + len(self._position)
+        if cycle != following or not len(self._position):
             self._cycle = cycle
             self._position = position_rad
             self._current = current
         else:
             self._position = np.concatenate((self._position, position_rad))
             self._current = np.concatenate((self._current, current))
-        if self.problem or len(self._position) - 2 - 2 * self._margin < self._step:
+        usable = len(self._position) - 2 - 2 * self._margin
+        if self.problem or usable < self._step:
             return None
         found = self._predict()
         # The next window begins so that its first whole row follows the last one of this.
-        done = found.cycle[-1] + self._filter.factor - self._cycle - 1 - self._margin
+        next_row = found.cycle[-1] + self._filter.factor
+        done = next_row - self._cycle - 1 - self._margin
         self._cycle += done
         self._position = self._position[done:]
         self._current = self._current[done:]
@@ -210,21 +220,21 @@ class Predictor:
         # A recorded motion: what the calibration corrects of recordings, as a late position, is
         # wrong with it too.
         data = replace(planned(motion, rate_hz, self._payload), is_planned=False)
-        predicted = self._filter(predict_current(self._calibration, self._model, data).T)
-        measured = self._filter(
-            measured_current(self._calibration, self._model, self._current[1:-1], motion).T
-        )
-        centres = self._filter.centres(position.shape[1])
-        whole = (centres >= self._margin) & (centres < position.shape[1] - self._margin)
+        current = self._current[1:-1]
+        predicted_a = predict_current(self._calibration, self._model, data)
+        measured_a = measured_current(self._calibration, self._model, current, motion)
+        predicted = self._filter(predicted_a.T)
+        measured = self._filter(measured_a.T)
+        count = position.shape[1]
+        centres = self._filter.centres(count)
+        whole = (centres >= self._margin) & (centres < count - self._margin)
         moving, motor_moving = moving_samples(velocity, self._still, self._model.drive_train)
         data = replace(data, moving=moving.T, motor_moving=motor_moving.T)
-        still = ~row_masks(self._model, data, settings)[1][:, whole]
-        predicted = predicted[:, whole]
-        measured = measured[:, whole]
-        predicted = np.where(still, np.nan, predicted)
-        return PredictedRows(
-            self._cycle + 1 + centres[whole], predicted.T, (measured - predicted).T, self._band
-        )
+        _, use = row_masks(self._model, data, settings)
+        predicted = np.where(use[:, whole], predicted[:, whole], np.nan)
+        residual = measured[:, whole] - predicted
+        cycle = self._cycle + 1 + centres[whole]
+        return PredictedRows(cycle, predicted.T, residual.T, self._band)
 
 
 def predictor_of(
@@ -233,9 +243,11 @@ def predictor_of(
     """Return the predictor of a run, and why it predicts nothing, empty if it does."""
     if run.axes != cell.axis_names:
         return None, "no prediction: the run has other axes than the cell file"
-    payload = next((one.payload for one in cell.payloads if one.name == run.payload), None)
+    payloads = {declared.name: declared.payload for declared in reversed(cell.payloads)}
+    payload = None if run.payload is None else payloads.get(run.payload)
     try:
-        if run.rate_hz < 2.0 * (passed_hz := conditioning_of(calibration).position_cutoff_hz):
+        passed_hz = conditioning_of(calibration).position_cutoff_hz
+        if run.rate_hz < 2.0 * passed_hz:
             return None, (
                 f"no prediction: {run.rate_hz:.3g} positions a second are too few for velocity and "
                 f"acceleration; the fit's filter passes {passed_hz:g} Hz"

@@ -136,11 +136,12 @@ class CellWatch:
         loads = zip(self._cell.buses, bus_loads_percent(self._cell, reading), strict=True)
         self._feed.measured({bus.name: load / 100.0 for bus, load in loads})
         self._predict()
+        alarms_and_events = sorted((*self._alarms, *self._events), key=lambda event: event.time_ns)
         return WatchedCell(
             reading,
             joint_positions(self._cell, reading),
             tuple(self._ampere),
-            sorted((*self._alarms, *self._events), key=lambda event: event.time_ns),
+            alarms_and_events,
             faults=self._faults(),
             recorder=recorder,
             prediction=self._prediction(),
@@ -148,7 +149,8 @@ class CellWatch:
 
     def _take(self, sample: Sample) -> None:
         self._samples.append(sample)
-        self._cycles = range(self._cycles.start if self._count else sample.cycle, sample.cycle + 1)
+        first = self._cycles.start if self._count else sample.cycle
+        self._cycles = range(first, sample.cycle + 1)
         self._count += 1
         for axis in range(len(self._missing)):
             self._missing[axis] += sample.missing >> axis & 1
@@ -203,11 +205,12 @@ class CellWatch:
             self._feed.event(CellEvent(time.time_ns(), axis, EventKind.EMCY, code, text))
 
     def _faults(self) -> dict[str, ErrorCode]:
-        return {
-            self._cell.axis_names[axis]: explain_error_code(code)
-            for axis, code in self._codes.items()
-            if code
-        }
+        faults = {}
+        for axis, code in self._codes.items():
+            if code:
+                name = self._cell.axis_names[axis]
+                faults[name] = explain_error_code(code)
+        return faults
 
     def _follow(self, reading: CellReading, recorder: bool) -> None:
         """Begin anew where the source of the samples has changed."""
@@ -234,11 +237,11 @@ class CellWatch:
             self._samples.clear()  # they are of another rate
         self._source = source
         try:
-            self._begin(
-                self._own_facts(rate_hz or 0.0)
-                if run is None
-                else replace(run, log=None, moves=0, bus_load={})
-            )
+            if run is None:
+                facts = self._own_facts(rate_hz or 0.0)
+            else:
+                facts = replace(run, log=None, moves=0, bus_load={})
+            self._begin(facts)
         except LogIncomplete as error:
             self._facts = None
             self._remark = str(error)
@@ -256,31 +259,27 @@ class CellWatch:
         before_hz = self._sync_hz
         self._sync_hz = reading.sync_hz
         counting_hz = 2.0 / reading.seconds  # error of a count of SYNCs
-        known = self._source
-        if known is None or known.reading is not reading.source:
-            known_hz = None
-        else:
-            known_hz = known.rate_hz
-        if (
-            known_hz is not None
-            and abs(reading.sync_hz - known_hz) < CHANGED_RATE * known_hz + counting_hz
-        ):
-            return known_hz
-        if (
-            before_hz == 0.0
-            or abs(reading.sync_hz - before_hz) > SAME_RATE * before_hz + counting_hz
-        ):
+        known_hz = None
+        if self._source is not None and self._source.reading is reading.source:
+            known_hz = self._source.rate_hz
+        if known_hz is not None:
+            change_hz = abs(reading.sync_hz - known_hz)
+            if change_hz < CHANGED_RATE * known_hz + counting_hz:
+                return known_hz
+        change_hz = abs(reading.sync_hz - before_hz)
+        if before_hz == 0.0 or change_hz > SAME_RATE * before_hz + counting_hz:
             return None
-        same = abs(reading.sync_hz - declared_hz) < SAME_RATE * declared_hz + counting_hz
-        return declared_hz if same else reading.sync_hz
+        difference_hz = abs(reading.sync_hz - declared_hz)
+        if difference_hz < SAME_RATE * declared_hz + counting_hz:
+            return declared_hz
+        return reading.sync_hz
 
     def _own_facts(self, rate_hz: float) -> RunFacts:
         """Facts of a run that no recorder names."""
         units = (nan if ampere is None else ampere for ampere in self._ampere)
         answers = zip(self._cell.axis_names, units, strict=True)
-        scale = scaling(
-            self._cell, Readback(tuple(AxisReadback(name, unit) for name, unit in answers))
-        )
+        axes = tuple(AxisReadback(name, unit) for name, unit in answers)
+        scale = scaling(self._cell, Readback(axes))
         return RunFacts(
             run_id="monitor",
             log=None,
@@ -316,9 +315,8 @@ class CellWatch:
                 self._recent = Recent(self._predictor.rows_hz)
 
     def _statistics(self) -> RunStatistics:
-        return RunStatistics(
-            self._count, len(self._cycles) - self._count, tuple(self._missing), valid=True
-        )
+        lost = len(self._cycles) - self._count
+        return RunStatistics(self._count, lost, tuple(self._missing), valid=True)
 
     def _predict(self) -> None:
         """Take the samples of a reading."""
@@ -327,14 +325,12 @@ class CellWatch:
         if self._predictor is None or self._recent is None or self._facts is None or not whole:
             return
         scale = self._facts.scaling
-        position = scale.joint_position(
-            np.array([sample.position_counts for sample in whole], dtype=np.int64)
-        )
+        counts = np.array([sample.position_counts for sample in whole], dtype=np.int64)
+        position = scale.joint_position(counts)
         current = np.array([sample.current_raw for sample in whole]) * scale.current_per_unit
         try:
-            for rows in self._predictor.take(
-                np.array([sample.cycle for sample in whole]), position, current
-            ):
+            cycles = np.array([sample.cycle for sample in whole])
+            for rows in self._predictor.take(cycles, position, current):
                 self._recent.add(rows)
         except IdentificationError as error:
             self._predictor = None
@@ -343,24 +339,25 @@ class CellWatch:
     def _prediction(self) -> CellPrediction | None:
         if self._calibration is None:
             return None
-        return CellPrediction(
-            payload=self._payload if self._facts is None else self._facts.payload,
-            remark=self._remark,
-            axes=() if self._recent is None or self._facts is None else self._recent.axes(),
-        )
+        if self._facts is None:
+            return CellPrediction(payload=self._payload, remark=self._remark, axes=())
+        axes = () if self._recent is None else self._recent.axes()
+        return CellPrediction(payload=self._facts.payload, remark=self._remark, axes=axes)
 
 
 def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
     """Position of each joint [rad or m], None where a motor that moves it is unknown."""
-    rad_per_count = np.array(
-        [2.0 * np.pi / (axis.counts_per_revolution or np.inf) for axis in cell.axes]
-    )
-    unknown = np.array([axis.position_counts is None for axis in reading.axes]) | (
-        rad_per_count == 0.0
-    )
+    counts_per_turn = np.array([axis.counts_per_revolution or np.inf for axis in cell.axes])
+    rad_per_count = 2.0 * np.pi / counts_per_turn
+    is_unknown = [axis.position_counts is None for axis in reading.axes]
+    unknown = np.array(is_unknown) | (rad_per_count == 0.0)
     to_joint = np.linalg.inv(cell.ratio).astype(np.float64)
     offset = np.array([axis.zero_offset_rad for axis in cell.axes])
     scale = SiScaling(rad_per_count, to_joint, offset, current_per_unit=np.full(len(offset), nan))
-    joint = scale.joint_position(np.array([axis.position_counts or 0 for axis in reading.axes]))
+    counts = [axis.position_counts or 0 for axis in reading.axes]
+    joint = scale.joint_position(np.array(counts))
     known = scale.joints_known(~unknown)
-    return [float(value) if shown else None for shown, value in zip(known, joint, strict=True)]
+    positions: list[float | None] = []
+    for is_known, position in zip(known, joint, strict=True):
+        positions.append(float(position) if is_known else None)
+    return positions

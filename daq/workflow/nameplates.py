@@ -51,15 +51,15 @@ def check_controller(cell_file: Path, cell: Cell) -> None:
     if controller is None or file is None:
         return
     try:
-        numbers = decode_document(read_controller_file(file), str(file), controller.format).locate(
-            controller.keys
-        )
+        content = read_controller_file(file)
+        document = decode_document(content, str(file), controller.format)
+        numbers = document.locate(controller.keys)
     except ControllerUnfit:
         return
-    current_gains = [
-        Reference(number.value / factor, "the current gain", f"{file.name}, line {number.line}")
-        for number, factor in zip(numbers, controller.factors, strict=True)
-    ]
+    current_gains = []
+    for number, factor in zip(numbers, controller.factors, strict=True):
+        source = f"{file.name}, line {number.line}"
+        current_gains.append(Reference(number.value / factor, "the current gain", source))
     _require_alike(cell_file, cell, current_gains)
 
 
@@ -77,20 +77,15 @@ def check_nameplates(cell_file: Path, cell: Cell, readings: Sequence[ScaleReadin
     """
     check_controller(cell_file, cell)
     references = list[Reference | None]()
-    for axis, reduction, reading in zip(
-        cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True
-    ):
-        if reading is None:
-            constant = None
-        else:
-            constant = reading.torque_constant_nm_per_a
+    reductions = DriveTrain(cell.ratio).reduction.tolist()
+    for axis, reduction, reading in zip(cell.axes, reductions, readings, strict=True):
+        constant = None if reading is None else reading.torque_constant_nm_per_a
         if reading is None or constant is None or not _comparable(axis):
             references.append(None)
             continue
         source = f"{reading.rated_torque_nm} Nm / {reading.rated_current_a} A"
-        references.append(
-            Reference(constant * abs(float(reduction)), "N·Kt of the drive's motor", source)
-        )
+        gain = constant * abs(reduction)
+        references.append(Reference(gain, "N·Kt of the drive's motor", source))
     _require_alike(cell_file, cell, references)
 
 
@@ -103,47 +98,52 @@ def nameplate_warnings(cell: Cell, readings: Sequence[ScaleReading | None]) -> t
         readings: of each drive; None for one that does not answer.
     """
     axes_by_warning: dict[str, list[str]] = {}
-    for axis, reduction, reading in zip(
-        cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True
-    ):
+    reductions = DriveTrain(cell.ratio).reduction.tolist()
+    for axis, reduction, reading in zip(cell.axes, reductions, readings, strict=True):
         if reading is None:
             continue
         found = reading.warnings
         if axis.profile is None or not _comparable(axis):
             found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
         else:
-            found += check_nameplate(
-                reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction)
-            )
+            motor_gain = axis.nameplate_gain / reduction
+            found += check_nameplate(reading, axis.profile.amplitude, motor_gain)
         for warning in found:
             axes_by_warning.setdefault(warning, []).append(axis.name)
+    warnings = []
     note = actual_current_note(cell)
-    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
-    return grouped if note is None else (note, *grouped)
+    if note is not None:
+        warnings.append(note)
+    for warning, axes in axes_by_warning.items():
+        names = ", ".join(axes)
+        warnings.append(f"{names}: {warning}")
+    return tuple(warnings)
 
 
 def _comparable(axis: CellAxis) -> bool:
     """Whether the gain is per ampere, as the torque constant is."""
-    return axis.profile is not None and axis.gain_unit.startswith(("Nm/A", "N/A"))
+    if axis.profile is None:
+        return False
+    return axis.gain_unit.startswith(("Nm/A", "N/A"))
 
 
 def actual_current_note(cell: Cell) -> str | None:
     """Warning where an axis has no current reference:
     its gain is per actual current, not per reference.
     """
-    actual = [
-        axis
-        for axis in cell.axes
-        if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL
-    ]
-    if not actual:
+    axis_names = []
+    profile_names = []
+    for axis in cell.axes:
+        if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL:
+            axis_names.append(axis.name)
+            profile_names.append(axis.profile.name)
+    if not axis_names:
         return None
-    drives = ", ".join(
-        dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None)
-    )
+    axes = ", ".join(axis_names)
+    drives = ", ".join(dict.fromkeys(profile_names))
     return (
-        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} "
-        "reports none): the gains are Nm per A of actual current"
+        f"{axes}: ACTUAL current, not the reference ({drives} reports none): the gains are Nm per "
+        "A of actual current"
     )
 
 
@@ -152,8 +152,9 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
     signs are compared before a write.
     """
     wrong: dict[int, Reference] = {}
-    for index, (axis, reference) in enumerate(zip(cell.axes, references, strict=True)):
-        if reference is not None and not _alike(axis.nameplate_gain, reference.gain):
+    for index, reference in enumerate(references):
+        nameplate = cell.axes[index].nameplate_gain
+        if reference is not None and not _alike(nameplate, reference.gain):
             wrong[index] = reference
     if not wrong:
         return
@@ -163,13 +164,11 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
         axis = cell.axes[index]
         keys = document.tree["axes"][index]
         key = next(key for key in keys if key.startswith("nameplate_gain"))
-        found = (
-            f"{axis.nameplate_gain:g} {axis.gain_unit}, while {reference.name} is "
-            f"{reference.gain:.4g} ({reference.source})"
-        )
-        faults.append(
-            Fault(("axes", index, key), found, f"the same within a factor of {NAMEPLATE_RATIO:g}")
-        )
+        written = f"{axis.nameplate_gain:g} {axis.gain_unit}"
+        other = f"{reference.name} is {reference.gain:.4g} ({reference.source})"
+        found = f"{written}, while {other}"
+        expected = f"the same within a factor of {NAMEPLATE_RATIO:g}"
+        faults.append(Fault(("axes", index, key), found, expected))
     raise ConfigurationInconsistent(
         **fault_texts(document, faults),
         remedy="correct the nameplate, the gear ratio or the other number: is one of them in "
@@ -178,4 +177,5 @@ def _require_alike(cell_file: Path, cell: Cell, references: Sequence[Reference |
 
 
 def _alike(one: float, other: float) -> bool:
-    return abs(one) < NAMEPLATE_RATIO * abs(other) and abs(other) < NAMEPLATE_RATIO * abs(one)
+    smaller, larger = sorted((abs(one), abs(other)))
+    return larger < NAMEPLATE_RATIO * smaller

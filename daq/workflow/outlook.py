@@ -18,7 +18,7 @@ from ident.planning.excitation import Design
 from ident.planning.gain_verdict import verdicts
 from ident.planning.target import SlowCause, recorded_information, slow_cause
 
-HELP = {
+ADVICE_OF_CAUSE = {
     SlowCause.NO_PAYLOAD: "record blocks with the payload",
     SlowCause.PRELOAD: "let the platform shift and turn farther, by wider joint limits in the "
     "cell file",
@@ -67,9 +67,8 @@ class Outlook:
             room: of the moves that were accepted.
         """
         mounted = (0,) if is_loaded else (None,)
-        return replace(
-            experiment, design=self.design, scene=room.scene(experiment.scene), mounted=mounted
-        )
+        scene = room.scene(experiment.scene)
+        return replace(experiment, design=self.design, scene=scene, mounted=mounted)
 
 
 def outlook_of(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> Outlook:
@@ -88,18 +87,21 @@ def outlook_of(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> 
     judged = verdicts(design, runs)
     information = recorded_information(design, runs)
     noise_ratio = design.expectation.noise_a / experiment.design.expectation.noise_a
-    has_payload = any(payload is not None for _, payloads in runs for payload in payloads)
-    causes = tuple(
-        slow_cause(gain, has_payload=has_payload, noise_ratio=float(ratio))
-        for gain, ratio in zip(judged.gains, noise_ratio, strict=True)
-    )
+    mounted = set[int | None]()
+    for _, payloads in runs:
+        mounted.update(payloads)
+    has_payload = bool(mounted - {None})
+    causes = []
+    for gain, ratio in zip(judged.gains, noise_ratio, strict=True):
+        causes.append(slow_cause(gain, has_payload=has_payload, noise_ratio=float(ratio)))
     predicted = design.std_percent(information)
-    is_known = np.isfinite(predicted) & np.isfinite(std_percent) & (std_percent > 0.0)
+    is_finite = np.isfinite(predicted) & np.isfinite(std_percent)
+    is_known = is_finite & (std_percent > 0.0)
     scale = np.ones(len(predicted))
     scale[is_known] = std_percent[is_known] / predicted[is_known]
-    return Outlook(design, information, causes, scale)
+    return Outlook(design, information, tuple(causes), scale)
 
 
 def help_with(cause: SlowCause, axis: str) -> str:
     """Say what makes σ of a gain fall faster, beside more time; empty where nothing else does."""
-    return HELP[cause].format(axis=axis)
+    return ADVICE_OF_CAUSE[cause].format(axis=axis)

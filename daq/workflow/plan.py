@@ -160,9 +160,7 @@ class PlanGoal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetBox:
-    """Least and largest joint positions that targets may have [rad;
-    m of a prismatic joint], shape (n,) each.
-    """
+    """Least and largest positions of targets [rad; m of a prismatic joint], shape (n,) each."""
 
     lower: FloatArray
     upper: FloatArray
@@ -208,16 +206,14 @@ class Search:
         for _ in range(MAX_STARTS):
             moves, paths = self._filled()
             if len(moves) >= MIN_PLANNED_MOVES:
-                return Draft(
-                    tuple(moves),
-                    tuple(paths),
-                    tuple(self._experiment.informations(paths, THINNING)),
-                )
+                informations = self._experiment.informations(paths, THINNING)
+                return Draft(tuple(moves), tuple(paths), tuple(informations))
             most = max(most, moves, key=len)
         found = f"room for {len(most)} moves"
         if len(most) == 1:  # which only says where the run starts
             found = "no room for a move"
-        longer_s = _tens(self._duration_s * WISHED_MOVES / max(len(most), 1))
+        shortage = WISHED_MOVES / max(len(most), 1)
+        longer_s = _tens(self._duration_s * shortage)
         expected = f"at least {MIN_PLANNED_MOVES}, better {WISHED_MOVES}"
         remedy = f"allow a longer run (some --duration {longer_s:.0f})"
         raise _unfit(self._cell, self._duration_s, found, expected, remedy, PlanTooShort)
@@ -258,9 +254,8 @@ class Search:
             count = min(ROUND, tries - done)
             chosen = draft
             # One a round: proposals that were made from the same moves do not go together.
-            for candidate in self._drafts(
-                draft, [self._proposal(draft.moves) for _ in range(count)]
-            ):
+            proposals = [self._proposal(draft.moves) for _ in range(count)]
+            for candidate in self._drafts(draft, proposals):
                 value, found = self._judge(candidate, best)
                 if value < best:
                     chosen = candidate
@@ -280,12 +275,13 @@ class Search:
         # Unseen gains are as bad as each other; the norm of inf would hide the rest.
         bounded = np.minimum(self._goal.ratio(found), 1e6)
         worst = np.max(bounded)
-        value = float(worst * np.sum((bounded / worst) ** SHARPNESS) ** (1.0 / SHARPNESS))
+        # (Σ rᵖ)^(1/p), scaled by the worst so that nothing overflows
+        total = np.sum((bounded / worst) ** SHARPNESS)
+        value = float(worst * total ** (1.0 / SHARPNESS))
         if value < to_beat:  # the condition can only raise it
-            value *= (
-                max(1.0, self._experiment.design.condition(information) / self._largest_condition)
-                ** 2
-            )
+            condition = self._experiment.design.condition(information)
+            excess = max(1.0, condition / self._largest_condition)
+            value *= excess**2
         return value, found
 
     def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
@@ -302,15 +298,18 @@ class Search:
             case Kind.ANEW:
                 changed: tuple[PlannedMove, ...] = (*before, random, *after)
             case Kind.NEAR:
-                step = rng.normal(0.0, NEAR, len(low)) * (high - low) * (rng.random(len(low)) < 0.5)
-                near = self._written(np.clip(np.array(old.target_rad) + step, low, high))
+                step = rng.normal(0.0, NEAR, len(low)) * (high - low)
+                is_moved = rng.random(len(low)) < 0.5
+                target = np.array(old.target_rad) + step * is_moved
+                near = self._written(np.clip(target, low, high))
                 changed = (*before, replace(old, target_rad=near), *after)
             case Kind.SWING:
                 axis = int(rng.integers(len(low)))
                 inwards = 0.25 * float(rng.random()) * (high[axis] - low[axis])
                 target = np.array(old.target_rad)
-                below = moves[max(index - 1, 0)].target_rad[axis] < 0.5 * (low[axis] + high[axis])
-                if below:
+                previous = moves[max(index - 1, 0)].target_rad[axis]
+                middle = 0.5 * (low[axis] + high[axis])
+                if previous < middle:
                     target[axis] = high[axis] - inwards
                 else:
                     target[axis] = low[axis] + inwards
@@ -329,35 +328,32 @@ class Search:
         """The proposals that are short enough and whose new ways are clear,
         with their information.
         """
-        known = {
-            _way(pair): (path, information)
-            for pair, path, information in zip(
-                pairwise(draft.moves), draft.paths, draft.informations, strict=True
-            )
-        }
+        known: dict[_Way, tuple[Trapezoid, FloatArray]] = {}
+        pairs = pairwise(draft.moves)
+        for pair, path, information in zip(pairs, draft.paths, draft.informations, strict=True):
+            known[_way(pair)] = (path, information)
         fresh: dict[_Way, Trapezoid] = {}
         kept = []
         for moves in proposals:
             ways = [_way(pair) for pair in pairwise(moves)]
-            new = {
-                way: path_of(self._cell, np.array(way[0]), way[1])
-                for way in ways
-                if way not in known
-            }
-            lengths = [
-                new[way].duration_s if way in new else known[way][0].duration_s for way in ways
-            ]
+            new: dict[_Way, Trapezoid] = {}
+            lengths_s = []
+            for way in ways:
+                if way in known:
+                    path, _ = known[way]
+                else:
+                    start, move = way
+                    path = path_of(self._cell, np.array(start), move)
+                    new[way] = path
+                lengths_s.append(path.duration_s)
+            dwell_s = sum(move.dwell_s for move in moves)
             # The time is quick to check, the clearance is not.
-            if sum(lengths) + sum(move.dwell_s for move in moves) > self._duration_s:
+            if sum(lengths_s) + dwell_s > self._duration_s:
                 continue
             if not all(map(self._is_within, moves)):
                 continue
-            obstruction = self._experiment.scene.checker.obstruction
-            if all(
-                obstruction(path.start, path.end) is None
-                for way, path in new.items()
-                if way not in fresh
-            ):
+            unchecked = [path for way, path in new.items() if way not in fresh]
+            if all(map(self._is_clear, unchecked)):
                 kept.append((moves, ways))
                 fresh |= new
         is_carried = self._is_carried(list(fresh.values()))
@@ -367,26 +363,31 @@ class Search:
         usable = known.keys() | fresh.keys()
         kept = [(moves, ways) for moves, ways in kept if usable.issuperset(ways)]
         informations = self._experiment.informations(list(fresh.values()), THINNING)
-        known |= {
-            way: (path, information)
-            for (way, path), information in zip(fresh.items(), informations, strict=True)
-        }
+        for (way, path), information in zip(fresh.items(), informations, strict=True):
+            known[way] = (path, information)
         drafts = []
         for moves, ways in kept:
-            paths, of_paths = zip(*(known[way] for way in ways), strict=True)
+            of_ways = [known[way] for way in ways]
+            paths, of_paths = zip(*of_ways, strict=True)
             drafts.append(Draft(moves, paths, of_paths))
         return drafts
+
+    def _is_clear(self, path: Trapezoid) -> bool:
+        checker = self._experiment.scene.checker
+        return checker.obstruction(path.start, path.end) is None
 
     def _clear_start(self) -> PlannedMove:
         for _ in range(MAX_TRIES):
             move = self._random_move()
             checker = self._experiment.scene.checker
             if checker.robot.is_constrained:
-                near = towards(
-                    checker, checker.home, np.array(move.target_rad), self._low, self._high
-                )
+                target = np.array(move.target_rad)
+                near = towards(checker, checker.home, target, self._low, self._high)
                 move = replace(move, target_rad=self._written(near))
-            if self._is_within(move) and checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
+            if not self._is_within(move):
+                continue
+            [margin_m] = checker.margins(np.array([move.target_rad]))
+            if margin_m > 0.0:
                 return move
         raise self._blocked("posture")
 
@@ -428,10 +429,13 @@ class Search:
     def _random_move(self) -> PlannedMove:
         # Slow and fast moves both: friction is distinguished from inertia by moves of different
         # speed and acceleration.
+        target = self._written(self._rng.uniform(self._low, self._high))
+        velocity = self._speed * float(self._rng.uniform(0.35, 1.0))
+        acceleration = self._acceleration * float(self._rng.uniform(0.4, 1.0))
         return PlannedMove(
-            target_rad=self._written(self._rng.uniform(self._low, self._high)),
-            velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),
-            acceleration=round(self._acceleration * float(self._rng.uniform(0.4, 1.0)), PLACES),
+            target_rad=target,
+            velocity=round(velocity, PLACES),
+            acceleration=round(acceleration, PLACES),
             dwell_s=DWELL_S,
         )
 
@@ -440,15 +444,18 @@ class Search:
         other.
         """
         target = np.array(move.target_rad)
-        return bool(np.all((target >= self._allowed.lower) & (target <= self._allowed.upper)))
+        is_above = target >= self._allowed.lower
+        is_below = target <= self._allowed.upper
+        return bool(np.all(is_above & is_below))
 
     def _written(self, target: FloatArray) -> tuple[float, ...]:
         """As the plan file will say it: what is judged is what is made."""
         target = self._experiment.scene.checker.fitting(target)
-        units = [axis.unit.si for axis in self._cell.axes]
-        return tuple(
-            round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True)
-        )
+        written = []
+        for value, axis in zip(target.tolist(), self._cell.axes, strict=True):
+            si = axis.unit.si
+            written.append(round(value / si, PLACES) * si)
+        return tuple(written)
 
     def _blocked(self, what: str) -> UsageError:
         """Error that names the two bodies which are in the way most often."""
@@ -479,12 +486,14 @@ class Search:
         if worst[0] == CLOSURES:
             remedy = f"correct {_keys(blocking[0])} in the cell file"
             return _unfit(self._cell, self._duration_s, found, "poses that the loops allow", remedy)
-        farthest_m = max(one.distance_m for one in blocking if (one.first, one.second) == worst)
+        of_worst = [one for one in blocking if (one.first, one.second) == worst]
+        farthest_mm = 1000.0 * max(one.distance_m for one in of_worst)
         found += (
             f": in {times} of {MAX_TRIES} {worst[0]} and {worst[1]} are at most "
-            f"{1000.0 * farthest_m:.0f} mm apart"
+            f"{farthest_mm:.0f} mm apart"
         )
-        expected = f"at least {1000.0 * checker.scene.minimum_m:.0f} mm"
+        minimum_mm = 1000.0 * checker.scene.minimum_m
+        expected = f"at least {minimum_mm:.0f} mm"
         return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, worst))
 
     def _too_weak(self) -> list[str]:
@@ -499,8 +508,8 @@ class Search:
             start = np.array(move.target_rad)
         is_heavy = EFFORT_MARGIN * self._experiment.effort_shares(paths) > 1.0
         share_heavy = np.mean(is_heavy, axis=0)
-        often = share_heavy > min(0.5, 0.99 * float(np.max(share_heavy)))
-        return list(compress(self._cell.axis_names, often))
+        limit = min(0.5, 0.99 * float(np.max(share_heavy)))
+        return list(compress(self._cell.axis_names, share_heavy > limit))
 
 
 def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
@@ -617,21 +626,26 @@ def plan(
     goal = goal or PlanGoal.of_first(experiment.design)
     room = _room(cell, duration_s, box)
     allowed = _allowed_targets(cell, box)
+    if acceleration is None:
+        acceleration = speed
     search = Search(
         experiment,
         np.random.default_rng(seed),
         duration_s,
         speed,
-        speed if acceleration is None else acceleration,
+        acceleration,
         largest_condition,
         goal,
         room,
         allowed,
     )
-    draft = search.improve(
-        search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found)))
-    )
-    information = goal.recorded + np.sum(experiment.informations(draft.paths), axis=0)
+
+    def report_worst(done: int, std_percent: FloatArray) -> None:
+        progress(done, float(np.max(std_percent)))
+
+    draft = search.improve(search.random_moves(), exchanges, report_worst)
+    of_moves = np.sum(experiment.informations(draft.paths), axis=0)
+    information = goal.recorded + of_moves
     predicted = experiment.design.std_percent(information)
     found = experiment.design.condition(information)
     worst = int(np.argmax(goal.ratio(predicted)))
@@ -648,19 +662,18 @@ def plan(
     if not predicted[worst] <= largest_std_percent:
         percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
         words = f"{percent} % predicted for the gain of {cell.axes[worst].name}"
-        judged = verdicts(
-            experiment.design, [(experiment.excitation(draft.paths)[0], experiment.mounted)]
-        )
+        excitation, _ = experiment.excitation(draft.paths)
+        judged = verdicts(experiment.design, [(excitation, experiment.mounted)])
         ways = ["allow more exchanges, wider joint limits or higher speed"]
         kind = UsageError
         if np.isfinite(predicted[worst]):
-            longer_s = longer_run_s(
-                used_s, duration_s, float(predicted[worst]) / largest_std_percent
-            )
+            excess = float(predicted[worst]) / largest_std_percent
+            longer_s = longer_run_s(used_s, duration_s, excess)
             if longer_s is not None:
                 ways.insert(0, f"allow a longer run (some --duration {longer_s:.0f})")
                 kind = PlanTooShort
-        remedy = ". ".join(("; or ".join(ways), *judged.sentences(cell.axis_names)))
+        sentences = ["; or ".join(ways), *judged.sentences(cell.axis_names)]
+        remedy = ". ".join(sentences)
         raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy, kind)
     return Plan(
         cell=cell.name,
@@ -680,7 +693,9 @@ MADE_BY_MORE_MOVES = 10.0
 
 def _is_mended_by_time(duration_s: float, ratio: float) -> bool:
     """Whether a run of twice the duration may lower a condition that is too large by a ratio."""
-    return ratio <= MADE_BY_MORE_MOVES and _tens(2.0 * duration_s) <= LONGEST_S
+    if ratio > MADE_BY_MORE_MOVES:
+        return False
+    return _tens(2.0 * duration_s) <= LONGEST_S
 
 
 def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -> str:
@@ -689,13 +704,15 @@ def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -
     """
     other = "more exchanges, wider joint limits or higher speed; `--condition` accepts more"
     if _is_mended_by_time(duration_s, ratio):
-        return f"allow a longer run (some --duration {_tens(2.0 * duration_s):.0f}), {other}"
+        longer_s = _tens(2.0 * duration_s)
+        return f"allow a longer run (some --duration {longer_s:.0f}), {other}"
     turned = nearly_right_joints(experiment.design.expectation.model.robot)
     if not turned:
         return f"allow {other}"
     exact = "1.5707963267948966 for a quarter turn, 3.141592653589793 for a half"
+    listed = ", ".join(turned)
     return (
-        f"the URDF turns {', '.join(turned)} by nearly a right angle, as rounded numbers do "
+        f"the URDF turns {listed} by nearly a right angle, as rounded numbers do "
         f"(1.5708): parameters that an exact angle hides are nearly invisible then. Write {exact}. "
         "If these angles are measured ones, `--condition` accepts more"
     )
@@ -728,13 +745,10 @@ def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
     if box is None:
         return TargetBox(lower, upper)
     room = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
-    outside = [
-        axis.name
-        for axis, is_empty in zip(cell.axes, room.lower > room.upper, strict=True)
-        if is_empty
-    ]
+    outside = list(compress(cell.axis_names, room.lower > room.upper))
     if outside:
-        found = f"a box of targets outside the joint limits of {', '.join(outside)}"
+        listed = ", ".join(outside)
+        found = f"a box of targets outside the joint limits of {listed}"
         raise _unfit(
             cell, duration_s, found, "a box inside the limits", "give a box that they allow"
         )
@@ -748,11 +762,11 @@ def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
     limits = limits_of(cell)
     if box is None:
         return TargetBox(limits.lower, limits.upper)
-    rounding = np.array([axis.unit.si for axis in cell.axes]) * 10.0**-PLACES
-    return TargetBox(
-        np.maximum(limits.lower, box.lower - rounding),
-        np.minimum(limits.upper, box.upper + rounding),
-    )
+    units = np.array([axis.unit.si for axis in cell.axes])
+    rounding = units * 10.0**-PLACES
+    lower = np.maximum(limits.lower, box.lower - rounding)
+    upper = np.minimum(limits.upper, box.upper + rounding)
+    return TargetBox(lower, upper)
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
@@ -887,10 +901,11 @@ def save_plan(plan: Plan, path: Path) -> None:
     recorded = "moves made without load and with the payload"
     if plan.purpose:
         recorded = "all blocks of the session and these moves together"
+    units = ", ".join(unit.name for unit in plan.units)
     lines = [
         "# Synchronised point-to-point moves; velocity and acceleration are shares of the "
         "joint limits.",
-        f"# Targets: {', '.join(unit.name for unit in plan.units)}.",
+        f"# Targets: {units}.",
         "format: drivegain-plan",
         f"cell: {plan.cell}",
         f"seed: {plan.seed}",
@@ -903,13 +918,18 @@ def save_plan(plan: Plan, path: Path) -> None:
         lines += _robot_lines(plan.robot)
     lines.append("moves:")
     for move in plan.moves:
-        target = ", ".join(
-            f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True)
-        )
-        lines.append(
-            f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: "
-            f"{move.acceleration:.4f}, dwell_s: {move.dwell_s:.3f}}}"
-        )
+        positions = []
+        for position, unit in zip(move.target_rad, plan.units, strict=True):
+            positions.append(f"{position / unit.si:.3f}")
+        target = ", ".join(positions)
+        fields = [
+            f"{key}: [{target}]",
+            f"velocity: {move.velocity:.3f}",
+            f"acceleration: {move.acceleration:.4f}",
+            f"dwell_s: {move.dwell_s:.3f}",
+        ]
+        written = ", ".join(fields)
+        lines.append(f"  - {{{written}}}")
     replace_file(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -946,16 +966,14 @@ def load_plan(path: Path, cell: Cell) -> Plan:
     model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
     if model.cell != cell.name:
         remedy = "make a plan for this cell: `drivegain plan CELL`"
-        raise _refused(
-            str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy
-        )
+        found = f"a plan for cell {model.cell!r}"
+        raise _refused(str(path), found, f"one for {cell.name!r}", remedy)
     robot = _robot_of(path, model.robot, cell)
     if len(model.predicted_std_percent) not in (0, len(cell.axes)):
         found = f"{len(model.predicted_std_percent)} numbers"
         remedy = "make the plan anew: `drivegain plan CELL`"
-        raise _refused(
-            f"{path}: predicted_std_percent", found, f"{len(cell.axes)}, one a gain", remedy
-        )
+        expected = f"{len(cell.axes)}, one a gain"
+        raise _refused(f"{path}: predicted_std_percent", found, expected, remedy)
     moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
     duration_s = experiment_duration_s(cell, moves)
     if duration_s > LONGEST_S:
@@ -1022,9 +1040,10 @@ def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
     for axis, position in zip(cell.axes, target, strict=True):
         lower, upper = axis.limits.position
         if not lower <= position <= upper:
-            expected = f"{axis.unit.spell(lower)} to {axis.unit.spell(upper)}, the joint's limits"
+            spell = axis.unit.spell
+            expected = f"{spell(lower)} to {spell(upper)}, the joint's limits"
             remedy = "correct the move, or the limits if they are wrong"
-            raise _refused(f"{where}, {axis.name}", axis.unit.spell(position), expected, remedy)
+            raise _refused(f"{where}, {axis.name}", spell(position), expected, remedy)
     return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
 
 
@@ -1069,16 +1088,16 @@ def way_to_first_target(
             "and no other clear way between the positions of the plan; bring the robot near the "
             f"first target by hand, or correct {_keys(blocked)} in the cell file"
         )
-    slow = replace(
-        first,
-        velocity=min(first.velocity, AROUND_SHARE),
-        acceleration=min(first.acceleration, AROUND_SHARE),
-    )
-    moves = [replace(slow, target_rad=tuple(turn.tolist()), dwell_s=DWELL_S) for turn in turns]
+    velocity = min(first.velocity, AROUND_SHARE)
+    acceleration = min(first.acceleration, AROUND_SHARE)
+    slow = replace(first, velocity=velocity, acceleration=acceleration)
+    moves = []
+    for turn in turns:
+        moves.append(replace(slow, target_rad=tuple(turn.tolist()), dwell_s=DWELL_S))
+    positions_between = counted(len(turns), "further position")
     remark = (
         f"the straight way from where the robot stood to the first target of the plan is not clear "
-        f"({_spell(cell, blocked)}): slow moves led around it, by "
-        f"{counted(len(turns), 'further position')}"
+        f"({_spell(cell, blocked)}): slow moves led around it, by {positions_between}"
     )
     return (*moves, slow), remark
 
@@ -1105,10 +1124,14 @@ def _is_bounded(cell: Cell) -> bool:
 
 
 def _spell(cell: Cell, found: Obstruction) -> str:
-    where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
+    positions = []
+    for axis, position in zip(cell.axes, found.position, strict=True):
+        positions.append(axis.unit.spell(position))
+    where = ", ".join(positions)
     if found.first == CLOSURES:
         return f"that the loops do not close, or are close to a singularity, at ({where})"
-    return f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})"
+    distance_mm = 1000 * found.distance_m
+    return f"{distance_mm:.0f} mm between {found.first} and {found.second} at ({where})"
 
 
 def _keys(found: Obstruction) -> str:
@@ -1138,11 +1161,13 @@ def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
     for number, way in enumerate(paths_of(cell, moves), start=1):
         found = checker.obstruction(np.asarray(way.start), np.asarray(way.end))
         if found is not None:
+            if found.first == CLOSURES:
+                expected = "poses inside the workspace"
+            else:
+                expected = f"at least {1000 * minimum_m:.0f} mm"
             raise _refused(
                 f"{path}: moves[{number}], on the way there",
                 _spell(cell, found),
-                "poses inside the workspace"
-                if found.first == CLOSURES
-                else f"at least {1000 * minimum_m:.0f} mm",
+                expected,
                 f"correct the move, or {_keys(found)} in the cell file",
             )

@@ -56,7 +56,8 @@ class RunSoFar:
 
     def take(self, rows: NDArray[np.void]) -> None:
         """Take samples in the layout of `daq.log.feed.packet_dtype`."""
-        expected = range(int(rows["cycle"][0]), int(rows["cycle"][0]) + len(rows))
+        first_cycle = int(rows["cycle"][0])
+        expected = range(first_cycle, first_cycle + len(rows))
         follows = self._next_cycle in (None, expected.start)
         if not follows or not np.array_equal(rows["cycle"], expected):
             self.is_whole = False
@@ -83,15 +84,17 @@ class RunSoFar:
         self._rows = [rows]
         scale = self._facts.scaling
         answered = answers(rows["missing"], len(self._cell.axes))
+        limited = limit_active(self._cell, rows["statusword"])
         cycle = rows["cycle"].astype(np.int64)
+        motor_counts = unwrapped(rows["position_counts"])
         return Run(
             name=self._name,
             time_s=(cycle - cycle[0]) / self._facts.rate_hz,
-            position_rad=scale.joint_position(unwrapped(rows["position_counts"])),
+            position_rad=scale.joint_position(motor_counts),
             current_a=rows["current_raw"] * scale.current_per_unit,
             payload=self.payload,
             move=moves(tuple(self._events), rows["time_ns"]),
-            valid=answered & ~limit_active(self._cell, rows["statusword"]),
+            valid=answered & ~limited,
         )
 
 
@@ -161,9 +164,8 @@ class GainsSoFar:
         mounted = None if run.payload is None else 0
         motion = recorded(model, data, self.fit.conditioning)
         seconds = float(run.time_s[-1] - run.time_s[0])
-        return replace(
-            self, motions=(*self.motions, (motion, (mounted,))), motion_s=self.motion_s + seconds
-        )
+        motions = (*self.motions, (motion, (mounted,)))
+        return replace(self, motions=motions, motion_s=self.motion_s + seconds)
 
     def in_proportion(self, std_percent: FloatArray) -> GainsSoFar:
         """Show σ from now on in proportion to that of the estimator after these blocks.
@@ -223,15 +225,17 @@ class GainsSoFar:
         """Say why nothing fixes the gains yet, with the axes."""
         unknown = found.unknown or Unknown.PAYLOAD_UNSEEN
         names = ", ".join(self.experiment.cell.axis_names[axis] for axis in found.axes)
-        return f"{names}: {unknown.value}" if names else unknown.value
+        if not names:
+            return unknown.value
+        return f"{names}: {unknown.value}"
 
     def _gains(self, gains: FloatArray, std_percent: FloatArray) -> list[QuickGain]:
         """Return the gains, the worst first."""
-        rows = zip(self.experiment.cell.axes, gains.tolist(), std_percent.tolist(), strict=True)
-        found = [
-            QuickGain(axis.name, axis.gain_unit, value, std, self.target_percent)
-            for axis, value, std in rows
-        ]
+        axes = self.experiment.cell.axes
+        found = []
+        for axis, value, std in zip(axes, gains.tolist(), std_percent.tolist(), strict=True):
+            gain = QuickGain(axis.name, axis.gain_unit, value, std, self.target_percent)
+            found.append(gain)
         return sorted(found, key=lambda gain: -gain.ratio)
 
     def _why(self, axis: int) -> str:

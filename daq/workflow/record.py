@@ -237,7 +237,7 @@ def record(
         run = _run_info(request, rate_hz, clocks)
         content = LogContent.of(cell, run, files, readback)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
-            kept = Kept(
+            kept = LogAndFeed(
                 log,
                 feed or Feed(request.cell_file),
                 lambda done: progress(done, len(moves)),
@@ -275,17 +275,19 @@ def record(
 def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunInfo:
     """Return what the log says of a run that starts now."""
     started_ns = clocks.monotonic_ns()
+    wall_ns = started_ns + clocks.wall_minus_monotonic_ns()
+    digest = controller_digest(request.cell)
     return RunInfo(
         run_id=request.run_id,
         rate_hz=rate_hz,
         payload=request.payload,
         operator=request.operator,
         software=software(),
-        started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
+        started_wall_ns=wall_ns,
         started_monotonic_ns=started_ns,
         speed=request.speed,
         entered_kg=request.entered_kg,
-        controller_sha256=controller_digest(request.cell),
+        controller_sha256=digest,
     )
 
 
@@ -304,6 +306,8 @@ def controller_digest(cell: Cell) -> str | None:
 
 def _facts(cell: Cell, scale: SiScaling, run: RunInfo, out: Path, moves: int) -> RunFacts:
     """Return what a console must know of a run."""
+    bus_load = {bus.name: load.mean for bus, load in bus_loads(cell)}
+    payload = None if run.payload is None else run.payload.name
     return RunFacts(
         run_id=run.run_id,
         log=str(out.resolve()),
@@ -314,13 +318,13 @@ def _facts(cell: Cell, scale: SiScaling, run: RunInfo, out: Path, moves: int) ->
         current_per_unit=scale.current_per_unit.tolist(),
         to_joint=scale.to_joint.tolist(),
         offset_rad=scale.offset_rad.tolist(),
-        payload=None if run.payload is None else run.payload.name,
-        bus_load={bus.name: load.mean for bus, load in bus_loads(cell)},
+        payload=payload,
+        bus_load=bus_load,
     )
 
 
 @dataclass(slots=True)
-class Kept:
+class LogAndFeed:
     """Log of a run and the feed of what it gets."""
 
     log: LogWriter
@@ -345,7 +349,7 @@ class Kept:
 
 
 def keep_samples(
-    samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int
+    samples: Generator[Sample, None, None], kept: LogAndFeed, room: DiskRoom, check_every: int
 ) -> None:
     """Log and publish every sample of a motion; end the motion when logging fails.
 
@@ -366,7 +370,7 @@ def keep_samples(
 
 
 def _keep_motion(
-    samples: Generator[Sample, None, None], kept: Kept, room: DiskRoom, check_every: int
+    samples: Generator[Sample, None, None], kept: LogAndFeed, room: DiskRoom, check_every: int
 ) -> DiskSpaceShort | None:
     """Log a motion to its end; returns the error of a disk that became full,
     after which the axes were stopped.
@@ -384,7 +388,8 @@ def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: flo
     total_s = 0.0
     here = tuple(start_counts)
     for move in moves:
-        total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
+        moving_s = max(move.duration_s(here))
+        total_s += moving_s + move.dwell_cycles / rate_hz
         here = move.target_counts
     return total_s
 
@@ -438,10 +443,17 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
     velocity = turns @ limits.velocity
     acceleration = turns @ limits.acceleration
-    return tuple(
-        AxisLimits(int(np.floor(least)), int(np.ceil(most)), float(fast), float(hard))
-        for least, most, fast, hard in zip(low, high, velocity, acceleration, strict=True)
-    )
+    motors = []
+    for motor in range(len(low)):
+        motors.append(
+            AxisLimits(
+                position_min_counts=int(np.floor(low[motor])),
+                position_max_counts=int(np.ceil(high[motor])),
+                velocity_counts_s=float(velocity[motor]),
+                acceleration_counts_s2=float(acceleration[motor]),
+            )
+        )
+    return tuple(motors)
 
 
 def motor_moves(
@@ -456,10 +468,10 @@ def motor_moves(
     for planned in plan.moves:
         path = path_of(cell, here_rad, planned)
         target_rad = np.array(planned.target_rad)
-        target = tuple(
-            int(count)
-            for count in np.rint(cell.ratio @ (target_rad - scale.offset_rad) / scale.rad_per_count)
-        )
+        # q_motor = R (q − offset), eq. 24
+        motor_rad = cell.ratio @ (target_rad - scale.offset_rad)
+        target_counts = np.rint(motor_rad / scale.rad_per_count)
+        target = tuple(map(int, target_counts))
         speed = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
         ramp = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
         # Limits for this move alone: the fastest trapezoid within them is that of the joints.
@@ -498,10 +510,12 @@ def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
     """
     without = network.without_guard()
     if without and not unguarded:
+        remarks = "; ".join(network.unguarded())
+        listed = ", ".join(without)
         raise MotionRefused(
-            f"axes that are UNGUARDED: {'; '.join(network.unguarded())}",
+            f"axes that are UNGUARDED: {remarks}",
             expected="that every axis watches the recorder's heartbeat (1016h)",
-            remedy=f"nothing has moved; pass --unguarded to move {', '.join(without)} all the "
+            remedy=f"nothing has moved; pass --unguarded to move {listed} all the "
             "same, with a hand at the emergency stop; a scheduled job needs `policy: {unguarded: "
             "allowed}` in the cell file",
         )
@@ -517,6 +531,18 @@ RECOVERY_SPEED = 0.05  #: Share of an axis's limits of velocity and acceleration
 #: counts
 INSIDE = 0.001
 LEAST_PER_S = 3.0  #: Least velocity and acceleration of a move [counts/s, counts/s²]
+
+
+def _recovery_limits(start_counts: int, limit: AxisLimits) -> AxisLimits:
+    """Return the limits of a motor on its way back, which reach to where it stands."""
+    velocity = RECOVERY_SPEED * limit.velocity_counts_s
+    acceleration = RECOVERY_SPEED * limit.acceleration_counts_s2
+    return AxisLimits(
+        position_min_counts=min(limit.position_min_counts, start_counts),
+        position_max_counts=max(limit.position_max_counts, start_counts),
+        velocity_counts_s=max(velocity, LEAST_PER_S),
+        acceleration_counts_s2=max(acceleration, LEAST_PER_S),
+    )
 
 
 def recovery_move(
@@ -541,9 +567,9 @@ def recovery_move(
             continue
         share = beyond / max(high - low, 1)
         largest_share = max(largest_share, share)
+        percent = 100.0 * share
         outside.append(
-            f"{name} at {start} counts, {beyond} ({100.0 * share:.2g} % of its range) "
-            "beyond its limits"
+            f"{name} at {start} counts, {beyond} ({percent:.2g} % of its range) beyond its limits"
         )
         inside = INSIDE * (high - low)
         target.append(round(np.clip(start, low + inside, high - inside)))
@@ -554,15 +580,7 @@ def recovery_move(
     here = scale.joint_position(np.array(start_counts))
     there = scale.joint_position(np.array(target))
     check_way(cell, here, there, "the slow return within the limits")
-    slow = tuple(
-        AxisLimits(
-            min(limit.position_min_counts, start),
-            max(limit.position_max_counts, start),
-            max(RECOVERY_SPEED * limit.velocity_counts_s, LEAST_PER_S),
-            max(RECOVERY_SPEED * limit.acceleration_counts_s2, LEAST_PER_S),
-        )
-        for start, limit in zip(start_counts, limits, strict=True)
-    )
+    slow = tuple(map(_recovery_limits, start_counts, limits))
     return (
         synchronised_move(start_counts, tuple(target), slow),
         slow,
@@ -652,7 +670,7 @@ def _checked_moves(
     return moves, (remark,) if remark else ()
 
 
-def _stopped(short: DiskSpaceShort | None, kept: Kept, moves: int) -> str:
+def _stopped(short: DiskSpaceShort | None, kept: LogAndFeed, moves: int) -> str:
     """Return why the moves were not finished; empty where they were."""
     if short is None:
         return ""
@@ -702,9 +720,8 @@ def _sync_producer(
         return nullcontext()
     timed = sync.pacing is declared.PacingMode.TIMED
     by_kernel = isinstance(address, BusAddress) and address.kind.has_kernel_sync
-    if sync.producer == declared.KERNEL or (
-        sync.producer == declared.RECORDER and timed and by_kernel
-    ):
+    is_kernel_better = sync.producer == declared.RECORDER and timed and by_kernel
+    if sync.producer == declared.KERNEL or is_kernel_better:
         return KernelProducer(network, sync.period_us)
     if sync.producer == declared.RECORDER:
         return nullcontext()

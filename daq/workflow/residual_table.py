@@ -60,18 +60,19 @@ def residual_table(calibration: Calibration, log: Path, cell: Cell | None = None
     measured_a = to_current @ found.measured_nm
     predicted_a = to_current @ found.predicted_nm
     columns: Columns = {"time_s": found.time_s}
-    for index, (axis, name) in enumerate(zip(described.axes, column_names(described), strict=True)):
+    residual_nm = found.measured_nm - found.predicted_nm
+    residual_a = measured_a - predicted_a
+    names = column_names(described)
+    for index, axis in enumerate(described.axes):
+        name = names[index]
         force = axis.unit.force
         torque = "torque" if force == "Nm" else "force"
         current = current_unit(axis)
-        columns |= {
-            f"{name}.{torque}_predicted_{force}": found.predicted_nm[index],
-            f"{name}.{torque}_measured_{force}": found.measured_nm[index],
-            f"{name}.{torque}_residual_{force}": found.measured_nm[index]
-            - found.predicted_nm[index],
-            f"{name}.current_predicted_{current}": predicted_a[index],
-            f"{name}.current_measured_{current}": measured_a[index],
-            f"{name}.current_residual_{current}": measured_a[index] - predicted_a[index],
-            f"{name}.counts": found.use[index].astype(np.uint8),
-        }
+        columns[f"{name}.{torque}_predicted_{force}"] = found.predicted_nm[index]
+        columns[f"{name}.{torque}_measured_{force}"] = found.measured_nm[index]
+        columns[f"{name}.{torque}_residual_{force}"] = residual_nm[index]
+        columns[f"{name}.current_predicted_{current}"] = predicted_a[index]
+        columns[f"{name}.current_measured_{current}"] = measured_a[index]
+        columns[f"{name}.current_residual_{current}"] = residual_a[index]
+        columns[f"{name}.counts"] = found.use[index].astype(np.uint8)
     return ResidualTable(found, columns)

@@ -39,20 +39,16 @@ def largest_log_bytes(
 ) -> int:
     """Size of a log at most: as if nothing could be compressed [bytes]."""
     zeros = [0.0] * len(names)
-    shown = (
-        joint_state_bytes(joint_state_prefix(names), 0, zeros, zeros),
-        currents_bytes(0, zeros),
-    )
-    of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
-    of_states = (
-        1e9
-        / JOINT_STATE_NS
-        * sum(MESSAGE_HEAD_BYTES + len(message) + INDEX_BYTES for message in shown)
-    )
-    growth_bytes_s = of_samples + of_states + CHUNKS_BYTES_S
+    joint_state = joint_state_bytes(joint_state_prefix(names), 0, zeros, zeros)
+    currents = currents_bytes(0, zeros)
+    sample_bytes = sample_dtype(len(names)).itemsize + INDEX_BYTES
+    state_bytes = 2 * (MESSAGE_HEAD_BYTES + INDEX_BYTES) + len(joint_state) + len(currents)
+    states_hz = 1e9 / JOINT_STATE_NS
+    growth_bytes_s = rate_hz * sample_bytes + states_hz * state_bytes + CHUNKS_BYTES_S
+    attached_bytes = sum(map(len, attached.values()))
     # A topic has it too, for viewers
-    files = sum(map(len, attached.values())) + len(attached.get(URDF, b""))
-    return round(duration_s * growth_bytes_s) + ENDS_BYTES + files
+    urdf_bytes = len(attached.get(URDF, b""))
+    return round(duration_s * growth_bytes_s) + ENDS_BYTES + attached_bytes + urdf_bytes
 
 
 class DiskRoom:
@@ -69,10 +65,11 @@ class DiskRoom:
             DiskSpaceShort: there is less than that, and a reserve.
             OutputFailed: there is no such folder.
         """
+        needed = _megabytes(needed_bytes)
+        reserve = _megabytes(RESERVE_BYTES)
         self._require(
             needed_bytes + RESERVE_BYTES,
-            f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} "
-            "in reserve",
+            f"{needed} for the log of this plan and {reserve} in reserve",
             "nothing has moved; free space, name a folder on another disk, or plan a shorter run",
         )
 

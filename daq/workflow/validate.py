@@ -152,10 +152,13 @@ def together(validations: Sequence[Validation]) -> RelativeError:
     """‖ρ‖/‖Y‖ over the rows of several runs [%];
     of the logs of the fit, it is the fit's own figure.
     """
+    measured_nm = [validation.measured_nm for validation in validations]
+    predicted_nm = [validation.predicted_nm for validation in validations]
+    use = [validation.use for validation in validations]
     return relative_error(
-        np.concatenate([validation.measured_nm for validation in validations], axis=1),
-        np.concatenate([validation.predicted_nm for validation in validations], axis=1),
-        np.concatenate([validation.use for validation in validations], axis=1),
+        np.concatenate(measured_nm, axis=1),
+        np.concatenate(predicted_nm, axis=1),
+        np.concatenate(use, axis=1),
     )
 
 
@@ -169,11 +172,12 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
         return calibration.conditioning
     except ModelError as error:
         numbers = sorted(Conditioning().document().keys() - {"standstill_rad_s"})
+        settings = [f"{name}: {value}" for name, value in calibration.filter.items()]
+        wanted = ", ".join(numbers)
         raise CalibrationUnreadable(
             f"calibration of cell {calibration.cell!r}, filter",
-            found=", ".join(f"{name}: {value}" for name, value in calibration.filter.items())
-            or "nothing",
-            expected=f"a list standstill_rad_s and numbers {', '.join(numbers)}",
+            found=", ".join(settings) or "nothing",
+            expected=f"a list standstill_rad_s and numbers {wanted}",
             remedy="fit the logs again with this drivegain",
         ) from error
 
@@ -240,6 +244,9 @@ def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) ->
         raise DataUnfit(
             data.name, "no row is left after the standstill and validity masks; did the robot move?"
         )
+    centres = filter_.centres(len(data.time_s))
+    torque_nm = measured_torque(calibration, model, data.current_a, data.motion())
+    predicted_nm = predict_torque(calibration, model, data)
     return Validation(
         log=log,
         run=run.name,
@@ -247,9 +254,9 @@ def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) ->
         data_use=data_use(calibration, run),
         same_configuration=described.digest == calibration.configuration_sha256,
         partial=run.partial,
-        time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
-        measured_nm=filter_(measured_torque(calibration, model, data.current_a, data.motion()).T),
-        predicted_nm=filter_(predict_torque(calibration, model, data).T),
+        time_s=data.time_s[centres] - data.time_s[0],
+        measured_nm=filter_(torque_nm.T),
+        predicted_nm=filter_(predicted_nm.T),
         use=use,
     )
 
@@ -268,10 +275,11 @@ def warn_of_fitted(
     """Warn of runs that the fit has seen, and name them."""
     seen = tuple(run.name for run in runs if data_use(calibration, run) is DataUse.FIT)
     if seen:
+        verb = "were" if len(seen) > 1 else "was"
         _LOG.warning(
             "%s %s part of the fit: %s",
             ", ".join(seen),
-            "were" if len(seen) > 1 else "was",
+            verb,
             consequence,
         )
     return seen
@@ -388,16 +396,7 @@ def cross_validate(
         IdentificationError: a calibration contradicts the cell or a run.
     """
     first = next(iter(calibrations))
-    conditioning = conditioning_of(calibrations[first])
-    for label, calibration in calibrations.items():
-        if conditioning_of(calibration) != conditioning:
-            raise LogsDiffer(
-                f"calibration {label}",
-                found=f"the filter {calibration.filter}",
-                expected=f"that of {first}: {calibrations[first].filter}",
-                remedy="a relative error can be compared under one filter only: fit both with one "
-                "cell file",
-            )
+    conditioning = _common_conditioning(calibrations)
     runs = []
     bare = []
     loaded = []
@@ -408,16 +407,7 @@ def cross_validate(
         run, described = load_run(log, cell)
         corrections.note(log, run)
         first_own, model = on_cell(calibrations[first], described)
-        found: dict[str, Validation] = {}
-        reasons: dict[str, list[str]] = {}
-        for label, calibration in calibrations.items():
-            check_cell(calibration, log, described)
-            warn_without_temperature(calibration, run.name, run.temperature_c)
-            reason = unpredictable(calibration, run.payload)
-            if reason:
-                reasons.setdefault(reason, []).append(label)
-            else:
-                found[label] = predicted(calibration, described, log, run)
+        found, reasons = _predictions(calibrations, described, log, run)
         if first in found:
             validations.append(found[first])
         condition = None
@@ -432,29 +422,25 @@ def cross_validate(
             )
         if run.payload is not None:
             # From the log, else from the cell, since a body weighs the same anywhere.
-            of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
-            kg = run.payload.known.get("m", next(of_cell, None))
+            kg = run.payload.known.get("m", _declared_mass(described, run.payload.name))
             loaded.append((log, run, run.payload, kg))
         elif standard is not None:
             bare.append(run)
+        errors = {label: validation.error for label, validation in found.items()}
+        seen_by = [label for label, v in found.items() if v.data_use is DataUse.FIT]
         runs.append(
             CheckedRun(
                 log=log,
                 run=run.name,
                 condition=condition,
-                errors={label: validation.error for label, validation in found.items()},
-                left_out="; ".join(
-                    reason
-                    if len(labels) == len(calibrations)
-                    else f"{reason} ({', '.join(labels)})"
-                    for reason, labels in reasons.items()
-                ),
-                seen_by=tuple(label for label, v in found.items() if v.data_use is DataUse.FIT),
+                errors=errors,
+                left_out=_left_out(reasons, len(calibrations)),
+                seen_by=tuple(seen_by),
             )
         )
-    of_cell_now = {
-        label: on_cell(calibration, described)[0] for label, calibration in calibrations.items()
-    }
+    of_cell_now = {}
+    for label, calibration in calibrations.items():
+        of_cell_now[label], _ = on_cell(calibration, described)
     weighed = []
     for log, run, payload, kg in loaded:
         rows: RowsToWeigh | str
@@ -462,10 +448,12 @@ def cross_validate(
             rows = rows_to_weigh(model, (run,), conditioning, bare=bare)
         except IdentificationError as error:
             rows = str(error)
-        weighed.append(WeighedRun(log, log.stem, payload, kg, _masses(of_cell_now, rows, kg)))
+        masses = _masses(of_cell_now, rows, kg)
+        weighed.append(WeighedRun(log, log.stem, payload, kg, masses))
     stored = not_repeated(not_corrected_since(calibrations[first], described), diagnoses)
+    axes = tuple(gain.axis for gain in calibrations[first].gains)
     return CrossValidation(
-        axes=tuple(gain.axis for gain in calibrations[first].gains),
+        axes=axes,
         calibrations=dict(calibrations),
         runs=tuple(runs),
         weighed=tuple(weighed),
@@ -473,6 +461,66 @@ def cross_validate(
         validations=tuple(validations),
         diagnoses=(*diagnoses, *stored),
     )
+
+
+def _common_conditioning(calibrations: Mapping[str, Calibration]) -> Conditioning:
+    """Return the conditioning that all calibrations were made with.
+
+    Raises:
+        LogsDiffer: one was made with another.
+    """
+    first, *others = calibrations
+    conditioning = conditioning_of(calibrations[first])
+    for label in others:
+        calibration = calibrations[label]
+        if conditioning_of(calibration) != conditioning:
+            raise LogsDiffer(
+                f"calibration {label}",
+                found=f"the filter {calibration.filter}",
+                expected=f"that of {first}: {calibrations[first].filter}",
+                remedy="a relative error can be compared under one filter only: fit both with one "
+                "cell file",
+            )
+    return conditioning
+
+
+def _predictions(
+    calibrations: Mapping[str, Calibration], described: Cell, log: Path, run: Run
+) -> tuple[dict[str, Validation], dict[str, list[str]]]:
+    """Return what each calibration predicts of a run, and why the others predict nothing,
+    by label and by reason.
+    """
+    found: dict[str, Validation] = {}
+    reasons: dict[str, list[str]] = {}
+    for label, calibration in calibrations.items():
+        check_cell(calibration, log, described)
+        warn_without_temperature(calibration, run.name, run.temperature_c)
+        reason = unpredictable(calibration, run.payload)
+        if reason:
+            reasons.setdefault(reason, []).append(label)
+        else:
+            found[label] = predicted(calibration, described, log, run)
+    return found, reasons
+
+
+def _declared_mass(cell: Cell, payload: str) -> float | None:
+    """Return the mass of a payload by the cell file; None where it does not have it."""
+    for body in cell.payloads:
+        if body.name == payload:
+            return body.mass_kg
+    return None
+
+
+def _left_out(reasons: Mapping[str, Sequence[str]], count: int) -> str:
+    """Say why calibrations were not checked, naming them where they are not all of them."""
+    texts = []
+    for reason, labels in reasons.items():
+        if len(labels) < count:
+            names = ", ".join(labels)
+            texts.append(f"{reason} ({names})")
+        else:
+            texts.append(reason)
+    return "; ".join(texts)
 
 
 def _standard_system(
@@ -540,11 +588,13 @@ def _masses(
                 "these moves do not distinguish the payload's mass from its other parameters"
             )
             continue
+        std_kg = float(np.sqrt(found.moves_covariance[-1, -1]))
+        error_percent = None if kg is None else 100.0 * abs(mass - kg) / kg
         masses[label] = Mass(
             mass_kg=mass,
-            std_percent=100.0 * float(np.sqrt(found.moves_covariance[-1, -1])) / abs(mass),
+            std_percent=100.0 * std_kg / abs(mass),
             std_with_gains_percent=100.0 * found.mass_std_kg / abs(mass),
-            error_percent=None if kg is None else 100.0 * abs(mass - kg) / kg,
+            error_percent=error_percent,
         )
     return masses
 
@@ -647,7 +697,8 @@ def replaced_geometry(
 def _rms(torque_nm: FloatArray, use: BoolArray) -> FloatArray:
     """Root mean square of each axis over its rows that count, shape (m,); zero without any."""
     rows = np.maximum(use.sum(axis=1), 1)
-    return np.asarray(np.sqrt(np.sum(torque_nm**2, axis=1, where=use) / rows))
+    square = np.sum(torque_nm**2, axis=1, where=use)
+    return np.asarray(np.sqrt(square / rows))
 
 
 def _payload_diagnoses(
@@ -655,16 +706,16 @@ def _payload_diagnoses(
 ) -> Iterator[Diagnosis]:
     """Compare the payload of a run with that of its mounting in the calibration."""
     mounted = mounted_parameters(calibration, payload.mounting)
-    unknown = tuple(
-        index
-        for index, parameter in enumerate(LINK_PARAMETERS)
-        if parameter not in payload.known and parameter in mounted
-    )
-    of_payload = [mounted[LINK_PARAMETERS[index]].value for index in unknown]
-    values = np.concatenate((standard_parameters(calibration, standard.model), of_payload))
-    return payload_diagnoses(
-        regrouped(standard, standard.base, (unknown,)), _gains(calibration), values
-    )
+    unknown = []
+    of_payload = []
+    for index, parameter in enumerate(LINK_PARAMETERS):
+        if parameter not in payload.known and parameter in mounted:
+            unknown.append(index)
+            of_payload.append(mounted[parameter].value)
+    of_links = standard_parameters(calibration, standard.model)
+    values = np.concatenate((of_links, of_payload))
+    system = regrouped(standard, standard.base, (tuple(unknown),))
+    return payload_diagnoses(system, _gains(calibration), values)
 
 
 def not_repeated(stored: Iterable[Diagnosis], fresh: Iterable[Diagnosis]) -> Iterator[Diagnosis]:
@@ -733,7 +784,8 @@ def _remaining(accepted: AcceptedEffect, calibration: Calibration, cell: Cell) -
             left = turn_between(np.array(now), turned_gravity(then, values.tolist()))
         case _:
             return accepted
-    by_name = dict(zip((column.name for column in placed.columns), left, strict=True))
+    names = [column.name for column in placed.columns]
+    by_name = dict(zip(names, left, strict=True))
     coefficients = tuple(
         replace(one, value=float(by_name[one.name])) for one in accepted.coefficients
     )

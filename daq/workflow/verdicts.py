@@ -45,13 +45,12 @@ def design_after(found: Identification) -> Design:
         parameters = payload.known_parameters
         parameters[list(indices)] = estimate.parameters[first : first + len(indices)]
         first += len(indices)
-        payloads.append(
-            ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters)
-        )
+        known = frozenset(payload.known) & frozenset(LINK_PARAMETERS)
+        payloads.append(ExpectedPayload(known, parameters))
     # ml's noise is that of the current references, the others' that of the joint torques.
-    noise = estimate.axis_noise / (
-        1.0 if estimate.method.is_of_currents else np.abs(estimate.gains)
-    )
+    noise = estimate.axis_noise
+    if not estimate.method.is_of_currents:
+        noise = noise / np.abs(estimate.gains)
     expectation = Expectation(
         model=found.model,
         gains=estimate.gains,
@@ -72,16 +71,23 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     extra: tuple[ExtraMoves, ...] = ()
     with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
         extra = extra_moves(experiment_of(fitted.cell))
-    judged = verdicts(design_after(fitted.identification), list(excitations(fitted)), extra)
-    true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
-    return tuple(_scaled(gain, float(std)) for gain, std in zip(judged.gains, true, strict=True))
+    design = design_after(fitted.identification)
+    judged = verdicts(design, list(excitations(fitted)), extra)
+    estimate = fitted.estimate
+    std_percent = 100.0 * estimate.gains_std / np.abs(estimate.gains)
+    scaled = []
+    for gain, std in zip(judged.gains, std_percent.tolist(), strict=True):
+        scaled.append(_scaled(gain, std))
+    return tuple(scaled)
 
 
 def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     """The verdicts, or none where the gains were given or all are known well enough."""
     estimate = fitted.estimate
-    good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
-    return () if good else gain_verdicts(fitted)
+    is_good = 100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)
+    if np.all(is_good):
+        return ()
+    return gain_verdicts(fitted)
 
 
 def excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
@@ -98,11 +104,12 @@ def excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...
 
 
 def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:
+    factor = 1.0
     if np.isfinite(gain.std_percent) and gain.std_percent:
         factor = std_percent / gain.std_percent
-    else:
-        factor = 1.0
-    advice = gain.advice and replace(gain.advice, std_percent=factor * gain.advice.std_percent)
+    advice = gain.advice
+    if advice is not None:
+        advice = replace(advice, std_percent=factor * advice.std_percent)
     alone = {source: factor * alone for source, alone in gain.alone_percent.items()}
     known = gain.known_preload_percent and factor * gain.known_preload_percent
     return replace(

@@ -15,8 +15,7 @@ FEWEST_DECIMALS = 2
 
 
 def zero_off_text(name: str, value: float, std: float, unit: str) -> str:
-    """Say how far a zero is off: `the zero of J3 off by -2.00 ± 0.04° (to be added to its
-    position)`.
+    """Say how far a zero is off: `the zero of J3 off by -2.00 ± 0.04°`.
 
     Args:
         name: of the axis.
@@ -27,7 +26,9 @@ def zero_off_text(name: str, value: float, std: float, unit: str) -> str:
     decimals = zero_decimals(std)
     shown_std = max(std, 0.5 * 10.0**-MOST_DECIMALS)
     space = "" if unit == DEGREES else " "
-    size = f"{value:+.{decimals}f} ± {shown_std:.{decimals}f}{space}{unit}"
+    size_text = f"{value:+.{decimals}f}"
+    std_text = f"{shown_std:.{decimals}f}"
+    size = f"{size_text} ± {std_text}{space}{unit}"
     return f"the zero of {name} off by {size} (to be added to its position)"
 
 
@@ -43,9 +44,11 @@ def zero_remedy(name: str, value: float, std: float, unit: str, described: float
     """
     key = "zero_offset_deg" if unit == DEGREES else "zero_offset_mm"
     decimals = zero_decimals(std)
+    change = f"{value:+.{decimals}f}"
+    corrected = f"{described + value:.{decimals}f}"
     return (
-        f"add {value:+.{decimals}f} to `{key}` of {name} in the cell file, which makes it "
-        f"{described + value:.{decimals}f}, or correct the zero in the controller"
+        f"add {change} to `{key}` of {name} in the cell file, which makes it {corrected}, or "
+        "correct the zero in the controller"
     )
 
 
@@ -53,4 +56,5 @@ def zero_decimals(std: float) -> int:
     """Decimals of a zero that its σ leaves."""
     if not std > 0.0:
         return MOST_DECIMALS
-    return min(MOST_DECIMALS, max(FEWEST_DECIMALS, -math.floor(math.log10(std))))
+    decimals = -math.floor(math.log10(std))
+    return min(MOST_DECIMALS, max(FEWEST_DECIMALS, decimals))

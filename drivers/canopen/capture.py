@@ -127,9 +127,7 @@ class Batch:
         return count
 
     def about(self, number: int) -> tuple[int, int, int | None, int | None]:
-        """Return bytes, flags, time stamp [ns since 1970;
-        None without] and drop counter of a received frame.
-        """
+        """Return bytes, flags, time stamp [ns since 1970] and drop counter of a received frame."""
         message = self._messages[number]
         stamp_ns: int | None = None
         drops: int | None = None

@@ -17,10 +17,7 @@ if TYPE_CHECKING:
     from drivers.canopen.sdo import ObjectAccess
 
 _LINES = Path(__file__).with_name("emcy.txt").read_text(encoding="utf-8").splitlines()
-_TEXTS = {
-    digits: text
-    for digits, _, text in (line.partition(" ") for line in _LINES if not line.startswith("#"))
-}
+_TEXTS = dict(line.split(" ", maxsplit=1) for line in _LINES if not line.startswith("#"))
 CODES = {int(digits, 16): text for digits, text in _TEXTS.items() if len(digits) == 4}
 """Text of each code that the two standards name."""
 

@@ -104,7 +104,9 @@ def nmt_name(state: int | None) -> str:
     """Return the name of an NMT state."""
     if state is None:
         return "nothing"
-    return str(NmtState(state)) if state in tuple(NmtState) else f"unknown ({state})"
+    if state in tuple(NmtState):
+        return str(NmtState(state))
+    return f"unknown ({state})"
 
 
 def command_name(identifier: int, names: Mapping[int, str]) -> str:
@@ -138,11 +140,9 @@ def _sent_ns(message: can.Message, now_ns: int) -> int:
     """Return the time of a frame by its own stamp where it has one, however late it is read;
     one clock for one bus.
     """
-    return (
-        message.monotonic_ns
-        if isinstance(message, CapturedMessage)
-        else round(message.timestamp * 1e9) or now_ns
-    )
+    if isinstance(message, CapturedMessage):
+        return message.monotonic_ns
+    return round(message.timestamp * 1e9) or now_ns
 
 
 class Link:
@@ -208,7 +208,9 @@ class Link:
         a flood of others costs nothing.
         """
         services = (EMCY, *range(0x180, SDO_REQUEST, 0x80), HEARTBEAT)
-        wanted = [(service + node_id, 0x7FF) for service in services for node_id in self.names]
+        wanted: list[tuple[int, int]] = []
+        for service in services:
+            wanted += [(service + node_id, 0x7FF) for node_id in self.names]
         wanted += [(number, 0x7FF) for number in sorted(_COMMANDS)]
         wanted += [(SDO_REQUEST, 0x780), (self.own_id or NMT_COB_ID, 0x7F)]
         receive_only(self.bus, wanted)
@@ -252,11 +254,10 @@ class Link:
         """
         if self.deadline_ns is None:
             return seconds
-        return (
-            0.0
-            if self.given_up()
-            else min(seconds, max(0.0, (self.deadline_ns - self.clock()) * 1e-9))
-        )
+        if self.given_up():
+            return 0.0
+        left_s = (self.deadline_ns - self.clock()) * 1e-9
+        return min(seconds, max(0.0, left_s))
 
     def pass_time(self) -> None:
         """Send one SYNC and handle frames for 1 ms: a cell in lockstep advances by SYNC alone."""
@@ -366,9 +367,9 @@ class Link:
             self._events.append(
                 (0, EventKind.CONTROLLER, _RESTARTED, "the CAN controller was restarted")
             )
-        bits = (
-            message.data[1] if message.arbitration_id & _CONTROLLER and len(message.data) > 1 else 0
-        )
+        bits = 0
+        if message.arbitration_id & _CONTROLLER and len(message.data) > 1:
+            bits = message.data[1]
         if bits & _PASSIVE:
             text = "the CAN controller is error passive: check termination, wiring and bit rate"
             self._events.append((0, EventKind.BUS_PASSIVE, bits, text))
@@ -378,12 +379,10 @@ class Link:
                 (_WARNING, "counts errors"),
                 (_ACTIVE, "recovered"),
             )
-            description = (
-                ", ".join(text for mask, text in states if bits & mask) or f"reports {bits:02X}h"
-            )
-            self._events.append(
-                (0, EventKind.CONTROLLER, bits, f"the CAN controller {description}")
-            )
+            texts = [text for mask, text in states if bits & mask]
+            description = ", ".join(texts) or f"reports {bits:02X}h"
+            text = f"the CAN controller {description}"
+            self._events.append((0, EventKind.CONTROLLER, bits, text))
 
     def is_own(self, identifier: int) -> bool:
         """Whether only a device with our own node id sends a frame with this identifier."""
@@ -471,13 +470,13 @@ class Link:
             elapsed_ms = (beats[-1].at_ns - beats[0].at_ns) * 1e-6
             return f"{len(beats)} heartbeats in {elapsed_ms:.0f} ms, its period is {period_ms} ms"
         states = [beat.state for beat in beats]
-        between = [
-            (before, state)
-            for before, state, after in zip(states, states[1:], states[2:], strict=False)
-            if before == after != state
-        ]
+        between = []
+        for before, state, after in zip(states, states[1:], states[2:], strict=False):
+            if before == after != state:
+                between.append((before, state))
         if len(between) > 1:
-            return f"heartbeats {nmt_name(between[0][0])} and {nmt_name(between[0][1])} in turn"
+            one, other = map(nmt_name, between[0])
+            return f"heartbeats {one} and {other} in turn"
         return ""
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
@@ -489,8 +488,8 @@ class Link:
         found = []
         for node, kind, code, text in taken:
             axis = node_ids.index(node) if node in node_ids else None
-            whole = f"{node_label(self.objects(node))}: {text}" if node else text
-            found.append(CellEvent(time_ns, axis, kind, code, whole))
+            subject = f"{node_label(self.objects(node))}: " if node else ""
+            found.append(CellEvent(time_ns, axis, kind, code, f"{subject}{text}"))
         return tuple(found)
 
     def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
@@ -499,9 +498,8 @@ class Link:
         if (node_id, policy) not in self._access:
             client = SynchronousSdoClient(node_id, self, policy)
             self.listen(node_id, client.receive)
-            self._access[node_id, policy] = ObjectAccess(
-                node_id, client, policy, self.names.get(node_id, "")
-            )
+            name = self.names.get(node_id, "")
+            self._access[node_id, policy] = ObjectAccess(node_id, client, policy, name)
         return self._access[node_id, policy]
 
     def listen(self, node_id: int, listener: SdoListener) -> None:
@@ -522,9 +520,10 @@ class Link:
         """
 
         def found() -> int | None:
-            return (
-                self.nmt[node_id] if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
-            )
+            heard_ns = self.heard_ns.get(node_id)
+            if heard_ns is None or heard_ns < since_ns:
+                return None
+            return self.nmt[node_id]
 
         if not self.wait(within_s, lambda: found() == state):
             shown = f"{nmt_name(found())} after {within_s:.3g} s"

@@ -344,14 +344,15 @@ class CanopenNetwork:
         identities = self.check_identities()
         consumers = [read_consumers(self.objects(axis)) for axis in self.axes]
         if self.link.own_id is None:
-            self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
-        new = {
-            axis.node_id: AxisSetup(
-                self.link, axis, HeartbeatGuard(self.objects(axis), entries, self.was_ours)
-            )
-            for axis, entries in zip(self.axes, consumers, strict=True)
-            if axis.node_id not in self._setups
-        }
+            watched: list[int] = []
+            for entries in consumers:
+                watched += [value for _, value in entries or ()]
+            self._take_recorder_id(watched)
+        new: dict[int, AxisSetup] = {}
+        for axis, entries in zip(self.axes, consumers, strict=True):
+            if axis.node_id not in self._setups:
+                guard = HeartbeatGuard(self.objects(axis), entries, self.was_ours)
+                new[axis.node_id] = AxisSetup(self.link, axis, guard)
         for setup in new.values():
             setup.check(self.profiles)
         self._require_own_ids(0)
@@ -384,10 +385,11 @@ class CanopenNetwork:
         """PDOs of each axis: as they are mapped, or before `prepare` as they will be on most
         drives.
         """
-        return tuple(
-            self._setups[axis.node_id].pdos if axis.node_id in self._setups else wanted_pdos(axis)
-            for axis in self.axes
-        )
+        pdos = []
+        for axis in self.axes:
+            setup = self._setups.get(axis.node_id)
+            pdos.append(wanted_pdos(axis) if setup is None else setup.pdos)
+        return tuple(pdos)
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
         """Choose the highest node id that no device uses,
@@ -467,12 +469,12 @@ class CanopenNetwork:
         """Report the amplifiers of the prepared network that do not stop by themselves when the
         recorder is killed.
         """
-        lacks = {
-            axis.name: self._setups[axis.node_id].guard.lack
-            for axis in self.axes
-            if axis.node_id in self._setups
-        }
-        return tuple(f"{name}: {lack}" for name, lack in lacks.items() if lack)
+        lacks = []
+        for axis in self.axes:
+            setup = self._setups.get(axis.node_id)
+            if setup is not None and setup.guard.lack:
+                lacks.append(f"{axis.name}: {setup.guard.lack}")
+        return tuple(lacks)
 
     def without_guard(self) -> tuple[str, ...]:
         """Return the names of the axes of the prepared network that go on moving when the recorder
@@ -661,14 +663,10 @@ class CanopenNetwork:
                 cause = "asked a second time"
             else:
                 cause = "some did not answer, or the time limit was over"
-            names = "; ".join(
-                f"{name}: {', '.join(steps)}" for name, steps in left.items() if steps
-            )
+            not_restored = {name: ", ".join(steps) for name, steps in left.items() if steps}
+            names = "; ".join(f"{name}: {steps}" for name, steps in not_restored.items())
             remedy = "switch these drives off and on before they are used"
-            problems.append(
-                BusError(
-                    str(self.link.address), f"settings not restored ({cause}): {names}; {remedy}"
-                )
-            )
+            text = f"settings not restored ({cause}): {names}; {remedy}"
+            problems.append(BusError(str(self.link.address), text))
         self._setups.clear()
         return problems

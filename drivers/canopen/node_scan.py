@@ -139,9 +139,7 @@ def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, in
 
 
 def read_identity(access: ObjectAccess) -> Identity:
-    """Read object 1018h; product code and serial are None where a node has none (CiA 301 requires
-    the vendor only).
-    """
+    """Read object 1018h, of which CiA 301 requires the vendor only: the rest may be None."""
     vendor_id = access.read(VENDOR_ID)
     product_code = access.read_optional(PRODUCT_CODE, any_abort=True)
     serial = access.read_optional(SERIAL, any_abort=True)

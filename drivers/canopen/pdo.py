@@ -53,9 +53,7 @@ _CODES = {
 
 
 class Direction(Enum):
-    """Direction seen from the drive; the value is (communication index, mapping index,
-    first COB-ID).
-    """
+    """Direction seen from the drive: communication index, mapping index and first COB-ID."""
 
     TPDO = (0x1800, 0x1A00, 0x180)
     RPDO = (0x1400, 0x1600, 0x200)
@@ -101,7 +99,8 @@ def pack(
                 f"object {entry} has {entry.bits} bits; only 8, 16 and 32 can be decoded"
             )
         for pdo in pdos:
-            if sum(other.bits for other in pdo) + entry.bits <= 8 * most_bytes:
+            used_bits = sum(other.bits for other in pdo)
+            if used_bits + entry.bits <= 8 * most_bytes:
                 pdo.append(entry)
                 break
         else:
@@ -127,16 +126,13 @@ def records(
         raise ValueError(
             f"found {len(numbers)} {direction.name}s in the drive; expected {len(pdos)}"
         )
-    return tuple(
-        PdoRecord(
-            direction,
-            number,
-            direction.value[2] + 0x100 * number + node_id,
-            SYNCHRONOUS,
-            tuple(map(word, pdo)),
-        )
-        for number, pdo in zip(numbers, pdos, strict=False)
-    )
+    _, _, first_cob_id = direction.value
+    found = []
+    for number, pdo in zip(numbers, pdos, strict=False):
+        cob_id = first_cob_id + 0x100 * number + node_id
+        entries = tuple(map(word, pdo))
+        found.append(PdoRecord(direction, number, cob_id, SYNCHRONOUS, entries))
+    return tuple(found)
 
 
 def feedback_entries(axis: Axis) -> tuple[ObjectEntry, ...]:
@@ -193,17 +189,12 @@ def wanted_pdos(
         ValueError: the drive has too few PDOs, or an object is no integer.
     """
     have = dict.fromkeys(Direction, range(PDOS)) if numbers is None else numbers
-    setpoints = pack(COMMAND, most_bytes) + pack(
-        [entry for entry in MOTION_PROFILE if entry not in absent], most_bytes
-    )
+    profile = [entry for entry in MOTION_PROFILE if entry not in absent]
+    setpoints = pack(COMMAND, most_bytes) + pack(profile, most_bytes)
+    feedback = pack(feedback_entries(axis), most_bytes)
     return AxisPdos(
-        records(
-            Direction.TPDO,
-            axis.node_id,
-            pack(feedback_entries(axis), most_bytes),
-            have[Direction.TPDO],
-        ),
-        records(Direction.RPDO, axis.node_id, setpoints, have[Direction.RPDO]),
+        feedback=records(Direction.TPDO, axis.node_id, feedback, have[Direction.TPDO]),
+        setpoints=records(Direction.RPDO, axis.node_id, setpoints, have[Direction.RPDO]),
     )
 
 
@@ -225,12 +216,14 @@ def fixed_setpoints(
     command = set(map(word, COMMAND))
     profile = {word(entry) for entry in MOTION_PROFILE if entry not in absent}
     used = _carrying(command | profile, found)
-    if any(
-        not (set(record.entries) <= command or set(record.entries) <= profile) for record in used
-    ):
-        return ()
+    for record in used:
+        entries = set(record.entries)
+        if not entries <= command and not entries <= profile:
+            return ()
     order = [mapped for mapped in _all_mapped(used) if mapped in command]
-    return used if order == list(map(word, COMMAND)) else ()
+    if order != list(map(word, COMMAND)):
+        return ()
+    return used
 
 
 def _all_mapped(pdos: Sequence[PdoRecord]) -> tuple[int, ...]:
@@ -238,14 +231,15 @@ def _all_mapped(pdos: Sequence[PdoRecord]) -> tuple[int, ...]:
 
 
 def _carrying(needed: set[int], found: Sequence[PdoRecord]) -> tuple[PdoRecord, ...]:
-    used = [
-        record
-        for record in found
-        if needed & set(record.entries) and not record.cob_id & (NOT_VALID | _EXTENDED)
-    ]
+    used = []
+    for record in found:
+        is_usable = not record.cob_id & (NOT_VALID | _EXTENDED)
+        if is_usable and needed & set(record.entries):
+            used.append(record)
     every = _all_mapped(used)
-    whole_bytes = all((mapped & 0xFF) % 8 == 0 for mapped in every)
-    if sorted(mapped for mapped in every if mapped in needed) != sorted(needed) or not whole_bytes:
+    has_whole_bytes = all((mapped & 0xFF) % 8 == 0 for mapped in every)
+    carried = [mapped for mapped in every if mapped in needed]
+    if sorted(carried) != sorted(needed) or not has_whole_bytes:
         return ()
     return tuple(replace(record, transmission=SYNCHRONOUS) for record in used)
 
@@ -257,15 +251,17 @@ def record_payload(
     it skips others.
     """
     known = {word(entry): entry for entry in entries}
-    codes = [
-        _CODES[known[mapped].bits, known[mapped].signed]
-        if mapped in known
-        else f"{(mapped & 0xFF) // 8}x"
-        for mapped in record.entries
-    ]
-    return struct.Struct("<" + "".join(codes)), tuple(
-        known[mapped] for mapped in record.entries if mapped in known
-    )
+    codes = "<"
+    carried = []
+    for mapped in record.entries:
+        entry = known.get(mapped)
+        if entry is None:
+            skipped_bytes = (mapped & 0xFF) // 8
+            codes += f"{skipped_bytes}x"
+        else:
+            codes += _CODES[entry.bits, entry.signed]
+            carried.append(entry)
+    return struct.Struct(codes), tuple(carried)
 
 
 def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
@@ -316,10 +312,9 @@ def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
     fixed = False
     steps = [(cob_id, off)]
     if not mapped:
-        steps += [
-            (count, 0),
-            *((_entry(count, sub), word) for sub, word in enumerate(record.entries, start=1)),
-        ]
+        steps.append((count, 0))
+        for sub, mapped_object in enumerate(record.entries, start=1):
+            steps.append((_entry(count, sub), mapped_object))
     if before is None or before.transmission != record.transmission:
         steps.append((transmission, record.transmission))
     if not mapped:
@@ -341,14 +336,17 @@ def write_pdo_record(access: ObjectAccess, record: PdoRecord) -> None:
                     access, reason, expected=MAPPABLE, remedy=NOT_MAPPABLE
                 ) from error
     found = read_pdo_record(access, record.direction, record.number)
-    if (
-        found is None
-        or (found.entries, found.transmission) != (record.entries, record.transmission)
-        or (found.cob_id ^ record.cob_id) & _COB_ID_BITS
-    ):
+    if found is None or not _is_as_written(found, record):
         raise SetupRefused(
             access, f"{record.name}: reads back as '{found}', written was '{record}'"
         )
+
+
+def _is_as_written(found: PdoRecord, record: PdoRecord) -> bool:
+    """Whether a PDO that was read back is the one that was written."""
+    if found.entries != record.entries or found.transmission != record.transmission:
+        return False
+    return not (found.cob_id ^ record.cob_id) & _COB_ID_BITS
 
 
 def turn_off(access: ObjectAccess, record: PdoRecord) -> None:

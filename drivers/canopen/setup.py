@@ -194,11 +194,12 @@ def misfit(access: ObjectAccess, profile: DriveProfile, others: Profiles = tuple
     expected = f"every object of profile {profile.name}"
     if any(str(HEARTBEAT_TIME) in one for one in lacking):
         return Misfit(found, expected, HEARTBEATS_NEEDED)
-    fitting = [
-        other for other in others() if other.name != profile.name and not _lacking(access, other)
-    ]
-    if fitting:
-        advice = " or ".join(f"`{other.name}` ({_difference(other, profile)})" for other in fitting)
+    advised = []
+    for other in others():
+        if other.name != profile.name and not _lacking(access, other):
+            advised.append(f"`{other.name}` ({_difference(other, profile)})")
+    if advised:
+        advice = " or ".join(advised)
         remedy = f"use a profile that fits this drive: {advice}"
     else:
         remedy = "no shipped profile fits this drive: write one with the objects of its manual"
@@ -212,10 +213,8 @@ def why_no_heartbeat(access: ObjectAccess) -> str:
         ObjectAccessError: the drive does not answer.
     """
     period_ms = access.read_optional(HEARTBEAT_TIME, any_abort=True)
-    found = (
-        "it answers SDO and sends no heartbeat (1017h = "
-        f"{'none' if period_ms is None else period_ms})"
-    )
+    period = "none" if period_ms is None else period_ms
+    found = f"it answers SDO and sends no heartbeat (1017h = {period})"
     guard_ms = access.read_optional(GUARD_TIME, any_abort=True)
     if guard_ms is not None:
         found += f", and has node guarding (100Ch = {guard_ms})"
@@ -241,15 +240,14 @@ def _lacking(access: ObjectAccess, profile: DriveProfile) -> tuple[str, ...]:
 def _difference(other: DriveProfile, profile: DriveProfile) -> str:
     """Describe the objects by which another profile differs."""
     same = needs_of(profile)
-    parts = [
-        f"{purpose} from {entry}"
-        for entry, purpose in needs_of(other).items()
-        if same.get(entry) != purpose
-    ]
-    if other.rated is not None and (
-        profile.rated is None or other.rated.current != profile.rated.current
-    ):
-        parts.append(f"rated current from {other.rated.current}")
+    parts = []
+    for entry, purpose in needs_of(other).items():
+        if same.get(entry) != purpose:
+            parts.append(f"{purpose} from {entry}")
+    if other.rated is not None:
+        rated_current = None if profile.rated is None else profile.rated.current
+        if other.rated.current != rated_current:
+            parts.append(f"rated current from {other.rated.current}")
     return ", ".join(parts) or "the same objects in other units"
 
 
@@ -291,9 +289,10 @@ class HeartbeatGuard:
         """Describe the guard in words, for the log."""
         if self._consumer is None:
             return self.lack
-        return (f"watches the recorder by {self._consumer}, {silence_ms} ms") + (
-            f"; {self.lack}" if self.lack else ""
-        )
+        text = f"watches the recorder by {self._consumer}, {silence_ms} ms"
+        if self.lack:
+            text += f"; {self.lack}"
+        return text
 
     def arm(self, recorder_id: int, silence_ms: int) -> None:
         """Let the amplifier quick stop after this silence of the recorder,
@@ -381,10 +380,9 @@ class AxisSetup:
         self.pdos = self._wanted(PDO_BYTES)
 
     def _wanted(self, most_bytes: int) -> AxisPdos:
-        numbers = {
-            direction: [record.number for record in found]
-            for direction, found in self._found.items()
-        }
+        numbers = {}
+        for direction, found in self._found.items():
+            numbers[direction] = [record.number for record in found]
         try:
             return wanted_pdos(self._axis, numbers, self._absent, most_bytes)
         except ValueError as error:
@@ -462,11 +460,13 @@ class AxisSetup:
         Raises:
             SetupRefused: a mapping is impossible, was refused, or reads back differently.
         """
-        tpdos, rpdos = (self._found[direction] for direction in (Direction.TPDO, Direction.RPDO))
-        self.pdos = AxisPdos(
-            self._map(lambda pdos: pdos.feedback, tpdos, fixed_feedback(self._axis, tpdos)),
-            self._map(lambda pdos: pdos.setpoints, rpdos, fixed_setpoints(rpdos, self._absent)),
-        )
+        tpdos = self._found[Direction.TPDO]
+        rpdos = self._found[Direction.RPDO]
+        own_feedback = fixed_feedback(self._axis, tpdos)
+        feedback = self._map(lambda pdos: pdos.feedback, tpdos, own_feedback)
+        own_setpoints = fixed_setpoints(rpdos, self._absent)
+        setpoints = self._map(lambda pdos: pdos.setpoints, rpdos, own_setpoints)
+        self.pdos = AxisPdos(feedback, setpoints)
 
     def _map(
         self,
@@ -525,9 +525,7 @@ class AxisSetup:
             self._link.pass_time()
 
     def _mode_remedy(self) -> str:
-        """Say what to do where the mode is refused, by the modes that the drive reports (6502h;
-        bit 0: this one).
-        """
+        """Say what to do where the mode is refused, by bit 0 of the reported modes (6502h)."""
         supported = self._access.read_optional(SUPPORTED_MODES, any_abort=True)
         if supported is None or supported & 1:
             return MODE_REMEDY

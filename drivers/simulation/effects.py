@@ -256,9 +256,7 @@ class Presliding:
 
 @dataclass(slots=True)
 class Coupling:
-    """Friction on the sum of the speeds of two joints, dry and viscous (one shaft runs through the
-    other, eq. 25).
-    """
+    """Dry and viscous friction of two concentric shafts, on the sum of their speeds (eq. 25)."""
 
     axis: int  #: one joint
     other_axis: float  #: number of the other joint, from 1 as a person counts

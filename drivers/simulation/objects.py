@@ -1,5 +1,6 @@
-"""Object dictionary of a simulated CiA 402 amplifier and its SDO server (CiA 301 §7.2 and §7.5,
-CiA 402-2).
+"""Object dictionary of a simulated CiA 402 amplifier, and its SDO server.
+
+Source: CiA 301 §7.2 and §7.5, CiA 402-2.
 
 Amplifiers of a vendor differ only in the objects that a recording reads (current, rated values);
 states, moves and limits are those of CiA 402. Their units are written here from the vendors'

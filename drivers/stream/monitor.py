@@ -97,7 +97,8 @@ class _AxisWatch:
         self.values: list[int | None] = [None] * len(self.entries)
         self.seen: set[int] = set()
         self.followed = False
-        self.readings = self.lost = 0
+        self.readings = 0
+        self.lost = 0
         self.complete_ns: int | None = None  # when the last complete reading by SDO came
         self.asked = -1
         self.asked_ns: int | None = None  # when the request that waits for its answer was sent
@@ -109,17 +110,19 @@ class _AxisWatch:
     def take(self, nmt: int | None, since_ns: int, now_ns: int) -> AxisReading:
         """Return a reading and begin the next."""
         position, current, statusword = self.values
+        lasted_s = max((now_ns - since_ns) * 1e-9, 1e-9)
+        abandoned_ns = min(since_ns, now_ns - round(ABANDONED_S * 1e9))
+        refused = [self.refused[column] for column in sorted(self.refused)]
         reading = AxisReading(
-            position,
-            current,
-            statusword,
-            nmt,
-            self.readings / max((now_ns - since_ns) * 1e-9, 1e-9),
-            self.lost,
-            self.heard_ns is not None
-            and self.heard_ns >= min(since_ns, now_ns - round(ABANDONED_S * 1e9)),
-            None if self.delay_ns is None else self.delay_ns * 1e-9,
-            tuple(self.refused[column] for column in sorted(self.refused)),
+            position_counts=position,
+            current_raw=current,
+            statusword=statusword,
+            nmt=nmt,
+            rate_hz=self.readings / lasted_s,
+            lost=self.lost,
+            heard=self.heard_ns is not None and self.heard_ns >= abandoned_ns,
+            delay_s=None if self.delay_ns is None else self.delay_ns * 1e-9,
+            refused=tuple(refused),
         )
         self.readings = 0
         self.delay_ns = None
@@ -215,7 +218,9 @@ class CellMonitor:
         self._offset_ns = wall_minus_monotonic_ns
         self._taken = taken
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
-        self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
+        self._by_cob_id: dict[int, _AxisWatch] = {}
+        for axis_watch in self._axes:
+            self._by_cob_id |= dict.fromkeys(axis_watch.slots, axis_watch)
         self._by_node = {axis.node_id: axis for axis in self._axes}
         self._split = link.address if isinstance(link.address, SplitAddress) else None
         self._buses = ("",) if self._split is None else tuple(map(str, self._split.parts))
@@ -253,20 +258,20 @@ class CellMonitor:
                     self._hear(message)
         now_ns = clock()
         lasted_s = max((now_ns - self._since_ns) * 1e-9, 1e-9)
-        axes = tuple(
-            axis.take(self._link.nmt.get(axis.node_id), self._since_ns, now_ns)
-            for axis in self._axes
-        )
+        axes = []
+        for axis in self._axes:
+            nmt = self._link.nmt.get(axis.node_id)
+            axes.append(axis.take(nmt, self._since_ns, now_ns))
         self._since_ns = now_ns
-        frames = tuple(
-            tuple(self._frames[bus, length] for length in range(9))
-            for bus in range(len(self._buses))
-        )
+        frames = []
+        for bus in range(len(self._buses)):
+            by_length = [self._frames[bus, length] for length in range(9)]
+            frames.append(tuple(by_length))
         sync_hz = self._syncs / lasted_s
         self._syncs = 0
         self._frames.clear()
         events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
-        return CellReading(self.source, lasted_s, axes, sync_hz, frames, events)
+        return CellReading(self.source, lasted_s, tuple(axes), sync_hz, tuple(frames), events)
 
     def pause(self) -> None:
         """Drop open requests: other code reads the bus for a moment."""
@@ -339,16 +344,23 @@ class CellMonitor:
             return
         self._sample_due_ns = now_ns + round(READING_S * 1e9)
         oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
-        self._emit(
-            now_ns,
-            [axis.complete_ns is None or axis.complete_ns < oldest_ns for axis in self._axes],
-        )
+        missing = []
+        for axis in self._axes:
+            missing.append(axis.complete_ns is None or axis.complete_ns < oldest_ns)
+        self._emit(now_ns, missing)
 
     def _emit(self, time_ns: int, missing: list[bool]) -> None:
-        columns = zip(*([value or 0 for value in axis.values] for axis in self._axes), strict=True)
-        position, current, statusword = columns
-        bits = sum(1 << number for number, absent in enumerate(missing) if absent)
-        self._on_sample(
-            Sample(self._cycle, time_ns + self._offset_ns, position, current, statusword, bits)
+        by_axis = []
+        for axis in self._axes:
+            by_axis.append([value or 0 for value in axis.values])
+        position, current, statusword = zip(*by_axis, strict=True)
+        sample = Sample(
+            cycle=self._cycle,
+            time_ns=time_ns + self._offset_ns,
+            position_counts=position,
+            current_raw=current,
+            statusword=statusword,
+            missing=sum(1 << number for number, absent in enumerate(missing) if absent),
         )
+        self._on_sample(sample)
         self._cycle += 1

@@ -40,7 +40,7 @@ from daq.log.conversion import scaling
 from daq.log.feed import Feed
 from daq.log.motion import RecordedMotion
 from daq.log.writer import LogWriter
-from daq.workflow.record import SPACE_CHECK_S, Kept, _facts
+from daq.workflow.record import SPACE_CHECK_S, LogAndFeed, _facts
 from daq.workflow.safeguards import DiskRoom, free_bytes
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork
@@ -286,7 +286,7 @@ def one_run(
 
 
 @contextmanager
-def _kept(path: Path, rate_hz: float) -> Iterator[tuple[Kept, DiskRoom]]:
+def _kept(path: Path, rate_hz: float) -> Iterator[tuple[LogAndFeed, DiskRoom]]:
     """A log and a feed, as those of `record`, and the disk that is watched meanwhile."""
     content = demo_content(CHECKOUT)
     cell = load_cell(DEMO)
@@ -300,7 +300,7 @@ def _kept(path: Path, rate_hz: float) -> Iterator[tuple[Kept, DiskRoom]]:
             lambda: log.statistics,
         )
         yield (
-            Kept(log, feed, lambda _moves: None, RecordedMotion(len(cell.axes))),
+            LogAndFeed(log, feed, lambda _moves: None, RecordedMotion(len(cell.axes))),
             DiskRoom(path, free_bytes),
         )
         log.conclude(valid=False, reason="a benchmark")

@@ -27,7 +27,7 @@ from daq.documents.calibration_file import decode_calibration, encode_calibratio
 from daq.errors import ConfigurationInconsistent, ExitCode, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.experiment import PlannedMove
-from daq.workflow.fit import Reading
+from daq.workflow.fit import LogLoader
 from daq.workflow.plan import Plan, load_plan, save_plan
 from daq.workflow.weigh import weigh_logs
 from ident.calibration import Calibration, Source
@@ -252,7 +252,7 @@ def test_a_correction_is_said_once_for_logs_that_share_a_description(
         samples([[k] * 6 for k in range(60)]),
     )
     corrected = load_cell(_copy(checkout, tmp_path, UPSIDE_DOWN))
-    reading = Reading.of([log, loaded], corrected)
+    reading = LogLoader.of([log, loaded], corrected)
     list(reading.runs([log, loaded], "fit"))
     assert [record.getMessage() for record in caplog.records] == [
         f"{log}: the given description of the cell replaces the one in the log; they differ in "

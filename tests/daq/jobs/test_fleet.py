@@ -656,7 +656,7 @@ class _Gone(Executor):
 
 @pytest.mark.parametrize("cancels", [True, False])
 def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fleet_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(fleet_module, "WORKER_CHECK_S", 0.01)
     pool = WorkerPool(_Gone(cancels), 2, lambda: False)
 
     def submit(piece: int) -> Future[str]:

@@ -276,4 +276,6 @@ def test_a_temperature_that_no_motor_has_is_left_out() -> None:
     log: Any = SimpleNamespace(readings=readings, samples=samples_of_log)
     nothing = [np.nan] * 3
     expected = np.column_stack([[30.0, 31.0, 32.0], nothing, nothing])
-    np.testing.assert_allclose(temperatures(log), expected)
+    celsius_of_samples = temperatures(log)
+    assert celsius_of_samples is not None
+    np.testing.assert_allclose(celsius_of_samples, expected)

@@ -39,7 +39,7 @@ from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
 from daq.log.salvage import salvage
 from daq.log.writer import LogWriter
-from daq.workflow.fit import Reading
+from daq.workflow.fit import LogLoader
 from daq.writeback.gates.gate import Gate, GateContext
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
@@ -295,7 +295,7 @@ def test_the_reader_is_reported_and_the_calibration_says_so(
         run, _ = load_run(saved)
     assert run.partial
     assert "saved.mcap is PARTIAL" in caplog.text
-    reading = Reading.of([saved], None)
+    reading = LogLoader.of([saved], None)
     list(reading.runs([saved], "fit"))
     assert [(source.name, source.partial) for source in reading.sources] == [("saved", True)]
 

@@ -26,7 +26,7 @@ from daq.log.conversion import load_run
 from daq.log.metadata import run_from_record, run_record
 from daq.log.reader import LossyLogs, read_log
 from daq.workflow import fit as fit_module
-from daq.workflow.fit import Fit, Reading, calibration_of, close_loop, fit
+from daq.workflow.fit import Fit, LogLoader, calibration_of, close_loop, fit
 from daq.workflow.plan import load_plan
 from daq.workflow.record import Clocks, RecordingRequest, record
 from daq.workflow.safeguards import check_entered_mass
@@ -104,7 +104,7 @@ def test_a_source_carries_payload_and_recording(tmp_path: Path, checkout: Path) 
     turning = [[100 * k + axis for axis in range(6)] for k in range(50)]
     bare = write(tmp_path / "bare.mcap", demo_content(checkout), samples(turning))
     loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), samples(turning[::-1]))
-    reading = Reading.of([bare, loaded], None)
+    reading = LogLoader.of([bare, loaded], None)
     runs = list(reading.runs([bare, loaded], "fit"))
     first, second = reading.sources
     assert (first.payload, first.mass_kg, first.recording) == (None, None, runs[0].recording)

@@ -18,7 +18,7 @@ from daq.config.workspace import Clearance
 from daq.report.plan_preview import preview_page
 from daq.workflow.accepted_room import SLACK_M, AcceptedRoom, accepted_room, extent, placed
 from daq.workflow.experiment import Experiment, experiment_of, limits_of, paths_of
-from daq.workflow.outlook import HELP, Outlook, help_with
+from daq.workflow.outlook import ADVICE_OF_CAUSE, Outlook, help_with
 from daq.workflow.plan import Plan, TargetBox, load_plan, plan, save_plan
 from ident.planning.clearance import Box
 from ident.planning.target import SlowCause
@@ -223,6 +223,6 @@ def test_the_plan_and_its_page_say_what_they_were_planned_for(
 
 @pytest.mark.parametrize("cause", SlowCause)
 def test_every_cause_but_time_has_a_remedy(cause: SlowCause) -> None:
-    assert set(HELP) == set(SlowCause)
+    assert set(ADVICE_OF_CAUSE) == set(SlowCause)
     assert bool(help_with(cause, "J6")) is (cause is not SlowCause.TIME)
     assert "{" not in help_with(cause, "J6")
