@@ -543,8 +543,10 @@ def _golden_section(
 
     def fall(x: float) -> float:
         changed = effect.with_settings({name: float(np.exp(x))})
-        (trial,) = search_problem.trials([search_problem.torque(changed, axis)])
-        return -np.inf if trial is None else float(trial.fallen.sum())
+        (fit,) = search_problem.fits([search_problem.torque(changed, axis)])
+        if fit is None:
+            return -np.inf
+        return float(fit.fallen.sum())
 
     inner = b - GOLDEN * (b - a)
     outer = a + GOLDEN * (b - a)

@@ -27,6 +27,8 @@ LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 """Fields of a linearisation that have a number a row."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
 FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
+#: Columns of a candidate up to which the products of single rows are summed; see `MotorRows.grams`
+MOST_SUMMED = 2
 RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it: two effects may be nearly equal
 #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 CORRELATED = 2.0
@@ -588,6 +590,25 @@ class MotorRows:
             np.matmul(first[..., block], transposed, out=product)
         return out
 
+    def grams(self, columns: FloatArray) -> FloatArray:
+        """Products A_b A_bᵀ over the rows of each block, shape (blocks, …, a, a);
+        see `sums`.
+
+        The products of a few columns are summed along memory, because a matrix product for each
+        block and candidate would be a call for a few dozen numbers.
+        """
+        count = columns.shape[-2]
+        if count > MOST_SUMMED:
+            return self.sums(columns, columns)
+        out = np.empty((len(self.starts), *columns.shape[:-1], count))
+        for row in range(count):
+            for column in range(row + 1):
+                product = columns[..., row, :] * columns[..., column, :]
+                of_blocks = np.moveaxis(np.add.reduceat(product, self.starts, axis=-1), -1, 0)
+                out[..., row, column] = of_blocks
+                out[..., column, row] = of_blocks
+        return out
+
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
         """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,)
         or (p, f).
@@ -635,6 +656,7 @@ class Folds:
     cluster_score: FloatArray  #: Jᵀe of each cluster, shape (clusters, f)
     part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, m, f, f)
     part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
+    motor_hessian: FloatArray  #: JᵀJ of each motor, shape (m, f, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
     #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
     residual: FloatArray
@@ -726,6 +748,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         cluster_score=sums.cluster_score,
         part_hessian=sums.part_hessian,
         part_score=part_score,
+        motor_hessian=sums.part_hessian.sum(axis=0),
         motor_score=sums.motor_score,
         residual=residual,
         estimate_factor=estimate_factor,
