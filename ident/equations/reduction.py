@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -296,16 +297,11 @@ class _Reducer:
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
             without_clusters = without_clusters.holding(given)
-        # The clusters are by far the largest part: none of them is in memory twice.
-        clusters: list[tuple[FloatArray, ...]] = []
-        instruments: list[tuple[FloatArray, ...]] = []
-        for one in self.clusters:
-            rows = self._of_cluster(one, self._currents, unknowns, self.leading)
-            clusters.append(rows)
-            if self.has_demanded_motion:
-                rows = self._of_cluster(one, self._instruments, unknowns, 0)
-                instruments.append(rows)
-        return replace(without_clusters, clusters=tuple(clusters), instruments=tuple(instruments))
+        clusters = self._of_clusters(self._currents, unknowns, self.leading)
+        instruments: tuple[tuple[FloatArray, ...], ...] = ()
+        if self.has_demanded_motion:
+            instruments = self._of_clusters(self._instruments, unknowns, 0)
+        return replace(without_clusters, clusters=clusters, instruments=instruments)
 
     def _without_clusters(self) -> System:
         """The equations with all columns, before the rows of each cluster are added."""
@@ -366,21 +362,29 @@ class _Reducer:
         """Number of the columns of [W | W_L of each mounting | 0]."""
         return len(self.unknowns.columns) + BODY * len(self.payloads) + 1
 
-    def _of_cluster(
+    def _of_clusters(
         self,
-        cluster: _Cluster,
         columns: Callable[[FloatArray, int, int], FloatArray],
         given: GivenUnknowns,
         first: int,
-    ) -> tuple[FloatArray, ...]:
-        """Rows of each motor: some columns of a cluster, so many of currents first,
+    ) -> tuple[tuple[FloatArray, ...], ...]:
+        """Rows of each motor in each cluster: some of their columns, so many of currents first,
         without those that are given.
+
+        Neighbours with the same mounting have the same columns, and are put into them together: a
+        cluster has a few dozen rows, and each call would cost more than its numbers.
         """
-        motors: list[FloatArray] = []
-        for motor, factor in enumerate(cluster.factors):
-            rows = columns(factor, motor, cluster.mounting)
-            motors.append(given.joined_in(rows, first))
-        return tuple(motors)
+        by_motor: list[list[FloatArray]] = []
+        for motor in range(len(self.of_motor)):
+            of_clusters: list[FloatArray] = []
+            for mounting, neighbours in groupby(self.clusters, lambda one: one.mounting):
+                parts = [one.factors[motor] for one in neighbours]
+                rows = columns(np.concatenate(parts), motor, mounting)
+                joined = given.joined_in(rows, first)
+                ends = np.cumsum([len(part) for part in parts])
+                of_clusters += np.split(joined, ends[:-1])
+            by_motor.append(of_clusters)
+        return tuple(zip(*by_motor, strict=True))
 
     def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""
