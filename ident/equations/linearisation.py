@@ -540,17 +540,10 @@ def jackknife_covariance(
     free = slice(first_free, size)
     if recorded is None:
         recorded = system
-    grams = np.zeros((clusters, size, size))
-    scores = np.zeros((clusters, size))
-    for index, (cluster, own) in enumerate(zip(system.clusters, recorded.clusters, strict=True)):
-        preload = system.preload_of(index)
-        equations = motor_jacobians(cluster, preload, gains, parameters, noise)
-        for motor, (jacobian, residual, _) in enumerate(equations):
-            grams[index] += jacobian.T @ jacobian
-            recorded_residual = residual
-            if own[motor] is not cluster[motor]:
-                _, recorded_residual = motor_jacobian(own[motor], motor, gains, parameters, noise)
-            scores[index] += jacobian.T @ recorded_residual
+    if system.preload:
+        grams, scores = _sums_with_preload(system, gains, parameters, noise)
+    else:
+        grams, scores = _sums_of_motors(system, recorded, gains, parameters, noise)
     runs = np.array([run for run, _ in system.cluster_runs])
     free_grams = grams[:, free, free]
     free_scores = scores[:, free]
@@ -561,6 +554,59 @@ def jackknife_covariance(
     covariance = np.zeros((size, size))
     covariance[free, free] = scatter_of(shifts)
     return covariance
+
+
+def _sums_with_preload(
+    system: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ and Jᵀe of each cluster of a redundant drive, shapes (C, f, f) and (C, f)."""
+    clusters = len(system.clusters)
+    size = len(gains) + len(parameters)
+    grams = np.zeros((clusters, size, size))
+    scores = np.zeros((clusters, size))
+    for index, cluster in enumerate(system.clusters):
+        preload = system.preload_of(index)
+        for jacobian, residual, _ in motor_jacobians(cluster, preload, gains, parameters, noise):
+            grams[index] += jacobian.T @ jacobian
+            scores[index] += jacobian.T @ residual
+    return grams, scores
+
+
+def _sums_of_motors(
+    system: System, recorded: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ and Jᵀe of each cluster, shapes (C, f, f) and (C, f).
+
+    A motor is linearised on the rows of all clusters at once, and products are made of the unknowns
+    that it has: near the flange these are less than half.
+
+    Args:
+        system: of J.
+        recorded: of e.
+        gains, parameters, noise: see `jackknife_covariance`.
+    """
+    size = len(gains) + len(parameters)
+    grams = np.zeros((len(system.clusters), size, size))
+    scores = np.zeros((len(system.clusters), size))
+    for motor in range(len(gains)):
+        of_clusters = [cluster[motor] for cluster in system.clusters]
+        rows = np.concatenate(of_clusters)
+        jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
+        if recorded is not system:
+            recorded_rows = np.concatenate([cluster[motor] for cluster in recorded.clusters])
+            _, residual = motor_jacobian(recorded_rows, motor, gains, parameters, noise)
+        seen = np.flatnonzero(jacobian.any(axis=0))
+        own_jacobian = jacobian[:, seen]
+        ends = np.cumsum([len(of_cluster) for of_cluster in of_clusters])
+        products = np.empty((len(ends), len(seen), len(seen)))
+        first = 0
+        for index, end in enumerate(ends.tolist()):
+            of_cluster = own_jacobian[first:end]
+            np.matmul(of_cluster.T, of_cluster, out=products[index])
+            scores[index, seen] += of_cluster.T @ residual[first:end]
+            first = end
+        grams[:, seen[:, None], seen] += products
+    return grams, scores
 
 
 @dataclass(frozen=True, slots=True)
