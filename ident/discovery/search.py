@@ -184,8 +184,8 @@ def rank_families(
             )
             probability[alike] = np.fmin(probability[alike], among_them)
     probabilities = iter(probability)
-    before = search_problem.folds.square_sum(search_problem.folds.residual)
-    findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
+    sizes = MotorSizes.of(search_problem)
+    findings = [_judge(search_problem, sizes, family, probabilities, gates) for family in tested]
     ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
     errors = np.stack([finding.fold_errors for finding in ranked])
     better = is_better(errors[:, None], errors[None])
@@ -305,14 +305,36 @@ def refine_setting(
     return effect
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MotorSizes:
+    """What all candidates of a turn are compared with."""
+
+    before: FloatArray  #: ‖e‖² of each fold and motor on held-out moves, shape (folds, m)
+    residual: FloatArray  #: ‖e‖² of each motor, shape (m,)
+    current: FloatArray  #: ‖v‖² of each motor, shape (m,)
+
+    @classmethod
+    def of(cls, search_problem: SearchProblem) -> MotorSizes:
+        """Sum the squares of a problem around the model."""
+        folds = search_problem.folds
+        problem = folds.linearisation
+        count = len(problem.gamma)
+        return cls(
+            before=folds.square_sum(folds.residual),
+            residual=np.bincount(problem.motor, problem.residual**2, minlength=count),
+            current=np.bincount(problem.motor, problem.current**2, minlength=count),
+        )
+
+
 def _judge(
     search_problem: SearchProblem,
-    before: FloatArray,
+    sizes: MotorSizes,
     family: FamilyTrials,
     probabilities: Iterator[float],
     gates: Gates,
 ) -> Finding:
     problem = search_problem.folds.linearisation
+    before = sizes.before
     probability = [next(probabilities) for _ in family.members]
     # A setting that needs impossible coefficients is chosen only where every setting of the family
     # does.
@@ -337,9 +359,8 @@ def _judge(
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual
     # falls most.
     motor = int(np.argmax(trial.fallen))
-    rows = problem.motor == motor
-    own = float(np.sum(problem.residual[rows] ** 2))
-    size = float(np.sum(problem.current[rows] ** 2))
+    own = float(sizes.residual[motor])
+    size = float(sizes.current[motor])
     explained = float(trial.fallen[motor] / own)
     error_before, error_after = (
         float(np.sqrt(part[:, motor].sum() / size)) for part in (before, after)
