@@ -15,7 +15,7 @@ import numpy as np
 from scipy import linalg
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.equations.linearisation import Folds
+from ident.equations.linearisation import Folds, MotorRows
 
 #: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
 Felt = Mapping[int, FloatArray]
@@ -85,9 +85,14 @@ class MotorSums:
     @classmethod
     def empty(cls, folds: Folds, count: int, width: int) -> MotorSums:
         """Zeros for so many candidates of so many columns."""
-        shape = (len(folds.linearisation.gamma), count, width)
-        unknowns = folds.linearisation.jacobian.width
-        return cls(np.zeros((*shape, unknowns)), np.zeros((*shape, width)), np.zeros(shape))
+        problem = folds.linearisation
+        motors = len(problem.gamma)
+        shape = (motors, count, width)
+        return cls(
+            jacobian=np.zeros((*shape, problem.jacobian.width)),
+            gram=np.zeros((*shape, width)),
+            score=np.zeros(shape),
+        )
 
     @property
     def squares(self) -> FloatArray:
@@ -96,7 +101,36 @@ class MotorSums:
 
     def only(self, chosen: IntArray) -> MotorSums:
         """The same of some of the candidates."""
-        return MotorSums(self.jacobian[:, chosen], self.gram[:, chosen], self.score[:, chosen])
+        return MotorSums(
+            self.jacobian[:, chosen],
+            self.gram[:, chosen],
+            self.score[:, chosen],
+        )
+
+    def put(
+        self,
+        own: MotorRows,
+        numbers: IntArray,
+        *,
+        jacobian: FloatArray,
+        gram: FloatArray,
+        score: FloatArray,
+    ) -> None:
+        """Put the products of some candidates with the rows of a motor into their places.
+
+        Args:
+            own: the motor.
+            numbers: of these candidates.
+            jacobian: ΦᵀJ of the motor's own unknowns, shape (k, p, s).
+            gram: ΦᵀΦ, shape (k, p, p).
+            score: Φᵀe, shape (k, p).
+        """
+        unknowns = self.jacobian.shape[-1]
+        of_every_unknown = np.zeros((*score.shape, unknowns))
+        of_every_unknown[..., own.seen] = jacobian
+        self.jacobian[own.motor, numbers] = of_every_unknown
+        self.gram[own.motor, numbers] = gram
+        self.score[own.motor, numbers] = score
 
 
 def sums_over_motors(folds: Folds, width: int, candidates: Sequence[Felt]) -> MotorSums:
@@ -106,14 +140,19 @@ def sums_over_motors(folds: Folds, width: int, candidates: Sequence[Felt]) -> Mo
         numbers = felt_by(candidates, own.motor)
         if not len(numbers):
             continue
-        columns = np.stack([candidates[number][own.motor] for number in numbers])
-        flat = columns.reshape(-1, columns.shape[-1]) @ own.equations[:-1].T
-        products = flat.reshape(*columns.shape[:2], -1)
-        of_unknowns = np.zeros((len(numbers), width, sums.jacobian.shape[-1]))
-        of_unknowns[..., own.seen] = products[..., :-1]
-        sums.jacobian[own.motor, numbers] = of_unknowns
-        sums.score[own.motor, numbers] = products[..., -1]
-        sums.gram[own.motor, numbers] = columns @ np.swapaxes(columns, -1, -2)
+        felt = [candidates[number][own.motor] for number in numbers]
+        columns = np.stack(felt)
+        flat = columns.reshape(-1, columns.shape[-1])
+        equations = own.equations[:-1]  # J and e
+        products = flat @ equations.T
+        products = products.reshape(len(felt), width, -1)
+        sums.put(
+            own,
+            numbers,
+            jacobian=products[..., :-1],
+            gram=columns @ np.swapaxes(columns, -1, -2),
+            score=products[..., -1],
+        )
     return sums
 
 
@@ -137,17 +176,27 @@ class Projection:
         crossed = sums.jacobian.sum(axis=0)
         along = solved(folds.full_factor, crossed)
         hessian = folds.motor_hessian.sum(axis=0)
-        gram = projected_gram(sums.gram.sum(axis=0), crossed, along, pushed(along, hessian))
-        score = sums.score.sum(axis=0) - along @ folds.motor_score.sum(axis=0)
+        moved = pushed(along, hessian)
+        whole = sums.gram.sum(axis=0)
+        gram = projected_gram(whole, crossed, along, moved)
+        declared_score = folds.motor_score.sum(axis=0)
+        score = sums.score.sum(axis=0)
+        score -= along @ declared_score
         return cls(along, gram, score)
 
     def only(self, chosen: IntArray) -> Projection:
         """The same of some of the candidates."""
-        return Projection(self.along[chosen], self.gram[chosen], self.score[chosen])
+        return Projection(
+            self.along[chosen],
+            self.gram[chosen],
+            self.score[chosen],
+        )
 
     def coefficients(self) -> FloatArray:
         """Best coefficients of each candidate, shape (c, p)."""
-        return np.asarray(np.linalg.solve(self.gram, self.score[..., None])[..., 0])
+        right = self.score[..., None]
+        solution = np.linalg.solve(self.gram, right)
+        return np.asarray(solution[..., 0])
 
 
 def fall_of_motors(
@@ -162,7 +211,8 @@ def fall_of_motors(
         coefficients: of each candidate, shape (c, p).
     """
     score = sums.score - scored_along(along, folds.motor_score)
-    gram = projected_gram(sums.gram, sums.jacobian, along, pushed(along, folds.motor_hessian))
+    moved = pushed(along, folds.motor_hessian)
+    gram = projected_gram(sums.gram, sums.jacobian, along, moved)
     linear = np.einsum("ncp,cp->cn", score, coefficients)
     square = np.einsum("cp,ncpq,cq->cn", coefficients, gram, coefficients)
     return np.asarray(2.0 * linear - square)
@@ -203,19 +253,23 @@ def _fitted_together(
 def solved(factor: tuple[FloatArray, bool], right: FloatArray) -> FloatArray:
     """H⁻¹JᵀΦ of each candidate, transposed, from ΦᵀJ, both of shape (c, p, f)."""
     flat = right.reshape(-1, right.shape[-1])
-    return np.asarray(linalg.cho_solve(factor, flat.T).T.reshape(right.shape))
+    solution = linalg.cho_solve(factor, flat.T)
+    return np.asarray(solution.T.reshape(right.shape))
 
 
 def pushed(along: FloatArray, hessian: FloatArray) -> FloatArray:
     """w H of each part, shape (…, c, p, f), from w, shape (c, p, f), and H, shape (…, f, f)."""
     flat = along.reshape(-1, along.shape[-1])
-    return (flat @ hessian).reshape(*hessian.shape[:-2], *along.shape)
+    product = flat @ hessian
+    parts = hessian.shape[:-2]
+    return product.reshape(*parts, *along.shape)
 
 
 def scored_along(along: FloatArray, scores: FloatArray) -> FloatArray:
     """w s of each part, shape (parts, c, p), from w, shape (c, p, f), and s, shape (parts, f)."""
     flat = along.reshape(-1, along.shape[-1])
-    return (scores @ flat.T).reshape(-1, *along.shape[:-1])
+    product = scores @ flat.T
+    return product.reshape(-1, *along.shape[:-1])
 
 
 def crossed_gram(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -230,4 +284,6 @@ def projected_gram(
     the last three (…, p, f).
     """
     crossed = crossed_gram(jacobian, along)
-    return gram - crossed - np.swapaxes(crossed, -1, -2) + crossed_gram(pushed_along, along)
+    transposed = np.swapaxes(crossed, -1, -2)
+    of_declared = crossed_gram(pushed_along, along)
+    return gram - crossed - transposed + of_declared

@@ -571,13 +571,13 @@ class _Products:
 
     def add_to(self, sums: MotorSums) -> None:
         """Put the sums over all blocks into their places."""
-        motor = self.own.motor
-        unknowns = sums.jacobian.shape[-1]
-        of_unknowns = np.zeros((*self.jacobian.shape[1:-1], unknowns))
-        of_unknowns[..., self.own.seen] = self.jacobian.sum(axis=0)
-        sums.jacobian[motor, self.felt] = of_unknowns
-        sums.gram[motor, self.felt] = self.gram.sum(axis=0)
-        sums.score[motor, self.felt] = self.score.sum(axis=0)
+        sums.put(
+            self.own,
+            self.felt,
+            jacobian=self.jacobian.sum(axis=0),
+            gram=self.gram.sum(axis=0),
+            score=self.score.sum(axis=0),
+        )
 
     def only(self, chosen: IntArray) -> _Products:
         """The same of some of the candidates of the batch, which are counted anew."""

@@ -319,11 +319,12 @@ class MotorSizes:
         folds = search_problem.folds
         problem = folds.linearisation
         count = len(problem.gamma)
-        return cls(
-            before=folds.square_sum(folds.residual),
-            residual=np.bincount(problem.motor, problem.residual**2, minlength=count),
-            current=np.bincount(problem.motor, problem.current**2, minlength=count),
-        )
+        residual = np.zeros(count)
+        current = np.zeros(count)
+        np.add.at(residual, problem.motor, problem.residual**2)
+        np.add.at(current, problem.motor, problem.current**2)
+        before = folds.square_sum(folds.residual)
+        return cls(before, residual, current)
 
 
 def _judge(

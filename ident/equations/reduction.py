@@ -297,11 +297,35 @@ class _Reducer:
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
             without_clusters = without_clusters.holding(given)
-        clusters = self._of_clusters(self._currents, unknowns, self.leading)
-        instruments: tuple[tuple[FloatArray, ...], ...] = ()
-        if self.has_demanded_motion:
-            instruments = self._of_clusters(self._instruments, unknowns, 0)
-        return replace(without_clusters, clusters=clusters, instruments=instruments)
+        mountings = [one.mounting for one in self.clusters]
+        waiting = self._taken_rows()
+        clusters: list[list[FloatArray]] = []
+        instruments: list[list[FloatArray]] = []
+        for motor in range(len(waiting)):
+            rows = waiting[motor]
+            waiting[motor] = []
+            own = _Columns(motor, mountings, unknowns)
+            clusters.append(own.of(rows, self._currents, self.leading))
+            if self.has_demanded_motion:
+                instruments.append(own.of(rows, self._instruments, 0))
+        return replace(
+            without_clusters,
+            clusters=tuple(zip(*clusters, strict=True)),
+            instruments=tuple(zip(*instruments, strict=True)),
+        )
+
+    def _taken_rows(self) -> list[list[FloatArray]]:
+        """Take the rows of each motor in each cluster out of here.
+
+        They are by far the largest part: those of one motor alone are in memory twice while they
+        are put into their columns.
+        """
+        taken: list[list[FloatArray]] = []
+        for motor in range(len(self.of_motor)):
+            of_clusters = [one.factors[motor] for one in self.clusters]
+            taken.append(of_clusters)
+        self.clusters.clear()
+        return taken
 
     def _without_clusters(self) -> System:
         """The equations with all columns, before the rows of each cluster are added."""
@@ -362,30 +386,6 @@ class _Reducer:
         """Number of the columns of [W | W_L of each mounting | 0]."""
         return len(self.unknowns.columns) + BODY * len(self.payloads) + 1
 
-    def _of_clusters(
-        self,
-        columns: Callable[[FloatArray, int, int], FloatArray],
-        given: GivenUnknowns,
-        first: int,
-    ) -> tuple[tuple[FloatArray, ...], ...]:
-        """Rows of each motor in each cluster: some of their columns, so many of currents first,
-        without those that are given.
-
-        Neighbours with the same mounting have the same columns, and are put into them together: a
-        cluster has a few dozen rows, and each call would cost more than its numbers.
-        """
-        by_motor: list[list[FloatArray]] = []
-        for motor in range(len(self.of_motor)):
-            of_clusters: list[FloatArray] = []
-            for mounting, neighbours in groupby(self.clusters, lambda one: one.mounting):
-                parts = [one.factors[motor] for one in neighbours]
-                rows = columns(np.concatenate(parts), motor, mounting)
-                joined = given.joined_in(rows, first)
-                ends = np.cumsum([len(part) for part in parts])
-                of_clusters += np.split(joined, ends[:-1])
-            by_motor.append(of_clusters)
-        return tuple(zip(*by_motor, strict=True))
-
     def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""
         chosen = self.of_motor[motor]
@@ -411,6 +411,38 @@ class _Reducer:
             first = robot + BODY * mounting
             out[:, first : first + BODY] = every[:, self.flange]
         return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Columns:
+    """How the rows of a motor get the columns of a system."""
+
+    motor: int  #: index
+    mountings: Sequence[int]  #: of each cluster
+    given: GivenUnknowns  #: leave the columns
+
+    def of(
+        self,
+        clusters: Sequence[FloatArray],
+        columns: Callable[[FloatArray, int, int], FloatArray],
+        first: int,
+    ) -> list[FloatArray]:
+        """Rows of the motor in each cluster, in some columns, so many of currents first.
+
+        Neighbours with the same mounting have the same columns, and are put into them together: a
+        cluster has a few dozen rows, and each call would cost more than its numbers.
+        """
+        found: list[FloatArray] = []
+        begin = 0
+        for mounting, neighbours in groupby(self.mountings):
+            end = begin + len(list(neighbours))
+            parts = clusters[begin:end]
+            begin = end
+            rows = columns(np.concatenate(parts), self.motor, mounting)
+            joined = self.given.joined_in(rows, first)
+            ends = np.cumsum([len(part) for part in parts])
+            found += np.split(joined, ends[:-1])
+        return found
 
 
 def _support_with_currents(model: Model, support: BoolArray) -> BoolArray:
