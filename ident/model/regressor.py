@@ -280,7 +280,7 @@ class _Work:
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class _JointPlace:
     """Where a joint is, over k samples."""
 
     position: FloatArray  #: shape (k,)
@@ -288,13 +288,13 @@ class _Place:
     sine: FloatArray  #: the same of its sine
 
 
-def _placed(link: _Link, position: FloatArray) -> _Place:
+def _placed(link: _Link, position: FloatArray) -> _JointPlace:
     """Place of a link's joint, with what turns its frame."""
     if not link.revolute:
         none = np.empty(0)
-        return _Place(position, none, none)
+        return _JointPlace(position, none, none)
     cosine, sine = cos_sin(position)
-    return _Place(position, cosine, sine)
+    return _JointPlace(position, cosine, sine)
 
 
 def _links(robot: Robot) -> tuple[_Link, ...]:
@@ -372,7 +372,7 @@ def _move(
     link: _Link,
     work: _Work,
     index: int,
-    place: _Place,
+    place: _JointPlace,
     velocity: FloatArray,
     acceleration: FloatArray,
 ) -> None:
@@ -406,7 +406,7 @@ def _move(
         here[:] = link.back @ here
 
 
-def _borne(link: _Link, wrench: FloatArray, place: _Place) -> FloatArray:
+def _borne(link: _Link, wrench: FloatArray, place: _JointPlace) -> FloatArray:
     """A link's wrench at its parent, shape (6, k): the transpose of `_move`."""
     if link.back is not None:
         wrench = link.back.T @ wrench
