@@ -23,7 +23,7 @@ from daq.log.metadata import Readback, reports_only_losses
 from daq.log.reader import Log, LossyLogs, SampleChecks, read_log
 from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.channel_faults import find_faults
+from ident.data.channel_faults import JudgedChannels, faults_in_use, find_faults
 from ident.data.run import Recording, Run
 from ident.data.torque_channel import TorqueChannel
 from ident.data.unsigned_current import unsigned_currents
@@ -247,7 +247,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     valid = answered & ~limited
     current = samples.current_raw * scale.current_per_unit
     known = scale.joints_known(answered)
-    faults = find_faults(position_rad, current, rate_hz, cell.ratio, known)
+    every_fault = find_faults(position_rad, current, rate_hz, cell.ratio)
+    faults = faults_in_use(every_fault, known)
     check_limits(str(log.path), position_rad, cell, valid)
     fault = motion_fault(str(log.path), cell, rate_hz, position_rad, current, known, faults)
     if fault is not None:
@@ -269,6 +270,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         temperature_c=temperatures(log),
         torque_channels=torque_channels(log, cell, current, valid),
         recording=_recording_of(log, limited_percent),
+        judged_channels=JudgedChannels(position_rad, current, cell.ratio, every_fault),
     )
     if unsigned_currents(converted, cell.ratio).any():
         from ident.estimators.diagnosis import require_explained_currents  # noqa: PLC0415 - needs scipy, seldom

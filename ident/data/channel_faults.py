@@ -142,6 +142,27 @@ def find_faults(
     return faults_in_use(found, usable)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedChannels:
+    """All that is wrong with the channels of a recording, whether a sample is used or not.
+
+    Who reads a log judges it once; the answer goes with the run, so that whoever differentiates it
+    need not judge it again.
+    """
+
+    position: FloatArray  #: of the joints, as of `find_faults`
+    current: FloatArray  #: of the motors
+    ratio: FloatArray  #: R of the drive train
+    faults: tuple[ChannelFault, ...]
+
+    def answers_for(self, position: object, current: object, ratio: FloatArray) -> bool:
+        """Whether these are the arrays that were judged:
+        other ones may be wrong elsewhere, though they look alike.
+        """
+        are_same_arrays = position is self.position and current is self.current
+        return are_same_arrays and np.array_equal(ratio, self.ratio)
+
+
 def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[ChannelFault, ...]:
     """Return what is wrong with samples that count.
 

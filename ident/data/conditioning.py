@@ -181,6 +181,10 @@ def _filtered(sections: list[_Section], values: FloatArray) -> FloatArray:
     return np.asarray(out + start)
 
 
+#: Samples from which on a series is decimated by itself: several would not fit a core's cache
+LONG_SERIES = 16_384
+
+
 @dataclass(frozen=True, slots=True)
 class Decimator:
     """A symmetric FIR low-pass of which every q-th output is used:
@@ -213,25 +217,58 @@ class Decimator:
         """Filter and decimate along the last axis: shape (..., k) → (..., rows(k))."""
         *leading, samples = columns.shape
         count = self.rows(samples)
-        factor = self.factor
-        # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over
-        # blocks of samples: one matrix product that reads every sample once.
-        blocks = ceil(len(self.taps) / factor)
-        taps = np.zeros(blocks * factor)
-        taps[: len(self.taps)] = self.taps
-        length = (count + blocks - 1) * factor
         flat = columns.reshape(-1, samples)
+        if samples >= LONG_SERIES:
+            series = [self._of_long_series(own, count) for own in flat]
+            return np.reshape(series, (*leading, count))
+        return self._of_series(flat, count).reshape(*leading, count)
+
+    @property
+    def _taps_of_blocks(self) -> FloatArray:
+        """Taps cut into blocks of q, with zeros behind the last one, shape (blocks, q).
+
+        Window r starts at sample r·q, so it is a sum over blocks of samples: one matrix product
+        that reads every sample once. Taps come first in it: its sums then run along memory.
+        """
+        blocks = ceil(len(self.taps) / self.factor)
+        taps = np.zeros(blocks * self.factor)
+        taps[: len(self.taps)] = self.taps
+        return taps.reshape(blocks, self.factor)
+
+    def _of_series(self, flat: FloatArray, count: int) -> FloatArray:
+        """So many outputs of several series together, shape (c, k) → (c, count)."""
+        taps = self._taps_of_blocks
+        blocks = len(taps)
+        samples = flat.shape[1]
+        length = (count + blocks - 1) * self.factor
         if samples != length:
             padded = np.zeros((len(flat), length))
             padded[:, : min(length, samples)] = flat[:, :length]
             flat = padded
-        # Taps first: the sums below then run along memory.
-        weighted = taps.reshape(blocks, factor) @ flat.reshape(-1, factor).T
+        weighted = taps @ flat.reshape(-1, self.factor).T
         by_block = weighted.reshape(blocks, len(flat), -1)
         out = np.zeros((len(flat), count))
         for block, share in enumerate(by_block):
             out += share[:, block : block + count]
-        return out.reshape(*leading, count)
+        return out
+
+    def _of_long_series(self, series: FloatArray, count: int) -> FloatArray:
+        """So many outputs of one series, shape (k,) → (count,):
+        it is not copied, and its products stay in the cache's reach.
+        """
+        taps = self._taps_of_blocks
+        blocks = len(taps)
+        whole_blocks = min(count + blocks - 1, len(series) // self.factor)
+        end = whole_blocks * self.factor
+        weighted = taps @ series[:end].reshape(whole_blocks, self.factor).T
+        out = np.zeros(count)
+        for block, share in enumerate(weighted):
+            inside = share[block : block + count]
+            out[: len(inside)] += inside
+        if whole_blocks < count + blocks - 1:  # the last window ends within a block of samples
+            rest = series[end:]
+            out[-1] += taps[-1, : len(rest)] @ rest
+        return out
 
 
 @lru_cache(maxsize=64)

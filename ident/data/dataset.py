@@ -137,7 +137,7 @@ def differentiate(
     given = _checked(run, time_s, drive_train, conditioning, refuse)
     shape = given.current.shape
     rate_hz = replace(run, time_s=time_s).rate_hz
-    faults = find_faults(given.position, given.current, rate_hz, drive_train.ratio)
+    faults = _faults_of(run, given, rate_hz, drive_train)
     filled_position, filled_current, held = fill_held(
         given.position,
         given.current,
@@ -191,6 +191,18 @@ def differentiate(
         held=held,
         faults=faults_found,
     )
+
+
+def _faults_of(
+    run: Run, given: _CheckedArrays, rate_hz: float, drive_train: DriveTrain
+) -> tuple[ChannelFault, ...]:
+    """What is wrong with all samples of a run, as it was judged when it was read."""
+    judged = run.judged_channels
+    if judged is not None and judged.answers_for(
+        run.position_rad, run.current_a, drive_train.ratio
+    ):
+        return judged.faults
+    return find_faults(given.position, given.current, rate_hz, drive_train.ratio)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.data.channel_faults import JudgedChannels
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueChannel
 from ident.model.bodies import Payload
@@ -73,6 +74,9 @@ class Run:
     #: The controller's own torque, one an axis, for a comparison with the gains that no fit uses;
     #: empty without any.
     torque_channels: tuple[TorqueChannel, ...] = ()
+    #: What was found wrong with positions and currents when the run was read; None where nobody
+    #: looked. A run with other positions or currents is judged anew.
+    judged_channels: JudgedChannels | None = field(default=None, repr=False, compare=False)
 
     # Whatever becomes an array: the fields are converted where they are first used
     if TYPE_CHECKING:
@@ -92,6 +96,7 @@ class Run:
             recording: Recording | None = None,
             temperature_c: ArrayLike | None = None,
             torque_channels: tuple[TorqueChannel, ...] = (),
+            judged_channels: JudgedChannels | None = None,
         ) -> None: ...
 
     @property

@@ -38,16 +38,15 @@ def propose_balancers(
     for axis in range(search_problem.axes) if grid else ():
         if axis in taken:
             continue
-        tested = search_problem.test((grid,), axis, at_rows=True)
-        if not tested:  # gravity's parameters hold the spring's share
-            bare = tuple(effect.with_settings({"with_spring": 0}) for effect in grid)
-            tested = search_problem.test((bare,), axis, at_rows=True)
-        grid_trials = [member for family in tested for member in family.members]
-        shares = shares_explained(search_problem, [trial for _, trial in grid_trials])
+        tried = search_problem.fits_at_rows(grid, axis)
+        if not tried:  # gravity's parameters hold the spring's share
+            bare = [effect.with_settings({"with_spring": 0}) for effect in grid]
+            tried = search_problem.fits_at_rows(bare, axis)
+        shares = shares_explained(search_problem, [fit for _, fit in tried])
         found = [
             (share, effect)
-            for share, (effect, trial) in zip(shares, grid_trials, strict=True)
-            if is_strictly_possible(effect, trial)
+            for share, (effect, fit) in zip(shares, tried, strict=True)
+            if is_strictly_possible(effect, fit)
         ]
         members = [
             effect
@@ -56,8 +55,8 @@ def propose_balancers(
         ]
         refined = [refine_together(search_problem, start, axis) for start in _apart(members)]
         if refined:
-            tried = (effect for effect, _ in grid_trials)
-            proposed[axis] = ((*tried, *refined),)
+            grid_effects = [effect for effect, _ in tried]
+            proposed[axis] = ((*grid_effects, *refined),)
     return proposed
 
 

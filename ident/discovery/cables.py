@@ -9,11 +9,13 @@ with all that were tried, which represent the search.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
+from ident.discovery.candidate_fits import CandidateFit
+from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
 from ident.discovery.refinement import is_strictly_possible, refine_together
 from ident.effects.effect import Effect, is_placeable
@@ -28,7 +30,7 @@ LEAST_SLACK = 0.05
 #: Of a direction from a joint's own, below which a cable is a `Hinge` of that joint
 ONE_JOINT_RAD = 0.15
 
-Tried = tuple[Effect, CandidateTrial]
+Tried = tuple[Effect, CandidateFit]
 
 
 def propose_cables(
@@ -48,9 +50,8 @@ def propose_cables(
         return {}
     found: list[tuple[float, int, Effect]] = []
     for axis in range(search_problem.axes):
-        tested = search_problem.test(cables, axis, at_rows=True)
-        tried = [member for family in tested for member in family.members]
-        shares = shares_explained(search_problem, [trial for _, trial in tried])
+        tried = search_problem.fits_at_rows(chain.from_iterable(cables), axis)
+        shares = shares_explained(search_problem, [fit for _, fit in tried])
         found += [(share, axis, effect) for share, (effect, _) in zip(shares, tried, strict=True)]
     if not found:
         return {}
@@ -71,7 +72,7 @@ def propose_cables(
 
 
 def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tried]:
-    """Slack cables on a pair of joints that the model does not contain, with their trials."""
+    """Slack cables on a pair of joints that the model does not contain, with their fits."""
     effects: list[SlackCable] = []
     step_rad = 2.0 * np.pi / DIRECTIONS
     # None along one joint alone
@@ -82,11 +83,7 @@ def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tr
             SlackCable(other_axis, direction_rad, float(f"{start_rad:.4g}"))
             for start_rad in starts_rad
         ]
-    tested = search_problem.test((tuple(effects),), axis, at_rows=True)
-    found: list[tuple[Effect, CandidateTrial]] = []
-    for family in tested:
-        found.extend(family.members)
-    return found
+    return search_problem.fits_at_rows(effects, axis)
 
 
 def _way(search_problem: SearchProblem, cable: SlackCable, axis: int) -> FloatArray:
@@ -106,11 +103,11 @@ def _best_of(search_problem: SearchProblem, tried: Sequence[Tried]) -> tuple[Eff
     """The best possible cable of each of the best directions:
     the simplex does not find the way between them.
     """
-    shares = shares_explained(search_problem, [trial for _, trial in tried])
+    shares = shares_explained(search_problem, [fit for _, fit in tried])
     possible = [
         (share, effect)
-        for share, (effect, trial) in zip(shares, tried, strict=True)
-        if is_strictly_possible(effect, trial)
+        for share, (effect, fit) in zip(shares, tried, strict=True)
+        if is_strictly_possible(effect, fit)
     ]
     best: dict[float, Effect] = {}
     for _, effect in sorted(possible, key=lambda one: -one[0]):

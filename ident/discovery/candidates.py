@@ -15,16 +15,31 @@ dictionary tries.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
+from ident.discovery.candidate_fits import (
+    CandidateFit,
+    Felt,
+    MotorSums,
+    Projection,
+    crossed_gram,
+    fall_of_motors,
+    felt_by,
+    fit_candidates,
+    in_batches,
+    is_new,
+    projected_gram,
+    pushed,
+    scored_along,
+    solved,
+)
 from ident.discovery.few_moves import FEW_MOVES, MoveScores, moves_behind, without_most_leverage
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import (
@@ -50,16 +65,9 @@ ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
 
 There are hundreds, and single precision is enough for their trials.
 """
-#: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
-Felt = Mapping[int, FloatArray]
-
-#: Columns tested together: enough for fast products, few enough to keep memory small
-BATCH_COLUMNS = 48
 DECORRELATED_TOGETHER = 16  #: Candidates that are decorrelated at once
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
-#: Share of a column that must be left when all declared directions are projected out of it
-REDUNDANT_SHARE = 1e-6
 UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
 #: Fields of `Signals` that do not change in a run
 NO_SERIES = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm"})
@@ -121,6 +129,27 @@ class SearchProblem:
         None where the model contains them already.
         """
         return _scored(self.folds, self._felt(torques))
+
+    def fits(self, torques: Iterable[FloatArray]) -> tuple[CandidateFit | None, ...]:
+        """Fit candidates to all rows, without folds and moves, which takes a tenth of the time;
+        see `trials`.
+        """
+        return fit_candidates(self.folds, self._felt(torques))
+
+    def fits_at_rows(
+        self, effects: Iterable[Effect], axis: int
+    ) -> list[tuple[Effect, CandidateFit]]:
+        """Fit effects on an axis by columns built at the rows;
+        those that the model contains already, or that cannot be there, are left out.
+        """
+        robot = self.model.robot
+        placed = [effect for effect in effects if is_placeable(effect, axis, robot)]
+        fits = self.fits(self.torque_at_rows(effect, axis) for effect in placed)
+        found: list[tuple[Effect, CandidateFit]] = []
+        for effect, fit in zip(placed, fits, strict=True):
+            if fit is not None:
+                found.append((effect, fit))
+        return found
 
     def _felt(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, Felt]]:
         """Number of columns of each candidate, and its whitened columns;
@@ -215,7 +244,7 @@ class CandidateTrial:
 
 
 def shares_explained(
-    search_problem: SearchProblem, trials: Sequence[CandidateTrial | None]
+    search_problem: SearchProblem, trials: Sequence[CandidateTrial | CandidateFit | None]
 ) -> list[float]:
     """Share of a motor's squared residual that each trial explains,
     of the motor that it affects most.
@@ -377,118 +406,154 @@ def score_candidates(
 def _scored(
     folds: Folds, candidates: Iterable[tuple[int, Felt]]
 ) -> tuple[CandidateTrial | None, ...]:
-    """Test candidates, each given by its number of columns and these,
-    in batches of equal numbers.
-    """
-    trials: dict[int, CandidateTrial | None] = {}
-    waiting: dict[int, dict[int, Felt]] = {}
+    """Test candidates, each given by its number of columns and these."""
+    before = folds.square_sum(folds.residual)
 
-    def score(width: int) -> None:
-        batch = waiting.pop(width)
-        trials.update(zip(batch, _scored_together(folds, width, list(batch.values())), strict=True))
+    def score(width: int, batch: Sequence[Felt]) -> Sequence[CandidateTrial | None]:
+        return _scored_together(folds, before, width, batch)
 
-    for number, (width, felt) in enumerate(candidates):
-        waiting.setdefault(width, {})[number] = felt
-        if len(waiting[width]) * width >= BATCH_COLUMNS:
-            score(width)
-    for width in tuple(waiting):
-        score(width)
-    return tuple(trials[number] for number in range(len(trials)))
+    return in_batches(candidates, score)
 
 
 def _scored_together(
-    folds: Folds, width: int, candidates: Sequence[Felt]
-) -> tuple[CandidateTrial | None, ...]:
-    """Test c candidates with the same number of columns p.
+    folds: Folds, before: FloatArray, width: int, candidates: Sequence[Felt]
+) -> Sequence[CandidateTrial | None]:
+    """Test candidates with the same number of columns p.
 
     Everything is computed from products that are summed block by block, so that no candidate needs
-    a pass over the rows of its own.
+    a pass over the rows of its own. What the declared model contains already leaves before the sums
+    over moves and folds are made.
+
+    Args:
+        folds: the problem.
+        before: ‖r‖² of each fold and motor, shape (folds, m).
+        width: p.
+        candidates: their columns.
     """
-    made = [
-        _products(own, candidates)
-        for own in folds.motors
-        if any(own.motor in felt for felt in candidates)
-    ]
-    shape, unknowns = (len(candidates), width), folds.linearisation.jacobian.width
+    made: list[_Products] = []
+    for own in folds.motors:
+        numbers = felt_by(candidates, own.motor)
+        if len(numbers):
+            made.append(_products(own, numbers, candidates))
+    sums = MotorSums.empty(folds, len(candidates), width)
+    for one in made:
+        one.add_to(sums)
+    projection = Projection.of(folds, sums)
+    new = np.flatnonzero(is_new(projection.gram, sums.squares))
+    results: list[CandidateTrial | None] = [None] * len(candidates)
+    if not len(new):
+        return results
+    if len(new) < len(candidates):
+        made = [one.only(new) for one in made]
+        sums = sums.only(new)
+        projection = projection.only(new)
+    trials = _tried_on_folds(folds, before, made, sums, projection)
+    for number, trial in zip(new, trials, strict=True):
+        results[number] = trial
+    return results
+
+
+def _tried_on_folds(
+    folds: Folds,
+    before: FloatArray,
+    made: Sequence[_Products],
+    sums: MotorSums,
+    projection: Projection,
+) -> tuple[CandidateTrial, ...]:
+    """Test c candidates that the declared model lacks on moves and folds; see `_scored_together`
+    and `_HeldOut`.
+    """
+    along = projection.along
+    # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster.
+    gram = crossed_gram(pushed(along, folds.cluster_hessian), along)
+    cluster_score = -scored_along(along, folds.cluster_score)
+    for one in made:
+        at = np.ix_(one.own.cluster, one.felt)
+        crossed = crossed_gram(one.jacobian, along[one.felt][..., one.own.seen])
+        gram[at] += one.gram - crossed - np.swapaxes(crossed, -1, -2)
+        cluster_score[at] += one.score
+    fitted = np.linalg.solve(gram.sum(axis=0), cluster_score.sum(axis=0)[..., None])[..., 0]
+    fallen = fall_of_motors(folds, sums, along, fitted)
+    scatter = cluster_score - (gram @ fitted[..., None])[..., 0]
+    held_out = _held_out(folds, before, made, sums)
+    score = cluster_score.sum(axis=0)
+    trials: list[CandidateTrial] = []
+    for place in range(len(along)):
+        own_gram = gram[:, place]
+        trial = CandidateTrial(
+            coefficients=fitted[place],
+            fallen=fallen[place],
+            training_fall=held_out.training_fall[:, place],
+            held_out=held_out.squares[:, :, place],
+            score=score[place],
+            scatter=scatter[:, place],
+            gram=own_gram,
+            rest=_rest(folds, made, place, own_gram),
+        )
+        trials.append(trial)
+    return tuple(trials)
+
+
+@dataclass(frozen=True, slots=True)
+class _HeldOut:
+    """Candidates fitted without each fold, beside a model fitted without it."""
+
+    training_fall: FloatArray  #: fall of ‖e‖² on the other folds, shape (folds, c)
+    squares: FloatArray  #: ‖e‖² on the fold, shape (folds, m, c)
+
+
+def _held_out(
+    folds: Folds, before: FloatArray, made: Sequence[_Products], sums: MotorSums
+) -> _HeldOut:
+    """Fit candidates with J and Φ of the other folds, for each fold k: Φ − J w_k."""
+    _, count, width, unknowns = sums.jacobian.shape
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
-    parts = (folds.count, len(folds.linearisation.gamma), *shape)
-    part_jacobian, part_gram = np.zeros((*parts, unknowns)), np.zeros((*parts, width))
-    part_score, part_held = np.zeros(parts), np.zeros(parts)
+    parts = (folds.count, len(folds.linearisation.gamma), count, width)
+    part_jacobian = np.zeros((*parts, unknowns))
+    part_gram = np.zeros((*parts, width))
+    part_score = np.zeros(parts)
+    part_held = np.zeros(parts)
     for one in made:
         place = np.s_[:, one.own.motor, one.felt]
         spread = np.zeros((folds.count, len(one.felt), width, unknowns))
         spread[..., one.own.seen] = one.own.by_fold(one.jacobian, folds.count)
-        part_jacobian[place], part_gram[place] = spread, one.own.by_fold(one.gram, folds.count)
-        part_score[place], part_held[place] = (
-            one.own.by_fold(part, folds.count) for part in (one.score, one.held)
-        )
-    motor_jacobian, fold_jacobian = part_jacobian.sum(axis=0), part_jacobian.sum(axis=1)
-    motor_gram, whole_jacobian = part_gram.sum(axis=0), fold_jacobian.sum(axis=0)
-    # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster and of each motor.
-    along = _solved(folds.full_factor, whole_jacobian)
-    gram = _crossed(_pushed(along, folds.cluster_hessian), along)
-    cluster_score = -_scored_along(along, folds.cluster_score)
-    for one in made:
-        at, crossed = (
-            np.ix_(one.own.cluster, one.felt),
-            _crossed(one.jacobian, along[one.felt][..., one.own.seen]),
-        )
-        gram[at] += one.gram - crossed - np.swapaxes(crossed, -1, -2)
-        cluster_score[at] += one.score
-    squares = np.diagonal(motor_gram.sum(axis=0), axis1=1, axis2=2)
-    new = _is_new(gram.sum(axis=0), squares)
-    if not new.all():
-        kept = [felt for felt, is_new in zip(candidates, new, strict=True) if is_new]
-        trials = iter(_scored_together(folds, width, kept) if kept else ())
-        return tuple(next(trials) if is_new else None for is_new in new)
-    fitted = np.linalg.solve(gram.sum(axis=0), cluster_score.sum(axis=0)[..., None])[..., 0]
-    motor_score = part_score.sum(axis=0) - _scored_along(along, folds.motor_score)
-    own = _projected_gram(
-        motor_gram, motor_jacobian, along, _pushed(along, folds.part_hessian.sum(axis=0))
-    )
-    fallen = 2.0 * np.einsum("ncp,cp->cn", motor_score, fitted) - np.einsum(
-        "cp,ncpq,cq->cn", fitted, own, fitted
-    )
-    scatter = cluster_score - (gram @ fitted[..., None])[..., 0]
-    # The same with J and Φ of the other folds, for each fold k: Φ − J w_k.
-    coupling = whole_jacobian - fold_jacobian
-    steps = np.stack(
-        [_solved(factor, part) for factor, part in zip(folds.factors, coupling, strict=True)]
-    )
+        part_jacobian[place] = spread
+        part_gram[place] = one.own.by_fold(one.gram, folds.count)
+        part_score[place] = one.own.by_fold(one.score, folds.count)
+        part_held[place] = one.own.by_fold(one.held, folds.count)
+    coupling = sums.jacobian.sum(axis=0) - part_jacobian.sum(axis=1)
+    step_of_folds: list[FloatArray] = []
+    pushed_of_folds: list[FloatArray] = []
+    for factor, own_coupling, hessian in zip(
+        folds.factors, coupling, folds.part_hessian, strict=True
+    ):
+        step = solved(factor, own_coupling)
+        step_of_folds.append(step)
+        pushed_of_folds.append(pushed(step, hessian))
+    steps = np.stack(step_of_folds)
     drive = part_score.sum(axis=(0, 1)) - part_score.sum(axis=1)
     drive -= (steps @ folds.scores[:, None, :, None])[..., 0]
     shown = part_held - (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
     # What the other folds do not show at all is left as it is: in its own unit, the shortest of all
     # solutions.
-    unit = np.sqrt(squares)
-    schur = motor_gram.sum(axis=0) - part_gram.sum(axis=1) - _crossed(coupling, steps)
-    inverse = np.linalg.pinv(schur / (unit[:, :, None] * unit[:, None, :]), rcond=UNSEEN)
+    unit = np.sqrt(sums.squares)
+    schur = sums.gram.sum(axis=0) - part_gram.sum(axis=1) - crossed_gram(coupling, steps)
+    inverse = _shortest_inverse(schur / (unit[:, :, None] * unit[:, None, :]))
     without = (inverse @ (drive / unit)[..., None])[..., 0] / unit
     # r − (Φ − J w_k) fitted, squared motor by motor.
-    pushed = np.stack(
-        [_pushed(step, hessian) for step, hessian in zip(steps, folds.part_hessian, strict=True)]
-    )
-    inside = _projected_gram(part_gram, part_jacobian, steps[:, None], pushed)
-    held_out = folds.square_sum(folds.residual)[:, :, None] - 2.0 * np.einsum(
-        "kncp,kcp->knc", shown, without
-    )
-    held_out += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
-    training = np.sum(drive * without, axis=-1)
-    score = cluster_score.sum(axis=0)
-    rests = [_rest(folds, made, place, gram[:, place]) for place in range(len(candidates))]
-    return tuple(
-        CandidateTrial(
-            coefficients=fitted[place],
-            fallen=fallen[place],
-            training_fall=training[:, place],
-            held_out=held_out[:, :, place],
-            score=score[place],
-            scatter=scatter[:, place],
-            gram=gram[:, place],
-            rest=rests[place],
-        )
-        for place in range(len(candidates))
-    )
+    inside = projected_gram(part_gram, part_jacobian, steps[:, None], np.stack(pushed_of_folds))
+    squares = before[:, :, None] - 2.0 * np.einsum("kncp,kcp->knc", shown, without)
+    squares += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
+    return _HeldOut(np.sum(drive * without, axis=-1), squares)
+
+
+def _shortest_inverse(matrices: FloatArray) -> FloatArray:
+    """Pseudoinverse of matrices in their own units, shape (…, p, p);
+    of single numbers without a decomposition.
+    """
+    if matrices.shape[-1] > 1:
+        return np.asarray(np.linalg.pinv(matrices, rcond=UNSEEN))
+    return np.divide(1.0, matrices, out=np.zeros_like(matrices), where=matrices != 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -504,14 +569,40 @@ class _Products:
     score: FloatArray  #: Φᵀe, shape (blocks, c, p)
     held: FloatArray  #: Φᵀr, shape (blocks, c, p)
 
+    def add_to(self, sums: MotorSums) -> None:
+        """Put the sums over all blocks into their places."""
+        sums.put(
+            self.own,
+            self.felt,
+            jacobian=self.jacobian.sum(axis=0),
+            gram=self.gram.sum(axis=0),
+            score=self.score.sum(axis=0),
+        )
 
-def _products(own: MotorRows, candidates: Sequence[Felt]) -> _Products:
-    felt = np.array([number for number, columns in enumerate(candidates) if own.motor in columns])
-    inside = np.stack([candidates[number][own.motor] for number in felt])
+    def only(self, chosen: IntArray) -> _Products:
+        """The same of some of the candidates of the batch, which are counted anew."""
+        inside = np.flatnonzero(np.isin(self.felt, chosen))
+        return _Products(
+            own=self.own,
+            felt=np.searchsorted(chosen, self.felt[inside]),
+            jacobian=self.jacobian[:, inside],
+            gram=self.gram[:, inside],
+            score=self.score[:, inside],
+            held=self.held[:, inside],
+        )
+
+
+def _products(own: MotorRows, numbers: IntArray, candidates: Sequence[Felt]) -> _Products:
+    inside = np.stack([candidates[number][own.motor] for number in numbers])
     flat = own.sums(inside.reshape(-1, inside.shape[-1]), own.equations)
     beside = flat.reshape(len(flat), *inside.shape[:2], -1)
     return _Products(
-        own, felt, beside[..., :-2], own.sums(inside, inside), beside[..., -2], beside[..., -1]
+        own=own,
+        felt=numbers,
+        jacobian=beside[..., :-2],
+        gram=own.grams(inside),
+        score=beside[..., -2],
+        held=beside[..., -1],
     )
 
 
@@ -531,46 +622,3 @@ def _rest(
             squares[clusters] += one.gram[:, index]
             scores[clusters] += one.score[:, index]
     return without_most_leverage(folds, crossed, squares, scores, projected)
-
-
-def _is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
-    """Mask of candidates that the declared model lacks, from Φ⊥ᵀΦ⊥, (c, p, p),
-    and ‖φ‖² of their columns, (c, p).
-    """
-    size = np.diagonal(gram, axis1=1, axis2=2)
-    new = np.asarray(np.all(size > REDUNDANT_SHARE * squares, axis=1))
-    root = np.sqrt(size[new])
-    new[new] = np.linalg.cond(gram[new] / (root[:, :, None] * root[:, None, :])) <= 1e10
-    return new
-
-
-def _solved(factor: tuple[FloatArray, bool], right: FloatArray) -> FloatArray:
-    """H⁻¹JᵀΦ of each candidate, transposed, from ΦᵀJ, both of shape (c, p, f)."""
-    return np.asarray(
-        linalg.cho_solve(factor, right.reshape(-1, right.shape[-1]).T).T.reshape(right.shape)
-    )
-
-
-def _pushed(along: FloatArray, hessian: FloatArray) -> FloatArray:
-    """w H of each part, shape (…, c, p, f), from w, shape (c, p, f), and H, shape (…, f, f)."""
-    return (along.reshape(-1, along.shape[-1]) @ hessian).reshape(*hessian.shape[:-2], *along.shape)
-
-
-def _scored_along(along: FloatArray, scores: FloatArray) -> FloatArray:
-    """w s of each part, shape (parts, c, p), from w, shape (c, p, f), and s, shape (parts, f)."""
-    return (scores @ along.reshape(-1, along.shape[-1]).T).reshape(-1, *along.shape[:-1])
-
-
-def _crossed(first: FloatArray, second: FloatArray) -> FloatArray:
-    """A Bᵀ of each candidate, shape (…, p, p), from A and B, shape (…, p, f)."""
-    return np.asarray(first @ np.swapaxes(second, -1, -2))
-
-
-def _projected_gram(
-    gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed: FloatArray
-) -> FloatArray:
-    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), from ΦᵀΦ, ΦᵀJ, wᵀ and wᵀJᵀJ,
-    the last three (…, p, f).
-    """
-    crossed = _crossed(jacobian, along)
-    return gram - crossed - np.swapaxes(crossed, -1, -2) + _crossed(pushed, along)

@@ -108,7 +108,7 @@ def without_most_leverage(
     order = np.argsort(share)
     left = np.sort(order[:-LEVERAGE])
     clusters, unknowns, _ = folds.cluster_hessian.shape
-    whole_hessian = folds.cluster_hessian.sum(axis=0)
+    whole_hessian = folds.motor_hessian.sum(axis=0)
     hessian = whole_hessian - folds.cluster_hessian[order[-LEVERAGE:]].sum(axis=0)
     factor = linalg.cho_factor(hessian + RIDGE * np.diag(np.diag(whole_hessian)), lower=True)
     along = linalg.cho_solve(factor, crossed[left].sum(axis=0).T)

@@ -13,6 +13,7 @@ import numpy as np
 import scipy  # loads scipy.optimize when it is first used
 
 from ident.arrays import FloatArray
+from ident.discovery.candidate_fits import CandidateFit
 from ident.discovery.candidates import CandidateTrial, SearchProblem
 from ident.effects.effect import Effect, Range, is_shipped, setting_range
 
@@ -22,11 +23,11 @@ CLOSE_ENOUGH = 1e-3  #: Change of a setting at which the simplex stops, in its u
 DIGITS = 4  #: Of a setting, as a calibration shows it
 
 
-def is_strictly_possible(effect: Effect, trial: CandidateTrial) -> bool:
+def is_strictly_possible(effect: Effect, fit: CandidateTrial | CandidateFit) -> bool:
     """Whether every coefficient is inside its possible values, without tolerance."""
     return all(
         column.least <= value <= column.largest
-        for column, value in zip(effect.coefficients, trial.coefficients, strict=True)
+        for column, value in zip(effect.coefficients, fit.coefficients, strict=True)
     )
 
 
@@ -52,9 +53,9 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
             one.least <= value <= one.largest for one, value in zip(ranges, values, strict=True)
         ):
             return 0.0  # it explains nothing
-        (trial,) = search_problem.trials([search_problem.torque_at_rows(changed(values), axis)])
-        if trial is not None and is_strictly_possible(effect, trial):
-            return -float(trial.fallen.sum())
+        (fit,) = search_problem.fits([search_problem.torque_at_rows(changed(values), axis)])
+        if fit is not None and is_strictly_possible(effect, fit):
+            return -float(fit.fallen.sum())
         return 0.0
 
     start = np.array([effect.settings[name] for name in names])

@@ -23,7 +23,8 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
-from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
+from ident.discovery.candidate_fits import CandidateFit
+from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
 from ident.discovery.refinement import is_strictly_possible
 from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia
@@ -145,13 +146,13 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
                 tried += gears
                 shares += _explained(search_problem, axis, gears)
         forms.append(tried[int(np.argmax(shares))])
-    trials = search_problem.trials(search_problem.torque(form, axis) for form in forms)
-    falls = [
-        float(trial.fallen.sum())
-        if trial is not None and is_strictly_possible(form, trial)
-        else 0.0
-        for form, trial in zip(forms, trials, strict=True)
-    ]
+    fits = search_problem.fits(search_problem.torque(form, axis) for form in forms)
+    falls: list[float] = []
+    for tried_form, fit in zip(forms, fits, strict=True):
+        fall = 0.0
+        if fit is not None and is_strictly_possible(tried_form, fit):
+            fall = float(fit.fallen.sum())
+        falls.append(fall)
     return forms[int(np.argmax(falls))]
 
 
@@ -241,8 +242,8 @@ def _rounded(setting: float) -> float:
 
 def _tried(
     search_problem: SearchProblem, axis: int, added: Callable[[Signals], FloatArray]
-) -> tuple[CandidateTrial | None, ...]:
-    """Test gears by their torque on the joint itself:
+) -> tuple[CandidateFit | None, ...]:
+    """Fit gears by their torque on the joint itself:
     a sixth of the work of all joints on a six-axis arm.
     """
     conditioning = search_problem.observation.conditioning
@@ -254,4 +255,4 @@ def _tried(
     columns = np.concatenate(rows, axis=-1)
     torque = np.zeros((search_problem.axes, *columns.shape))
     torque[axis] = columns
-    return search_problem.trials([torque[:, index : index + 1] for index in range(len(columns))])
+    return search_problem.fits([torque[:, index : index + 1] for index in range(len(columns))])

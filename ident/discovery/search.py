@@ -61,6 +61,7 @@ CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t;
 folds share training data, so it is a rough one).
 """
+PAIRS_TOGETHER = 32  #: Candidates with two coefficients whose draws stay in a core's cache
 #: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
 GOLDEN_STEPS = 6
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -184,8 +185,8 @@ def rank_families(
             )
             probability[alike] = np.fmin(probability[alike], among_them)
     probabilities = iter(probability)
-    before = search_problem.folds.square_sum(search_problem.folds.residual)
-    findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
+    sizes = MotorSizes.of(search_problem)
+    findings = [_judge(search_problem, sizes, family, probabilities, gates) for family in tested]
     ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
     errors = np.stack([finding.fold_errors for finding in ranked])
     better = is_better(errors[:, None], errors[None])
@@ -305,14 +306,37 @@ def refine_setting(
     return effect
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MotorSizes:
+    """What all candidates of a turn are compared with."""
+
+    before: FloatArray  #: ‖e‖² of each fold and motor on held-out moves, shape (folds, m)
+    residual: FloatArray  #: ‖e‖² of each motor, shape (m,)
+    current: FloatArray  #: ‖v‖² of each motor, shape (m,)
+
+    @classmethod
+    def of(cls, search_problem: SearchProblem) -> MotorSizes:
+        """Sum the squares of a problem around the model."""
+        folds = search_problem.folds
+        problem = folds.linearisation
+        count = len(problem.gamma)
+        residual = np.zeros(count)
+        current = np.zeros(count)
+        np.add.at(residual, problem.motor, problem.residual**2)
+        np.add.at(current, problem.motor, problem.current**2)
+        before = folds.square_sum(folds.residual)
+        return cls(before, residual, current)
+
+
 def _judge(
     search_problem: SearchProblem,
-    before: FloatArray,
+    sizes: MotorSizes,
     family: FamilyTrials,
     probabilities: Iterator[float],
     gates: Gates,
 ) -> Finding:
     problem = search_problem.folds.linearisation
+    before = sizes.before
     probability = [next(probabilities) for _ in family.members]
     # A setting that needs impossible coefficients is chosen only where every setting of the family
     # does.
@@ -337,9 +361,8 @@ def _judge(
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual
     # falls most.
     motor = int(np.argmax(trial.fallen))
-    rows = problem.motor == motor
-    own = float(np.sum(problem.residual[rows] ** 2))
-    size = float(np.sum(problem.current[rows] ** 2))
+    own = float(sizes.residual[motor])
+    size = float(sizes.current[motor])
     explained = float(trial.fallen[motor] / own)
     error_before, error_after = (
         float(np.sqrt(part[:, motor].sum() / size)) for part in (before, after)
@@ -475,6 +498,9 @@ def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatAr
             drawn = _drawn_numbers(
                 scatter[:, :, 0].T, np.stack([one.gram[:, 0, 0] for one in alike], axis=1), signs
             )
+        elif freedom == 2:
+            gram = np.stack([one.gram for one in alike], axis=1)
+            drawn = _drawn_pairs(np.swapaxes(scatter, 0, 1), gram, signs)
         else:
             drawn = reduce(np.maximum, (_drawn_wald(one, signs) for one in alike))
         # On the scale of −log p, so that candidates with one and with two coefficients compete
@@ -535,6 +561,46 @@ def _drawn_numbers(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatA
     return np.asarray(np.max(sums**2 / left, axis=1))
 
 
+def _drawn_pairs(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatArray:
+    """The same for candidates with two coefficients each, the largest of all;
+    x_m of shape (moves, c, 2), G_m of shape (moves, c, 2, 2).
+
+    Most candidates have one or two, and a matrix of two rows has its inverse written out.
+    """
+    largest = np.zeros(len(signs))
+    for first in range(0, x.shape[1], PAIRS_TOGETHER):
+        batch = slice(first, first + PAIRS_TOGETHER)
+        wald = _wald_of_pairs(x[:, batch], gram[:, batch], signs)
+        np.maximum(largest, np.max(wald, axis=1), out=largest)
+    return largest
+
+
+def _wald_of_pairs(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatArray:
+    """Wald statistic of each draw and candidate, shape (draws, c)."""
+    sums = [signs @ x[:, :, row] for row in (0, 1)]
+    inverse = np.linalg.pinv(gram.sum(axis=0))
+    fitted = [sums[0] * inverse[:, 0, row] + sums[1] * inverse[:, 1, row] for row in (0, 1)]
+    left: dict[tuple[int, int], FloatArray] = {}
+    for row, column in ((0, 0), (1, 0), (1, 1)):
+        own = x[:, :, row]
+        other = x[:, :, column]
+        found = np.sum(own * other, axis=0) + np.zeros_like(sums[0])
+        for one in (0, 1):
+            mixed = own * gram[:, :, column, one] + gram[:, :, row, one] * other
+            found -= (signs @ mixed) * fitted[one]
+            for two in (0, 1):
+                square = np.sum(gram[:, :, row, one] * gram[:, :, column, two], axis=0)
+                found += square * fitted[one] * fitted[two]
+        left[row, column] = found
+    # A coefficient that no draw scatters
+    least = 1e-12 * (left[0, 0] + left[1, 1])
+    upper = left[0, 0] + least
+    lower = left[1, 1] + least
+    beside = left[1, 0]
+    square_sum = sums[0] ** 2 * lower + sums[1] ** 2 * upper - 2.0 * sums[0] * sums[1] * beside
+    return np.asarray(square_sum / (upper * lower - beside**2))
+
+
 def _golden_section(
     search_problem: SearchProblem, effect: Effect, axis: int, name: str, lower: float, upper: float
 ) -> Effect:
@@ -543,8 +609,10 @@ def _golden_section(
 
     def fall(x: float) -> float:
         changed = effect.with_settings({name: float(np.exp(x))})
-        (trial,) = search_problem.trials([search_problem.torque(changed, axis)])
-        return -np.inf if trial is None else float(trial.fallen.sum())
+        (fit,) = search_problem.fits([search_problem.torque(changed, axis)])
+        if fit is None:
+            return -np.inf
+        return float(fit.fallen.sum())
 
     inner = b - GOLDEN * (b - a)
     outer = a + GOLDEN * (b - a)

@@ -123,12 +123,17 @@ def twists(link: DrivenLink, gears: Gears) -> Twists:
         none = np.zeros((len(gears.half_gap_rad), len(pushed)))
         return Twists(none, none, np.broadcast_to(pushed, none.shape))
     inertia = np.maximum(link.inertia_kg_m2, LEAST_SHARE * mean)
-    bent = _bent_springs(pushed, inertia, link.rate_hz, gears)
-    bend = np.stack([curvature(one, link.rate_hz) for one in bent])
+    twist = _bent_springs(pushed, inertia, link.rate_hz, gears)
+    bend = np.empty_like(twist)
+    for one, of_spring in zip(bend, twist, strict=True):
+        one[:] = curvature(of_spring, link.rate_hz)
     side = np.sign(np.where(pushed == 0.0, link.torque_nm, pushed))
-    around = Twists(gears.half_gap_rad[:, None] * side + bent, bend, pushed - inertia * bend)
+    twist += gears.half_gap_rad[:, None] * side
+    around = Twists(twist, bend, pushed - inertia * bend)
     windows = _windows(link, pushed, has_gap=bool(np.any(gears.half_gap_rad > 0.0)))
-    return around if windows is None else _followed(link, inertia, gears, around, windows)
+    if windows is not None:
+        _follow(link, inertia, gears, around, windows)
+    return around
 
 
 def _bent_springs(
@@ -188,10 +193,12 @@ def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
     return np.asarray(is_held)
 
 
-def _followed(
+def _follow(
     link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around: Twists, windows: Windows
-) -> Twists:
-    """Integrate the link in the windows; around them it is known."""
+) -> None:
+    """Integrate the link in the windows, and write it over what was known around them:
+    these are the largest arrays of a search, and there is no second copy of them.
+    """
     rate_hz = link.rate_hz
     # A flank too stiff for the steps is as good as one that they resolve.
     stiffest = 1.0 / (np.min(inertia_kg_m2) * (2.0 * STEP_RAD * MOST_STEPS * rate_hz) ** 2)
@@ -204,9 +211,9 @@ def _followed(
     begin = windows.begin
     twist = around.twist_rad[:, begin]
     rate = (around.twist_rad[:, begin + 1] - around.twist_rad[:, begin - 1]) * (0.5 * rate_hz)
-    twisted = around.twist_rad.copy()
-    bent = around.acceleration_rad_s2.copy()
-    passed = around.passed_nm.copy()
+    twisted = around.twist_rad
+    bent = around.acceleration_rad_s2
+    passed = around.passed_nm
     # Means from one sample to the next lie half a sample late: each sample gets that of the means
     # on its two sides.
     bend_before = np.zeros_like(rate)
@@ -244,7 +251,6 @@ def _followed(
         )
         bend_before = mean_bend
         flank_before = mean_flank
-    return Twists(twisted, bent, passed)
 
 
 def _flank(

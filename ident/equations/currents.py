@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import FloatArray, IntArray
-from ident.equations.triangles import Triangles, solve, triangle_of
+from ident.equations.triangles import Triangles, least_squares, triangle_of
 
 ROUNDS = 30  #: At most; σ and χ depend on each other
 ROWS_FOR_TRIANGLE = 20  #: From so many rows a column on, they are reduced to a triangle first
@@ -81,12 +81,10 @@ class Currents:
         driven = self.drive @ gains
         torque = driven - self.known
         if len(torque) < ROWS_FOR_TRIANGLE * self.linear.shape[1]:
-            parameters, _ = solve(self.linear, torque)
-            return parameters
+            return least_squares(self.linear, torque)
         columns = np.vstack((self.linear.T, torque))
         factor = triangle_of(columns)
-        parameters, _ = solve(factor[:, :-1], factor[:, -1])
-        return parameters
+        return least_squares(factor[:, :-1], factor[:, -1])
 
     def whitened(self, gains: FloatArray, noise: FloatArray) -> Currents:
         """The equations in units of the noise.

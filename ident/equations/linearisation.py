@@ -27,6 +27,8 @@ LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 """Fields of a linearisation that have a number a row."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
 FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
+#: Columns of a candidate up to which the products of single rows are summed; see `MotorRows.grams`
+MOST_SUMMED = 2
 RIDGE = 1e-10  #: Share of the diagonal of JᵀJ added to it: two effects may be nearly equal
 #: Standard errors of the correlation of neighbouring clusters, above which they are joined
 CORRELATED = 2.0
@@ -538,17 +540,10 @@ def jackknife_covariance(
     free = slice(first_free, size)
     if recorded is None:
         recorded = system
-    grams = np.zeros((clusters, size, size))
-    scores = np.zeros((clusters, size))
-    for index, (cluster, own) in enumerate(zip(system.clusters, recorded.clusters, strict=True)):
-        preload = system.preload_of(index)
-        equations = motor_jacobians(cluster, preload, gains, parameters, noise)
-        for motor, (jacobian, residual, _) in enumerate(equations):
-            grams[index] += jacobian.T @ jacobian
-            recorded_residual = residual
-            if own[motor] is not cluster[motor]:
-                _, recorded_residual = motor_jacobian(own[motor], motor, gains, parameters, noise)
-            scores[index] += jacobian.T @ recorded_residual
+    if system.preload:
+        grams, scores = _sums_with_preload(system, gains, parameters, noise)
+    else:
+        grams, scores = _sums_of_motors(system, recorded, gains, parameters, noise)
     runs = np.array([run for run, _ in system.cluster_runs])
     free_grams = grams[:, free, free]
     free_scores = scores[:, free]
@@ -559,6 +554,59 @@ def jackknife_covariance(
     covariance = np.zeros((size, size))
     covariance[free, free] = scatter_of(shifts)
     return covariance
+
+
+def _sums_with_preload(
+    system: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ and Jᵀe of each cluster of a redundant drive, shapes (C, f, f) and (C, f)."""
+    clusters = len(system.clusters)
+    size = len(gains) + len(parameters)
+    grams = np.zeros((clusters, size, size))
+    scores = np.zeros((clusters, size))
+    for index, cluster in enumerate(system.clusters):
+        preload = system.preload_of(index)
+        for jacobian, residual, _ in motor_jacobians(cluster, preload, gains, parameters, noise):
+            grams[index] += jacobian.T @ jacobian
+            scores[index] += jacobian.T @ residual
+    return grams, scores
+
+
+def _sums_of_motors(
+    system: System, recorded: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ and Jᵀe of each cluster, shapes (C, f, f) and (C, f).
+
+    A motor is linearised on the rows of all clusters at once, and products are made of the unknowns
+    that it has: near the flange these are less than half.
+
+    Args:
+        system: of J.
+        recorded: of e.
+        gains, parameters, noise: see `jackknife_covariance`.
+    """
+    size = len(gains) + len(parameters)
+    grams = np.zeros((len(system.clusters), size, size))
+    scores = np.zeros((len(system.clusters), size))
+    for motor in range(len(gains)):
+        of_clusters = [cluster[motor] for cluster in system.clusters]
+        rows = np.concatenate(of_clusters)
+        jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
+        if recorded is not system:
+            recorded_rows = np.concatenate([cluster[motor] for cluster in recorded.clusters])
+            _, residual = motor_jacobian(recorded_rows, motor, gains, parameters, noise)
+        seen = np.flatnonzero(jacobian.any(axis=0))
+        own_jacobian = jacobian[:, seen]
+        ends = np.cumsum([len(of_cluster) for of_cluster in of_clusters])
+        products = np.empty((len(ends), len(seen), len(seen)))
+        first = 0
+        for index, end in enumerate(ends.tolist()):
+            of_cluster = own_jacobian[first:end]
+            np.matmul(of_cluster.T, of_cluster, out=products[index])
+            scores[index, seen] += of_cluster.T @ residual[first:end]
+            first = end
+        grams[:, seen[:, None], seen] += products
+    return grams, scores
 
 
 @dataclass(frozen=True, slots=True)
@@ -586,6 +634,25 @@ class MotorRows:
         for product, block in zip(out, self._blocks(), strict=True):
             transposed = np.swapaxes(second[..., block], -1, -2)
             np.matmul(first[..., block], transposed, out=product)
+        return out
+
+    def grams(self, columns: FloatArray) -> FloatArray:
+        """Products A_b A_bᵀ over the rows of each block, shape (blocks, …, a, a);
+        see `sums`.
+
+        The products of a few columns are summed along memory, because a matrix product for each
+        block and candidate would be a call for a few dozen numbers.
+        """
+        count = columns.shape[-2]
+        if count > MOST_SUMMED:
+            return self.sums(columns, columns)
+        out = np.empty((len(self.starts), *columns.shape[:-1], count))
+        for row in range(count):
+            for column in range(row + 1):
+                product = columns[..., row, :] * columns[..., column, :]
+                of_blocks = np.moveaxis(np.add.reduceat(product, self.starts, axis=-1), -1, 0)
+                out[..., row, column] = of_blocks
+                out[..., column, row] = of_blocks
         return out
 
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
@@ -635,6 +702,7 @@ class Folds:
     cluster_score: FloatArray  #: Jᵀe of each cluster, shape (clusters, f)
     part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, m, f, f)
     part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, m, f)
+    motor_hessian: FloatArray  #: JᵀJ of each motor, shape (m, f, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (m, f)
     #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
     residual: FloatArray
@@ -726,6 +794,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         cluster_score=sums.cluster_score,
         part_hessian=sums.part_hessian,
         part_score=part_score,
+        motor_hessian=sums.part_hessian.sum(axis=0),
         motor_score=sums.motor_score,
         residual=residual,
         estimate_factor=estimate_factor,

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -296,16 +297,35 @@ class _Reducer:
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
             without_clusters = without_clusters.holding(given)
-        # The clusters are by far the largest part: none of them is in memory twice.
-        clusters: list[tuple[FloatArray, ...]] = []
-        instruments: list[tuple[FloatArray, ...]] = []
-        for one in self.clusters:
-            rows = self._of_cluster(one, self._currents, unknowns, self.leading)
-            clusters.append(rows)
+        mountings = [one.mounting for one in self.clusters]
+        waiting = self._taken_rows()
+        clusters: list[list[FloatArray]] = []
+        instruments: list[list[FloatArray]] = []
+        for motor in range(len(waiting)):
+            rows = waiting[motor]
+            waiting[motor] = []
+            own = _Columns(motor, mountings, unknowns)
+            clusters.append(own.of(rows, self._currents, self.leading))
             if self.has_demanded_motion:
-                rows = self._of_cluster(one, self._instruments, unknowns, 0)
-                instruments.append(rows)
-        return replace(without_clusters, clusters=tuple(clusters), instruments=tuple(instruments))
+                instruments.append(own.of(rows, self._instruments, 0))
+        return replace(
+            without_clusters,
+            clusters=tuple(zip(*clusters, strict=True)),
+            instruments=tuple(zip(*instruments, strict=True)),
+        )
+
+    def _taken_rows(self) -> list[list[FloatArray]]:
+        """Take the rows of each motor in each cluster out of here.
+
+        They are by far the largest part: those of one motor alone are in memory twice while they
+        are put into their columns.
+        """
+        taken: list[list[FloatArray]] = []
+        for motor in range(len(self.of_motor)):
+            of_clusters = [one.factors[motor] for one in self.clusters]
+            taken.append(of_clusters)
+        self.clusters.clear()
+        return taken
 
     def _without_clusters(self) -> System:
         """The equations with all columns, before the rows of each cluster are added."""
@@ -366,22 +386,6 @@ class _Reducer:
         """Number of the columns of [W | W_L of each mounting | 0]."""
         return len(self.unknowns.columns) + BODY * len(self.payloads) + 1
 
-    def _of_cluster(
-        self,
-        cluster: _Cluster,
-        columns: Callable[[FloatArray, int, int], FloatArray],
-        given: GivenUnknowns,
-        first: int,
-    ) -> tuple[FloatArray, ...]:
-        """Rows of each motor: some columns of a cluster, so many of currents first,
-        without those that are given.
-        """
-        motors: list[FloatArray] = []
-        for motor, factor in enumerate(cluster.factors):
-            rows = columns(factor, motor, cluster.mounting)
-            motors.append(given.joined_in(rows, first))
-        return tuple(motors)
-
     def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""
         chosen = self.of_motor[motor]
@@ -407,6 +411,38 @@ class _Reducer:
             first = robot + BODY * mounting
             out[:, first : first + BODY] = every[:, self.flange]
         return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Columns:
+    """How the rows of a motor get the columns of a system."""
+
+    motor: int  #: index
+    mountings: Sequence[int]  #: of each cluster
+    given: GivenUnknowns  #: leave the columns
+
+    def of(
+        self,
+        clusters: Sequence[FloatArray],
+        columns: Callable[[FloatArray, int, int], FloatArray],
+        first: int,
+    ) -> list[FloatArray]:
+        """Rows of the motor in each cluster, in some columns, so many of currents first.
+
+        Neighbours with the same mounting have the same columns, and are put into them together: a
+        cluster has a few dozen rows, and each call would cost more than its numbers.
+        """
+        found: list[FloatArray] = []
+        begin = 0
+        for mounting, neighbours in groupby(self.mountings):
+            end = begin + len(list(neighbours))
+            parts = clusters[begin:end]
+            begin = end
+            rows = columns(np.concatenate(parts), self.motor, mounting)
+            joined = self.given.joined_in(rows, first)
+            ends = np.cumsum([len(part) for part in parts])
+            found += np.split(joined, ends[:-1])
+        return found
 
 
 def _support_with_currents(model: Model, support: BoolArray) -> BoolArray:

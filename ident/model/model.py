@@ -462,8 +462,12 @@ class Model:
         dry = standard[self.dry_friction_columns, None]
         rotor = standard[self.rotor_columns, None]
         offset = standard[self._axis_columns + OFFSET, None]
-        geared = load + viscous * velocity + dry * np.sign(velocity)
-        total = geared + rotor * acceleration + offset
+        geared = dry * np.sign(velocity)
+        geared += viscous * velocity
+        geared += load
+        total = rotor * acceleration
+        total += geared
+        total += offset
         direction = self.drive_train.direction
         for motor, first in zip(
             self.drive_train.coupled, self._coupled_columns.tolist(), strict=True

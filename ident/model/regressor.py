@@ -70,7 +70,7 @@ def fill_rigid(
                 link,
                 work,
                 index,
-                position[index, block],
+                _placed(link, position[index, block]),
                 velocity[index, block],
                 acceleration[index, block],
             )
@@ -149,22 +149,28 @@ def rigid_torque(
     links = _links(robot)
     inertias = [_inertia(own) for own in parameters]
     out = np.empty_like(position)
+    size = min(position.shape[1], BLOCK_SAMPLES)
+    work = _work(robot, links, size, movers=False)
+    wrenches = np.zeros((len(links) + 1, 6, size))  # the last one is what the base bears
     for first in range(0, position.shape[1], BLOCK_SAMPLES):
         block = slice(first, first + BLOCK_SAMPLES)
         q = position[:, block]
         dq = velocity[:, block]
         ddq = acceleration[:, block]
         samples = q.shape[1]
-        work = _work(robot, links, samples, movers=False)
+        if samples != size:
+            work = _work(robot, links, samples, movers=False)
+            wrenches = np.zeros((len(links) + 1, 6, samples))
+        # Each cosine serves the way out and the way back.
+        places = [_placed(link, own) for link, own in zip(links, q, strict=True)]
         for index, link in enumerate(links):
-            _move(link, work, index, q[index], dq[index], ddq[index])
-        wrenches = np.zeros((len(links) + 1, 6, samples))  # the last one is what the base bears
+            _move(link, work, index, places[index], dq[index], ddq[index])
         for index, inertia in enumerate(inertias):
             _fill_inertial_wrench(wrenches[index], work.screws[index], inertia)
         for index in reversed(range(len(links))):
             link = links[index]
             out[index, block] = link.own @ wrenches[index]
-            wrenches[link.parent] += _borne(link, wrenches[index], q[index])
+            wrenches[link.parent] += _borne(link, wrenches[index], places[index])
     return out
 
 
@@ -206,7 +212,7 @@ def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> F
         work = _work(robot, links, q.shape[1])
         still = np.zeros(q.shape[1])
         for index, (link, inertia) in enumerate(zip(links, inertias, strict=True)):
-            _move(link, work, index, q[index], still, still)
+            _move(link, work, index, _placed(link, q[index]), still, still)
             screws = work.screws[index][2:]
             momenta = inertia @ screws
             # S_iᵀ M S_j of the joints i and j that move this link
@@ -271,6 +277,24 @@ class _Work:
     products: FloatArray
     inertia: FloatArray
     moments: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _JointPlace:
+    """Where a joint is, over k samples."""
+
+    position: FloatArray  #: shape (k,)
+    cosine: FloatArray  #: of the angle of a revolute joint; empty of a prismatic one
+    sine: FloatArray  #: the same of its sine
+
+
+def _placed(link: _Link, position: FloatArray) -> _JointPlace:
+    """Place of a link's joint, with what turns its frame."""
+    if not link.revolute:
+        none = np.empty(0)
+        return _JointPlace(position, none, none)
+    cosine, sine = cos_sin(position)
+    return _JointPlace(position, cosine, sine)
 
 
 def _links(robot: Robot) -> tuple[_Link, ...]:
@@ -348,7 +372,7 @@ def _move(
     link: _Link,
     work: _Work,
     index: int,
-    position: FloatArray,
+    place: _JointPlace,
     velocity: FloatArray,
     acceleration: FloatArray,
 ) -> None:
@@ -362,16 +386,15 @@ def _move(
     a = parts[1]
     # S × S is nothing: V may be that before S q̇ is added.
     if link.revolute:
-        cosine, sine = cos_sin(position)
-        turned = np.multiply(parts[:, :, 1::-1], sine, out=work.products[:count])
-        parts[:, :, :2] *= cosine
+        turned = np.multiply(parts[:, :, 1::-1], place.sine, out=work.products[:count])
+        parts[:, :, :2] *= place.cosine
         parts[:, :, 0] += turned[:, :, 0]
         parts[:, :, 1] -= turned[:, :, 1]
         a[:, 0] += v[:, 1] * velocity
         a[:, 1] -= v[:, 0] * velocity
     else:
-        parts[:, 1, 0] += position * parts[:, 0, 1]
-        parts[:, 1, 1] -= position * parts[:, 0, 0]
+        parts[:, 1, 0] += place.position * parts[:, 0, 1]
+        parts[:, 1, 1] -= place.position * parts[:, 0, 0]
         a[1, 0] += v[0, 1] * velocity
         a[1, 1] -= v[0, 0] * velocity
     kind = 1
@@ -383,29 +406,21 @@ def _move(
         here[:] = link.back @ here
 
 
-def _borne(link: _Link, wrench: FloatArray, position: FloatArray) -> FloatArray:
+def _borne(link: _Link, wrench: FloatArray, place: _JointPlace) -> FloatArray:
     """A link's wrench at its parent, shape (6, k): the transpose of `_move`."""
     if link.back is not None:
         wrench = link.back.T @ wrench
-    moment = wrench[:3]
-    force = wrench[3:]
+    at_joint = wrench.copy()
     if link.revolute:
-        cosine, sine = cos_sin(position)
-        moment = _turned_about_z(moment, cosine, sine)
-        force = _turned_about_z(force, cosine, sine)
+        x, y, _ = np.moveaxis(wrench.reshape(2, 3, -1), 1, 0)  # of moment and force
+        turned = at_joint.reshape(2, 3, -1)
+        turned[:, 0] = place.cosine * x - place.sine * y
+        turned[:, 1] = place.sine * x + place.cosine * y
     else:
-        x = moment[0] - position * force[1]
-        y = moment[1] + position * force[0]
-        moment = np.stack((x, y, moment[2]))
-    return link.fixed.T @ np.concatenate((moment, force))
-
-
-def _turned_about_z(vector: FloatArray, cosine: FloatArray, sine: FloatArray) -> FloatArray:
-    """Vectors turned about z by the angle of a cosine and a sine, shape (3, k)."""
-    x, y, z = vector
-    turned_x = cosine * x - sine * y
-    turned_y = sine * x + cosine * y
-    return np.stack((turned_x, turned_y, z))
+        force = wrench[3:]
+        at_joint[0] -= place.position * force[1]
+        at_joint[1] += place.position * force[0]
+    return np.asarray(link.fixed.T @ at_joint)
 
 
 def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray:

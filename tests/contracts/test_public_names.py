@@ -20,6 +20,7 @@ OPAQUE = {
     "Assembly": "of a model; nobody makes one",
     "Demands": "of an evidence, for instruments",
     "HeldChannels": "of a dataset, for diagnoses",
+    "JudgedChannels": "of a run that was read, for whoever differentiates it",
     "Observation": "rows of an evidence",
     "RunChannels": "of an identification, for diagnoses",
     "RunProgress": "of a growing fit",

@@ -28,7 +28,10 @@ from daq.log.conversion import load_run, run_from_log, scaling, temperatures, un
 from daq.log.metadata import AxisReadback, Readback, readback_of_drives
 from daq.log.reader import read_log
 from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
+from ident.data import dataset
+from ident.data.dataset import differentiate
 from ident.errors import CurrentUnsigned
+from ident.model.model import DriveTrain
 from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
 
@@ -91,6 +94,34 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
     assert run.valid is not None
     assert run.valid.all()
     assert len(run.digest) == 64
+
+
+def test_the_channels_of_a_log_are_judged_once(
+    record: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = np.round(20_000.0 * np.sin(np.arange(2_500) / 80.0)).astype(int)
+    counts[300] += 2_000  # a glitch
+    run, _ = load_run(record(samples([[count] * 6 for count in counts.tolist()])))
+    train = DriveTrain(CELL.ratio)
+    again = differentiate(replace(run, judged_channels=None), train, CELL.conditioning)
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset, "find_faults", _judged_again)
+        once = differentiate(run, train, CELL.conditioning)
+    assert once.faults
+    assert len(once.faults) == len(again.faults)
+    for own, expected in zip(once.faults, again.faults, strict=True):
+        assert own.kind is expected.kind
+        assert own.axis == expected.axis
+        assert own.stretches.tolist() == expected.stretches.tolist()
+    assert np.array_equal(once.position_rad, again.position_rad)
+    without_glitch = run.position_rad.copy()
+    without_glitch[300] = without_glitch[[299, 301]].mean(axis=0)
+    other = replace(run, position_rad=without_glitch)
+    assert differentiate(other, train, CELL.conditioning).faults == ()
+
+
+def _judged_again(*_: object) -> None:
+    raise AssertionError("the channels were judged when the log was read")
 
 
 def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from ident.data.conditioning import decimator, low_pass
+from ident.data.conditioning import LONG_SERIES, decimator, low_pass
 
 
 @settings(max_examples=40, deadline=None)
@@ -29,6 +29,30 @@ def test_each_row_is_its_whole_window_weighted(
     for row, centre in enumerate(filter_.centres(samples)):
         window = columns[:, centre - filter_.half : centre + filter_.half + 1]
         assert rows[:, row] == pytest.approx(window @ filter_.taps, abs=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    rate_hz=st.sampled_from((250.0, 999.0, 1000.0, 5000.0)),
+    cutoff_hz=st.floats(10.0, 90.0),
+    extra=st.integers(0, 700),
+    seed=st.integers(0, 2**31),
+)
+def test_a_long_series_is_decimated_as_its_windows_say(
+    rate_hz: float, cutoff_hz: float, extra: int, seed: int
+) -> None:
+    filter_ = decimator(rate_hz, cutoff_hz)
+    samples = LONG_SERIES + extra
+    columns = np.random.default_rng(seed).normal(size=(2, 1, samples))
+    rows = filter_(columns)
+    assert rows.shape == (2, 1, filter_.rows(samples))
+    windows = np.lib.stride_tricks.sliding_window_view(columns, len(filter_.taps), axis=-1)
+    expected = windows[..., :: filter_.factor, :] @ filter_.taps
+    assert rows == pytest.approx(expected, abs=1e-12)
+    # The beginning of a shorter series is decimated together with the other one.
+    shorter = columns[..., : LONG_SERIES - 1]
+    count = filter_.rows(LONG_SERIES - 1)
+    assert filter_(shorter) == pytest.approx(rows[..., :count], abs=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 7, 10])

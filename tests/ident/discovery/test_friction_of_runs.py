@@ -17,6 +17,7 @@ from ident.discovery.evidence import Evidence
 from ident.discovery.gates import gain_shifts, whitened_columns
 from ident.discovery.loop import find_effects
 from ident.effects.position import Spring
+from ident.equations import run_scatter
 from ident.equations.linearisation import cut_into_folds, linearise
 from ident.equations.run_scatter import RunScatter
 from tests.ident.recordings import (
@@ -141,3 +142,22 @@ def test_decorrelated_rows_have_the_identity_as_covariance(seed: int) -> None:
         scatter.decorrelate(0, columns)[:, order],
         atol=1e-9,
     )
+
+
+def test_directions_with_and_without_their_zeros_decorrelate_alike(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(3)
+    run = np.sort(rng.integers(0, 4, 200))
+    shared = rng.normal(size=(3, 200))
+    columns = rng.normal(size=(5, 200))
+    dense = RunScatter.of([shared], [run])
+    monkeypatch.setattr(run_scatter, "MOST_DENSE", 0)
+    sparse = RunScatter.of([shared], [run])
+    assert isinstance(dense.directions[0], np.ndarray)
+    assert not isinstance(sparse.directions[0], np.ndarray)
+    for one, other in (
+        (dense.decorrelate(0, columns), sparse.decorrelate(0, columns)),
+        (dense.correlate(0, columns), sparse.correlate(0, columns)),
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import CandidateTrial, SearchProblem
+from ident.discovery.candidate_fits import CandidateFit
+from ident.discovery.candidates import SearchProblem
 from ident.discovery.refinement import refine_together
 from ident.effects.effect import Effect, Property, Range
 from ident.effects.signals import Abscissa, Signals
@@ -42,26 +43,18 @@ class Bump(Effect):
         raise AssertionError("the search problem of this test needs none")
 
 
-@dataclass(frozen=True, slots=True)
-class _Trial:
-    """What a refinement reads of a trial."""
-
-    fallen: FloatArray
-    coefficients: FloatArray
-
-
 class _Hill:
     """A search problem whose fall has one hump, at BEST."""
 
     def torque_at_rows(self, effect: Effect, axis: int) -> Effect:
         return effect
 
-    def trials(self, effects: Sequence[Effect]) -> list[CandidateTrial]:
+    def fits(self, effects: Sequence[Effect]) -> list[CandidateFit]:
         (effect,) = effects
         centre, width = (effect.settings[name] for name in ("centre_rad", "width_rad"))
         distance = (centre - BEST[0]) ** 2 + (width - BEST[1]) ** 2
         fallen = np.array([SCALE / (1.0 + distance)])
-        return [cast(CandidateTrial, _Trial(fallen, np.array([1.0])))]
+        return [CandidateFit(coefficients=np.array([1.0]), fallen=fallen)]
 
 
 def _refined(centre_rad: float, width_rad: float) -> tuple[float, ...]:

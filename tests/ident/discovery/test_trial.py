@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.discovery.candidates import CandidateTrial, score_candidates
-from ident.discovery.search import _drawn_numbers, _drawn_wald
+from ident.discovery.few_moves import MoveScores
+from ident.discovery.search import PAIRS_TOGETHER, _drawn_numbers, _drawn_pairs, _drawn_wald
 from ident.equations.linearisation import Jacobian, Linearisation, cut_into_folds
 from tests.ident.recordings import whole
 
@@ -168,7 +169,7 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
                    coefficients=other.coefficients * np.array([1e5, 1e-4])), one)  # fmt: skip
 
 
-@pytest.mark.parametrize("width", [1, 3])
+@pytest.mark.parametrize("width", [1, 2, 3])
 def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     rng = np.random.default_rng(5)
     folds = cut_into_folds(_problem(rng))
@@ -188,3 +189,22 @@ def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     else:
         found = _drawn_numbers(trial.scatter, trial.gram[:, :, 0], signs)
     assert found == pytest.approx(np.array(expected), rel=1e-9)
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 2 * PAIRS_TOGETHER + 1))
+@settings(max_examples=15, deadline=None)
+def test_the_largest_statistic_of_pairs_is_that_of_each_of_them(seed: int, count: int) -> None:
+    """In units that differ by a million."""
+    rng = np.random.default_rng(seed)
+    units = 10.0 ** rng.uniform(-3.0, 3.0, size=(count, 2))
+    signs = rng.choice((-1.0, 1.0), size=(7, MOVES))
+    pairs: list[MoveScores] = []
+    for unit in units:
+        rows = rng.normal(size=(MOVES, 9, 2)) * unit
+        gram = np.swapaxes(rows, 1, 2) @ rows
+        scatter = rng.normal(size=(MOVES, 2)) * unit
+        pairs.append(MoveScores(scatter.sum(axis=0), scatter, gram))
+    scatters = np.stack([one.scatter for one in pairs], axis=1)
+    grams = np.stack([one.gram for one in pairs], axis=1)
+    expected = np.max([_drawn_wald(one, signs) for one in pairs], axis=0)
+    assert _drawn_pairs(scatters, grams, signs) == pytest.approx(expected, rel=1e-8)

@@ -49,3 +49,24 @@ def test_an_inertia_that_is_none_counts_as_a_small_one_and_a_real_one_as_it_is()
     heavier = twists(_link(2.0 * inertia), GEARS).twist_rad
     assert np.isfinite(heavier).all()
     assert np.abs(heavier - twists(_link(inertia), GEARS).twist_rad).max() > 0.0
+
+
+def test_gears_that_are_followed_together_lag_as_each_of_them_alone() -> None:
+    """One of them writes over what was known around its windows, and over nothing else."""
+    time_s = np.arange(SAMPLES) / RATE_HZ
+    speed = np.sin(2.0 * np.pi * time_s)
+    torque = 4.0 * np.sin(2.0 * np.pi * time_s + 0.4)
+    link = DrivenLink(RATE_HZ, np.full(SAMPLES, 0.2), torque, speed, np.zeros(SAMPLES))
+    before = link.pushed_nm.copy()
+    gaps_rad = np.array([0.0, 5e-4, 2e-3])
+    together = twists(link, Gears(gaps_rad, np.full(3, 1e-4), 0.2))
+    assert np.array_equal(link.pushed_nm, before)
+    for index in range(1, len(gaps_rad)):  # a gear without a gap has windows of its own
+        alone = twists(link, Gears(gaps_rad[[index]], np.array([1e-4]), 0.2))
+        assert_allclose(together.twist_rad[index], alone.twist_rad[0], rtol=1e-9, atol=1e-12)
+        assert_allclose(together.passed_nm[index], alone.passed_nm[0], rtol=1e-9, atol=1e-9)
+        assert_allclose(
+            together.acceleration_rad_s2[index], alone.acceleration_rad_s2[0], rtol=1e-9, atol=1e-9
+        )
+    # A link behind a gap is further from its motor than its spring alone allows.
+    assert np.all(np.abs(together.twist_rad[2]).max() > np.abs(together.twist_rad[0]).max())

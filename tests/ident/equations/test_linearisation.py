@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,10 +11,11 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from ident.data.run import Run
-from ident.discovery.evidence import gather
+from ident.discovery.evidence import Evidence, gather
 from ident.equations.linearisation import (
     MIN_MOVES_TO_LEAVE_OUT,
     Jacobian,
+    _sums_of_motors,
     independent_blocks,
     left_out_shifts,
     linearise,
@@ -106,6 +109,32 @@ def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
         jacobian, residual = motor_jacobian(part, 2, truth.gains, parameters, noise)
         products.append(np.column_stack((jacobian.T @ jacobian, jacobian.T @ residual)))
     assert products[0] == pytest.approx(products[1], abs=1e-10 * np.abs(products[0]).max())
+
+
+@pytest.mark.parametrize("has_instruments", [False, True])
+def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
+    noisy: Evidence, has_instruments: bool
+) -> None:
+    recorded = noisy.training.system()
+    system = recorded
+    if has_instruments:  # other rows for J than for e
+        tilted = [[rows * 1.01 for rows in cluster] for cluster in recorded.clusters]
+        system = replace(recorded, clusters=tuple(map(tuple, tilted)))
+    estimate = noisy.estimate
+    around = (estimate.gains, estimate.parameters, estimate.axis_noise)
+    grams, scores = _sums_of_motors(system, recorded, *around)
+    size = grams.shape[-1]
+    for index, cluster in enumerate(system.clusters):
+        gram = np.zeros((size, size))
+        score = np.zeros(size)
+        for motor, rows in enumerate(cluster):
+            jacobian, _ = motor_jacobian(rows, motor, *around)
+            own_rows = recorded.clusters[index][motor]
+            _, residual = motor_jacobian(own_rows, motor, *around)
+            gram += jacobian.T @ jacobian
+            score += jacobian.T @ residual
+        assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * np.abs(gram).max())
+        assert scores[index] == pytest.approx(score, rel=1e-9, abs=1e-9 * np.abs(score).max())
 
 
 FloatArray = NDArray[np.float64]

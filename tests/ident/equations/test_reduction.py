@@ -44,6 +44,21 @@ def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> 
     assert ml(whole).gains_std == pytest.approx(ml(rows).gains_std, rel=1e-6)
 
 
+def test_the_clusters_of_kept_rows_are_the_rows_of_their_motors(noisy: Evidence) -> None:
+    observation = noisy.training
+    system = observation.system()
+    columns_of_motors = observation.motor_columns()
+    for motor, columns in enumerate(columns_of_motors):
+        used = observation.motor_use[motor]
+        found = np.concatenate([cluster[motor] for cluster in system.clusters])
+        assert_allclose(found, columns[:, used].T, rtol=1e-12, atol=1e-12)
+    moves = np.unique(observation.move[observation.motor_use.any(axis=0)])
+    for move, cluster in zip(moves, system.clusters, strict=True):
+        of_move = observation.motor_use[:, observation.move == move]
+        counts = [len(rows) for rows in cluster]
+        assert counts == of_move.sum(axis=1).tolist()
+
+
 @pytest.fixture(scope="module")
 def small_estimate(small_truth: Truth, small_runs: tuple[Run, ...]) -> Estimate:
     """Estimate from a run of the three-axis arm without load and one with it,

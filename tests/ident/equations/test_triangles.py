@@ -6,12 +6,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from ident.arrays import FloatArray
-from ident.equations.triangles import Triangles, singular_values, solve, triangle, triangle_of
+from ident.equations.triangles import (
+    Triangles,
+    least_squares,
+    singular_values,
+    solve,
+    triangle,
+    triangle_of,
+)
 
 COLUMNS = 4
 ROWS = (30, 50)
@@ -120,6 +127,52 @@ def test_of_two_equal_columns_each_gets_half() -> None:
     matrix = np.column_stack((column, column))
     solution, _ = solve(matrix, 6.0 * column)
     assert_allclose(solution, [3.0, 3.0], rtol=1e-9)
+
+
+@given(
+    rows=st.integers(1, 60),
+    columns=st.integers(1, 8),
+    spread=st.floats(0.0, 6.0),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_back_substitution_solves_as_singular_values_do(
+    rows: int, columns: int, spread: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    units = 10.0 ** rng.uniform(-spread, spread, size=columns)
+    matrix = rng.normal(size=(rows, columns)) * units
+    right = rng.normal(size=rows)
+    expected, _ = solve(matrix, right)
+    found = least_squares(matrix, right)
+    largest = np.max(np.abs(expected * units))
+    assert_allclose(found * units, expected * units, rtol=1e-9, atol=1e-9 * largest)
+
+
+@pytest.mark.parametrize("difference", [0.0, 1e-13, 1e-11])
+def test_back_substitution_leaves_nearly_equal_columns_to_singular_values(
+    difference: float,
+) -> None:
+    rng = np.random.default_rng(6)
+    matrix = rng.normal(size=(40, 3))
+    matrix[:, 2] = matrix[:, 1] + difference * matrix[:, 2]
+    right = rng.normal(size=40)
+    expected, _ = solve(matrix, right)
+    assert np.array_equal(least_squares(matrix, right), expected)
+    matrix[:, 0] = 0.0
+    expected, _ = solve(matrix, right)
+    assert np.array_equal(least_squares(matrix, right), expected)
+
+
+@given(rows=st.integers(5, 3000), seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_a_triangle_of_many_rows_is_numpys_up_to_the_signs_of_its_rows(
+    rows: int, seed: int
+) -> None:
+    matrix = np.random.default_rng(seed).normal(size=(rows, COLUMNS))
+    found = triangle((matrix,), COLUMNS)
+    expected = np.linalg.qr(matrix, mode="r")
+    signs = np.sign(np.diag(found)) * np.sign(np.diag(expected))
+    assert_allclose(signs[:, None] * found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_singular_values_fall() -> None:

@@ -1,0 +1,147 @@
+"""Candidates fitted in-sample by sums over motors, against trials and against least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.discovery.candidate_fits import CandidateFit, Felt, fit_candidates
+from ident.discovery.candidates import score_candidates
+from ident.equations.linearisation import Folds, Jacobian, Linearisation, cut_into_folds
+from tests.ident.recordings import whole
+
+FloatArray = NDArray[np.float64]
+
+MOTORS = 3
+MOVES = 16
+WIDTH = 5
+
+
+def _problem(rng: np.random.Generator) -> Linearisation:
+    """Rows of three motors in sixteen moves; the last motor lacks the first two unknowns."""
+    row_counts = rng.integers(8, 20, size=(MOTORS, MOVES))
+    motor = np.repeat(np.arange(MOTORS), row_counts.sum(axis=1))
+    moves = np.tile(np.arange(MOVES), MOTORS)
+    cluster = np.repeat(moves, row_counts.ravel())
+    jacobian = rng.normal(size=(len(motor), WIDTH))
+    jacobian[motor == MOTORS - 1, :2] = 0.0
+    parts: list[FloatArray] = []
+    seen: list[NDArray[np.int64]] = []
+    for one in range(MOTORS):
+        own = jacobian[motor == one].T
+        is_seen = own.any(axis=1)
+        parts.append(own[is_seen])
+        seen.append(np.flatnonzero(is_seen))
+    raw = rng.normal(size=len(motor))
+    return Linearisation(
+        jacobian=Jacobian(tuple(parts), tuple(seen), WIDTH),
+        residual=raw - jacobian @ _fitted(jacobian, raw),
+        current=rng.normal(size=len(motor)),
+        motor=motor,
+        cluster=cluster,
+        source=np.arange(len(motor)),
+        gamma=np.ones(MOTORS),
+        noise=np.ones(MOTORS),
+        free=np.arange(WIDTH),
+        scale=np.ones(WIDTH),
+    )
+
+
+def _fitted(columns: FloatArray, target: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.lstsq(columns, target, rcond=None)[0])
+
+
+def _felt(folds: Folds, columns: FloatArray) -> Felt:
+    """Columns by motor; a motor whose rows are zero feels nothing."""
+    felt: dict[int, FloatArray] = {}
+    for own in folds.motors:
+        part = columns[own.rows].T
+        if part.any():
+            felt[own.motor] = part
+    return felt
+
+
+def _fits(folds: Folds, candidates: list[FloatArray]) -> tuple[CandidateFit | None, ...]:
+    widths_and_felt = ((one.shape[1], _felt(folds, one)) for one in candidates)
+    return fit_candidates(folds, widths_and_felt)
+
+
+def _candidates(rng: np.random.Generator, folds: Folds, widths: list[int]) -> list[FloatArray]:
+    """Columns that resemble the model and the residual; every other candidate is of one motor."""
+    problem = folds.linearisation
+    jacobian = whole(problem.jacobian)
+    found: list[FloatArray] = []
+    for number, width in enumerate(widths):
+        columns = rng.normal(size=(len(problem.motor), width))
+        columns += 0.4 * jacobian[:, :1] + 0.2 * problem.residual[:, None]
+        if number % 2:
+            columns *= (problem.motor == 1)[:, None]
+        found.append(columns)
+    return found
+
+
+@given(seed=st.integers(0, 2**32 - 1), widths=st.lists(st.integers(1, 4), min_size=1, max_size=5))
+@settings(max_examples=15, deadline=None)
+def test_a_fit_has_the_numbers_of_a_trial_and_of_least_squares(
+    seed: int, widths: list[int]
+) -> None:
+    rng = np.random.default_rng(seed)
+    folds = cut_into_folds(_problem(rng))
+    problem = folds.linearisation
+    jacobian = whole(problem.jacobian)
+    candidates = _candidates(rng, folds, widths)
+    fits = _fits(folds, candidates)
+    for fit, columns in zip(fits, candidates, strict=True):
+        (trial,) = score_candidates(folds, columns, [slice(0, columns.shape[1])])
+        assert fit is not None
+        assert trial is not None
+        assert fit.coefficients == pytest.approx(trial.coefficients, rel=1e-9, abs=1e-12)
+        assert fit.fallen == pytest.approx(trial.fallen, rel=1e-9, abs=1e-9)
+        both = np.concatenate((jacobian, columns), axis=1)
+        after = problem.residual - both @ _fitted(both, problem.residual)
+        change = problem.residual**2 - after**2
+        by_motor = np.bincount(problem.motor, change)
+        assert fit.fallen == pytest.approx(by_motor, rel=1e-7, abs=1e-7)
+
+
+def test_candidates_that_the_model_contains_leave_the_others_of_their_batch_as_they_are() -> None:
+    rng = np.random.default_rng(1)
+    folds = cut_into_folds(_problem(rng))
+    jacobian = whole(folds.linearisation.jacobian)
+    contained = jacobian @ rng.normal(size=(WIDTH, 2))
+    first, second = _candidates(rng, folds, [2, 2])
+    alone = _fits(folds, [first, second])
+    assert _fits(folds, [contained]) == (None,)
+    together = _fits(folds, [contained, first, contained, second])
+    assert together[0] is None
+    assert together[2] is None
+    for own, beside in zip(alone, (together[1], together[3]), strict=True):
+        assert own is not None
+        assert beside is not None
+        assert beside.coefficients == pytest.approx(own.coefficients, rel=1e-9)
+        assert beside.fallen == pytest.approx(own.fallen, rel=1e-9, abs=1e-12)
+    slices = [slice(0, 2), slice(2, 4), slice(4, 6), slice(6, 8)]
+    columns = np.concatenate((contained, first, contained, second), axis=1)
+    trials = score_candidates(folds, columns, slices)
+    assert trials[0] is None
+    assert trials[2] is None
+    for own, trial in zip(alone, (trials[1], trials[3]), strict=True):
+        assert own is not None
+        assert trial is not None
+        assert trial.fallen == pytest.approx(own.fallen, rel=1e-9, abs=1e-12)
+
+
+@given(seed=st.integers(0, 2**32 - 1), width=st.integers(1, 4))
+@settings(max_examples=10, deadline=None)
+def test_products_of_a_candidate_with_itself_are_those_of_matrix_products(
+    seed: int, width: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    folds = cut_into_folds(_problem(rng))
+    for own in folds.motors:
+        columns = rng.normal(size=(3, width, own.equations.shape[1]))
+        expected = own.sums(columns, columns)
+        assert own.grams(columns) == pytest.approx(expected, rel=1e-12, abs=1e-12)
