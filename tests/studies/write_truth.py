@@ -78,8 +78,12 @@ def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
 
 
 def _subject_not_begun(found: re.Match[str], facts: Facts) -> bool:
-    """Hold where a change of a file, or of any file of a folder, was begun and not made."""
+    """Hold where a change of a file, or of any file of a folder, was begun and not made;
+    the controller's file changes once, and is compared.
+    """
     subject = Path(found["subject"])
+    if subject == facts.controller and subject in facts.before:
+        return facts.is_as_before(subject)
     return any(path.is_relative_to(subject) for path in facts.not_made)
 
 
