@@ -62,6 +62,10 @@ def _is_old(_: re.Match[str], facts: Facts) -> bool:
     return facts.content is Content.OLD
 
 
+def _is_not_new(_: re.Match[str], facts: Facts) -> bool:
+    return facts.content in (Content.OLD, Content.MIXED)
+
+
 def _is_new(_: re.Match[str], facts: Facts) -> bool:
     return facts.content is Content.NEW
 
@@ -116,7 +120,12 @@ RULES = (
     Rule(r"the history lacks this write", lambda _, facts: not facts.has_write),
     Rule(r"the history may lack this write", _is_any),
     Rule(r"the audit log may lack the entry that it is (applied|rolled back)", _is_new),
-    Rule(r"the audit log may lack the entry that it is (failed|refused)", _is_old),
+    Rule(r"the audit log may lack the entry that it is failed", _is_not_new),
+    Rule(r"the audit log may lack the entry that it is refused", _is_old),
+    Rule(
+        r"the previous values are restored in no drive, and NOT confirmed where",
+        lambda _, facts: facts.content is Content.MIXED,
+    ),
     Rule(r"Written to \S+, backup (?P<backup>\S+); audit log", _written_with_backup),
     Rule(
         r"Restored \S+ to \S+; the replaced content is in "
