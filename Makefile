@@ -43,7 +43,7 @@ help:
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make kill-study  jobs killed at 60 random moments, each finished by the next one; some minutes"
 	@echo "make session-kill-study  guided sessions killed at 40 random moments of all stages, each finished by the same command; resumable, some minutes"
-	@echo "make write-fault-study  kills and failures at every changing system call of apply and rollback (docs/evidence/write-path.md); resumable, a quarter of an hour"
+	@echo "make write-fault-study  kills, errors and short writes at every changing system call of apply, rollback, recalibrate and calibrate (docs/evidence/write-path.md); VERBS=\"apply calibrate\" EVERY=3 MINUTES=20; resumable, an hour"
 	@echo "make guard-study  the axes of a recorder killed by kill -9, with a foreign node on every id from 1 to 127; minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
@@ -270,7 +270,8 @@ session-kill-study: setup
 	$(BIN)/python -m tests.studies.session_kills
 
 write-fault-study: setup
-	$(BIN)/python -m tests.studies.write_faults --tables docs/evidence/data
+	$(BIN)/python -m tests.studies.write_faults --tables docs/evidence/data \
+		$(if $(VERBS),--verbs $(VERBS)) $(if $(EVERY),--every $(EVERY)) $(if $(MINUTES),--minutes $(MINUTES))
 
 guard-study: setup
 	$(BIN)/python -m tests.faults.test_killed

@@ -294,12 +294,30 @@ class OwnerNotKept(PermissionError):
         )
 
 
+class WriteUnconfirmed(OSError):
+    """The system took the new content, or a part of an entry, and failed after that:
+    whether the disk has it is not known.
+    """
+
+    @classmethod
+    def of(cls, path: Path, error: OSError) -> WriteUnconfirmed:
+        """Make the error for a file that may have its new content."""
+        return cls(error.errno, error.strerror, str(path))
+
+
 class OutputFailed(DaqError):
     """The disk is full, or the folder is read-only."""
 
     @classmethod
     def of(cls, path: Path, error: OSError) -> OutputFailed:
         """Make the error for a file that was replaced whole or not at all."""
+        if isinstance(error, WriteUnconfirmed):
+            return cls(
+                str(path),
+                found=reason_of(error),
+                expected="a file system that completes what it began",
+                remedy="it may have the new content: check the disk, then repeat the command",
+            )
         if isinstance(error, OwnerNotKept):
             return cls(
                 str(path),

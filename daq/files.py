@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
-from daq.errors import OwnerNotKept
+from daq.errors import OwnerNotKept, WriteUnconfirmed
 
 
 def replace_file(
@@ -42,8 +42,8 @@ def replace_file(
 
     Raises:
         OSError: from the file system, also if owner or access lists cannot be kept; as
-            `judge_target`; or a folder is at `path`. Only a failing fsync of the folder leaves the
-            new content in place.
+            `judge_target`; or a folder is at `path`. The old content is in place.
+        WriteUnconfirmed: the fsync of the folder failed; the new content is in place.
     """
     target = judge_target(path)
     if target.is_dir():
@@ -65,7 +65,10 @@ def replace_file(
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    fsync_folder(target.parent)
+    try:
+        fsync_folder(target.parent)
+    except OSError as error:
+        raise WriteUnconfirmed.of(path, error) from error
 
 
 def judge_target(path: Path) -> Path:

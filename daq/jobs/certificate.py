@@ -65,7 +65,7 @@ def save_certificate(
     comparison = _compared(cell_file, cell, calibration, session, datetime.now(UTC))
     found = page_details(fitted, changed, calibration)
     details = StoredDetails(consequence=found.consequence, sections=found.sections)
-    with writing(folder):
+    with writing(folder / DETAILS):
         replace_file(folder / DETAILS, details.model_dump_json().encode())
     save_report(fitted, changed, calibration, folder, comparison, session=session.name)
     return certify(calibration, comparison)

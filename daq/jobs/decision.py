@@ -242,9 +242,11 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
         changes=[_proposed_gain(change) for change in proposal.edit.changes],
         refusals=refusals,
     )
-    with writing(session.folder / PROPOSAL):
-        replace_file(session.folder / PROPOSAL, json_text(report).encode())
-        replace_file(session.folder / DIFF, proposal.edit.diff.encode())
+    contents = {PROPOSAL: json_text(report), DIFF: proposal.edit.diff}
+    for name, content in contents.items():
+        path = session.folder / name
+        with writing(path):
+            replace_file(path, content.encode())
 
 
 def _proposed_gain(change: GainChange) -> ProposedGain:

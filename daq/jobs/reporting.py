@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
-from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
+from prometheus_client import CollectorRegistry, Gauge, generate_latest
 
 from daq.documents.session_state import GuidedState, Outcome, RecordedRun, SessionState
 from daq.errors import (
@@ -22,6 +22,7 @@ from daq.errors import (
     ExitCode,
     HistoryUnreadable,
     OutputFailed,
+    WriteUnconfirmed,
     exit_code,
     writing,
 )
@@ -102,7 +103,7 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
             context, Conclusion(outcome, int(code), session, remark, next_step), session, problem
         )
     except Exception as second:  # noqa: BLE001 - whatever it is, it must not hide the error that ended the job
-        error.add_note(f"kept: the end of the session could not be recorded: {second}")
+        error.add_note(f"kept: the end of the session may not be recorded: {second}")
 
 
 def audit_entry(
@@ -154,7 +155,8 @@ def _report(
         # Stored here too: a chain does not show by itself that its last lines are missing.
         state = state.with_(audit_sha256=entry.sha256)
     except (AuditUnusable, OutputFailed) as error:
-        context.journal.say(Level.ERROR, "the audit could not be written", text=str(error))
+        words = "the audit log may lack the end of the session"
+        context.journal.say(Level.ERROR, words, text=str(error))
         unwritten = error
     session = Session(session.folder, state)
     conclusion = replace(ended, session=session)
@@ -201,9 +203,11 @@ def _write_summary(conclusion: Conclusion, session: Session, cell_file: Path) ->
         report = session_report(conclusion, cell_file)
     else:
         report = conclusion_report(conclusion, cell_file)
-    with writing(session.folder):
-        replace_file(session.folder / SUMMARY_TEXT, text(conclusion, cell_file).encode())
-        replace_file(session.folder / SUMMARY_JSON, json_text(report).encode())
+    contents = {SUMMARY_TEXT: text(conclusion, cell_file), SUMMARY_JSON: json_text(report)}
+    for name, content in contents.items():
+        path = session.folder / name
+        with writing(path):
+            replace_file(path, content.encode())
 
 
 def _remove_old(context: SessionContext, found: tuple[Session, ...]) -> None:
@@ -503,9 +507,12 @@ def write_metrics(
         _set_calibration_gauges(gauge, calibration, cell)
     path = folder / f"drivegain_{file_stem(cell)}.prom"
     with writing(path):
-        write_to_textfile(str(path), registry)
-        # The collector is another user, and a service's umask may be strict.
-        path.chmod(0o644)
+        replace_file(path, generate_latest(registry))
+        try:
+            # The collector is another user, and a service's umask may be strict.
+            path.chmod(0o644)
+        except OSError as error:
+            raise WriteUnconfirmed.of(path, error) from error
     return path
 
 

@@ -25,7 +25,7 @@ from datetime import datetime
 from enum import Enum
 from pathlib import Path
 
-from daq.errors import AuditUnusable, counted, reason_of
+from daq.errors import AuditUnusable, WriteUnconfirmed, counted, reason_of
 from daq.files import follow_links, fsync_folder, read_regular, sha256, sha256_of
 
 MAX_BYTES = 2**30  #: Largest audit log; it is read whole
@@ -216,7 +216,9 @@ def append(
 
     Raises:
         AuditUnusable: no regular file, locked for long, or its last line is not what was written.
-        OSError: from the file system; at most an unfinished line was left.
+        OSError: from the file system; nothing was written.
+        WriteUnconfirmed: the file system failed while it took the entry, or at its flush: the entry
+            may be there, or an unfinished line.
     """
     with _locked(path) as descriptor:
         if os.fstat(descriptor).st_size > MAX_BYTES:
@@ -231,27 +233,41 @@ def append(
             line += encode(last) + b"\n"
         new = entry_after(last, at.isoformat(), who, action, subject, details)
         line += encode(new) + b"\n"
-        _write_all(descriptor, line)
-        os.fsync(descriptor)
-        if not content:
-            fsync_folder(Path(os.path.realpath(path)).parent)
+        _write_all(descriptor, line, path)
+        try:
+            os.fsync(descriptor)
+            if not content:
+                fsync_folder(Path(os.path.realpath(path)).parent)
+        except OSError as error:
+            raise WriteUnconfirmed.of(path, error) from error
         _note_head(path, content, new.sha256)
         return new
 
 
-def _write_all(descriptor: int, data: bytes) -> None:
+def _write_all(descriptor: int, data: bytes, path: Path) -> None:
     """Write all bytes, in several calls where the system takes a part:
     the next call says why it took no more.
 
     Raises:
-        OSError: from the file system; what was written until then stays.
+        OSError: from the file system, which took nothing.
+        WriteUnconfirmed: it took a part, which stays.
     """
     rest = memoryview(data)
     while rest:
-        taken = os.write(descriptor, rest)
-        if taken == 0:
-            raise OSError(errno.EIO, "the file system takes no more of an entry")
+        try:
+            taken = _write_part(descriptor, rest)
+        except OSError as error:
+            if len(rest) == len(data):
+                raise
+            raise WriteUnconfirmed.of(path, error) from error
         rest = rest[taken:]
+
+
+def _write_part(descriptor: int, data: memoryview) -> int:
+    taken = os.write(descriptor, data)
+    if taken == 0:
+        raise OSError(errno.EIO, "the file system takes no more of an entry")
+    return taken
 
 
 def noted_heads(path: Path) -> tuple[str, ...]:
@@ -288,12 +304,30 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
     with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
         descriptor = os.open(head_file(path), flags, 0o666)
         try:
-            # In one piece and in place: there are never fewer lines than before, but where a
-            # missing entry came back.
-            os.pwrite(descriptor, noted, 0)
-            os.ftruncate(descriptor, len(noted))
+            # In place: there are never fewer lines than before, but where a missing entry came
+            # back, or where the disk takes a part and no more.
+            _replace_in_place(descriptor, noted)
         finally:
             os.close(descriptor)
+
+
+def _replace_in_place(descriptor: int, lines: bytes) -> None:
+    """Replace the lines of a file; where the disk takes a part, the lines that it took remain.
+
+    The beginning of a new digest before the end of an old one would be the digest of no entry, and
+    a sound log would seem to lack its end.
+
+    Raises:
+        OSError: from the file system.
+    """
+    taken = 0
+    try:
+        while taken < len(lines):
+            taken += os.pwrite(descriptor, lines[taken:], taken)
+    finally:
+        # Nothing was taken: the lines of before are whole.
+        if taken:
+            os.ftruncate(descriptor, lines.rfind(b"\n", 0, taken) + 1)
 
 
 def read(path: Path) -> tuple[AuditEntry, ...]:

@@ -86,9 +86,9 @@ def save_report(
     document = ResidualFile.model_validate(fields, strict=False)
     page = residual_page(fitted, account, calibration, comparison, session)
     text = json_text(document)
-    with writing(folder):
-        replace_file(folder / PAGE, page.encode())
-        replace_file(folder / DOCUMENT, text.encode())
+    for path, content in ((folder / PAGE, page), (folder / DOCUMENT, text)):
+        with writing(path):
+            replace_file(path, content.encode())
 
 
 def beside_nameplate(fitted: Fit, calibration: Calibration) -> Comparison:

@@ -28,7 +28,9 @@ from daq.errors import (
     ConfigurationInconsistent,
     ControllerChanged,
     ControllerUnfit,
+    OutputFailed,
     counted,
+    reason_of,
 )
 from daq.files import read_regular, replace_file, sha256
 from daq.ledger.fold import NEVER, utc
@@ -341,7 +343,11 @@ class DriveTarget:
         return {"saving": self.saving.value, "drives": drives, **restored}
 
     def write(self, edit: DriveEdit, now: datetime, who: str) -> Written:
-        """See `Target.write` and `drivers.canopen.parameters.write_parameters`."""
+        """See `Target.write` and `drivers.canopen.parameters.write_parameters`.
+
+        Raises:
+            OutputFailed: the record of the previous gains is not on the disk; no drive was written.
+        """
         records: list[Path] = []
 
         def begin(found: tuple[ParameterValue, ...]) -> None:
@@ -367,7 +373,15 @@ class DriveTarget:
                 )
                 for value, write in zip(found, edit.writes, strict=True)
             )
-            records.append(write_record(edit.folder, self.cell.name, now, who, drives))
+            try:
+                records.append(write_record(edit.folder, self.cell.name, now, who, drives))
+            except OSError as error:
+                raise OutputFailed(
+                    str(edit.folder),
+                    found=reason_of(error),
+                    expected="a record of the previous gains on the disk, before any drive",
+                    remedy="nothing was written to the drives; free space or rights",
+                ) from error
 
         parameters = write_parameters(self.network, edit.writes, self.saving, begin)
         return Written(edit, records[0], parameters)

@@ -19,7 +19,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed, reason_of
+from daq.errors import (
+    CalibrationRefused,
+    ControllerUnfit,
+    OutputFailed,
+    WriteUnconfirmed,
+    reason_of,
+)
 from daq.files import follow_links, hold_lock, open_folder, replace_file
 from daq.formats.document import read_controller_file
 from daq.writeback.request import short_digest
@@ -192,8 +198,11 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
     # is free.
     try:
         replace_file(backup, before, like=target)
-    except BaseException:
+    except BaseException as error:
         backup.unlink(missing_ok=True)
+        if isinstance(error, WriteUnconfirmed):
+            # It is about the backup, which is gone: the controller's file is as it was.
+            raise OSError(error.errno, error.strerror, str(backup)) from error
         raise
     return backup
 

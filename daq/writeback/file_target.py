@@ -36,6 +36,7 @@ from daq.errors import (
     ConfigurationInconsistent,
     ControllerChanged,
     ControllerUnfit,
+    WriteUnconfirmed,
 )
 from daq.files import fsync_folder, replace_file, sha256
 from daq.formats.document import comment_behind, decode_document, read_controller_file
@@ -307,7 +308,7 @@ class FileTarget:
         except ControllerChanged:
             backup.unlink()
             raise
-        except BaseException:
+        except BaseException as error:
             # Before the rename the old file is in place; after it (the folder's fsync failed) the
             # backup replaces it. A file that was saved by another program in between stays, and so
             # does the backup. A file system that allows none of this leaves both.
@@ -318,6 +319,8 @@ class FileTarget:
                 elif found == edit.after:
                     backup.replace(target)
                     fsync_folder(target.parent)
+            if isinstance(error, WriteUnconfirmed) and _content(target) == edit.before:
+                raise OSError(error.errno, error.strerror, str(target)) from error
             raise
         return Written(edit, backup)
 

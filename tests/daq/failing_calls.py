@@ -55,6 +55,7 @@ class CallKind:
         folder: index of the register with the descriptor of the folder that a path is relative to.
         file: index of the register with the descriptor of the file.
         flags: index of the register with the flags of an open(2).
+        size: index of the register with the number of bytes of a write.
     """
 
     name: str
@@ -62,15 +63,16 @@ class CallKind:
     folder: int | None = None
     file: int | None = None
     flags: int | None = None
+    size: int | None = None
 
 
 CALLS = {
-    1: CallKind("write", file=_RDI),
-    18: CallKind("write", file=_RDI),  # pwrite64
+    1: CallKind("write", file=_RDI, size=_RDX),
+    18: CallKind("write", file=_RDI, size=_RDX),  # pwrite64
     20: CallKind("write", file=_RDI),  # writev
     296: CallKind("write", file=_RDI),  # pwritev
-    40: CallKind("write", file=_RDI),  # sendfile
-    326: CallKind("write", file=_RDX),  # copy_file_range
+    40: CallKind("write", file=_RDI, size=_R10),  # sendfile
+    326: CallKind("write", file=_RDX, size=_R8),  # copy_file_range
     3: CallKind("close", file=_RDI),
     2: CallKind("open", path=_RDI, flags=_RSI),
     257: CallKind("open", path=_RSI, folder=_RDI, flags=_RDX),
@@ -96,6 +98,8 @@ CALLS = {
     93: CallKind("chown", file=_RDI),
     94: CallKind("chown", path=_RDI),
     260: CallKind("chown", path=_RSI, folder=_RDI),
+    44: CallKind("send", file=_RDI),  # sendto
+    46: CallKind("send", file=_RDI),  # sendmsg
     76: CallKind("truncate", path=_RDI),
     77: CallKind("truncate", file=_RDI),
     285: CallKind("truncate", file=_RDI),  # fallocate
@@ -106,8 +110,10 @@ CALLS = {
 }
 """Changing calls by their number on x86-64.
 
-A close(2) may report that an earlier write failed (NFS, quotas).
+A close(2) may report that an earlier write failed (NFS, quotas). What is sent over a socket changes
+no disk, but may change a drive.
 """
+SOCKET = Path("/socket")  #: Path of what is sent
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +122,7 @@ class Call:
 
     name: str  #: as in `CALLS`
     path: Path  #: file or folder that it changes
+    size: int = 0  #: bytes that it is to write; 0 for another call, and for a writev(2)
 
     @property
     def is_change(self) -> bool:
@@ -131,12 +138,16 @@ class Fault:
         number: of the call, from 0.
         error: number of the error that the call gives; None kills the process (SIGKILL) before the
             call is made.
-        is_lasting: every later changing call gives the error too.
+        is_lasting: every later changing call gives the error too, or every later write takes at
+            most `length` bytes.
+        length: bytes that a write takes at most, as write(2) may: the call is made, gives their
+            number, and leaves the rest to the caller. 0 where the fault is not a short write.
     """
 
     number: int
     error: int | None = None
     is_lasting: bool = False
+    length: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +266,9 @@ class _Tracer:
             or (number > fault.number and not fault.is_lasting)
         ):
             return
+        if fault.length:
+            self._shorten(registers, fault.length)
+            return
         if fault.error is None:
             os.kill(self.child, signal.SIGKILL)
             return
@@ -262,6 +276,14 @@ class _Tracer:
         if call.is_change:  # the descriptor is closed, whatever close(2) says
             registers[_ORIG_RAX] = _NO_CALL
             ask_ptrace(_SETREGS, self.child, ctypes.addressof(registers))
+
+    def _shorten(self, registers: ctypes.Array[ctypes.c_ulonglong], length: int) -> None:
+        """Let the write that begins take no more than so many bytes."""
+        size = CALLS[registers[_ORIG_RAX]].size
+        if size is None or registers[size] <= length:
+            return
+        registers[size] = length
+        ask_ptrace(_SETREGS, self.child, ctypes.addressof(registers))
 
     def _changing(self, registers: ctypes.Array[ctypes.c_ulonglong]) -> Call | None:
         """The changing call that begins; None for any other."""
@@ -273,10 +295,15 @@ class _Tracer:
         path = self._path_of(kind, registers)
         if path is None or not self.is_counted(path):
             return None
-        return Call(kind.name, path)
+        size = 0
+        if kind.size is not None:
+            size = registers[kind.size]
+        return Call(kind.name, path, size)
 
     def _path_of(self, kind: CallKind, registers: ctypes.Array[ctypes.c_ulonglong]) -> Path | None:
         process = Path(f"/proc/{self.child}")
+        if kind.name == "send":
+            return SOCKET
         if kind.file is not None:
             descriptor = registers[kind.file]
             if kind.name == "close" and not _is_for_writing(process / "fdinfo" / str(descriptor)):

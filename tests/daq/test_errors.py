@@ -18,6 +18,7 @@ from daq.errors import (
     OwnerNotKept,
     SchemaMismatch,
     UsageError,
+    WriteUnconfirmed,
     exit_code,
     first_few,
 )
@@ -43,14 +44,15 @@ def test_every_exception_class_has_an_exit_code() -> None:
     assert {SetupRefused, RankDeficient, SchemaMismatch} <= kinds
     # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus,
     # FeedUnfit is said on the console's page, TransferUnboundedError becomes an ObjectAccessError,
-    # OwnerNotKept is an OSError that becomes an OutputFailed, ShapeUnreadable is listed in a model:
-    # they end no command.
+    # OwnerNotKept and WriteUnconfirmed are OSErrors that become an OutputFailed, ShapeUnreadable is
+    # listed in a model: they end no command.
     inner = {
         DaqError,
         SdoAbort,
         FeedUnfit,
         TransferUnboundedError,
         OwnerNotKept,
+        WriteUnconfirmed,
         ShapeUnreadable,
     }
     unmapped = {kind.__qualname__ for kind in kinds - inner if exit_code(kind) is None}

@@ -27,12 +27,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from daq.files import replace_file
+from tests.daq.jobs.made import Made
 from tests.daq.jobs.made_session import MadeSession, whole_session
+from tests.daq.jobs.rig import Rig
 from tests.daq.jobs.test_killed_recording import cell_process
 from tests.daq.jobs.test_killed_session import (
     Moment,
@@ -50,6 +53,7 @@ OUT = Path("out/session-kills")
 RECORDINGS = 4  #: Of a session: three blocks, and the moves that accept the gains
 RECORDING_S = 10.0  #: Some time within or behind a recording
 MODULE = "tests.studies.session_kills"
+MadeThing = TypeVar("MadeThing", bound=Made)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,17 +100,19 @@ def kill(unit: KillUnit, made: MadeSession, calls: Sequence[TimedCall]) -> KillR
     )
 
 
-def made_once(out: Path, fingerprint: str) -> MadeSession:
-    """The session that the others copy; it is made unless it is there."""
+def made_once(
+    out: Path, fingerprint: str, make: Callable[[Path], tuple[Rig, MadeThing]]
+) -> MadeThing:
+    """The session or job that the others copy; it is made unless it is there."""
     path = out / "made.pickle"
     folder = out.absolute() / "made"
     if not is_finished(path, fingerprint):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        _, made = whole_session(folder)
+        _, made = make(folder)
         replace_file(path, pickle.dumps(made))
         finish(path, fingerprint)
-    found: MadeSession = pickle.loads(path.read_bytes())
+    found: MadeThing = pickle.loads(path.read_bytes())
     return found
 
 
@@ -145,7 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     source = digest_of_source(MODULE)
-    made = made_once(options.out, digest(source))
+    made = made_once(options.out, digest(source), whole_session)
     units = [KillUnit(number, options.seed, real=True) for number in range(options.real)]
     units += [KillUnit(number, options.seed, real=False) for number in range(options.kills)]
     with tempfile.TemporaryDirectory() as place:

@@ -19,6 +19,7 @@ class Content(Enum):
     OLD = "old"
     NEW = "new"
     BROKEN = "neither"
+    MIXED = "both"  #: drives, some with old gains and some with new ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,8 @@ class Facts:
         before, after: every file of the place by its path, with its content.
         ended: actions of the writes that the audit log ends, in its order.
         has_write: the history has the write that the command was asked for.
+        has_calibration: the history has the calibration.
+        not_made: files and folders of which a change was begun and not made.
     """
 
     content: Content
@@ -39,6 +42,8 @@ class Facts:
     after: dict[Path, bytes]
     ended: tuple[str, ...]
     has_write: bool
+    has_calibration: bool = False
+    not_made: frozenset[Path] = frozenset()
 
     def is_as_before(self, path: Path) -> bool:
         """Whether a file has the content that it had, or is not there as before."""
@@ -57,6 +62,10 @@ def _is_old(_: re.Match[str], facts: Facts) -> bool:
     return facts.content is Content.OLD
 
 
+def _is_not_new(_: re.Match[str], facts: Facts) -> bool:
+    return facts.content in (Content.OLD, Content.MIXED)
+
+
 def _is_new(_: re.Match[str], facts: Facts) -> bool:
     return facts.content is Content.NEW
 
@@ -72,6 +81,27 @@ def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
     )
 
 
+def _subject_not_begun(found: re.Match[str], facts: Facts) -> bool:
+    """Hold where a change of a file, or of any file of a folder, was begun and not made;
+    the controller's file changes once, and is compared.
+    """
+    subject = Path(found["subject"])
+    if subject == facts.controller and subject in facts.before:
+        return facts.is_as_before(subject)
+    return any(path.is_relative_to(subject) for path in facts.not_made)
+
+
+def _written_with_path(found: re.Match[str], facts: Facts) -> bool:
+    backup = facts.after.get(Path(found["backup"]))
+    return facts.content is Content.NEW and backup == facts.before[facts.controller]
+
+
+def _blocks_are_there(found: re.Match[str], facts: Facts) -> bool:
+    names = {path.name for path in facts.after}
+    blocks = found["blocks"].split(", ")
+    return blocks == ["no block yet"] or names >= {f"{block}.mcap" for block in blocks}
+
+
 def _is_any(_: re.Match[str], __: Facts) -> bool:
     """Hold for a sentence that says itself that it does not know,
     or that speaks of what a reader may do.
@@ -81,14 +111,21 @@ def _is_any(_: re.Match[str], __: Facts) -> bool:
 
 RULES = (
     Rule(r"error: (?P<subject>\S+) found: [^;]*? do: it is as it was", _subject_as_before),
+    Rule(r"(?P<subject>/\S+): found [^;]*; expected [^;]*; it is as it was", _subject_not_begun),
     Rule(r"nothing was written to the controller", _is_old),
+    Rule(r"nothing was written to the drives", _is_old),
     Rule(r"nothing was (written|changed|restored)", _is_old),
     Rule(r"Nothing to write: the controller file has these gains already", _is_new),
     Rule(r"has the new content, complete", _is_new),
     Rule(r"the history lacks this write", lambda _, facts: not facts.has_write),
     Rule(r"the history may lack this write", _is_any),
     Rule(r"the audit log may lack the entry that it is (applied|rolled back)", _is_new),
-    Rule(r"the audit log may lack the entry that it is (failed|refused)", _is_old),
+    Rule(r"the audit log may lack the entry that it is failed", _is_not_new),
+    Rule(r"the audit log may lack the entry that it is refused", _is_old),
+    Rule(
+        r"the previous values are restored in no drive, and NOT confirmed where",
+        lambda _, facts: facts.content is Content.MIXED,
+    ),
     Rule(r"Written to \S+, backup (?P<backup>\S+); audit log", _written_with_backup),
     Rule(
         r"Restored \S+ to \S+; the replaced content is in "
@@ -96,15 +133,30 @@ RULES = (
         _written_with_backup,
     ),
     Rule(r"was written before that, completely", _is_new),
+    Rule(r"written to the controller's file: file \S+, backup (?P<backup>\S+)", _written_with_path),
+    Rule(r"certified: id \w+, written on", _is_new),
+    Rule(r"certified: id \w+, not written", lambda _, facts: not facts.has_write),
+    Rule(r"metrics could not be written", _is_any),
+    Rule(r"lost cycles \d+", _is_any),
+    Rule(r"`drivegain history CELL --add CALIBRATION` enters it", _is_any),
+    Rule(r"the next job, apply or history --add enters it", _is_any),
+    Rule(r"Written to the drives and read back", _is_new),
+    Rule(r"The drives have saved", _is_new),
+    Rule(r"(kept:\s+)?the previous values are restored in (J\d(, )?)+", _is_old),
     Rule(r"whether \S+ has the new content is not known", _is_any),
     Rule(r"a file system that completes what it began", _is_any),
+    Rule(r"kept: (?P<blocks>no block yet|block[-\w]+(, block[-\w]+)*)", _blocks_are_there),
+    Rule(r"hint: remove the cause", _is_any),
     Rule(r"a folder that can be written", _is_any),
+    Rule(r"it may have the new content", _is_any),
+    Rule(r"the audit log may lack the end of the session", _is_any),
+    Rule(r"(kept: )?the end of the session may not be recorded", _is_any),
     Rule(r"`drivegain rollback \S+` undoes it", _is_any),
 )
 CLAIMS = re.compile(
     r"\b(written|unchanged|as it was|as before|restored|rolled "
     r"back|kept|complete|completely|lacks|does not have|not "
-    r"known|was changed|undone|lost|saved|replaced)\b",
+    r"known|was changed|undone|lost|saved|replaced|enters?|entered|removed?|noted)\b",
     re.IGNORECASE,
 )
 """Words of a sentence that claims something about files."""
@@ -126,6 +178,10 @@ def false_sentences(said: str, facts: Facts) -> tuple[str, ...]:
     return tuple(found)
 
 
+#: Words by which a command that fails says that the new gains are there; the second are a job's
+WRITTEN = ("has the new content", "written to the controller's file: file")
+
+
 def wrong_code(code: int | None, said: str, facts: Facts) -> str:
     """Return what is wrong with an exit code; empty where it is right.
 
@@ -135,6 +191,7 @@ def wrong_code(code: int | None, said: str, facts: Facts) -> str:
         return ""
     if code == 0 and facts.content is not Content.NEW:
         return "exit 0 and the old file"
-    if code != 0 and facts.content is Content.NEW and "has the new content" not in said:
+    is_said = any(words in said for words in WRITTEN)
+    if code != 0 and facts.content is Content.NEW and not is_said:
         return f"exit {code}, the new file, and no word of it"
     return ""

@@ -61,7 +61,7 @@ def test_a_report_that_fails_does_not_hide_the_error_that_ended_the_job(
     error = DriveFault(3, "fault")
     context = cast("SessionContext", None)  # the report fails before it is used
     report_failure(context, tmp_path, error)
-    assert error.__notes__ == ["kept: the end of the session could not be recorded: no session"]
+    assert error.__notes__ == ["kept: the end of the session may not be recorded: no session"]
 
 
 def test_a_person_reads_words_and_no_control_characters() -> None:

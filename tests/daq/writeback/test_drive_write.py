@@ -4,6 +4,7 @@ without power, read back, saved, all or none, and back again.
 
 from __future__ import annotations
 
+import errno
 import json
 import multiprocessing
 import os
@@ -22,6 +23,7 @@ from daq.errors import (
     ConfigurationInconsistent,
     ControllerChanged,
     ControllerUnfit,
+    OutputFailed,
 )
 from daq.ledger.audit import AuditAction, read, verify
 from daq.ledger.ledger import Ledger, acknowledge, plan_rename, read_history, rename_cell
@@ -809,3 +811,23 @@ def _write_until_killed(folder: Path, address: BusAddress, writes: int) -> None:
 
     ObjectAccess.write = counted  # type: ignore[method-assign, assignment]
     _write(demo_cell(folder), address)
+
+
+def test_a_record_that_the_disk_refuses_leaves_the_drives_and_says_so(
+    address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = demo_cell(tmp_path)
+
+    def full(*_: object) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("daq.writeback.drive_target.write_record", full)
+    with simulated(address) as simulation:
+        with pytest.raises(OutputFailed, match="nothing was written to the drives") as caught:
+            _write(cell, address)
+        assert "not known" not in str(caught.value)
+        assert _gains(simulation) == IN_DRIVES
+        assert _saved(simulation) == IN_DRIVES
+    assert cell.history is not None
+    actions = [entry.action for entry in read(cell.history.audit)]
+    assert actions == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]

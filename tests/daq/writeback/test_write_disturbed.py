@@ -180,3 +180,31 @@ def test_what_is_in_place_is_called_applied_by_the_audit(
     assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
     assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("flushed_before", [0, 1], ids=["backup", "controller's file"])
+def test_a_write_that_is_undone_after_a_flush_is_called_undone(
+    cell: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flushed_before: int,
+) -> None:
+    """The folder cannot be flushed once: the old file is there, and no message doubts it."""
+    calibration = calibration_for(cell)
+    controller = load_cell(cell).controller_path
+    assert controller is not None
+    before = controller.read_bytes()
+    flushed: list[Path] = []
+
+    def flush(folder: Path) -> None:
+        flushed.append(folder)
+        if len(flushed) == flushed_before + 1:
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("daq.files.fsync_folder", flush)
+    assert main(["apply", str(cell), str(calibration), "--yes"]) == ExitCode.UNEXPECTED
+    assert controller.read_bytes() == before
+    assert list(controller.parent.glob("*.bak")) == []
+    said = " ".join(capsys.readouterr().err.split())
+    assert "it is as it was" in said
+    assert "it may have the new content" not in said

@@ -1,5 +1,5 @@
-"""Failures at system calls of a write, a sample of `tests.studies.write_faults`;
-and what its checks would notice.
+"""Kills, failures and short writes at system calls of a write, a sample of
+`tests.studies.write_faults`; and what its checks would notice.
 """
 
 from __future__ import annotations
@@ -14,8 +14,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.daq.failing_calls import Fault, Traced, traced, why_not_here
-from tests.studies.write_faults import ERRORS, CallUnit, FaultRow, Scene, counts
+from tests.daq.failing_calls import Call, Fault, Traced, traced, why_not_here
+from tests.studies.write_faults import counts
+from tests.studies.write_scenes import (
+    ERRORS,
+    KILL,
+    SHORT,
+    ApplyScene,
+    CallUnit,
+    DrivesScene,
+    FaultRow,
+    Injection,
+    Scene,
+    changes_not_made,
+)
 from tests.studies.write_truth import Content, Facts, false_sentences, wrong_code
 
 CONTROLLER = Path("/cell/x.yaml")
@@ -57,14 +69,20 @@ def _sampled(folder: Path) -> list[FaultRow]:
     """The last call of each kind of the sample:
     killed there, and failing with one error from there on.
     """
-    scene = Scene(folder, "apply")
-    last = {_label(unit): unit for unit in scene.units()}
+    scene = ApplyScene(folder)
+    scene.set_up()
+    last = _last_calls(scene)
     rows = []
     for number, label in enumerate(SAMPLE):
         unit = last[label]
-        rows.append(scene.run(unit, None))
-        rows.append(scene.run(unit, ERRORS[number % len(ERRORS)], is_lasting=True))
+        error = errno.errorcode[ERRORS[number % len(ERRORS)]]
+        rows.append(scene.run(unit, Injection(KILL)))
+        rows.append(scene.run(unit, Injection(error, is_lasting=True)))
     return rows
+
+
+def _last_calls(scene: Scene) -> dict[str, CallUnit]:
+    return {_label(unit): unit for unit in scene.units()}
 
 
 def test_sampled_failures_of_a_write_every_sentence_is_true_and_the_next_command_ends_well(
@@ -82,9 +100,10 @@ def test_sampled_failures_of_a_write_every_sentence_is_true_and_the_next_command
 
 def _closed_badly(folder: Path) -> FaultRow:
     """The first entry of the audit log is flushed, and its file cannot be closed."""
-    scene = Scene(folder, "apply")
+    scene = ApplyScene(folder)
+    scene.set_up()
     first = next(unit for unit in scene.units() if _label(unit) == "close of audit log")
-    return scene.run(first, errno.EIO)
+    return scene.run(first, Injection("EIO"))
 
 
 def test_an_entry_that_was_flushed_counts_although_the_audit_log_cannot_be_closed(
@@ -94,6 +113,50 @@ def test_an_entry_that_was_flushed_counts_although_the_audit_log_cannot_be_close
     row = small.submit(_closed_badly, tmp_path.resolve()).result()
     assert (row.code, row.content) == (0, "new")
     assert row.false_sentences == row.bad_states == ()
+
+
+def _shortened(folder: Path) -> list[FaultRow]:
+    """Every write of an apply takes half."""
+    scene = ApplyScene(folder)
+    scene.set_up()
+    units = [unit for unit in scene.units() if unit.call == "write"]
+    return [scene.run(unit, Injection(SHORT)) for unit in units]
+
+
+def test_a_write_of_which_the_system_takes_half_ends_as_any_other(
+    tmp_path: Path, small: Executor
+) -> None:
+    _require_tracing(small)
+    rows = small.submit(_shortened, tmp_path.resolve()).result()
+    assert len(rows) >= 8  # three entries, their notes, the backup and the file
+    assert {(row.code, row.content) for row in rows} == {(0, "new")}
+    assert {(row.false_sentences, row.bad_states) for row in rows} == {((), ())}
+
+
+def _faults_of_drives(folder: Path) -> list[FaultRow]:
+    """The record's rename, and frames before, between and behind the writes to drives."""
+    scene = DrivesScene(folder)
+    scene.set_up()
+    try:
+        frames = [unit for unit in scene.units() if unit.call == "send"]
+        chosen = [_last_calls(scene)["rename of record of the write"], *frames[80::40]]
+        return [scene.run(unit, Injection(name)) for unit in chosen for name in (KILL, "EIO")]
+    finally:
+        scene.close()
+
+
+def test_drives_have_old_or_new_gains_and_a_record_of_both_after_any_fault(
+    tmp_path: Path, small: Executor
+) -> None:
+    _require_tracing(small)
+    rows = small.submit(_faults_of_drives, tmp_path.resolve()).result()
+    assert len(rows) >= 8
+    assert [(row.number, row.error, row.false_sentences, row.bad_states) for row in rows] == [
+        (row.number, row.error, (), ()) for row in rows
+    ]
+    killed = {row.content for row in rows if row.code == -1}
+    assert killed >= {"old", "both"}
+    assert {row.content for row in rows if row.code > 0} == {"old"}
 
 
 def _append_twice(path: Path) -> int:
@@ -133,6 +196,58 @@ def test_a_fault_is_at_the_chosen_call_and_the_call_is_not_made(
     killed = small.submit(_traced_twice, path, Fault(1)).result()
     assert killed.code is None
     assert path.read_text() == ""
+
+
+def _written_at_once(path: Path) -> int:
+    """Return the number of bytes that the system took of eight."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT)
+    return os.write(descriptor, b"12345678")
+
+
+def _traced_at_once(path: Path, fault: Fault) -> Traced:
+    return traced(lambda: _written_at_once(path), path.__eq__, fault)
+
+
+def test_a_short_write_takes_the_bytes_that_it_says(tmp_path: Path, small: Executor) -> None:
+    _require_tracing(small)
+    path = tmp_path.resolve() / "file"
+    found = small.submit(_traced_at_once, path, Fault(1, length=3)).result()
+    assert found.code == 3
+    assert path.read_text() == "123"
+    assert found.calls[1].size == 8
+
+
+STATE = Path("/cell/state.json")
+COPY = Path("/cell/.state.json.12-0.tmp")
+REPLACED = (
+    Call("open", COPY),
+    Call("write", COPY),
+    Call("rename", STATE),
+    Call("fsync", Path("/cell")),
+)
+LOGGED = (Call("open", STATE), Call("write", STATE), Call("fsync", STATE))
+
+
+@pytest.mark.parametrize(
+    ("calls", "failing", "is_not_made"),
+    [
+        (REPLACED, 1, True),
+        (REPLACED, 2, True),
+        (REPLACED, 3, False),
+        (LOGGED, 1, True),
+        (LOGGED, 2, False),
+    ],
+)
+def test_a_change_is_made_by_its_rename_or_its_write(
+    calls: tuple[Call, ...], failing: int, is_not_made: bool
+) -> None:
+    found = changes_not_made(calls[: failing + 1], Fault(failing, errno.EIO))
+    assert found == (frozenset({STATE}) if is_not_made else frozenset())
+    again = changes_not_made((*calls[: failing + 1], *REPLACED), Fault(failing, errno.EIO))
+    assert again == found
+    said = f"error: {STATE}: found no space; expected room; it is as it was"
+    facts = _facts(Content.OLD, not_made=found)
+    assert bool(false_sentences(said, facts)) is not is_not_made
 
 
 def _facts(content: Content, **changed: object) -> Facts:
