@@ -116,9 +116,11 @@ def test_a_reader_that_goes_away_breaks_a_pipe_and_hangs_up_a_terminal(
         except OSError as error:
             return error.errno or 0
 
-    screen = Screen(tmp_path / "words", terminal=terminal)
+    words = tmp_path / "words"
+    screen = Screen(words, terminal=terminal)
     printing = Verb.start(tmp_path / "unused", print_on, screen.inside)
-    time.sleep(0.2)
+    # A process that has printed has its terminal; before that, no hang-up reaches it.
+    assert until(lambda: words.read_bytes() != b"")
     assert printing.running
     screen.close_reader()
     assert printing.wait(PATIENCE_S)

@@ -43,6 +43,7 @@ from daq.report import (
 from daq.report.bus_views import ScannedNode
 from daq.report.log import log_lines
 from daq.report.text import WholeTable
+from daq.workflow.full_choice import ChosenBy
 from daq.workflow.live_prediction import RecentCurrent
 from daq.workflow.monitor import CellPrediction, WatchedCell
 from daq.workflow.validate import DataUse
@@ -225,16 +226,20 @@ def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
 def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     body = SimpleNamespace(centre_m=(-1.234, 2.345, -3.456), mass_kg=123.0)
     update: Any = SimpleNamespace(body=body, damping=1.23e-5, friction=4.56e-5)
-    parameters = SimpleNamespace(
-        torque_change_percent=ERROR,
-        exact=True,
-        model=SimpleNamespace(
-            robot=SimpleNamespace(joints=(), closures=()), drive_train=SimpleNamespace(coupled=())
-        ),
+    model = SimpleNamespace(
+        robot=SimpleNamespace(joints=(), closures=()),
+        drive_train=SimpleNamespace(coupled=()),
+        columns=(),
     )
-    robot: Any = SimpleNamespace(parameters=parameters, prior=SimpleNamespace(assumed=()))
+    parameters = SimpleNamespace(torque_change_percent=ERROR, exact=True, model=model)
+    choice: Any = SimpleNamespace(
+        robot=SimpleNamespace(parameters=parameters),
+        model=model,
+        chosen_by=ChosenBy.NEAREST_BODIES,
+        assumed=(),
+    )
     updated: Any = SimpleNamespace(links={axis: f"link-of-{axis}" for axis in AXES}, merged=())
-    return urdf_views.urdf_view(CALIBRATION, robot, dict.fromkeys(AXES, update), updated, None)
+    return urdf_views.urdf_view(CALIBRATION, choice, dict.fromkeys(AXES, update), updated, None)
 
 
 def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
