@@ -208,16 +208,16 @@ class PayloadUnseen(IdentificationError):
     def __init__(
         self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = ""
     ) -> None:
+        question = hint or (
+            "was it mounted in every loaded run, and in no other? is its mass right? where one of "
+            "several runs is the wrong one, a fit without it passes"
+        )
         super().__init__(
             f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, "
             f"expected some 1 %, and on one at most {100.0 * LARGEST_GAIN_STD:g} %: the runs "
             "declared loaded and those declared unloaded do not differ by the weight of the "
             "payload, or are positions not in rad, or columns in another order than the joints? "
-            + (
-                hint
-                or "was it mounted in every loaded run, and in no other? is its mass right? where "
-                "one of several runs is the wrong one, a fit without it passes"
-            )
+            f"{question}"
         )
         self.std_percent = std_percent
         self.runs = runs

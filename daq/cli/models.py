@@ -19,7 +19,7 @@ from ident.plausible import format_at_limit
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.workflow.full_choice import FullChoice
-    from daq.workflow.mjcf_effects import MissingEffect
+    from daq.workflow.mjcf_effects import LeftOutEffect
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
     from ident.arrays import FloatArray
     from ident.calibration import Calibration
@@ -112,7 +112,7 @@ def export_mjcf_verb(
     the full parameters of `fit --prior`; without them, the nearest physical bodies to the URDF (pip
     install 'drivegain[physical]'). What the model cannot hold is listed in it and under --json.
     """
-    from daq.report.mjcf_views import head_remarks, left_out_of, mjcf_report, mjcf_view
+    from daq.report.mjcf_views import head_remarks, mjcf_report, mjcf_view
     from daq.workflow.mjcf_effects import joint_effects
     from daq.workflow.mjcf_export import FORMAT, MjcfSource, write_mjcf
     from daq.workflow.urdf_export import random_states
@@ -122,7 +122,6 @@ def export_mjcf_verb(
     given, calibration = _described_by("export mjcf", cell, calibration, urdf)
     check_output(out, (calibration, given), FORMAT)
     known = read_calibration(calibration)
-    as_read = known
     _require_explained(known, calibration)
     if urdf is None:
         described = _of_cell(known, given)
@@ -133,9 +132,7 @@ def export_mjcf_verb(
     followed = choice.model.follow(random_states(choice.model, described.limits))
     shapes = shapes_of(described.urdf, described.folder)
     effects = joint_effects(known, choice.model.robot)
-    missing = map(str, described.missing)
-    effects = replace(effects, left_out=(*effects.left_out, *missing))
-    effects_left_out = left_out_of(as_read, effects.left_out)
+    effects = replace(effects, left_out=(*effects.left_out, *described.missing))
     source = MjcfSource(
         name=known.cell,
         model=choice.model,
@@ -147,12 +144,12 @@ def export_mjcf_verb(
         shapes=shapes,
         folder=out.parent,
         effects=effects,
-        remarks=tuple(head_remarks(known, choice, effects, shapes, software(), effects_left_out)),
+        remarks=tuple(head_remarks(known, choice, effects, shapes, software())),
     )
     written = write_mjcf(source, followed.joints.position_rad)
     with replace_output(out):
         replace_file(out, written.content)
-    report = mjcf_report(known, choice, source, written, out, described.same, effects_left_out)
+    report = mjcf_report(known, choice, source, written, out, described.same)
     if json:
         print_json(report)
     else:
@@ -165,7 +162,7 @@ class _Described:
 
     #: without effects that are not installed, with the corrections that the cell still needs
     calibration: Calibration
-    missing: tuple[MissingEffect, ...]  #: effects that are not installed
+    missing: tuple[LeftOutEffect, ...]  #: effects that are not installed
     model: Model
     limits: FloatArray  #: ranges in which torques are compared, shape (4, m)
     lower: FloatArray  #: least position of each axis, -inf without a limit, shape (m,)

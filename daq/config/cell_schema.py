@@ -40,7 +40,7 @@ class RobotModel(ChainModel):
 
     #: file of the arm's geometry, relative to the cell file; its inertias are not used by a fit
     urdf: FileName
-    #: gravity in the base frame of the URDF, by which the mounting is told
+    #: gravity in the base frame of the URDF; it says how the robot is mounted
     gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
     #: by the maker [kg]; a heavier payload is refused as mistyped
     rated_payload_kg: Annotated[float, Field(gt=0, le=1e5)] | None = None

@@ -8,7 +8,14 @@ from collections.abc import Mapping
 
 from daq.config.yaml_file import Fault
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, GearSide, PlacedEffect, check_settings, is_placeable
+from ident.effects.effect import (
+    Effect,
+    GearSide,
+    PlacedEffect,
+    check_settings,
+    is_placeable,
+    setting_kind,
+)
 from ident.effects.own import installed_families
 from ident.errors import EffectRefused
 from ident.model.robot import Robot
@@ -48,7 +55,7 @@ def place_effect(
         return Fault(("settings",), str(error), "settings in their range")
     typed = {}
     for setting, value in full.items():
-        kind = type(known.settings[setting])
+        kind = setting_kind(known, setting)
         typed[setting] = kind(value)
     effect = known.with_settings(typed)
     if not is_placeable(effect, place, robot):

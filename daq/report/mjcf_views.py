@@ -4,7 +4,7 @@ and what it does not hold.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import RenderableType
@@ -128,7 +128,6 @@ def head_remarks(
     effects: JointEffects,
     shapes: UrdfShapes,
     software: str,
-    effects_left_out: Sequence[AcceptedEffect] = (),
 ) -> Iterator[str]:
     """Lines for the head of the model.
 
@@ -138,7 +137,6 @@ def head_remarks(
         effects: of it.
         shapes: of the robot's URDF.
         software: name and version.
-        effects_left_out: of the calibration, installed or not.
     """
     yield (
         f"By {software} from {origin_text(calibration.cell, calibration.created)}. MuJoCo 3.3.1 "
@@ -146,10 +144,9 @@ def head_remarks(
     )
     yield from choice_remarks(choice)
     if effects.left_out:
-        yield f"Effects NOT in this model: {', '.join(effects.left_out)}"
-    for one in effects_left_out:
-        yield _effect_line(one)
-    if effects_left_out:
+        yield f"Effects NOT in this model: {', '.join(map(str, effects.left_out))}"
+        for effect in effects.left_out:
+            yield _effect_line(effect.accepted)
         yield "Minus their torque at the joints, coefficients times columns, goes to qfrc_applied"
     mountings = _mountings(calibration)
     if mountings:
@@ -165,7 +162,6 @@ def mjcf_report(
     written: Mjcf,
     out: Path,
     same_configuration: bool | None,
-    effects_left_out: Sequence[AcceptedEffect] = (),
 ) -> MjcfReport:
     """Return what a model that was written holds of a calibration, and what not.
 
@@ -177,7 +173,6 @@ def mjcf_report(
         out: its file.
         same_configuration: whether the cell file is that of the fit; None where the calibration
             does not name one.
-        effects_left_out: of the calibration, installed or not.
     """
     return MjcfReport.of(
         choice,
@@ -191,30 +186,14 @@ def mjcf_report(
         parameters=list(chosen_parameters(choice)),
         not_in_mjcf=[NotInMjcf.of(left) for left in written.left_over],
         effects_at_joints=source.effects.at_joints,
-        effects_left_out=source.effects.left_out,
-        effects_not_in_mjcf=[_effect_entry(one) for one in effects_left_out],
+        effects_left_out=[str(effect) for effect in source.effects.left_out],
+        effects_not_in_mjcf=[_effect_entry(effect.accepted) for effect in source.effects.left_out],
         corrections_applied=source.effects.in_geometry,
         mountings_left_out=_mountings(calibration),
         closures_left_out=written.open_closures,
         meshes=sorted({str(shape.mesh) for shape in source.shapes.found if shape.mesh is not None}),
         shapes_left_out=source.shapes.left_out,
     )
-
-
-def left_out_of(calibration: Calibration, left_out: Sequence[str]) -> tuple[AcceptedEffect, ...]:
-    """The effects of a calibration that a model lacks.
-
-    Args:
-        calibration: as it was read.
-        left_out: their names, as `JointEffects.left_out` has them; behind the name of one that is
-            not installed stands its package.
-    """
-    found: list[AcceptedEffect] = []
-    for accepted in calibration.effects:
-        name = f"{accepted.name} on {accepted.axis}"
-        if any(one == name or one.startswith(f"{name} (of ") for one in left_out):
-            found.append(accepted)
-    return tuple(found)
 
 
 def _effect_line(effect: AcceptedEffect) -> str:

@@ -19,15 +19,13 @@ from daq.workflow.urdf_export import PhysicalRobot, Shift, identified_base, phys
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.errors import ModelError
-from ident.estimators.estimate import RelativeError, relative_error
-from ident.model.bodies import pseudo_inertia
+from ident.estimators.estimate import RelativeError
 from ident.model.model import Model
-from ident.physical.consistency import relative_to_prior
 from ident.physical.full_parameters import LinkPrior, RestsOn
 from ident.physical.full_set import FullSet
 from ident.physical.physical import PhysicalParameters, inertia_prior
 from ident.physical.prior_shares import prior_shares
-from ident.prediction import fitted_model, standard_parameters
+from ident.prediction import fitted_model
 
 
 class ChosenBy(Enum):
@@ -124,21 +122,9 @@ def _robot_of(
 ) -> PhysicalRobot:
     """The robot of full parameters, shape (c,), and how far it is from the base parameters."""
     base = identified_base(calibration, model, limits)
-    identified = np.einsum("jck,c->jk", base.columns, standard_parameters(calibration, model))
-    realised = np.einsum("jck,c->jk", base.columns, standard)
-    every_sample = np.ones(identified.shape, dtype=np.bool_)
     prior = inertia_prior(urdf)
-    pseudo_inertias = np.array([pseudo_inertia(link) for link in prior.links])
-    factors = np.asarray(np.linalg.cholesky(pseudo_inertias), dtype=np.float64)
-    links = relative_to_prior(factors, standard[model.link_columns])
-    parameters = PhysicalParameters(
-        model=model,
-        standard=standard,
-        base=base.grouping,
-        identified=base.values,
-        realised=base.grouping.grouping @ standard,
-        torque_change_percent=relative_error(identified, realised, every_sample),
-        eigenvalues=np.asarray(np.linalg.eigvalsh(links)[:, 0], dtype=np.float64),
+    parameters = PhysicalParameters.of(
+        standard, model, base.grouping, base.values, base.columns, prior
     )
     shifts: tuple[Shift, ...] = ()
     if not parameters.exact:

@@ -1,9 +1,9 @@
 """Whether MuJoCo reads a mesh: it refuses the whole model for one file that it cannot read.
 
-Its readers are told apart by the name's ending: a binary STL, an OBJ, and its own MSH. The
+The ending of the file's name decides which reader it uses: binary STL, OBJ, or its own MSH. The
 conditions are those of MuJoCo 4.0, as a test shows with files of each kind: at least four vertices,
-finite ones, triangles between vertices that exist, and an area above zero. Of an OBJ it shows the
-faces of the first object or group alone, without a word, so one with several is refused too.
+all finite, triangles between vertices that exist, and an area above zero. Of an OBJ it shows only
+the faces of the first object or group, without a warning, so one with several is refused too.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 
 STL_HEAD_BYTES = 84  #: Of a binary STL: 80 of text, 4 of the number of triangles
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
@@ -26,9 +25,8 @@ LEAST_VERTICES = 4
 LARGEST_COORDINATE = 1e9  #: The STL reader refuses somewhat more
 LEAST_AREA_M2 = 1e-14  #: Ten times what is refused
 CORNERS = 3  #: Least corners of a face
+NORMAL = 2  #: Place of the normal in `vertex/texture/normal`
 _PRIMITIVES = frozenset({b"f", b"l", b"p"})
-
-IntArray = NDArray[np.int64]
 
 
 class ShapeUnreadable(Exception):
@@ -135,14 +133,13 @@ class _ObjContent:
             self.faces.append((corners[0], second, third))
 
     def _vertex_of(self, word: bytes) -> int:
-        vertex, *others = word.split(b"/")
-        texture_and_normal = dict(enumerate(others))
-        normal = texture_and_normal.get(1)
-        if normal:
-            self.largest_normal = max(self.largest_normal, _from_zero(int(normal), self.normals))
+        numbers = word.split(b"/")  # of the vertex, its texture and its normal
+        if len(numbers) > NORMAL and numbers[NORMAL]:
+            normal = _from_zero(int(numbers[NORMAL]), self.normals)
+            self.largest_normal = max(self.largest_normal, normal)
         else:
             self.bare_corners += 1
-        return _from_zero(int(vertex), len(self.vertices))
+        return _from_zero(int(numbers[0]), len(self.vertices))
 
 
 def _from_zero(number: int, known: int) -> int:

@@ -29,6 +29,22 @@ from ident.model.robot import Robot
 from ident.prediction import placed_effect
 
 
+@dataclass(frozen=True, slots=True)
+class LeftOutEffect:
+    """An effect of a calibration that a model of a simulator lacks."""
+
+    accepted: AcceptedEffect
+    package_state: str = ""  #: as `not installed`; empty where its package is installed, or none is
+
+    def __str__(self) -> str:
+        """Name and axis; package, too, where it is not installed."""
+        accepted = self.accepted
+        name = f"{accepted.name} on {accepted.axis}"
+        if self.package_state:
+            return f"{name} (of {accepted.package}, {self.package_state})"
+        return name
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JointEffects:
     """Springs and friction of n joints by effects, and where each effect of a calibration is."""
@@ -39,7 +55,7 @@ class JointEffects:
     dry_friction: FloatArray  #: [Nm; N], shape (n,)
     at_joints: tuple[str, ...]  #: effects that are in these numbers
     in_geometry: tuple[str, ...]  #: effects that correct joint frames or gravity
-    left_out: tuple[str, ...]  #: all others
+    left_out: tuple[LeftOutEffect, ...]  #: all others
 
 
 def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
@@ -55,7 +71,7 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
     numbers = np.zeros((4, robot.joint_count))
     at_joints: list[str] = []
     in_geometry: list[str] = []
-    left_out: list[str] = []
+    left_out: list[LeftOutEffect] = []
     for accepted in calibration.effects:
         name = f"{accepted.name} on {accepted.axis}"
         placed, coefficients = placed_effect(accepted, calibration)
@@ -68,7 +84,7 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
         else:
             own = numbers_of(placed.effect, coefficients)
         if own is None or (own[0] > 0.0 and numbers[0, joint] > 0.0):
-            left_out.append(name)
+            left_out.append(LeftOutEffect(accepted))
         else:
             numbers[:, joint] += own
             at_joints.append(name)
@@ -84,20 +100,7 @@ def joint_effects(calibration: Calibration, robot: Robot) -> JointEffects:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class MissingEffect:
-    """An effect of a calibration that no installed package has."""
-
-    accepted: AcceptedEffect
-    state: str  #: of its package, as `not installed`
-
-    def __str__(self) -> str:
-        """Name, axis and package."""
-        accepted = self.accepted
-        return f"{accepted.name} on {accepted.axis} (of {accepted.package}, {self.state})"
-
-
-def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[MissingEffect, ...]]:
+def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[LeftOutEffect, ...]]:
     """Return a calibration without the effects of packages that are not installed, and those.
 
     A model of a simulator holds no effect of another package, so none is needed to write it.
@@ -107,13 +110,13 @@ def split_installed(calibration: Calibration) -> tuple[Calibration, tuple[Missin
             that had it.
     """
     installed: list[AcceptedEffect] = []
-    missing: list[MissingEffect] = []
+    missing: list[LeftOutEffect] = []
     gone: set[str] = set()
     for accepted in calibration.effects:
         try:
             placed_effect(accepted, calibration)
         except EffectNotInstalled as error:
-            missing.append(MissingEffect(accepted, error.state))
+            missing.append(LeftOutEffect(accepted, error.state))
             gone |= {coefficient.name for coefficient in accepted.coefficients}
         else:
             installed.append(accepted)

@@ -146,8 +146,8 @@ def find_faults(
 class JudgedChannels:
     """All that is wrong with the channels of a recording, whether a sample is used or not.
 
-    Who reads a log judges it once; the answer goes with the run, so that whoever differentiates it
-    need not judge it again.
+    The reader of a log judges it once, and stores the result in the run. `differentiate` takes it
+    from there.
     """
 
     position: FloatArray  #: of the joints, as of `find_faults`
@@ -156,9 +156,7 @@ class JudgedChannels:
     faults: tuple[ChannelFault, ...]
 
     def answers_for(self, position: object, current: object, ratio: FloatArray) -> bool:
-        """Whether these are the arrays that were judged:
-        other ones may be wrong elsewhere, though they look alike.
-        """
+        """Whether these are the arrays that were judged, not copies of them."""
         are_same_arrays = position is self.position and current is self.current
         return are_same_arrays and np.array_equal(ratio, self.ratio)
 

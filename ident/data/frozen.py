@@ -236,9 +236,7 @@ def _constant(readings: Readings, rounding: float, least_s: float) -> list[tuple
 
 
 def _samples(readings: Readings, found: list[tuple[int, int]]) -> IntArray:
-    """First sample and end of stretches that are given by their first and last reading, shape (s,
-    2).
-    """
+    """First sample and end of stretches, given by their first and last reading, shape (s, 2)."""
     if not found:
         return _no_stretch()
     first, last = np.array(found).T

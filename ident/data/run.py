@@ -74,8 +74,8 @@ class Run:
     #: The controller's own torque, one an axis, for a comparison with the gains that no fit uses;
     #: empty without any.
     torque_channels: tuple[TorqueChannel, ...] = ()
-    #: What was found wrong with positions and currents when the run was read; None where nobody
-    #: looked. A run with other positions or currents is judged anew.
+    #: What was found wrong with positions and currents when the log was read; None of a run that
+    #: was made from arrays. It is valid for these very arrays.
     judged_channels: JudgedChannels | None = field(default=None, repr=False, compare=False)
 
     # Whatever becomes an array: the fields are converted where they are first used

@@ -158,9 +158,11 @@ def place_names(model: Model, axes: Sequence[str]) -> list[str]:
     """
     robot = model.robot
     own = [place.name for place in robot.places]
-    if not len(axes):
+    if len(axes) == 0:
         return own
-    require_names("axes", axes, None if len(axes) == len(own) else robot.axis_count)
+    if len(axes) != len(own):
+        require_names("axes", axes, robot.axis_count)
+    require_names("axes", axes)
     return [*axes, *own[len(axes) :]]
 
 

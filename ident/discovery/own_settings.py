@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ident.discovery.candidates import CandidateTrial, SearchProblem, shares_explained
+from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
-from ident.discovery.search import refine_setting
-from ident.effects.effect import Effect, fits_data, is_placeable, is_shipped
+from ident.discovery.search import is_tried, refine_setting
+from ident.effects.effect import Effect, is_shipped
 
 
 def propose_own_settings(
@@ -47,18 +47,9 @@ def _members_that_explain(
     search_problem: SearchProblem, gates: Gates, family: tuple[Effect, ...], axis: int
 ) -> tuple[Effect, ...]:
     """The members that data can show on an axis; none where no member explains enough there."""
-    tried: list[Effect] = []
-    for effect in family:
-        can_be_there = is_placeable(effect, axis, search_problem.model.robot)
-        has_moves = effect.least_moves <= search_problem.folds.moves
-        if can_be_there and has_moves and fits_data(effect, search_problem.runs, axis):
-            tried.append(effect)
-    if not tried:
-        return ()
-    trials: list[CandidateTrial] = []
-    for tested in search_problem.test((tuple(tried),), axis, at_rows=True):
-        trials += [trial for _, trial in tested.members]
-    shares = shares_explained(search_problem, trials)
+    shown = [effect for effect in family if is_tried(search_problem, effect, axis)]
+    fits = [fit for _, fit in search_problem.fits_at_rows(shown, axis)]
+    shares = shares_explained(search_problem, fits)
     if max(shares, default=0.0) < gates.smallest_share:
         return ()
-    return tuple(tried)
+    return tuple(shown)

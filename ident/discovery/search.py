@@ -61,7 +61,6 @@ CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t;
 folds share training data, so it is a rough one).
 """
-PAIRS_TOGETHER = 32  #: Candidates with two coefficients whose draws stay in a core's cache
 #: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
 GOLDEN_STEPS = 6
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -129,20 +128,20 @@ def rank_effects(
         shared = (family for family in families if family[0].name not in names)
         fitting: list[tuple[Effect, ...]] = []
         for family in (*shared, *own):
-            members = tuple(one for one in family if _is_tried(search_problem, one, axis))
+            members = tuple(one for one in family if is_tried(search_problem, one, axis))
             if members:
                 fitting.append(members)
         tested += search_problem.test(fitting, axis)
     return rank_families(search_problem, tested, rng, gates or Gates(), known)
 
 
-def _is_tried(search_problem: SearchProblem, effect: Effect, axis: int) -> bool:
-    """Whether an effect can be on an axis, and these data can show it there."""
+def is_tried(search_problem: SearchProblem, effect: Effect, axis: int) -> bool:
+    """Return whether an effect can be on an axis, and these data can show it there."""
     if not is_placeable(effect, axis, search_problem.model.robot):
         return False
-    return effect.least_moves <= search_problem.folds.moves and fits_data(
-        effect, search_problem.runs, axis
-    )
+    if effect.least_moves > search_problem.folds.moves:
+        return False
+    return fits_data(effect, search_problem.runs, axis)
 
 
 def rank_families(
@@ -498,9 +497,6 @@ def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatAr
             drawn = _drawn_numbers(
                 scatter[:, :, 0].T, np.stack([one.gram[:, 0, 0] for one in alike], axis=1), signs
             )
-        elif freedom == 2:
-            gram = np.stack([one.gram for one in alike], axis=1)
-            drawn = _drawn_pairs(np.swapaxes(scatter, 0, 1), gram, signs)
         else:
             drawn = reduce(np.maximum, (_drawn_wald(one, signs) for one in alike))
         # On the scale of −log p, so that candidates with one and with two coefficients compete
@@ -559,46 +555,6 @@ def _drawn_numbers(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatA
         + fitted**2 * np.sum(gram**2, axis=0)
     )
     return np.asarray(np.max(sums**2 / left, axis=1))
-
-
-def _drawn_pairs(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatArray:
-    """The same for candidates with two coefficients each, the largest of all;
-    x_m of shape (moves, c, 2), G_m of shape (moves, c, 2, 2).
-
-    Most candidates have one or two, and a matrix of two rows has its inverse written out.
-    """
-    largest = np.zeros(len(signs))
-    for first in range(0, x.shape[1], PAIRS_TOGETHER):
-        batch = slice(first, first + PAIRS_TOGETHER)
-        wald = _wald_of_pairs(x[:, batch], gram[:, batch], signs)
-        np.maximum(largest, np.max(wald, axis=1), out=largest)
-    return largest
-
-
-def _wald_of_pairs(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatArray:
-    """Wald statistic of each draw and candidate, shape (draws, c)."""
-    sums = [signs @ x[:, :, row] for row in (0, 1)]
-    inverse = np.linalg.pinv(gram.sum(axis=0))
-    fitted = [sums[0] * inverse[:, 0, row] + sums[1] * inverse[:, 1, row] for row in (0, 1)]
-    left: dict[tuple[int, int], FloatArray] = {}
-    for row, column in ((0, 0), (1, 0), (1, 1)):
-        own = x[:, :, row]
-        other = x[:, :, column]
-        found = np.sum(own * other, axis=0) + np.zeros_like(sums[0])
-        for one in (0, 1):
-            mixed = own * gram[:, :, column, one] + gram[:, :, row, one] * other
-            found -= (signs @ mixed) * fitted[one]
-            for two in (0, 1):
-                square = np.sum(gram[:, :, row, one] * gram[:, :, column, two], axis=0)
-                found += square * fitted[one] * fitted[two]
-        left[row, column] = found
-    # A coefficient that no draw scatters
-    least = 1e-12 * (left[0, 0] + left[1, 1])
-    upper = left[0, 0] + least
-    lower = left[1, 1] + least
-    beside = left[1, 0]
-    square_sum = sums[0] ** 2 * lower + sums[1] ** 2 * upper - 2.0 * sums[0] * sums[1] * beside
-    return np.asarray(square_sum / (upper * lower - beside**2))
 
 
 def _golden_section(

@@ -81,13 +81,9 @@ class RunScatter:
     def _scaled(self, motor: int, columns: FloatArray, factors: FloatArray) -> FloatArray:
         """X + U diag(f) Uᵀ X, transposed."""
         directions = self.directions[motor]
-        if isinstance(directions, np.ndarray):  # rows stay along memory
-            own_components = columns @ directions.T
-            return np.asarray(columns + (own_components * factors) @ directions)
-        components = directions @ columns.T
-        scaled = factors[:, None] * components
-        change = directions.T @ scaled
-        return np.asarray(columns + change.T)
+        components = columns @ directions.T  # rows stay along memory
+        scaled = components * factors
+        return np.asarray(columns + scaled @ directions)
 
 
 def _directions_of_runs(columns: FloatArray, run: IntArray) -> tuple[Any, FloatArray]:

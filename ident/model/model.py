@@ -386,9 +386,7 @@ class Model:
     def _tree_regressor(
         self, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, *, loaded: bool
     ) -> FloatArray:
-        """Torque at each joint of the tree per unit of every standard parameter, shape (n, c,
-        k).
-        """
+        """Torque at each joint of the tree per unit of every parameter, shape (n, c, k)."""
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))

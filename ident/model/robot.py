@@ -30,8 +30,8 @@ class Joint:
     rotation: FloatArray
     translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
-    #: From the lowest to the highest position that its description allows [rad or m], by which
-    #: positions in another unit are told; None where it says nothing.
+    #: From the lowest to the highest position that its description allows [rad or m]; None where
+    #: it has no limits. Positions in another unit go far beyond it.
     travel: float | None = None
 
 

@@ -195,6 +195,12 @@ class InertiaPrior:
     links: FloatArray  #: parameters in the order of LINK_PARAMETERS, shape (n, 10)
     assumed: tuple[int, ...]  #: numbers (from 0) of the links for which a ball was taken
 
+    @property
+    def factors(self) -> FloatArray:
+        """Cholesky factor L of each link's pseudo-inertia, shape (n, 4, 4)."""
+        pseudo_inertias = np.array([pseudo_inertia(link) for link in self.links])
+        return np.asarray(np.linalg.cholesky(pseudo_inertias), dtype=np.float64)
+
 
 def urdf_links(urdf: str) -> FloatArray:
     """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints,
@@ -368,6 +374,36 @@ class PhysicalParameters:
     #: Smallest one of each link's pseudo-inertia, as a share of its prior's; at least about MARGIN.
     eigenvalues: FloatArray
 
+    @classmethod
+    def of(
+        cls,
+        standard: FloatArray,
+        model: Model,
+        base: BaseParameters,
+        values: FloatArray,
+        columns: FloatArray,
+        prior: InertiaPrior,
+    ) -> PhysicalParameters:
+        """Compare standard parameters, shape (c,), with base parameters and with a prior.
+
+        Args:
+            standard: χ_st.
+            model, base, values, columns, prior: as of `physical_parameters`.
+        """
+        identified = np.einsum("jck,c->jk", columns[:, list(base.independent)], values)
+        realised = np.einsum("jck,c->jk", columns, standard)
+        every_sample = np.ones(identified.shape, dtype=np.bool_)
+        links = relative_to_prior(prior.factors, standard[model.link_columns])
+        return cls(
+            model=model,
+            standard=standard,
+            base=base,
+            identified=values,
+            realised=base.grouping @ standard,
+            torque_change_percent=relative_error(identified, realised, every_sample),
+            eigenvalues=np.asarray(np.linalg.eigvalsh(links)[:, 0], dtype=np.float64),
+        )
+
     @property
     def exact(self) -> bool:
         """Whether the identified base parameters are those of a robot that can exist."""
@@ -436,22 +472,11 @@ def physical_parameters(
         standard[leading] += values - base.grouping @ standard
     for column in programme.consistency.positive:
         standard[column] = max(standard[column], 0.0)
-    realised_torque = np.einsum("jck,c->jk", columns, standard)
-    every_sample = np.ones(identified.shape, dtype=np.bool_)
-    links = relative_to_prior(programme.factors, standard[model.link_columns])
-    eigenvalues = np.linalg.eigvalsh(links)[:, 0]
-    if not np.all(eigenvalues >= 0.5 * MARGIN):
-        evidence = f"eigenvalues {np.array2string(eigenvalues, precision=3)}"
+    found = PhysicalParameters.of(standard, model, base, values, columns, prior)
+    if not np.all(found.eigenvalues >= 0.5 * MARGIN):
+        evidence = f"eigenvalues {np.array2string(found.eigenvalues, precision=3)}"
         raise NotPhysical("the solution has an impossible link", evidence)
-    return PhysicalParameters(
-        model=model,
-        standard=standard,
-        base=base,
-        identified=values,
-        realised=base.grouping @ standard,
-        torque_change_percent=relative_error(identified, realised_torque, every_sample),
-        eigenvalues=np.asarray(eigenvalues, dtype=np.float64),
-    )
+    return found
 
 
 def _programme(
@@ -466,9 +491,8 @@ def _programme(
     scalars = driven_scalars(model)
     norms = np.linalg.norm(rows[:, scalars], axis=0)
     scales = 1.0 / np.where(norms > 0.0, norms, 1.0)  # value of each that makes the total torque
-    pseudo_inertias = np.array([pseudo_inertia(link) for link in prior.links])
     return Programme(
-        factors=np.linalg.cholesky(pseudo_inertias),
+        factors=prior.factors,
         consistency=consistency_of(model, scales, other_friction),
         grouping=base.grouping,
         triangle=triangle,

@@ -357,8 +357,9 @@ class Checker:
         """Bound on the path of any point of one body relative to another one [m]."""
         first_chain = self._chain(first)
         second_chain = self._chain(second)
-        travel_m = self._travel_beyond(first, first_chain, second_chain, start, end)
-        return self._travel_beyond(second, second_chain, first_chain, start, end, travel_m)
+        first_m = self._travel_beyond(first, first_chain, second_chain, start, end)
+        second_m = self._travel_beyond(second, second_chain, first_chain, start, end)
+        return first_m + second_m
 
     def _travel_beyond(
         self,
@@ -367,13 +368,13 @@ class Checker:
         other: list[int],
         start: FloatArray,
         end: FloatArray,
-        travel_m: float = 0.0,
     ) -> float:
-        """Add the path that the joints of a chain, which are not in another one,
-        can move a capsule along [m].
+        """Path along which the joints of a chain that are not in another one can move a body [m];
+        zero of a box.
         """
         if body >= len(self.scene.capsules):
-            return travel_m
+            return 0.0
+        travel_m = 0.0
         capsule = self.scene.capsules[body]
         start_lever = float(np.linalg.norm(capsule.start_m))
         end_lever = float(np.linalg.norm(capsule.end_m))

@@ -30,7 +30,7 @@ from tests.daq.jobs.made_session import whole_session
 from tests.studies.fingerprint import digest, digest_of_source
 from tests.studies.output import print_line
 from tests.studies.session_kills import made_once
-from tests.studies.study_rows import finished_rows, rows_of_unit, to_csv, work_off
+from tests.studies.study_rows import finished_rows, from_csv, rows_of_unit, to_csv, work_off
 from tests.studies.write_scenes import (
     FILE_SCENES,
     CallUnit,
@@ -114,6 +114,18 @@ def counts(rows: Sequence[FaultRow]) -> list[FaultCount]:
     return found
 
 
+def with_other_verbs(
+    table: Path, rows: Sequence[FaultRow], verbs: Sequence[str]
+) -> tuple[FaultRow, ...]:
+    """Rows of some verbs, and those of the others that a table has, in the order of `VERBS`."""
+    found = list(rows)
+    if table.is_file():
+        for row in from_csv(FaultRow, table.read_text(encoding="utf-8")):
+            if row.verb not in verbs:
+                found.append(row)
+    return tuple(sorted(found, key=lambda row: VERBS.index(row.verb)))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Take the calls that were not taken yet; 1 where a sentence was false or a state bad."""
     parser = argparse.ArgumentParser(
@@ -167,13 +179,14 @@ def main(arguments: list[str] | None = None) -> int:
                 f"{row.verb} {row.number} {row.call} {row.file} {row.error} "
                 f"{row.is_lasting}: {text}"
             )
-    table = counts(rows)
     wrong = sum(bool(row.false_sentences or row.bad_states) for row in rows)
     print_line(f"{len(rows)} cases, {wrong} of them wrong; {left} calls were not begun")
     if options.tables is not None and left == 0:
-        replace_file(options.tables / "write-faults.csv", to_csv(FaultCount, table).encode())
-        every = to_csv(FaultRow, rows)
-        replace_file(options.tables / "write-fault-rows.csv", every.encode())
+        table_of_rows = options.tables / "write-fault-rows.csv"
+        every_row = with_other_verbs(table_of_rows, rows, options.verbs)
+        replace_file(table_of_rows, to_csv(FaultRow, every_row).encode())
+        every_count = to_csv(FaultCount, counts(every_row))
+        replace_file(options.tables / "write-faults.csv", every_count.encode())
     return int(wrong > 0)
 
 

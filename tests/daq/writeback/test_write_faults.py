@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from tests.daq.failing_calls import Call, Fault, Traced, traced, why_not_here
-from tests.studies.write_faults import counts
+from tests.studies.study_rows import to_csv
+from tests.studies.write_faults import counts, with_other_verbs
 from tests.studies.write_scenes import (
     ERRORS,
     KILL,
@@ -292,3 +293,17 @@ def test_an_exit_code_that_denies_or_invents_a_write_is_wrong() -> None:
     assert wrong_code(1, "", _facts(Content.NEW)) != ""
     assert wrong_code(1, "x has the new content, complete", _facts(Content.NEW)) == ""
     assert wrong_code(None, "", _facts(Content.OLD)) == ""
+
+
+def _row(verb: str, number: int) -> FaultRow:
+    return FaultRow(verb, number, "rename", "controller's file", KILL, False, -1, "old", (), ())
+
+
+def test_a_part_of_the_study_keeps_the_rows_of_the_other_verbs(tmp_path: Path) -> None:
+    table = tmp_path / "rows.csv"
+    earlier = (_row("apply", 1), _row("rollback", 1), _row("calibrate", 1))
+    table.write_text(to_csv(FaultRow, earlier))
+    new = (_row("rollback", 2), _row("rollback", 3))
+    found = with_other_verbs(table, new, ["rollback"])
+    assert found == (earlier[0], *new, earlier[2])
+    assert with_other_verbs(tmp_path / "none.csv", new, ["rollback"]) == new

@@ -10,48 +10,11 @@ from numpy.typing import NDArray
 
 from ident.discovery.candidate_fits import CandidateFit, Felt, fit_candidates
 from ident.discovery.candidates import score_candidates
-from ident.equations.linearisation import Folds, Jacobian, Linearisation, cut_into_folds
+from ident.equations.linearisation import Folds, cut_into_folds
+from tests.ident.discovery.random_problem import WIDTH, fitted_to, random_problem
 from tests.ident.recordings import whole
 
 FloatArray = NDArray[np.float64]
-
-MOTORS = 3
-MOVES = 16
-WIDTH = 5
-
-
-def _problem(rng: np.random.Generator) -> Linearisation:
-    """Rows of three motors in sixteen moves; the last motor lacks the first two unknowns."""
-    row_counts = rng.integers(8, 20, size=(MOTORS, MOVES))
-    motor = np.repeat(np.arange(MOTORS), row_counts.sum(axis=1))
-    moves = np.tile(np.arange(MOVES), MOTORS)
-    cluster = np.repeat(moves, row_counts.ravel())
-    jacobian = rng.normal(size=(len(motor), WIDTH))
-    jacobian[motor == MOTORS - 1, :2] = 0.0
-    parts: list[FloatArray] = []
-    seen: list[NDArray[np.int64]] = []
-    for one in range(MOTORS):
-        own = jacobian[motor == one].T
-        is_seen = own.any(axis=1)
-        parts.append(own[is_seen])
-        seen.append(np.flatnonzero(is_seen))
-    raw = rng.normal(size=len(motor))
-    return Linearisation(
-        jacobian=Jacobian(tuple(parts), tuple(seen), WIDTH),
-        residual=raw - jacobian @ _fitted(jacobian, raw),
-        current=rng.normal(size=len(motor)),
-        motor=motor,
-        cluster=cluster,
-        source=np.arange(len(motor)),
-        gamma=np.ones(MOTORS),
-        noise=np.ones(MOTORS),
-        free=np.arange(WIDTH),
-        scale=np.ones(WIDTH),
-    )
-
-
-def _fitted(columns: FloatArray, target: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.lstsq(columns, target, rcond=None)[0])
 
 
 def _felt(folds: Folds, columns: FloatArray) -> Felt:
@@ -89,7 +52,7 @@ def test_a_fit_has_the_numbers_of_a_trial_and_of_least_squares(
     seed: int, widths: list[int]
 ) -> None:
     rng = np.random.default_rng(seed)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     problem = folds.linearisation
     jacobian = whole(problem.jacobian)
     candidates = _candidates(rng, folds, widths)
@@ -101,7 +64,7 @@ def test_a_fit_has_the_numbers_of_a_trial_and_of_least_squares(
         assert fit.coefficients == pytest.approx(trial.coefficients, rel=1e-9, abs=1e-12)
         assert fit.fallen == pytest.approx(trial.fallen, rel=1e-9, abs=1e-9)
         both = np.concatenate((jacobian, columns), axis=1)
-        after = problem.residual - both @ _fitted(both, problem.residual)
+        after = problem.residual - both @ fitted_to(both, problem.residual)
         change = problem.residual**2 - after**2
         by_motor = np.bincount(problem.motor, change)
         assert fit.fallen == pytest.approx(by_motor, rel=1e-7, abs=1e-7)
@@ -109,7 +72,7 @@ def test_a_fit_has_the_numbers_of_a_trial_and_of_least_squares(
 
 def test_candidates_that_the_model_contains_leave_the_others_of_their_batch_as_they_are() -> None:
     rng = np.random.default_rng(1)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     jacobian = whole(folds.linearisation.jacobian)
     contained = jacobian @ rng.normal(size=(WIDTH, 2))
     first, second = _candidates(rng, folds, [2, 2])
@@ -140,7 +103,7 @@ def test_products_of_a_candidate_with_itself_are_those_of_matrix_products(
     seed: int, width: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     for own in folds.motors:
         columns = rng.normal(size=(3, width, own.equations.shape[1]))
         expected = own.sums(columns, columns)

@@ -11,60 +11,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.discovery.candidates import CandidateTrial, score_candidates
-from ident.discovery.few_moves import MoveScores
-from ident.discovery.search import PAIRS_TOGETHER, _drawn_numbers, _drawn_pairs, _drawn_wald
-from ident.equations.linearisation import Jacobian, Linearisation, cut_into_folds
+from ident.discovery.search import _drawn_numbers, _drawn_wald
+from ident.equations.linearisation import Linearisation, cut_into_folds
+from tests.ident.discovery.random_problem import MOTORS, MOVES, WIDTH, fitted_to, random_problem
 from tests.ident.recordings import whole
 
 FloatArray = NDArray[np.float64]
-
-MOTORS = 3
-MOVES = 16
-WIDTH = 5
-
-
-def _problem(rng: np.random.Generator) -> Linearisation:
-    """Rows of three motors in sixteen moves of uneven length; the residual is what a fit leaves.
-
-    The last motor's equation lacks the first two unknowns, as those near the flange do.
-    """
-    parts = [
-        (motor, move)
-        for motor in range(MOTORS)
-        for move in range(MOVES)
-        for _ in range(rng.integers(8, 20))
-    ]
-    motor, cluster = (np.array(part, dtype=np.int64) for part in zip(*parts, strict=True))
-    jacobian = rng.normal(size=(len(motor), WIDTH)) * (1.0 + motor[:, None])
-    jacobian[motor == MOTORS - 1, :2] = 0.0
-    raw = rng.normal(size=len(motor)) + 0.3 * np.sin(np.arange(len(motor)))
-    rows = [jacobian[motor == one].T for one in range(MOTORS)]
-    seen = [np.flatnonzero(own.any(axis=1)) for own in rows]
-    held = tuple(own[here] for own, here in zip(rows, seen, strict=True))
-    return Linearisation(
-        jacobian=Jacobian(held, tuple(seen), WIDTH),
-        residual=raw - jacobian @ np.linalg.lstsq(jacobian, raw, rcond=None)[0],
-        current=5.0 * rng.normal(size=len(motor)),
-        motor=motor,
-        cluster=cluster,
-        source=np.arange(len(motor)),
-        gamma=np.ones(MOTORS),
-        noise=np.ones(MOTORS),
-        free=np.arange(WIDTH),
-        scale=np.ones(WIDTH),
-    )
-
-
-def _fit(columns: FloatArray, target: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.lstsq(columns, target, rcond=None)[0])
 
 
 def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) -> CandidateTrial:
     """The same by projection and by one whole refit a fold."""
     j = whole(problem.jacobian)
     e = problem.residual
-    left = columns - j @ _fit(j, columns)
-    coefficients = _fit(left, e)
+    left = columns - j @ fitted_to(j, columns)
+    coefficients = fitted_to(left, e)
     after = e - left @ coefficients
 
     def by_motor(residual: FloatArray, rows: NDArray[np.bool_]) -> list[float]:
@@ -76,8 +36,8 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
     held = []
     for fold in range(count):
         out = problem.cluster % count == fold
-        without = e[~out] - j[~out] @ _fit(j[~out], e[~out])
-        fitted = _fit(both[~out], e[~out])
+        without = e[~out] - j[~out] @ fitted_to(j[~out], e[~out])
+        fitted = fitted_to(both[~out], e[~out])
         training.append(float(np.sum(without**2) - np.sum((e[~out] - both[~out] @ fitted) ** 2)))
         held.append(by_motor(e - both @ fitted, out))
     moves = [problem.cluster == move for move in range(MOVES)]
@@ -105,7 +65,7 @@ def _agree(found: CandidateTrial | None, expected: CandidateTrial) -> None:
 def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
     """Candidates of one and of several columns side by side, on all motors or on one alone."""
     rng = np.random.default_rng(seed)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     problem = folds.linearisation
     columns = rng.normal(size=(len(problem.motor), sum(widths)))
     columns[:, 0] *= problem.motor == 1
@@ -118,7 +78,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
 
 def test_what_the_model_says_already_is_no_candidate() -> None:
     rng = np.random.default_rng(1)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     j = whole(folds.linearisation.jacobian)
     own = rng.normal(size=len(j))
     said = j @ rng.normal(size=WIDTH)
@@ -134,7 +94,7 @@ def test_what_the_model_says_already_is_no_candidate() -> None:
 
 def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
     rng = np.random.default_rng(2)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     problem = folds.linearisation
     seen = rng.normal(size=(len(problem.motor), 1)) * (problem.cluster % 8 == 3)[:, None]
     (trial,) = score_candidates(folds, seen, [slice(0, 1)])
@@ -147,7 +107,7 @@ def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
 
 def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> None:
     rng = np.random.default_rng(3)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     problem = folds.linearisation
     whole = rng.normal(size=len(problem.motor)) + 0.5 * problem.residual
     seen = rng.normal(size=len(problem.motor)) * (problem.cluster % 8 == 3)
@@ -159,7 +119,7 @@ def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> N
 
 def test_the_unit_of_a_candidate_does_not_matter() -> None:
     rng = np.random.default_rng(4)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     columns = rng.normal(size=(len(folds.linearisation.motor), 2))
     (one,) = score_candidates(folds, columns, [slice(0, 2)])
     (other,) = score_candidates(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])
@@ -172,7 +132,7 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
 @pytest.mark.parametrize("width", [1, 2, 3])
 def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     rng = np.random.default_rng(5)
-    folds = cut_into_folds(_problem(rng))
+    folds = cut_into_folds(random_problem(rng))
     (trial,) = score_candidates(
         folds, rng.normal(size=(len(folds.linearisation.motor), width)), [slice(0, width)]
     )
@@ -189,22 +149,3 @@ def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     else:
         found = _drawn_numbers(trial.scatter, trial.gram[:, :, 0], signs)
     assert found == pytest.approx(np.array(expected), rel=1e-9)
-
-
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 2 * PAIRS_TOGETHER + 1))
-@settings(max_examples=15, deadline=None)
-def test_the_largest_statistic_of_pairs_is_that_of_each_of_them(seed: int, count: int) -> None:
-    """In units that differ by a million."""
-    rng = np.random.default_rng(seed)
-    units = 10.0 ** rng.uniform(-3.0, 3.0, size=(count, 2))
-    signs = rng.choice((-1.0, 1.0), size=(7, MOVES))
-    pairs: list[MoveScores] = []
-    for unit in units:
-        rows = rng.normal(size=(MOVES, 9, 2)) * unit
-        gram = np.swapaxes(rows, 1, 2) @ rows
-        scatter = rng.normal(size=(MOVES, 2)) * unit
-        pairs.append(MoveScores(scatter.sum(axis=0), scatter, gram))
-    scatters = np.stack([one.scatter for one in pairs], axis=1)
-    grams = np.stack([one.gram for one in pairs], axis=1)
-    expected = np.max([_drawn_wald(one, signs) for one in pairs], axis=0)
-    assert _drawn_pairs(scatters, grams, signs) == pytest.approx(expected, rel=1e-8)
