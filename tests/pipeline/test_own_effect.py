@@ -212,7 +212,7 @@ def test_an_effect_that_no_package_has_is_given_again(checkout: Path, other: Oth
     refused = other.run_code(not_given)
     assert refused.returncode == 1
     assert "expected module ring_effect, which had it" in refused.stderr
-    assert "give it as an argument (`own_effects`)" in refused.stderr
+    assert "give the effect to `load_calibration(path, own_effects=[...])`" in refused.stderr
 
 
 def test_an_installed_effect_goes_the_whole_way_to_a_certificate_and_back(
