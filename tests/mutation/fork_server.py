@@ -11,7 +11,9 @@ import contextlib
 import gc
 import importlib
 import json
+import math
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -111,20 +113,20 @@ class ForkServer:
         self._process.stdin.close()
         self._process.wait()
 
-    def run(self, tests: list[str], timeout_s: float, options: tuple[str, ...] = ()) -> Run:
-        """Run tests in their given order until the first that fails.
+    def run(self, tests: list[str], timeout_s: float, processor_s: float) -> Run:
+        """Run tests until the first that fails, files in the order of their first test.
 
         Parameters
         ----------
         tests : names of tests, such as `tests/a/test_b.py::test_c[1]`.
         timeout_s : time in s after which the run and what it started is killed.
-        options : further options of pytest.
+        processor_s : the same for processor time, which a busy machine does not make longer.
 
         """
         assert self._process is not None
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        request = {"tests": tests, "timeout_s": timeout_s, "options": options}
+        request = {"tests": tests, "timeout_s": timeout_s, "processor_s": processor_s}
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         answer = self._process.stdout.readline()
@@ -134,37 +136,25 @@ class ForkServer:
 
 
 class _Selection:
-    """Pytest plugin: keep the tests that are named, in the order of their names.
+    """Pytest plugin: keep the tests that are named.
 
     Names as arguments would not do: one that a fault takes away would be an error of usage.
     """
 
     def __init__(self, tests: list[str]) -> None:
-        self._place = {test: place for place, test in enumerate(tests)}
+        self._tests = set(tests)
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        chosen = [item for item in items if item.nodeid in self._place]
-        chosen.sort(key=lambda item: self._place[item.nodeid])
-        items[:] = chosen
+        items[:] = [item for item in items if item.nodeid in self._tests]
 
 
-def _run_here(tests: list[str], options: list[str]) -> int:
-    files = list(dict.fromkeys(test.split("::")[0] for test in tests))
-    arguments = [
-        "-q",
-        "-x",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        # Hypothesis was imported before pytest could rewrite its assertions.
-        "-W",
-        "ignore::pytest.PytestAssertRewriteWarning",
-        *options,
-        *files,
-    ]
-    return int(pytest.main(arguments, plugins=[_Selection(tests)]))
+def _run_here(tests: list[str]) -> int:
+    files = dict.fromkeys(test.split("::", maxsplit=1)[0] for test in tests)
+    arguments = ["-q", "-x", "-n", "0", "-p", "no:cacheprovider"]
+    # Hypothesis was imported before pytest could rewrite its assertions.
+    arguments += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+    return int(pytest.main([*arguments, *files], plugins=[_Selection(tests)]))
 
 
 def _fork(request: dict[str, Any], printed: Path) -> int:
@@ -179,7 +169,9 @@ def _fork(request: dict[str, Any], printed: Path) -> int:
         os.dup2(nothing, 0)
         os.dup2(output, 1)
         os.dup2(output, 2)
-        status = _run_here(request["tests"], request["options"])
+        limit_s = math.ceil(request["processor_s"])
+        resource.setrlimit(resource.RLIMIT_CPU, (limit_s, limit_s))
+        status = _run_here(request["tests"])
         sys.stdout.flush()
         sys.stderr.flush()
     finally:
@@ -200,6 +192,9 @@ def _wait(child: int, timeout_s: float) -> int:
         os.killpg(child, signal.SIGKILL)
     if status == TIMED_OUT:
         os.waitpid(child, 0)
+    if status == -signal.SIGKILL:
+        # Linux ends a process so where soft and hard limit of processor time are the same.
+        status = TIMED_OUT
     return status
 
 

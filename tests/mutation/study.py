@@ -45,8 +45,9 @@ a line that every test executes would take an hour otherwise.
 SLOWER = 5.0
 """A test that takes this many times its duration is taken as caught in an endless loop."""
 
-START_S = 60.0
-"""Time for a process of pytest to start and to collect, on a busy machine."""
+START_S = 300.0
+START_PROCESSOR_S = 20.0
+"""Time and processor time for a run of pytest to start and to collect, on a busy machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,17 +213,19 @@ class Bench:
 
     def _fails_without_fault(self, noticed_by: str, tests: list[str]) -> bool:
         """Whether a test fails here anyway: by chance, or as it is not run as in `make test`."""
+        again = [test for test in tests if _is_of(test, noticed_by)]
+        if not again:
+            # It did not end, or ended without a name: all are suspected.
+            return bool(self._first_that_fails(tests))
         if noticed_by not in self._failing_without_fault:
-            again = [test for test in tests if _is_of(test, noticed_by)]
-            if not again:
-                # It did not end, or ended without a name: all are suspected.
-                again = tests
             self._failing_without_fault[noticed_by] = bool(self._first_that_fails(again))
         return self._failing_without_fault[noticed_by]
 
     def _first_that_fails(self, tests: list[str]) -> str:
         duration_s = self._covered.duration_s(tests)
-        run = self._server.run(tests, START_S + SLOWER * duration_s)
+        run = self._server.run(
+            tests, START_S + SLOWER * duration_s, START_PROCESSOR_S + SLOWER * duration_s
+        )
         if run.status in (0, NO_TESTS_WERE_COLLECTED):
             return ""
         if run.status == TIMED_OUT:
