@@ -36,10 +36,12 @@ from tests.studies.output import print_line
 CHECKOUT = Path(__file__).resolve().parents[2]
 PACKAGES = ("daq", "drivers", "ident")
 
-MIRRORED_S = 600.0
-OTHERS_S = 300.0
-"""Tests are tried, the cheapest files first, until their durations add up to this:
-a line that every test executes would take an hour otherwise.
+MIRRORED_S = 300.0
+OTHERS_S = 150.0
+UNSEEN_S = 60.0
+"""Tests are tried, the cheapest files first, until their durations add up to this: a line that
+every test executes would take an hour otherwise. The last is for a line that no test executes in
+its own process.
 """
 
 SLOWER = 5.0
@@ -180,16 +182,22 @@ class Bench:
 
     def _groups(self, planted: Planted) -> tuple[tuple[str, list[str]], ...]:
         """Tests of the mirrored room, in two runs, and the others."""
-        tests = self._covered.tests_that_could_notice(planted.file, planted.mutant.line)
+        line = planted.mutant.line
+        tests = self._covered.tests_that_could_notice(planted.file, line)
         own = [test for test in tests if mirrored(test, planted.file)]
         others = [test for test in tests if not mirrored(test, planted.file)]
         files = self._covered.cheapest_files(own, Path(planted.file).stem)
         first = [test for test in own if test.split("::")[0] in files[:1]]
         rest = [test for test in own if test not in set(first)]
+        mirrored_s = MIRRORED_S
+        others_s = OTHERS_S
+        if not self._covered.executes(planted.file, line):
+            mirrored_s = UNSEEN_S
+            others_s = UNSEEN_S
         return (
             ("mirrored", first),
-            ("mirrored", self._covered.affordable(rest, MIRRORED_S)),
-            ("other", self._covered.affordable(others, OTHERS_S)),
+            ("mirrored", self._covered.affordable(rest, mirrored_s)),
+            ("other", self._covered.affordable(others, others_s)),
         )
 
     def _noticed_by(self, planted: Planted, tests: list[str]) -> str:
