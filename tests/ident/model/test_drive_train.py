@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import ArrayLike
 
 from ident.errors import ModelError
 from ident.model.model import Column, DriveTrain, Model
@@ -53,7 +54,7 @@ def test_directions_are_ratios_to_the_own_joint_and_motors_have_their_inverse() 
     ],
 )
 def test_a_drive_train_that_is_none_is_refused_with_what_was_found(
-    ratio: list[object], words: str
+    ratio: ArrayLike, words: str
 ) -> None:
     with pytest.raises(ModelError, match=words):
         DriveTrain(ratio)
