@@ -4,11 +4,12 @@ measured once, by one run of the tests under coverage.
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,18 +44,102 @@ class CoverageMap:
     tree: Path
 
     def tests_of(self, file: str, line: int) -> tuple[str, ...]:
-        """Tests that execute a line, the fastest first;
-        none where it runs at import or in other processes only.
-        """
-        contexts = self.data.contexts_by_lineno(str(self.tree / file)).get(line, [])
-        tests = [context for context in contexts if context]
-        return tuple(sorted(tests, key=lambda test: self.durations_s.get(test, 0.0)))
+        """Tests that execute a line; none where it runs at import or in other processes only."""
+        return _tests_among(self._contexts(file).get(line, []))
 
-    def runs_at_import(self, file: str, line: int) -> bool:
-        """Whether a line is executed outside of all tests:
-        what it makes is used by tests that do not execute it.
+    def executes(self, file: str, line: int) -> bool:
+        """Whether a line is executed at all, by a test or at import."""
+        return line in self._contexts(file)
+
+    def tests_that_could_notice(self, file: str, line: int) -> tuple[str, ...]:
+        """Tests that execute a line or use what it makes.
+
+        What is made at import is used where its name is read. A line that no test executes may be
+        executed by another process, which a test of the same file starts.
         """
-        return "" in self.data.contexts_by_lineno(str(self.tree / file)).get(line, [])
+        contexts = self._contexts(file)
+        executing = contexts.get(line, [])
+        if executing and "" not in executing:
+            return _tests_among(executing)
+        found = set(executing)
+        source = (self.tree / file).read_text()
+        for reader in lines_that_read(source, line):
+            found.update(contexts.get(reader, []))
+        if not _tests_among(found):
+            for of_line in contexts.values():
+                found.update(of_line)
+        return _tests_among(found)
+
+    def duration_s(self, tests: Iterable[str]) -> float:
+        """Sum of the durations of tests."""
+        return sum(self.durations_s.get(test, 1.0) for test in tests)
+
+    def cheapest_files(self, tests: Iterable[str], stem: str) -> tuple[str, ...]:
+        """Files of tests: the one that is named after a module first, then the cheapest.
+
+        Tests of a file share fixtures, so they are not torn apart.
+        """
+        cost_s: dict[str, float] = {}
+        for test in tests:
+            file = test.split("::")[0]
+            cost_s[file] = cost_s.get(file, 0.0) + self.durations_s.get(test, 1.0)
+        return tuple(
+            sorted(cost_s, key=lambda file: (Path(file).stem != f"test_{stem}", cost_s[file]))
+        )
+
+    def affordable(self, tests: list[str], limit_s: float) -> list[str]:
+        """Tests of the cheapest files that take a time together."""
+        chosen: list[str] = []
+        spent_s = 0.0
+        for file in self.cheapest_files(tests, ""):
+            of_file = [test for test in tests if test.split("::")[0] == file]
+            spent_s += self.duration_s(of_file)
+            if chosen and spent_s > limit_s:
+                break
+            chosen.extend(of_file)
+        return chosen
+
+    def _contexts(self, file: str) -> dict[int, list[str]]:
+        return self.data.contexts_by_lineno(str(self.tree / file))
+
+
+def _tests_among(contexts: Iterable[str]) -> tuple[str, ...]:
+    """Names of tests; the empty context is what runs at import."""
+    return tuple(sorted(context for context in contexts if context))
+
+
+def lines_that_read(source: str, line: int) -> tuple[int, ...]:
+    """Lines of a module that read a name which one of its statements assigns.
+
+    Parameters
+    ----------
+    source : source of the module.
+    line : line within an assignment, counted from 1.
+
+    """
+    tree = ast.parse(source)
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Assign | ast.AnnAssign):
+            continue
+        assert node.end_lineno is not None
+        if node.lineno <= line <= node.end_lineno:
+            names.update(_assigned_names(node))
+    readers: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load) and node.id in names:
+            readers.add(node.lineno)
+        if isinstance(node, ast.Attribute) and node.attr in names:
+            readers.add(node.lineno)
+    return tuple(sorted(readers))
+
+
+def _assigned_names(node: ast.Assign | ast.AnnAssign) -> Iterator[str]:
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+    for target in targets:
+        for part in ast.walk(target):
+            if isinstance(part, ast.Name):
+                yield part.id
 
 
 def measured_map(tree: Path, folder: Path, jobs: int) -> CoverageMap:

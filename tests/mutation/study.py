@@ -12,40 +12,44 @@ import csv
 import os
 import random
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
+from threading import Lock
 
 from tests.mutation.coverage_map import (
-    FAST,
     NO_TESTS_WERE_COLLECTED,
     CoverageMap,
     environment_of,
     measured_map,
 )
+from tests.mutation.fork_server import TIMED_OUT, ForkServer
 from tests.mutation.mutants import Mutant, compiles, mutants_of
 from tests.studies.output import print_line
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PACKAGES = ("daq", "drivers", "ident")
 
-TESTS_AT_ONCE = 60
-"""Tests given to one process of pytest:
-a command line has a limit, and the fastest tests are tried first.
+MIRRORED_S = 300.0
+OTHERS_S = 150.0
+UNSEEN_S = 60.0
+"""Tests are tried, the cheapest files first, until their durations add up to this: a line that
+every test executes would take an hour otherwise. The last is for a line that no test executes in
+its own process.
 """
 
 SLOWER = 5.0
 """A test that takes this many times its duration is taken as caught in an endless loop."""
 
-START_S = 60.0
-"""Time for a process of pytest to start and to collect, on a busy machine."""
+START_S = 300.0
+START_PROCESSOR_S = 20.0
+"""Time and processor time for a run of pytest to start and to collect, on a busy machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,28 +140,113 @@ def _draw(
     return file, mutant
 
 
-def try_mutant(planted: Planted, tree: Path, covered: CoverageMap) -> Outcome:
-    """Plant one fault into a tree of its own, run the tests that could notice it,
-    and take it out again.
+class Bench:
+    """A tree that faults are planted into, with a process that runs its tests.
+
+    Parameters
+    ----------
+    tree : checkout of its own.
+    server : fork server in that tree.
+    covered : which tests execute which line.
+
     """
-    path = tree / planted.file
-    source = path.read_bytes()
-    try:
-        _write(path, planted.mutant.planted(source))
-        result, test = _verdict(planted, tree, covered)
-    finally:
-        _write(path, source)
-    mutant = planted.mutant
-    return Outcome(
-        planted.number,
-        planted.file,
-        mutant.line,
-        mutant.kind,
-        mutant.before,
-        mutant.after,
-        result,
-        test,
-    )
+
+    def __init__(self, tree: Path, server: ForkServer, covered: CoverageMap) -> None:
+        self.tree = tree
+        self._server = server
+        self._covered = covered
+        self._failing_without_fault: dict[str, bool] = {}
+
+    def try_mutant(self, planted: Planted) -> Outcome:
+        """Plant one fault, run the tests that could notice it, and take it out again."""
+        mutant = planted.mutant
+        result = "survived"
+        noticed_by = ""
+        for name, tests in self._groups(planted):
+            noticed_by = self._noticed_by(planted, tests)
+            if noticed_by:
+                result = name
+                break
+        if not noticed_by and not self._covered.executes(planted.file, mutant.line):
+            result = "not executed"
+        return Outcome(
+            planted.number,
+            planted.file,
+            mutant.line,
+            mutant.kind,
+            mutant.before,
+            mutant.after,
+            result,
+            noticed_by,
+        )
+
+    def _groups(self, planted: Planted) -> tuple[tuple[str, list[str]], ...]:
+        """Tests of the mirrored room, in two runs, and the others."""
+        line = planted.mutant.line
+        tests = self._covered.tests_that_could_notice(planted.file, line)
+        own = [test for test in tests if mirrored(test, planted.file)]
+        others = [test for test in tests if not mirrored(test, planted.file)]
+        files = self._covered.cheapest_files(own, Path(planted.file).stem)
+        first = [test for test in own if test.split("::")[0] in files[:1]]
+        rest = [test for test in own if test not in set(first)]
+        mirrored_s = MIRRORED_S
+        others_s = OTHERS_S
+        if not self._covered.executes(planted.file, line):
+            mirrored_s = UNSEEN_S
+            others_s = UNSEEN_S
+        return (
+            ("mirrored", first),
+            ("mirrored", self._covered.affordable(rest, mirrored_s)),
+            ("other", self._covered.affordable(others, others_s)),
+        )
+
+    def _noticed_by(self, planted: Planted, tests: list[str]) -> str:
+        """First test that fails with the fault and passes without it, or nothing."""
+        waiting = tests
+        while waiting:
+            noticed_by = self._first_that_fails_with(planted, waiting)
+            if not noticed_by or not self._fails_without_fault(noticed_by, waiting):
+                return noticed_by
+            waiting = [test for test in waiting if not _is_of(test, noticed_by)]
+        return ""
+
+    def _first_that_fails_with(self, planted: Planted, tests: list[str]) -> str:
+        path = self.tree / planted.file
+        source = path.read_bytes()
+        try:
+            _write(path, planted.mutant.planted(source))
+            return self._first_that_fails(tests)
+        finally:
+            _write(path, source)
+
+    def _fails_without_fault(self, noticed_by: str, tests: list[str]) -> bool:
+        """Whether a test fails here anyway: by chance, or as it is not run as in `make test`."""
+        again = [test for test in tests if _is_of(test, noticed_by)]
+        if not again:
+            # It did not end, or ended without a name: all are suspected.
+            return bool(self._first_that_fails(tests))
+        if noticed_by not in self._failing_without_fault:
+            self._failing_without_fault[noticed_by] = bool(self._first_that_fails(again))
+        return self._failing_without_fault[noticed_by]
+
+    def _first_that_fails(self, tests: list[str]) -> str:
+        duration_s = self._covered.duration_s(tests)
+        run = self._server.run(
+            tests, START_S + SLOWER * duration_s, START_PROCESSOR_S + SLOWER * duration_s
+        )
+        if run.status in (0, NO_TESTS_WERE_COLLECTED):
+            return ""
+        if run.status == TIMED_OUT:
+            return "timeout"
+        for line in run.printed.splitlines():
+            if line.startswith(("FAILED ", "ERROR ")):
+                return line.split(" ", 1)[1].split(" - ")[0]
+        return f"pytest ended with {run.status}"
+
+
+def _is_of(test: str, named: str) -> bool:
+    """Whether a test is the one that is named, or of the file that is named."""
+    return test == named or test.split("::", maxsplit=1)[0] == named
 
 
 _written_at_s = iter(range(1_000_000_000, 2_000_000_000))
@@ -170,84 +259,6 @@ def _write(path: Path, source: bytes) -> None:
     path.write_bytes(source)
     stamp = next(_written_at_s)
     os.utime(path, (stamp, stamp))
-
-
-def _verdict(planted: Planted, tree: Path, covered: CoverageMap) -> tuple[str, str]:
-    tests = covered.tests_of(planted.file, planted.mutant.line)
-    if not tests or covered.runs_at_import(planted.file, planted.mutant.line):
-        name, noticed_by = _verdict_of_room(planted, tree)
-        if noticed_by or not tests:
-            return name, noticed_by
-    own = [test for test in tests if mirrored(test, planted.file)]
-    others = [test for test in tests if not mirrored(test, planted.file)]
-    for name, group in (("mirrored", own), ("other", others)):
-        noticed_by = _first_that_fails(group, tree, covered)
-        if noticed_by:
-            return name, noticed_by
-    return "survived", ""
-
-
-def _verdict_of_room(planted: Planted, tree: Path) -> tuple[str, str]:
-    """Judge a line that runs at import or in other processes:
-    by the tests of its room, then by the pipeline's.
-    """
-    room = f"tests/{room_of(planted.file)}"
-    for name, folder in (("mirrored", room), ("other", "tests/pipeline")):
-        if not (tree / folder).is_dir():
-            continue
-        noticed_by = _run([folder], tree, timeout_s=1200.0)
-        if noticed_by:
-            return name, noticed_by
-    return "not executed", ""
-
-
-def _first_that_fails(tests: list[str], tree: Path, covered: CoverageMap) -> str:
-    for first in range(0, len(tests), TESTS_AT_ONCE):
-        some = tests[first : first + TESTS_AT_ONCE]
-        duration_s = sum(covered.durations_s.get(test, 1.0) for test in some)
-        noticed_by = _run(some, tree, timeout_s=START_S + SLOWER * duration_s)
-        if noticed_by:
-            return noticed_by
-    return ""
-
-
-def _run(tests: list[str], tree: Path, timeout_s: float) -> str:
-    """First test that fails, "timeout", or nothing where all pass."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "-m",
-        FAST,
-        *tests,
-    ]
-    process = subprocess.Popen(
-        command,
-        cwd=tree,
-        env=environment_of(tree),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        printed, _ = process.communicate(timeout=timeout_s)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        return "timeout"
-    if process.returncode in (0, NO_TESTS_WERE_COLLECTED):
-        return ""
-    failed = [line for line in printed.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    if failed:
-        return failed[0].split(" ", 1)[1].split(" - ")[0]
-    return f"pytest ended with {process.returncode}"
 
 
 def _tree_of_head(folder: Path) -> Path:
@@ -325,7 +336,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--mutants", type=int, default=300)
     parser.add_argument("--minutes", type=float, default=55.0)
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--folder", type=Path, default=CHECKOUT / "out" / "mutation")
     arguments = parser.parse_args()
     ends_at_s = time.monotonic() + 60.0 * arguments.minutes
@@ -333,32 +344,33 @@ def main() -> int:
 
     clean = _tree_of_head(arguments.folder / "clean")
     covered = measured_map(clean, arguments.folder / "coverage", arguments.jobs)
-    trees: Queue[Path] = Queue()
-    for job in range(arguments.jobs):
-        trees.put(_tree_of_head(arguments.folder / f"job-{job}"))
-
     done = {outcome.number for outcome in _rows_of(tables)}
     mutants = chosen_mutants(clean, arguments.seed, arguments.mutants)
+    waiting: Queue[Planted] = Queue()
+    for planted in mutants:
+        if planted.number not in done:
+            waiting.put(planted)
+    writing = Lock()
 
-    def work(planted: Planted) -> Outcome | None:
-        if time.monotonic() > ends_at_s:
-            return None
-        tree = trees.get()
-        try:
-            return try_mutant(planted, tree, covered)
-        finally:
-            trees.put(tree)
+    def work(job: int) -> None:
+        tree = _tree_of_head(arguments.folder / f"job-{job}")
+        with ForkServer(tree, environment_of(tree)) as server:
+            bench = Bench(tree, server, covered)
+            while time.monotonic() < ends_at_s:
+                try:
+                    planted = waiting.get_nowait()
+                except Empty:
+                    return
+                outcome = bench.try_mutant(planted)
+                with writing:
+                    _append(tables, outcome)
+                    print_line(
+                        f"{outcome.number:4d} {outcome.result:12s} "
+                        f"{outcome.file}:{outcome.line} {outcome.kind}"
+                    )
 
-    waiting = [planted for planted in mutants if planted.number not in done]
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        for finished in as_completed([pool.submit(work, planted) for planted in waiting]):
-            outcome = finished.result()
-            if outcome is not None:
-                _append(tables, outcome)
-                print_line(
-                    f"{outcome.number:4d} {outcome.result:12s} "
-                    f"{outcome.file}:{outcome.line} {outcome.kind}"
-                )
+        list(pool.map(work, range(arguments.jobs)))
     for line in summary(_rows_of(tables)):
         print_line(line)
     return 0

@@ -47,7 +47,6 @@ from drivers.profiles.profile import Axis
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import SdoAbort
 from drivers.stream.monitor import (
-    ABANDONED_S,
     QUIET_S,
     READING_S,
     AxisReading,
@@ -61,38 +60,12 @@ from ident.data.dataset import planned
 from ident.model.robot import Motion
 from ident.prediction import predict_current
 from tests.daq.console.feeds import facts, predicting_calibration
+from tests.drivers.quiet_bus import QuietBus, frame, overheard_cycle
 from tests.drivers.scripted import FakeClock
 
 CHECKOUT = Path(__file__).parents[3]
 CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
 ADDRESS = BusAddress("virtual", "monitored")
-
-
-class QuietBus(can.BusABC):
-    """A bus on which a test says what comes; waiting for a frame lets the clock's time pass."""
-
-    def __init__(self, clock: FakeClock) -> None:
-        self.clock = clock
-        self.sent: list[can.Message] = []
-        self.coming: list[tuple[int, can.Message]] = []
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Keep it."""
-        self.sent.append(msg)
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The next frame, if it comes in this time."""
-        until_ns = self.clock.now_ns + max(1, round((timeout or 0.0) * 1e9))
-        if self.coming and self.coming[0][0] <= until_ns:
-            at_ns, message = self.coming.pop(0)
-            self.clock.now_ns = max(self.clock.now_ns, at_ns)
-            return message
-        self.clock.now_ns = until_ns
-        return None
-
-    def shutdown(self) -> None:
-        """Nothing to close."""
-        self._is_shutdown = True
 
 
 @dataclass(frozen=True)
@@ -101,10 +74,6 @@ class Network:
 
     link: Link
     axes: tuple[Axis, ...]
-
-
-def _frame(identifier: int, data: bytes = b"") -> can.Message:
-    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
 
 
 @pytest.fixture
@@ -140,22 +109,13 @@ def _watch(
     )
 
 
-def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[int, can.Message]]:
-    frames = [(at_ns, _frame(0x80))]
-    for node in range(1, 7):
-        if node != silent:
-            data = struct.pack("<ihH", 1000 * node + cycle, -node, 0x1237)
-            frames.append((at_ns + 1000 * node, _frame(0x180 + node, data)))
-    return frames
-
-
 def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(
     bus: QuietBus,
 ) -> None:
     monitor = _monitor(bus)
     start = bus.clock.now_ns
     for cycle in range(500):
-        bus.coming += _answers(
+        bus.coming += overheard_cycle(
             start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle in (200, 201) else None
         )
     reading = monitor.watch(5.005)
@@ -176,46 +136,6 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(
     )
 
 
-def test_each_overheard_cycle_is_a_sample_and_a_gap_is_counted(bus: QuietBus) -> None:
-    samples: list[Sample] = []
-    monitor = _monitor(bus, samples)
-    monitor.period_ns = 10_000_000
-    start = bus.clock.now_ns
-    for cycle in (*range(20), *range(25, 40)):  # five SYNCs that this program missed
-        frames = _answers(
-            start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle == 30 else None
-        )
-        frames[0][1].timestamp = 1.7e9 + 0.01 * cycle
-        bus.coming += frames
-    monitor.watch(0.5)
-    # The last may still be answered
-    assert [sample.cycle for sample in samples] == [*range(20), *range(25, 39)]
-    assert [sample.cycle for sample in samples if sample.missing] == [30]
-    assert samples[25].missing == 0b100
-    for sample in samples:
-        position = [1000 * node + sample.cycle for node in range(1, 7)]
-        assert sample.missing or list(sample.position_counts) == position
-        assert sample.current_raw == (-1, -2, -3, -4, -5, -6)
-        assert sample.statusword == (0x1237,) * 6
-
-
-def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: QuietBus) -> None:
-    monitor = _monitor(bus)
-    monitor.watch(QUIET_S - 0.01)
-    assert bus.sent == []
-    reading = monitor.watch(9.5 * ABANDONED_S)
-    assert {message.arbitration_id for message in bus.sent} == {
-        0x600 + node for node in range(1, 7)
-    }
-    assert {message.data[0] for message in bus.sent} == {0x40}
-    assert reading.source is ReadingSource.ASKED
-    assert all(
-        8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0
-        for axis in reading.axes
-    )
-    assert not any(axis.heard for axis in reading.axes)
-
-
 def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every request is answered at once;
     still a reading is asked for ten times a second and no more.
@@ -229,7 +149,7 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.Monk
         nonlocal answered
         answered += 1
         reply = bytes((0x43, *msg.data[1:4])) + bytes(4)
-        bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        bus.coming.append((bus.clock.now_ns, frame(msg.arbitration_id - 0x80, reply)))
 
     monkeypatch.setattr(bus, "send", answer)
     reading = monitor.watch(5.0)
@@ -238,42 +158,6 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.Monk
     assert bus_loads_percent(CELL, reading)[0] < 6.0
     assert len(samples) == pytest.approx(5.0 / READING_S, rel=0.15)
     assert {sample.missing for sample in samples[5:]} == {0}
-
-
-@pytest.mark.parametrize("identifier", [0x000, 0x080, 0x601])
-def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) -> None:
-    monitor = _monitor(bus)
-    monitor.watch(QUIET_S + 0.1)
-    asked = len(bus.sent)
-    bus.coming.append((bus.clock.now_ns, _frame(identifier, bytes(8))))
-    assert monitor.watch(QUIET_S - 0.01).source is ReadingSource.OVERHEARD
-    assert len(bus.sent) <= asked + 6  # those that left before it spoke
-    asked = len(bus.sent)
-    monitor.watch(0.1)
-    assert len(bus.sent) == asked + 6
-
-
-def test_nothing_is_sent_once_a_recorder_has_the_bus(bus: QuietBus) -> None:
-    """It listens before its first frame, and would refuse to begin."""
-    held: list[bool] = []
-    monitor = CellMonitor(_link(bus), drive_axes(CELL), taken=lambda: bool(held))
-    monitor.watch(QUIET_S + 0.5)
-    asked = len(bus.sent)
-    assert asked > 0
-    held.append(True)
-    assert monitor.watch(1.0).source is ReadingSource.OVERHEARD
-    assert len(bus.sent) == asked
-
-
-def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
-    monitor = _monitor(bus)
-    monitor.watch(QUIET_S + 0.01)
-    other = bytes((0x43, 0x75, 0x60, 0)) + struct.pack("<I", 2000)
-    bus.coming.append((bus.clock.now_ns, _frame(0x581, other)))
-    assert monitor.watch(0.05).axes[0].position_counts is None
-    mine = bytes((0x43, 0x64, 0x60, 0)) + struct.pack("<i", -7)
-    bus.coming.append((bus.clock.now_ns, _frame(0x581, mine)))
-    assert monitor.watch(0.05).axes[0].position_counts == -7
 
 
 @settings(deadline=None)
@@ -477,15 +361,6 @@ def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
     assert json.loads(capsys.readouterr().out)["axes"][0]["remark"].startswith("answers after ")
 
 
-@pytest.mark.parametrize("identifier", [0x081, 0x181, 0x701])
-def test_a_node_that_only_sends_by_itself_is_not_silent(bus: QuietBus, identifier: int) -> None:
-    monitor = _monitor(bus)
-    monitor.watch(QUIET_S)
-    bus.coming.append((bus.clock.now_ns + 200_000_000, _frame(identifier, b"\x05")))
-    assert [axis.heard for axis in monitor.watch(1.5).axes] == [True, *[False] * 5]
-    assert not any(axis.heard for axis in monitor.watch(0.5).axes)  # longer ago than ABANDONED_S
-
-
 def _answering(
     bus: QuietBus,
     monkeypatch: pytest.MonkeyPatch,
@@ -500,7 +375,7 @@ def _answering(
         data = bytes(msg.data)
         reply = own(data) or bytes((0x43, *data[1:4])) + bytes(4)
         at_ns = bus.clock.now_ns + (slow or {}).get(msg.arbitration_id & 0x7F, 0)
-        bus.coming.append((at_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        bus.coming.append((at_ns, frame(msg.arbitration_id - 0x80, reply)))
         bus.coming.sort(key=lambda one: one[0])
 
     monkeypatch.setattr(bus, "send", answer)
@@ -584,10 +459,10 @@ def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
     start = bus.clock.now_ns
     for cycle in range(len(time_s)):
         at_ns = start + round((cycle + 1) * 1e9 / PREDICTED_HZ)
-        bus.coming.append((at_ns, _frame(0x80)))
+        bus.coming.append((at_ns, frame(0x80)))
         for node in range(1, 7):
             data = struct.pack("<ihH", counts[cycle, node - 1], raw[cycle, node - 1], 0x1237)
-            bus.coming.append((at_ns + 1000 * node, _frame(0x180 + node, data)))
+            bus.coming.append((at_ns + 1000 * node, frame(0x180 + node, data)))
     return run
 
 
@@ -672,7 +547,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         else:
             value = 0
         reply = bytes((0x43, *msg.data[1:4])) + value.to_bytes(4, "little")
-        bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        bus.coming.append((bus.clock.now_ns, frame(msg.arbitration_id - 0x80, reply)))
 
     monkeypatch.setattr(bus, "send", answer)
     feed = Feed(tmp_path / "cell.yaml", stop=None)
@@ -700,9 +575,9 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     ) in out.getvalue()
     # A console gets it too, however late it comes.
     assert [(event["axis"], event["code"]) for event in feed._events] == [(2, 0x7305)]
-    bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
+    bus.coming.append((bus.clock.now_ns, frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
     for node in range(1, 7):  # other events do not displace it
-        bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
+        bus.coming.append((bus.clock.now_ns, frame(0x700 + node, b"\x05")))
     (notice,) = (one for one in monitor_report(CELL, watch.read(0.5)).notices if one.alarm)
     assert notice.model_dump() == asdict(notice_of(EventKind.EMCY, 0x3210, "J2", notice.text))
     assert notice.text.startswith("EMCY 3210h") and notice.remedy == for_command_line(

@@ -7,8 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.profiles.cia402 import (
+    CONTROL_CHANGE_IMMEDIATELY,
+    CONTROL_NEW_SETPOINT,
+    ENABLED,
     FAULT_RESET_SEQUENCE,
+    FAULTY,
     POWERLESS,
+    STATUS_FAULT,
+    STATUS_FOLLOWING_ERROR,
+    STATUS_SETPOINT_ACKNOWLEDGE,
+    STATUS_TARGET_REACHED,
     ControlCommand,
     Goal,
     State,
@@ -110,3 +118,46 @@ def test_a_fault_reset_ends_without_power() -> None:
     assert state is State.SWITCH_ON_DISABLED
     # Otherwise there is no rising edge
     assert FAULT_RESET_SEQUENCE[0] & ControlCommand.FAULT_RESET == 0
+
+
+@pytest.mark.parametrize(
+    ("bit", "number"),
+    [
+        (STATUS_FAULT, 3),
+        (STATUS_TARGET_REACHED, 10),
+        (STATUS_SETPOINT_ACKNOWLEDGE, 12),
+        (STATUS_FOLLOWING_ERROR, 13),
+        (CONTROL_NEW_SETPOINT, 4),
+        (CONTROL_CHANGE_IMMEDIATELY, 5),
+    ],
+)
+def test_bits_stand_where_cia_402_puts_them(bit: int, number: int) -> None:
+    assert bit == 1 << number
+
+
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [
+        (ControlCommand.DISABLE_VOLTAGE, 0x00),
+        (ControlCommand.QUICK_STOP, 0x02),
+        (ControlCommand.SHUTDOWN, 0x06),
+        (ControlCommand.SWITCH_ON, 0x07),
+        (ControlCommand.DISABLE_OPERATION, 0x07),
+        (ControlCommand.ENABLE_OPERATION, 0x0F),
+        (ControlCommand.FAULT_RESET, 0x80),
+    ],
+)
+def test_commands_have_the_controlwords_of_cia_402(command: ControlCommand, word: int) -> None:
+    assert int(command) == word
+
+
+def test_a_state_is_named_in_the_words_of_the_standard() -> None:
+    assert str(State.SWITCH_ON_DISABLED) == "SWITCH ON DISABLED"
+    assert str(State.FAULT) == "FAULT"
+
+
+def test_a_drive_in_fault_reaction_or_quick_stop_still_has_torque() -> None:
+    with_torque = {State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE}
+    assert set(ENABLED) == with_torque
+    assert not with_torque & set(POWERLESS)
+    assert set(FAULTY) == {State.FAULT, State.FAULT_REACTION_ACTIVE}

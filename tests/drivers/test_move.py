@@ -124,3 +124,121 @@ def test_refusals_name_axis_found_and_allowed() -> None:
         assert all(word in str(refusal.value) for word in words)
     with pytest.raises(MotionRefused, match="names no operator"):
         check_moves((0,), (), MotionPermission(" ", room), ("J1",))
+
+
+# One axis from 10 to 34 units, at most 4 unit/s and 2 unit/s²: 2 s of ramp, 4 s of cruise, 2 s of
+# ramp, 8 s in all. By hand: 4 + 16 + 4 units.
+LONG_WAY = synchronised(np.array([10.0]), np.array([34.0]), np.array([4.0]), np.array([2.0]))
+
+
+def test_a_long_way_has_ramps_and_a_cruise_as_by_hand() -> None:
+    assert LONG_WAY.ramp_s == pytest.approx(2.0)
+    assert LONG_WAY.duration_s == pytest.approx(8.0)
+    assert LONG_WAY.velocity == pytest.approx([4.0])
+    assert LONG_WAY.acceleration == pytest.approx([2.0])
+
+
+@pytest.mark.parametrize(
+    ("time_s", "position", "velocity", "acceleration"),
+    [
+        (-1.0, 10.0, 0.0, 0.0),
+        (1.0, 11.0, 2.0, 2.0),
+        (2.0, 14.0, 4.0, 0.0),
+        (4.0, 22.0, 4.0, 0.0),
+        (6.0, 30.0, 4.0, 0.0),
+        (7.0, 33.0, 2.0, -2.0),
+        (8.0, 34.0, 0.0, 0.0),
+        (9.0, 34.0, 0.0, 0.0),
+    ],
+)
+def test_a_way_at_a_time_is_where_the_formulas_of_a_ramp_put_it(
+    time_s: float, position: float, velocity: float, acceleration: float
+) -> None:
+    found = LONG_WAY.at(np.array([time_s]))
+    assert [float(value[0, 0]) for value in found] == pytest.approx(
+        [position, velocity, acceleration], abs=1e-9
+    )
+
+
+def test_a_way_accelerates_from_its_first_instant() -> None:
+    _, velocity, acceleration = LONG_WAY.at(np.array([0.0]))
+    assert velocity[0, 0] == 0.0
+    assert acceleration[0, 0] == pytest.approx(2.0)
+
+
+def test_a_short_way_has_no_cruise() -> None:
+    # 2 units at 2 unit/s²: 1 s up to 2 unit/s, below the limit of 4, and 1 s down.
+    short = synchronised(np.array([0.0]), np.array([-2.0]), np.array([4.0]), np.array([2.0]))
+    assert short.duration_s == pytest.approx(2.0)
+    assert short.ramp_s == pytest.approx(1.0)
+    assert short.velocity == pytest.approx([-2.0])
+
+
+def test_a_way_without_distance_has_no_speed_and_no_acceleration() -> None:
+    still = Trapezoid(np.array([3.0, 4.0]), np.array([3.0, 4.0]), 0.0, 0.0)
+    assert still.velocity.tolist() == [0.0, 0.0]
+    assert still.acceleration.tolist() == [0.0, 0.0]
+
+
+def test_one_limit_of_zero_among_others_is_refused_with_all_of_them() -> None:
+    with pytest.raises(
+        ValueError, match=r"positive, found \(1.0, 1.0, 1.0\) and \(2.0, 0.0, 2.0\)"
+    ):
+        synchronised(np.zeros(3), np.ones(3), (1.0, 1.0, 1.0), (2.0, 0.0, 2.0))  # type: ignore[arg-type]
+
+
+def test_an_axis_that_stays_needs_no_time_and_gets_the_least_profile() -> None:
+    move = synchronised_move((7, 0), (7, 4000), (AxisLimits(-9999, 9999, 1001.0, 2001.0),) * 2)
+    assert move.velocity_counts_s == (1, 1000)
+    assert move.acceleration_counts_s2 == (1, 2000)
+    # 0.5 s up to 1000 counts/s over 250 counts, 3.5 s of cruise, 0.5 s down.
+    assert list(move.duration_s((7, 0))) == pytest.approx([0.0, 4.5])
+    assert move.dwell_cycles == 0
+
+
+def test_a_move_keeps_the_cycles_that_it_dwells() -> None:
+    room = (AxisLimits(-10, 10, 100.0, 100.0),)
+    assert synchronised_move((0,), (5,), room, 12).dwell_cycles == 12
+
+
+TWO = (AxisLimits(-10, 10, 100.0, 1000.0), AxisLimits(-20, 20, 50.0, 500.0))
+TWO_GRANTED = MotionPermission("test", TWO)
+
+
+def _refusal(start: tuple[int, ...], *moves: Move) -> str:
+    with pytest.raises(MotionRefused) as refusal:
+        check_moves(start, moves, TWO_GRANTED, ("J1", "J2"))
+    return str(refusal.value)
+
+
+def test_an_axis_behind_one_that_stays_is_checked() -> None:
+    text = _refusal((0, 0), Move((0, 5), (0, 51), (0, 500)))
+    assert text == "move 0: J2: velocity 51, allowed is above 0 up to 50"
+
+
+def test_limits_themselves_are_allowed() -> None:
+    check_moves((-10, 20), (Move((10, -20), (100, 50), (1000, 500)),), TWO_GRANTED, ("J1", "J2"))
+
+
+def test_a_later_move_starts_where_the_one_before_ends() -> None:
+    there = Move((5, 0), (100, 0), (1000, 0))
+    # J1 stays at 5 in the second move, so its profile of zeros is none.
+    check_moves((0, 0), (there, Move((5, 1), (0, 50), (0, 500))), TWO_GRANTED, ("J1", "J2"))
+    text = _refusal((0, 0), there, Move((0, 1), (0, 50), (0, 500)))
+    assert text == "move 1: J1: velocity 0, allowed is above 0 up to 100"
+
+
+def test_a_move_of_too_many_values_in_one_profile_is_refused_with_its_lengths() -> None:
+    text = _refusal((0, 0), Move((5, 5), (50, 50), (500, 500, 500)))
+    assert text == "move 0: has (2, 2, 3) values, the cell has 2 axes"
+
+
+def test_a_dwell_before_the_target_is_refused_and_none_is_not() -> None:
+    text = _refusal((0, 0), Move((5, 5), (50, 50), (500, 500), dwell_cycles=-1))
+    assert text == "move 0: dwells for -1 cycles"
+    check_moves((0, 0), (Move((5, 5), (50, 50), (500, 500), 0),), TWO_GRANTED, ("J1", "J2"))
+
+
+def test_a_permission_for_fewer_axes_than_the_cell_is_refused_with_both_numbers() -> None:
+    with pytest.raises(MotionRefused, match="limits for 2 axes, the cell has 3"):
+        check_moves((0, 0, 0), (), TWO_GRANTED, ("J1", "J2", "J3"))

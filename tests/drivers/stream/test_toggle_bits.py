@@ -77,3 +77,17 @@ def test_only_a_bit_that_is_the_makers_own_can_be_a_toggle_bit_and_it_needs_a_so
     )
     assert profile.toggle_bit == 14
     assert {fact.about for fact in profile.facts} >= {"toggle_bit", "save"}
+
+
+def test_the_second_axis_is_watched_while_the_first_is_missing_or_toggles() -> None:
+    profile = replace(PROFILE, toggle_bit=BIT, update_period_us=1000)
+    for missing in (0, 1):
+        bits = ToggleBits((Axis("J1", 1, profile), Axis("J2", 2, profile)))
+        found = []
+        for cycle in range(4):
+            words = (cycle % 2 << BIT, 1 << BIT)
+            found.append(list(bits.stale(cycle * PERIOD_NS, words, missing)))
+        (stale,) = found[2]
+        assert (stale[0], stale[1]) == (1, BIT)
+        assert "J2 (node 2): statusword bit 14 has not toggled for 2 cycles, 2 ms" in str(stale[2])
+        assert not [one for number in (0, 1, 3) for one in found[number]]
