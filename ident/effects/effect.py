@@ -333,7 +333,9 @@ class Effect(ABC):
 
 def sense_fault(sense: int) -> str:
     """What is wrong with a sense, for `Effect.settings_fault`; empty of 1 and −1."""
-    return "" if sense else "sense = 0; it is 1 or -1"
+    if sense:
+        return ""
+    return "sense = 0; it is 1 or -1"
 
 
 def setting_range(effect: Effect, setting: str) -> Range:
@@ -342,9 +344,7 @@ def setting_range(effect: Effect, setting: str) -> Range:
 
 
 def setting_kind(effect: Effect, setting: str) -> type:
-    """Return the type of a setting, as it is annotated:
-    int, or float for one that can be refined.
-    """
+    """Return the type of a setting, as annotated: int, or float for one that can be refined."""
     hint = get_type_hints(type(effect), include_extras=True)[setting]
     kind: type = get_args(hint)[0]
     return kind
@@ -352,18 +352,19 @@ def setting_kind(effect: Effect, setting: str) -> type:
 
 @cache
 def _ranges(kind: type[Effect]) -> dict[str, Range]:
-    hints = get_type_hints(kind, include_extras=True)
-    return {
-        name: part
-        for name, hint in hints.items()
-        for part in get_args(hint)[1:]
-        if isinstance(part, Range)
-    }
+    """Range of each setting, by its name: annotated as ``Annotated[float, Range(…)]``."""
+    ranges: dict[str, Range] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        for annotation in get_args(hint)[1:]:
+            if isinstance(annotation, Range):
+                ranges[name] = annotation
+    return ranges
 
 
 def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axes: int) -> None:
-    """Refuse settings that an effect cannot have on this axis:
-    a calibration written by hand may hold anything.
+    """Refuse settings that an effect cannot have on this axis.
+
+    A calibration written by hand may hold anything.
 
     Args:
         effect: any member of the family.
@@ -384,17 +385,20 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
     for setting, allowed in _ranges(type(effect)).items():
         value = settings[setting]
         if setting == effect.axis_setting:
-            if value not in range(1, axes + 1) or value == axis + 1:
+            number = axis + 1
+            is_axis = value in range(1, axes + 1)
+            if not is_axis or value == number:
                 raise EffectRefused(
-                    f"effect {name!r} on axis {axis + 1} is given {setting} = {value:g}; it is the "
+                    f"effect {name!r} on axis {number} is given {setting} = {value:g}; it is the "
                     f"number of another of the {axes} axes"
                 )
-        elif not allowed.least <= settings[setting] <= allowed.largest:
+        elif not allowed.least <= value <= allowed.largest:
             raise EffectRefused(
-                f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between "
+                f"effect {name!r} is given {setting} = {value:g}; it lies between "
                 f"{allowed.least:g} and {allowed.largest:g}"
             )
-    if fault := effect.with_settings(settings).settings_fault:
+    fault = effect.with_settings(settings).settings_fault
+    if fault:
         raise EffectRefused(f"effect {name!r} is given {fault}")
 
 
@@ -403,44 +407,46 @@ ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 
 @dataclass(frozen=True, slots=True)
 class PlacedEffect:
-    """An effect on an axis (index from 0), or on a joint without a motor:
-    those follow the axes (`Robot.places`).
-    """
+    """An effect on an axis, or on a joint without a motor."""
 
     effect: Effect
-    axis: int
+    axis: int  #: index; joints without a motor follow the axes (`Robot.places`)
 
     def axis_name(self, axes: Sequence[str]) -> str:
-        """Name of its axis; what acts on every axis alike is placed on the first one for order
-        only: ALL_AXES.
+        """Name of its axis; ALL_AXES of what acts on every axis alike.
+
+        That is placed on the first axis for order only.
         """
-        return axes[self.axis] if self.effect.has_axis else ALL_AXES
+        if not self.effect.has_axis:
+            return ALL_AXES
+        return axes[self.axis]
 
     def name_among(self, axes: Sequence[str]) -> str:
         """Name of effect and place: `load-friction on J3`, `coupling on J4 with J5`."""
+        name = f"{self.effect.name} on {self.axis_name(axes)}"
         other = self.effect.second_axis
-        return (f"{self.effect.name} on {self.axis_name(axes)}") + (
-            f" with {axes[other - 1]}" if other else ""
-        )
+        if other:
+            name += f" with {axes[other - 1]}"
+        return name
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Linear parameters named after effect, axis and settings,
-        because an axis may have cogging of two orders.
+        """Linear parameters named after effect, axis and settings.
+
+        An axis may have cogging of two orders.
         """
-        name = self.effect.name
-        number = self.axis + 1
-        given = {
-            key: value
-            for key, value in self.effect.settings.items()
-            if value or key not in self.effect.added_settings
-        }
-        settings = ", ".join(f"{key} {value:.6g}" for key, value in given.items())
-        suffix = f" ({settings})" if settings else ""
-        return tuple(
-            replace(column, name=f"{name} {column.name} {number}{suffix}")
-            for column in self.effect.coefficients
-        )
+        settings: list[str] = []
+        for setting, value in self.effect.settings.items():
+            if value or setting not in self.effect.added_settings:
+                settings.append(f"{setting} {value:.6g}")
+        suffix = f"{self.axis + 1}"
+        if settings:
+            suffix = f"{suffix} ({', '.join(settings)})"
+        columns: list[Column] = []
+        for coefficient in self.effect.coefficients:
+            name = f"{self.effect.name} {coefficient.name} {suffix}"
+            columns.append(replace(coefficient, name=name))
+        return tuple(columns)
 
 
 def effect_torque(
@@ -451,12 +457,12 @@ def effect_torque(
     conditioning: Conditioning,
     model: Model,
 ) -> FloatArray:
-    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m, p,
-    r).
+    """An effect's columns as joint torques on the observation's rows, shape (m, p, r).
+
+    In Nm per unit of each coefficient.
     """
-    return at_joints(
-        effect, axis, effect_columns(effect, axis, runs, datasets, conditioning), model.drive_train
-    )
+    columns = effect_columns(effect, axis, runs, datasets, conditioning)
+    return at_joints(effect, axis, columns, model.drive_train)
 
 
 def effect_columns(
@@ -466,13 +472,15 @@ def effect_columns(
     datasets: Sequence[Dataset],
     conditioning: Conditioning,
 ) -> FloatArray:
-    """An effect's columns where it is placed, on the observation's rows, shape (p, r) or (joints,
-    p, r).
+    """An effect's columns where it is placed, on the observation's rows.
+
+    Returns:
+        shape (p, r) or (joints, p, r).
     """
-    parts = [
-        decimate_rows(data, conditioning, columns_at(effect, run, axis))
-        for run, data in zip(runs, datasets, strict=True)
-    ]
+    parts: list[FloatArray] = []
+    for run, data in zip(runs, datasets, strict=True):
+        columns = columns_at(effect, run, axis)
+        parts.append(decimate_rows(data, conditioning, columns))
     return np.concatenate(parts, axis=-1)
 
 
@@ -482,8 +490,9 @@ def is_shipped(effect: Effect) -> bool:
 
 
 def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
-    """Columns of an effect where it is placed;
-    on a joint without a motor, as torques of all axes, (m, p, k).
+    """Columns of an effect where it is placed.
+
+    On a joint without a motor they are torques of all axes, shape (m, p, k).
 
     Raises:
         EffectRefused: an effect of one's own fails, or returns columns of another shape or a number
@@ -496,7 +505,8 @@ def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
         columns = _own_columns(effect, signals, axis, count)
     if axis < count:
         return columns
-    return np.asarray(signals.leverage[axis - count][:, None] * columns)
+    leverage = signals.leverage[axis - count]
+    return np.asarray(leverage[:, None] * columns)
 
 
 def fits_data(effect: Effect, runs: Sequence[Signals], axis: int) -> bool:
@@ -521,8 +531,9 @@ _SHAPES = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}
 
 
 def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> FloatArray:
-    """Columns of an effect of one's own; refused where it fails,
-    their shape is wrong or a number is not finite.
+    """Columns of an effect of one's own; refused where it fails, or they have no use.
+
+    Their shape must be right and their numbers finite.
     """
     try:
         found = np.asarray(effect.columns(signals, axis), dtype=np.float64)
@@ -552,13 +563,15 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
 def at_joints(
     effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain
 ) -> FloatArray:
-    """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all axes,
-    shape (m, p, k).
+    """Convert an effect's columns to torques of all axes.
+
+    They have the shape (p, k) or (joints, p, k), and (m, p, k) then.
     """
     if axis >= len(drive_train.ratio):
         return columns
     if effect.side is GearSide.MOTOR:
-        return np.asarray(drive_train.direction[axis][:, None, None] * columns[None])
+        direction = drive_train.direction[axis]
+        return np.asarray(direction[:, None, None] * columns[None])
     if effect.side is GearSide.ALL_JOINTS:
         return columns
     if effect.side is GearSide.ALL_MOTORS:
@@ -572,9 +585,7 @@ def at_joints(
 
 
 def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
-    """Whether an effect can act on an axis;
-    an effect of two joints is placed on the one with the lower number.
-    """
+    """Whether an effect can act on an axis; one of two joints is placed on the lower number."""
     if effect.with_motor != (axis < robot.axis_count):
         return False
     if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:

@@ -106,9 +106,7 @@ class ZeroOffset(GeometryEffect):
         return ZeroOffset(applied_rad=float(offset))
 
     def correct_robot(self, robot: Robot, axis: int) -> Robot:
-        """Turn or shift the frame of the joint, so that its recorded position means what it
-        should.
-        """
+        """Turn or shift the frame of the joint, so that its recorded position is right."""
         zero = GeometryParameter(GeometryKind.ZERO, robot.axes[axis].name)
         return with_geometry(robot, (GeometryChange(zero, self.applied_rad),))
 
@@ -124,8 +122,7 @@ class ZeroOffset(GeometryEffect):
 
 @dataclass(frozen=True, slots=True)
 class GravityDirection(GeometryEffect):
-    """τ = a ∂τ/∂α + b ∂τ/∂β on all joints:
-    gravity is turned about two axes across the declared one.
+    """τ = a ∂τ/∂α + b ∂τ/∂β on all joints: gravity turned about two axes across the declared one.
 
     Source: torque is linear in the vector of gravity. Its length is known; two angles are its
     direction, so a mounting that is tilted shows in two columns. Signature: torque at rest on many
@@ -145,16 +142,15 @@ class GravityDirection(GeometryEffect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """The components of the turn."""
-        return tuple(
-            Column(
-                f"turn {number}",
-                "rad",
-                least=-LARGEST_TILT_RAD,
-                largest=LARGEST_TILT_RAD,
-                about=applied,
+        coefficients: list[Column] = []
+        for number, applied in enumerate(self.applied, start=1):
+            name = f"turn {number}"
+            coefficients.append(
+                Column(
+                    name, "rad", least=-LARGEST_TILT_RAD, largest=LARGEST_TILT_RAD, about=applied
+                )
             )
-            for number, applied in enumerate(self.applied, start=1)
-        )
+        return tuple(coefficients)
 
     @property
     def applied(self) -> tuple[float, ...]:
@@ -234,9 +230,7 @@ class LatePosition(GeometryEffect):
         return LatePosition(applied_s=float(delay_s))
 
     def correct_dataset(self, data: Dataset, axis: int) -> Dataset:
-        """Advance one joint's position and its derivatives;
-        what the filter has smoothed is interpolated.
-        """
+        """Advance one joint's position and its derivatives, between filtered samples."""
         steps = self.applied_s * data.rate_hz
 
         def advanced(values: FloatArray) -> FloatArray:
@@ -245,7 +239,8 @@ class LatePosition(GeometryEffect):
             return moved
 
         def advanced_mask(mask: BoolArray) -> BoolArray:
-            source = np.clip(np.arange(len(mask)) + round(steps), 0, len(mask) - 1)
+            later = np.arange(len(mask)) + round(steps)
+            source = np.clip(later, 0, len(mask) - 1)
             moved = mask.copy()
             moved[:, axis] = mask[source, axis]
             return moved
@@ -264,10 +259,9 @@ class LatePosition(GeometryEffect):
         arm = require_arm(signals)
         motion = arm.motion
         jerk = np.gradient(motion.acceleration_rad_s2[:, axis]) * signals.rate_hz
-        position, velocity, acceleration = (
-            state.copy()
-            for state in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
-        )
+        position = motion.position_rad.copy()
+        velocity = motion.velocity_rad_s.copy()
+        acceleration = motion.acceleration_rad_s2.copy()
         position[:, axis] += TIME_STEP_S * motion.velocity_rad_s[:, axis]
         velocity[:, axis] += TIME_STEP_S * motion.acceleration_rad_s2[:, axis]
         acceleration[:, axis] += TIME_STEP_S * jerk
@@ -294,9 +288,7 @@ def corrected_model(model: Model, effects: Iterable[PlacedEffect]) -> Model:
 
 
 def corrected_dataset(data: Dataset, effects: Iterable[PlacedEffect]) -> Dataset:
-    """A run with the applied part of all corrections among these effects;
-    one that was planned has nothing wrong.
-    """
+    """A run with the applied part of all corrections; one that was planned has nothing wrong."""
     if data.is_planned:
         return data
     for placed in effects:
@@ -325,40 +317,36 @@ def across(gravity_m_s2: FloatArray) -> tuple[FloatArray, FloatArray]:
     x and −y.
     """
     along = gravity_m_s2 / np.linalg.norm(gravity_m_s2)
-    other = np.eye(3)[int(np.argmin(np.abs(along)))]
+    least_along = int(np.argmin(np.abs(along)))
+    other = np.eye(3)[least_along]
     first = other - along * float(along @ other)
     first /= np.linalg.norm(first)
     return first, np.cross(first, along)
 
 
 def turned_gravity(declared_m_s2: FloatArray, turn_rad: Sequence[float]) -> FloatArray:
-    """Gravity turned by the two components of a turn about the axes of `across` [m/s²],
-    shape (3,).
-    """
+    """Gravity turned by a turn's two components about the axes of `across` [m/s²], shape (3,)."""
     first, second = across(declared_m_s2)
-    return rotation_by(turn_rad[0] * first + turn_rad[1] * second) @ declared_m_s2
+    turn_vector_rad = turn_rad[0] * first + turn_rad[1] * second
+    return rotation_by(turn_vector_rad) @ declared_m_s2
 
 
 def turned_gravity_std(
     declared_m_s2: FloatArray, turned_m_s2: FloatArray, deviations_rad: Sequence[float]
 ) -> FloatArray:
-    """σ of each component of gravity, from those of the two components of its turn [m/s²],
-    shape (3,).
+    """σ of each component of gravity, from those of its turn's two components [m/s²], (3,).
 
     To first order a small further turn t about an axis moves gravity by t × g; the two σ may
     differ, because the moves may show one of the turns alone.
     """
-    changes = [
-        deviation * np.cross(axis, turned_m_s2)
-        for axis, deviation in zip(across(declared_m_s2), deviations_rad, strict=True)
-    ]
+    changes: list[FloatArray] = []
+    for axis, std_rad in zip(across(declared_m_s2), deviations_rad, strict=True):
+        changes.append(std_rad * np.cross(axis, turned_m_s2))
     return np.asarray(np.linalg.norm(changes, axis=0))
 
 
 def turn_between(declared_m_s2: FloatArray, found_m_s2: FloatArray) -> FloatArray:
-    """The two components of the turn from one direction of gravity to another,
-    as of `turned_gravity`, shape (2,).
-    """
+    """Components of the turn between two directions of gravity (`turned_gravity`), shape (2,)."""
     axis = np.cross(declared_m_s2, found_m_s2)
     sine = float(np.linalg.norm(axis))
     if sine == 0.0:
@@ -373,13 +361,17 @@ def rotation_by(vector_rad: FloatArray) -> FloatArray:
     angle = float(np.linalg.norm(vector_rad))
     if angle == 0.0:
         return np.eye(3)
+    # I + sin φ [u]× + (1 − cos φ) [u]×²
     cross = skew(vector_rad / angle)
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+    along_circle = np.sin(angle) * cross
+    to_centre = (1.0 - np.cos(angle)) * cross @ cross
+    return np.asarray(np.eye(3) + along_circle + to_centre)
 
 
 def shifted(values: FloatArray, steps: float) -> FloatArray:
-    """Values so many samples later, by Lagrange's cubic between four neighbours, shape (k,);
-    the ends stay constant.
+    """Values so many samples later, by Lagrange's cubic between four neighbours, shape (k,).
+
+    The ends stay constant.
     """
     whole = int(np.floor(steps))
     part = steps - whole
@@ -389,8 +381,10 @@ def shifted(values: FloatArray, steps: float) -> FloatArray:
         -(part + 1.0) * part * (part - 2.0) / 2.0,
         (part + 1.0) * part * (part - 1.0) / 6.0,
     )
-    at = np.arange(len(values)) + whole
+    last = len(values) - 1
+    later = np.arange(len(values)) + whole
     out = np.zeros_like(values)
     for offset, weight in enumerate(weights, start=-1):
-        out += weight * values[np.clip(at + offset, 0, len(values) - 1)]
+        neighbours = np.clip(later + offset, 0, last)
+        out += weight * values[neighbours]
     return out

@@ -1,7 +1,6 @@
-"""Effects of one's own: subclasses of `Effect` in other packages,
-found by an entry point or given as an argument.
+"""Effects of one's own: found by an entry point of other packages, or given as an argument.
 
-A package registers its effects in its `pyproject.toml`::
+They are subclasses of `Effect`. A package registers its effects in its `pyproject.toml`::
 
     [project.entry-points."drivegain.effects"]
     eccentric-friction = "my_effects:EFFECTS"
@@ -23,11 +22,10 @@ from importlib.metadata import (
     packages_distributions,
     version,
 )
-from itertools import chain
 
 import numpy as np
 
-from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED
+from ident.effects.dictionary import EFFECTS, GEOMETRY, UNNAMED, Family
 from ident.effects.effect import Effect, GearSide, Reported, is_shipped, setting_kind, setting_range
 from ident.errors import EffectRefused
 
@@ -35,13 +33,8 @@ ENTRY_POINT_GROUP = "drivegain.effects"
 ROTOR_SETTINGS = ("rotor_inertia_kg_m2", "with_rotor")  #: Of an effect with a rotor's form
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 
-Family = tuple[Effect, ...]
-"""Effects of one name, with the values of its searched parameters that a search tries."""
-
-SHIPPED = {
-    effect.name: effect
-    for effect in chain((family[0] for family in (*EFFECTS, *GEOMETRY)), UNNAMED)
-}
+_FIRST_MEMBERS = [family[0] for family in (*EFFECTS, *GEOMETRY)]
+SHIPPED = {effect.name: effect for effect in (*_FIRST_MEMBERS, *UNNAMED)}
 """One member of each family of the dictionary, by its name."""
 
 
@@ -54,8 +47,7 @@ class InstalledFamily:
 
 
 def search_families(own_effects: Sequence[Effect] = ()) -> tuple[Family, ...]:
-    """Return the families that a search tries:
-    the dictionary, those of installed packages, and one's own.
+    """Return the families that a search tries: shipped, installed and one's own.
 
     Args:
         own_effects: given as an argument; they take the place of installed ones of the same name.
@@ -65,8 +57,11 @@ def search_families(own_effects: Sequence[Effect] = ()) -> tuple[Family, ...]:
             `families_of`).
     """
     given = families_of(own_effects, "`own_effects`")
-    names = {family[0].name for family in given}
-    installed = (one.family for name, one in installed_families().items() if name not in names)
+    given_names = {family[0].name for family in given}
+    installed: list[Family] = []
+    for name, family_of_package in installed_families().items():
+        if name not in given_names:
+            installed.append(family_of_package.family)
     return (*EFFECTS, *installed, *given)
 
 
@@ -86,7 +81,9 @@ def known_effect(name: str, own_effects: Sequence[Effect] = ()) -> Effect | None
         if effect.name == name:
             return effect
     installed = installed_families().get(name)
-    return None if installed is None else installed.family[0]
+    if installed is None:
+        return None
+    return installed.family[0]
 
 
 def known_names() -> tuple[str, ...]:
@@ -103,17 +100,17 @@ def installed_families() -> dict[str, InstalledFamily]:
             of one name.
     """
     found: dict[str, InstalledFamily] = {}
-    for point in sorted(
-        entry_points(group=ENTRY_POINT_GROUP), key=lambda one: (one.name, one.value)
-    ):
+    points = entry_points(group=ENTRY_POINT_GROUP)
+    for point in sorted(points, key=lambda one: (one.name, one.value)):
         package = _package_of_entry(point)
         where = f"entry point {point.name!r} of package {package!r}"
         for family in families_of(_loaded(point, where), where):
             name = family[0].name
             if name in found:
+                other = found[name].package
                 raise EffectRefused(
-                    f"{where}: found effect {name!r}, which package {found[name].package!r} has, "
-                    "too; expected one package for each effect; remove one of the packages"
+                    f"{where}: found effect {name!r}, which package {other!r} has, too; expected "
+                    "one package for each effect; remove one of the packages"
                 )
             found[name] = InstalledFamily(family, package)
     return found
@@ -219,13 +216,13 @@ def _loaded(point: EntryPoint, where: str) -> Iterable[object]:
         raise EffectRefused(
             f"{where}: found {found}; expected an effect; repair or remove the package"
         ) from error
-    return loaded if isinstance(loaded, list | tuple) else (loaded,)
+    if isinstance(loaded, list | tuple):
+        return loaded
+    return (loaded,)
 
 
 def _with_plain_settings(effect: Effect) -> Effect:
-    """Return an effect with settings of numpy as numbers of Python,
-    which a calibration reads back.
-    """
+    """Return an effect with settings of numpy as Python's numbers, as a calibration has them."""
     plain: dict[str, float] = {}
     for setting, value in effect.settings.items():
         if isinstance(value, np.floating | np.integer):
@@ -255,67 +252,85 @@ def _check(effect: Effect, where: str) -> None:
     kept = set(effect.settings)
     lost = [field.name for field in fields(effect) if field.name not in kept]
     if lost:
+        lost_names = ", ".join(lost)
         raise EffectRefused(
-            f"{where}: found fields of effect {name!r} without a range: {', '.join(lost)}; "
+            f"{where}: found fields of effect {name!r} without a range: {lost_names}; "
             "expected each as `Annotated[float, ident.Range(least, largest)]`: a calibration keeps "
             "these alone"
         )
-    if effect.side is GearSide.TWO_JOINTS and effect.axis_setting not in kept:
+    axis_setting = effect.axis_setting
+    if effect.side is GearSide.TWO_JOINTS and axis_setting not in kept:
         raise EffectRefused(
             f"{where}: found effect {name!r} on two joints without a setting "
-            f"`{effect.axis_setting}`; expected the number of the second one: "
-            f"`{effect.axis_setting}: Annotated[int, ident.Range(0, 12)] = 0`"
+            f"`{axis_setting}`; expected the number of the second one: "
+            f"`{axis_setting}: Annotated[int, ident.Range(0, 12)] = 0`"
         )
     _check_properties(effect, where)
+    _check_settings(effect, where)
+    _check_coefficients(effect, where)
+
+
+def _check_settings(effect: Effect, where: str) -> None:
+    """Refuse an effect with a setting of another type than annotated, or outside its range."""
+    name = effect.name
     for setting, value in effect.settings.items():
         kind = setting_kind(effect, setting)
+        kind_name = kind.__name__
         if type(value) is not kind:
             raise EffectRefused(
                 f"{where}: found {setting} = {value!r} in effect {name!r}; expected a value of "
-                f"type {kind.__name__}, as it is annotated; write {kind.__name__}({value!r})"
+                f"type {kind_name}, as it is annotated; write {kind_name}({value!r})"
             )
         allowed = setting_range(effect, setting)
         if not allowed.least <= value <= allowed.largest:
+            expected = f"a value from {allowed.least:g} to {allowed.largest:g}"
             raise EffectRefused(
-                f"{where}: found {setting} = {value:g} in effect {name!r}; expected a value from "
-                f"{allowed.least:g} to {allowed.largest:g}, as its range says; correct one of both"
+                f"{where}: found {setting} = {value:g} in effect {name!r}; expected {expected}, "
+                "as its range says; correct one of both"
             )
+
+
+def _check_coefficients(effect: Effect, where: str) -> None:
+    """Refuse an effect without coefficients, or with names that a parameter cannot have."""
     coefficients = [column.name for column in effect.coefficients]
+    found = f"{where}: found coefficients {coefficients} of effect {effect.name!r}"
     if len(set(coefficients)) < len(coefficients):
-        raise EffectRefused(
-            f"{where}: found coefficients {coefficients} of effect {name!r}; expected a name for "
-            "each"
-        )
-    unfit = [column.name for column in effect.coefficients if ":" in column.name or not column.name]
-    if unfit or not effect.coefficients:
-        raise EffectRefused(
-            f"{where}: found coefficients {[column.name for column in effect.coefficients]} of "
-            f"effect {name!r}; expected at least one, with a name without a colon"
-        )
+        raise EffectRefused(f"{found}; expected a name for each")
+    is_unfit = any(":" in name or not name for name in coefficients)
+    if is_unfit or not coefficients:
+        raise EffectRefused(f"{found}; expected at least one, with a name without a colon")
 
 
 def _check_properties(effect: Effect, where: str) -> None:
     """Refuse an effect whose properties name settings that it does not have."""
+    axis_settings: tuple[str, ...] = ()
+    if effect.axis_setting:
+        axis_settings = (effect.axis_setting,)
+    rotor_settings: tuple[str, ...] = ()
+    if effect.has_rotor_form:
+        rotor_settings = ROTOR_SETTINGS
     named = {
         "refined": effect.refined_once_chosen,
-        "axis_setting": (effect.axis_setting,) if effect.axis_setting else (),
+        "axis_setting": axis_settings,
         "form_settings": effect.form_settings,
         "key_settings": effect.key_settings,
         "added_settings": effect.added_settings,
         "nearly_declared": tuple(effect.nearly_declared),
-        "has_rotor_form": ROTOR_SETTINGS if effect.has_rotor_form else (),
+        "has_rotor_form": rotor_settings,
     }
     settings = sorted(effect.settings)
+    expected = ", ".join(settings) or "it has none"
     for given, names in named.items():
-        unknown = sorted(set(names) - set(settings))
+        unknown = ", ".join(sorted(set(names) - set(settings)))
         if unknown:
             raise EffectRefused(
-                f"{where}: found {', '.join(unknown)} in `{given}` of effect {effect.name!r}; "
-                f"expected names among its settings: {', '.join(settings) or 'it has none'}"
+                f"{where}: found {unknown} in `{given}` of effect {effect.name!r}; "
+                f"expected names among its settings: {expected}"
             )
-    if effect.reported is Reported.AMPLITUDE and len(effect.coefficients) != 2:
+    coefficient_count = len(effect.coefficients)
+    if effect.reported is Reported.AMPLITUDE and coefficient_count != 2:
         raise EffectRefused(
-            f"{where}: found {len(effect.coefficients)} coefficients of effect {effect.name!r}, "
+            f"{where}: found {coefficient_count} coefficients of effect {effect.name!r}, "
             "which reports give as one amplitude; expected two, of a cosine and a sine; leave "
             "`reported` out"
         )

@@ -1,10 +1,8 @@
-"""Signals that an effect may depend on:
-motion, predicted load and predicted current, at full rate.
-"""
+"""Signals that an effect may depend on: motion, predicted load and current, at full rate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from itertools import pairwise
@@ -70,66 +68,64 @@ class Arm:
     _kept: dict[str, FloatArray] = field(default_factory=dict, init=False, repr=False)
 
     def load_change(self, motion: Motion) -> FloatArray:
-        """Torque for links and payload of another motion, less that of this one [Nm or N],
-        shape (m, k).
-        """
+        """Change of the torque for links and payload with another motion [Nm or N], (m, k)."""
         if "load" not in self._kept:
             self._kept["load"] = self._load(self.motion)
         return self._load(motion) - self._kept["load"]
 
     def load_derivatives(self, axis: int, samples: IntArray) -> tuple[FloatArray, FloatArray]:
-        """∂τ/∂q_j and ∂τ/∂q̇_j of the torque for links and payload at some samples, shape (m, s)
-        each.
+        """∂τ/∂q_j and ∂τ/∂q̇_j of the torque for links and payload, shape (m, s) each.
 
         Args:
             axis: joint j.
             samples: at which they are computed, the same at every call.
         """
-        names = (f"position {axis}", f"velocity {axis}")
-        if names[0] not in self._kept:
+        by_position = f"position {axis}"
+        by_velocity = f"velocity {axis}"
+        if by_position not in self._kept:
             motion = Motion(
                 self.motion.position_rad[samples],
                 self.motion.velocity_rad_s[samples],
                 self.motion.acceleration_rad_s2[samples],
             )
-            load = self._load(motion)
             position = motion.position_rad.copy()
             position[:, axis] += TWIST_RAD
             velocity = motion.velocity_rad_s.copy()
             velocity[:, axis] += TWIST_RAD_S
-            self._kept[names[0]] = (
-                self._load(replace(motion, position_rad=position)) - load
-            ) / TWIST_RAD
-            self._kept[names[1]] = (
-                self._load(replace(motion, velocity_rad_s=velocity)) - load
-            ) / TWIST_RAD_S
-        return self._kept[names[0]], self._kept[names[1]]
+            load = self._load(motion)
+            load_turned = self._load(replace(motion, position_rad=position))
+            load_faster = self._load(replace(motion, velocity_rad_s=velocity))
+            self._kept[by_position] = (load_turned - load) / TWIST_RAD
+            self._kept[by_velocity] = (load_faster - load) / TWIST_RAD_S
+        return self._kept[by_position], self._kept[by_velocity]
 
     def smooth_torque_change(self, motion: Motion) -> FloatArray:
-        """Whole torque of another motion without dry friction, less that of this one [Nm or N],
-        shape (m, k).
-        """
+        """Change of the torque without dry friction with another motion [Nm or N], (m, k)."""
         if "smooth" not in self._kept:
             self._kept["smooth"] = self._smooth_torque(self.motion)
         return self._smooth_torque(motion) - self._kept["smooth"]
 
     def _load(self, motion: Motion) -> FloatArray:
-        return self.model.torques(motion, self.standard)[0]
+        load, _, _ = self.model.torques(motion, self.standard)
+        return load
 
     def _smooth_torque(self, motion: Motion) -> FloatArray:
         smooth = self.standard.copy()
         smooth[self.model.dry_friction_columns] = 0.0
-        smooth[JOINT_COLUMNS * self.model.robot.joint_count + 2 :: 3] = 0.0
-        return self.model.torques(motion, smooth)[2]
+        # Three columns for each coupled motor: its dry friction is the last one.
+        first_dry_of_motor = JOINT_COLUMNS * self.model.robot.joint_count + 2
+        smooth[first_dry_of_motor::3] = 0.0
+        _, _, total = self.model.torques(motion, smooth)
+        return total
 
     def weight(self, gravity_m_s2: FloatArray) -> FloatArray:
-        """Torque that carries links and payload in some gravity, at rest [Nm or N], shape (m,
-        k).
-        """
+        """Torque that carries links and payload in some gravity, at rest [Nm or N], (m, k)."""
         robot = replace(self.model.robot, gravity_m_s2=gravity_m_s2)
+        model = replace(self.model, robot=robot)
         still = np.zeros_like(self.motion.position_rad)
         at_rest = Motion(self.motion.position_rad, still, still)
-        return replace(self.model, robot=robot).torques(at_rest, self.standard)[0]
+        load, _, _ = model.torques(at_rest, self.standard)
+        return load
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,56 +195,75 @@ class Signals:
         return self._without_rotor(self.load_torque_nm, axis)
 
     def gear_torque(self, axis: int) -> FloatArray:
-        """Torque through the gear of an axis, load and friction, less that of a known rotor [Nm],
-        shape (k,).
-        """
+        """Load and friction through the gear of an axis, less a known rotor's [Nm], (k,)."""
         return self._without_rotor(self.geared_torque_nm, axis)
 
     def _without_rotor(self, torque_nm: FloatArray, axis: int) -> FloatArray:
         inertia_kg_m2 = self.rotor_inertia(axis)
         if not inertia_kg_m2:
             return np.asarray(torque_nm[axis])
-        return np.asarray(torque_nm[axis] - inertia_kg_m2 * self.acceleration_rad_s2[axis])
+        rotor_nm = inertia_kg_m2 * self.acceleration_rad_s2[axis]
+        return np.asarray(torque_nm[axis] - rotor_nm)
 
     def inertia(self, joints: int | slice, axis: int) -> FloatArray:
-        """Torque at joints per unit of acceleration of the joint `axis` along the run, shape (…,
-        k).
+        """Torque at joints per unit of acceleration of the joint `axis`, shape (…, k).
 
         It is interpolated between postures, because it changes slowly. A known rotor is left out.
         """
         of_axis = self.inertia_kg_m2[:, axis].copy()
         of_axis[axis] -= self.rotor_inertia(axis)
-        coarse = of_axis[joints]
-        at = _postures(len(self.time_s), coarse.shape[-1])
-        step = np.diff(at)
-        # The last sample is a posture, too
-        following = step + (np.arange(len(step)) == len(step) - 1)
-        out = np.repeat(np.diff(coarse, axis=-1) / step, following, axis=-1)
-        out *= np.arange(len(self.time_s)) - np.repeat(at[:-1], following)
-        out += np.repeat(coarse[..., :-1], following, axis=-1)
+        in_postures = of_axis[joints]
+        sample_count = len(self.time_s)
+        postures = _postures(sample_count, in_postures.shape[-1])
+        step = np.diff(postures)
+        # Samples from each posture on; the last sample is a posture, too
+        samples = step.copy()
+        samples[-1:] += 1
+        slope = np.diff(in_postures, axis=-1) / step
+        since_posture = np.arange(sample_count) - np.repeat(postures[:-1], samples)
+        out = np.repeat(slope, samples, axis=-1)
+        out *= since_posture
+        out += np.repeat(in_postures[..., :-1], samples, axis=-1)
         return np.asarray(out)
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
-        """Return a variable of an axis along the run, shape (k,);
-        `other` is the second axis of OTHER_VELOCITY.
+        """Return a variable of an axis along the run, shape (k,).
+
+        Args:
+            abscissa: the variable.
+            axis: the axis.
+            other: second axis, of OTHER_VELOCITY; the same one when None.
         """
-        choices: dict[Abscissa, Callable[[], FloatArray]] = {
-            Abscissa.VELOCITY: lambda: self.velocity_rad_s[axis],
-            Abscissa.POSITION: lambda: self.position_rad[axis],
-            Abscissa.LOAD: lambda: self.link_torque(axis),
-            Abscissa.TIME: lambda: self.time_s,
-            Abscissa.SESSION: lambda: self.session_s,
-            Abscissa.MOTOR_ANGLE: lambda: np.mod(self.motor_position_rad[axis], 2.0 * np.pi),
-            Abscissa.CURRENT: lambda: self.current_a[axis],
-            Abscissa.TORQUE_RATE: lambda: np.gradient(self.motor_torque_nm[axis]) * self.rate_hz,
-            Abscissa.LOAD_CURVATURE: lambda: curvature(self.link_torque(axis), self.rate_hz),
-            Abscissa.DISTANCE: lambda: distance_since_reversal(
-                self.velocity_rad_s[axis], self.rate_hz
-            )[1],
-            Abscissa.TEMPERATURE: lambda: self.temperature(axis),
-            Abscissa.OTHER_VELOCITY: lambda: self.velocity_rad_s[axis if other is None else other],
-        }
-        return np.asarray(choices[abscissa](), dtype=np.float64)
+        if abscissa is Abscissa.OTHER_VELOCITY and other is not None:
+            axis = other
+        return np.asarray(self._variable(abscissa, axis), dtype=np.float64)
+
+    def _variable(self, abscissa: Abscissa, axis: int) -> FloatArray:
+        variable: FloatArray
+        match abscissa:
+            case Abscissa.VELOCITY | Abscissa.OTHER_VELOCITY:
+                variable = self.velocity_rad_s[axis]
+            case Abscissa.POSITION:
+                variable = self.position_rad[axis]
+            case Abscissa.LOAD:
+                variable = self.link_torque(axis)
+            case Abscissa.TIME:
+                variable = self.time_s
+            case Abscissa.SESSION:
+                variable = self.session_s
+            case Abscissa.MOTOR_ANGLE:
+                variable = np.mod(self.motor_position_rad[axis], 2.0 * np.pi)
+            case Abscissa.CURRENT:
+                variable = self.current_a[axis]
+            case Abscissa.TORQUE_RATE:
+                variable = np.gradient(self.motor_torque_nm[axis]) * self.rate_hz
+            case Abscissa.LOAD_CURVATURE:
+                variable = curvature(self.link_torque(axis), self.rate_hz)
+            case Abscissa.DISTANCE:
+                _, variable = distance_since_reversal(self.velocity_rad_s[axis], self.rate_hz)
+            case Abscissa.TEMPERATURE:
+                variable = self.temperature(axis)
+        return variable
 
 
 def fitted_signals(
@@ -260,8 +275,7 @@ def fitted_signals(
     *,
     inertia: bool = True,
 ) -> Signals:
-    """Predict a run's torques with the declared part of an estimate;
-    coefficients of effects are left out.
+    """Predict a run's torques with the declared part of an estimate, without its effects.
 
     The observation, rows of the fit, names the base parameters; for the last two see
     `declared_signals`.
@@ -269,22 +283,28 @@ def fitted_signals(
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
     standard[independent] = estimate.parameters[: len(independent)]
-    identified: dict[str, float] = {}
-    first = len(observation.columns)
-    for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
-        if data.payload is not None and other.mounting == data.payload.mounting:
-            values = estimate.parameters[first : first + len(indices)]
-            identified = {
-                LINK_PARAMETERS[index]: float(value)
-                for index, value in zip(indices, values, strict=True)
-            }
-        first += len(indices)
-    if data.payload is None:
-        body = None
-    else:
+    body: FloatArray | None = None
+    if data.payload is not None:
+        identified = _identified_parameters(data.payload, observation, estimate)
         body = payload_parameters(data.payload, identified)
     standard = model.with_payload(standard, body)
     return declared_signals(model, data, standard, estimate.gains, session_began_s, inertia=inertia)
+
+
+def _identified_parameters(
+    payload: Payload, observation: Observation, estimate: Estimate
+) -> dict[str, float]:
+    """Parameters of a payload that an estimate has in its mounting, by their names."""
+    identified: dict[str, float] = {}
+    first = len(observation.columns)
+    for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
+        last = first + len(indices)
+        if other.mounting == payload.mounting:
+            values = estimate.parameters[first:last]
+            names = [LINK_PARAMETERS[index] for index in indices]
+            identified = dict(zip(names, values.tolist(), strict=True))
+        first = last
+    return identified
 
 
 def declared_signals(
@@ -323,60 +343,75 @@ def declared_signals(
         velocity = placed.velocity_rad_s
         acceleration = placed.acceleration_rad_s2
         leverage = model.leverage(followed)
-    motor = model.drive_train.to_motor @ total
-    if data.started_s is None or session_began_s is None:
-        began = None
-    else:
-        began = data.started_s - session_began_s
+    motor_torque = model.drive_train.to_motor @ total
+    motor_position = model.drive_train.ratio @ data.position_rad.T
+    time_s = data.time_s - data.time_s[0]
+    began_s = 0.0
+    if data.started_s is not None and session_began_s is not None:
+        began_s = max(0.0, data.started_s - session_began_s)
+    joint_count = len(load)
+    mass_matrix = np.empty((joint_count, joint_count, 0))
+    if inertia:
+        mass_matrix = _inertia_of_joints(model, data, standard)
+    temperature_c = data.temperature_c
+    if temperature_c is not None:
+        temperature_c = temperature_c.T
     return Signals(
         rate_hz=data.rate_hz,
-        time_s=data.time_s - data.time_s[0],
-        session_s=data.time_s - data.time_s[0] + (0.0 if began is None else max(0.0, began)),
+        time_s=time_s,
+        session_s=time_s + began_s,
         position_rad=position.T,
         velocity_rad_s=velocity.T,
         acceleration_rad_s2=acceleration.T,
-        motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
-        inertia_kg_m2=_inertia_of_joints(model, data, standard)
-        if inertia
-        else np.empty((len(load), len(load), 0)),
+        motor_position_rad=motor_position,
+        inertia_kg_m2=mass_matrix,
         load_torque_nm=load,
         geared_torque_nm=geared,
-        motor_torque_nm=motor,
-        current_a=motor / gains[:, None],
-        temperature_c=None if data.temperature_c is None else data.temperature_c.T,
+        motor_torque_nm=motor_torque,
+        current_a=motor_torque / gains[:, None],
+        temperature_c=temperature_c,
         leverage=leverage,
         arm=Arm(model, standard, motion),
     )
 
 
 def session_began_s(datasets: Sequence[Dataset]) -> float | None:
-    """Return the start of the earliest run, None if one of them has no clock,
-    or if they have no common one.
+    """Return the start of the earliest run; None if the runs have no common clock.
 
     Clocks that start with a run, or with a controller, show it: by them two runs of the robot
     overlap, or one is since 1970 and another is not.
     """
-    spans_s = sorted(
-        (data.started_s, data.time_s[-1] - data.time_s[0])
-        for data in datasets
-        if data.started_s is not None
-    )
-    if not spans_s or len(spans_s) < len(datasets):
+    spans_s: list[tuple[float, float]] = []
+    for data in datasets:
+        if data.started_s is None:
+            return None
+        length_s = data.time_s[-1] - data.time_s[0]
+        spans_s.append((data.started_s, length_s))
+    if not spans_s:
         return None
-    first_s = spans_s[0][0]
-    last_s = spans_s[-1][0]
-    overlap = any(
-        start_s + length_s > next_s for (start_s, length_s), (next_s, _) in pairwise(spans_s)
-    )
-    # By the time of day, runs of a simulated cell may overlap: it moves faster than time.
-    common = not overlap if last_s < UNIX_S else first_s >= UNIX_S
-    return first_s if common else None
+    spans_s.sort()
+    first_s, _ = spans_s[0]
+    last_s, _ = spans_s[-1]
+    if last_s >= UNIX_S:
+        # By the time of day, runs of a simulated cell may overlap: it moves faster than time.
+        has_common_clock = first_s >= UNIX_S
+    else:
+        has_common_clock = not _overlap(spans_s)
+    if not has_common_clock:
+        return None
+    return first_s
+
+
+def _overlap(spans_s: Sequence[tuple[float, float]]) -> bool:
+    """Whether one of some spans, (start, length) in order, goes on when the next begins."""
+    for (start_s, length_s), (next_s, _) in pairwise(spans_s):
+        if start_s + length_s > next_s:
+            return True
+    return False
 
 
 def watched_s(runs: Sequence[Signals], *, whole_session: bool) -> float:
-    """How long an effect that fades in time was watched [s]:
-    over the session, or over the longest run.
-    """
+    """How long an effect that fades was watched: over the session, or the longest run [s]."""
     if not whole_session:
         return float(max(run.time_s[-1] for run in runs))
     began_s = min(run.session_s[0] for run in runs)
@@ -387,40 +422,49 @@ def watched_s(runs: Sequence[Signals], *, whole_session: bool) -> float:
 def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
     """Mass matrix of links and payload in some postures, shape (m, m, postures)."""
     samples = len(data.position_rad)
-    postures = _postures(samples, max(2, samples // POSTURE_SAMPLES))
+    count = max(2, samples // POSTURE_SAMPLES)
+    postures = _postures(samples, count)
     return model.inertia(data.position_rad[postures], standard)
 
 
 def _postures(samples: int, count: int) -> IntArray:
     """Index of so many samples spread evenly over a run."""
-    return np.linspace(0, samples - 1, count).round().astype(np.int64)
+    places = np.linspace(0, samples - 1, count)
+    return places.round().astype(np.int64)
 
 
 def payload_parameters(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
-    """Return χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,);
-    zeros without payload.
+    """Return χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,).
 
-    Unknown parameters that are not identifiable in the data are missing in `identified`, and zero.
+    They are zero without payload. Unknown parameters that are not identifiable in the data are
+    missing in `identified`, and zero.
     """
-    values = {} if payload is None else {**payload.known, **identified}
+    values: dict[str, float] = {}
+    if payload is not None:
+        values = {**payload.known, **identified}
     return np.array([values.get(name, 0.0) for name in LINK_PARAMETERS])
 
 
 def curvature(value: FloatArray, rate_hz: float) -> FloatArray:
     """Second derivative in time by central differences, shape (k,)."""
-    return np.asarray(np.gradient(np.gradient(value)) * rate_hz**2)
+    rate = np.gradient(value)
+    return np.asarray(np.gradient(rate) * rate_hz**2)
 
 
 def distance_since_reversal(
     velocity_rad_s: FloatArray, rate_hz: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Direction of the last motion (−1, 0 before any, 1) and the distance moved in it [rad],
-    both of shape (k,).
+    """Direction of the last motion and the distance moved in it [rad], shape (k,) each.
+
+    The direction is 1 or −1, and 0 before any motion.
     """
-    moving = np.abs(velocity_rad_s) > STICKING_RAD_S
-    way = np.cumsum(np.abs(velocity_rad_s) * moving) / rate_hz
-    last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))
-    direction = np.where(last >= 0, np.sign(velocity_rad_s[last]), 0.0)
-    turned = np.diff(direction, prepend=direction[:1]) != 0
-    start = np.maximum.accumulate(np.where(turned, np.arange(len(moving)), 0))
-    return direction, way - way[start]
+    samples = np.arange(len(velocity_rad_s))
+    speed = np.abs(velocity_rad_s)
+    is_moving = speed > STICKING_RAD_S
+    way_rad = np.cumsum(speed * is_moving) / rate_hz
+    last_moving = np.maximum.accumulate(np.where(is_moving, samples, -1))
+    last_direction = np.sign(velocity_rad_s[last_moving])
+    direction = np.where(last_moving >= 0, last_direction, 0.0)
+    has_turned = np.diff(direction, prepend=direction[:1]) != 0
+    last_turn = np.maximum.accumulate(np.where(has_turned, samples, 0))
+    return direction, way_rad - way_rad[last_turn]

@@ -1,5 +1,4 @@
-"""How far a joint stands behind its motor where the gear between them is not rigid,
-and what the gear then passes.
+"""How far a joint stands behind its motor where their gear is not rigid, and what that passes.
 
 Joint j lags its motor by the twist δ, so that τ(q − δ, q̇ − δ̇, q̈ − δ̈) moves links and payload.
 To first order in δ that is −M_ij δ̈ on each joint i, M the mass matrix, and D_i(δ), what the twist
@@ -55,12 +54,11 @@ class DrivenLink:
     @property
     def pushed_nm(self) -> FloatArray:
         """Torque that a rigid gear passes, shape (k,); zero where friction holds the link."""
-        held = np.clip(self.torque_nm, -self.dry_nm, self.dry_nm)
-        direction = np.sign(self.speed_rad_s)
+        held_nm = np.clip(self.torque_nm, -self.dry_nm, self.dry_nm)
+        at_rest_nm = self.torque_nm - held_nm
+        moving_nm = self.torque_nm + self.dry_nm * np.sign(self.speed_rad_s)
         is_moving = np.abs(self.speed_rad_s) > STICKING_RAD_S
-        return np.asarray(
-            np.where(is_moving, self.torque_nm + self.dry_nm * direction, self.torque_nm - held)
-        )
+        return np.asarray(np.where(is_moving, moving_nm, at_rest_nm))
 
 
 def link_of(signals: Signals, axis: int, *, held: bool) -> DrivenLink:
@@ -84,7 +82,8 @@ def link_of(signals: Signals, axis: int, *, held: bool) -> DrivenLink:
     # At rest there is no friction in the prediction; in slow motion there is hardly any but the dry
     # one.
     at_rest = float(np.min(friction[is_moving]))
-    return DrivenLink(signals.rate_hz, inertia, load, speed, np.where(is_moving, friction, at_rest))
+    dry = np.where(is_moving, friction, at_rest)
+    return DrivenLink(signals.rate_hz, inertia, load, speed, dry)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,10 +126,12 @@ def twists(link: DrivenLink, gears: Gears) -> Twists:
     bend = np.empty_like(twist)
     for one, of_spring in zip(bend, twist, strict=True):
         one[:] = curvature(of_spring, link.rate_hz)
-    side = np.sign(np.where(pushed == 0.0, link.torque_nm, pushed))
-    twist += gears.half_gap_rad[:, None] * side
-    around = Twists(twist, bend, pushed - inertia * bend)
-    windows = _windows(link, pushed, has_gap=bool(np.any(gears.half_gap_rad > 0.0)))
+    pressing = np.where(pushed == 0.0, link.torque_nm, pushed)
+    twist += gears.half_gap_rad[:, None] * np.sign(pressing)
+    passed = pushed - inertia * bend
+    around = Twists(twist, bend, passed)
+    has_gap = bool(np.any(gears.half_gap_rad > 0.0))
+    windows = _windows(link, pushed, has_gap=has_gap)
     if windows is not None:
         _follow(link, inertia, gears, around, windows)
     return around
@@ -140,14 +141,14 @@ def _bent_springs(
     pushed_nm: FloatArray, inertia_kg_m2: FloatArray, rate_hz: float, gears: Gears
 ) -> FloatArray:
     """Twist of each gear's spring alone, shape (g, k)."""
-    found: dict[float, FloatArray] = {}
-    for compliance in gears.compliance_rad_nm.tolist():
-        if compliance not in found:
-            passed = spring_torque(
-                pushed_nm, inertia_kg_m2, rate_hz, compliance, gears.damping_ratio
-            )
-            found[compliance] = compliance * passed
-    return np.stack([found[compliance] for compliance in gears.compliance_rad_nm.tolist()])
+    compliances = gears.compliance_rad_nm.tolist()
+    damping = gears.damping_ratio
+    twists_rad: dict[float, FloatArray] = {}
+    for compliance in compliances:
+        if compliance not in twists_rad:
+            passed_nm = spring_torque(pushed_nm, inertia_kg_m2, rate_hz, compliance, damping)
+            twists_rad[compliance] = compliance * passed_nm
+    return np.stack([twists_rad[compliance] for compliance in compliances])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,30 +163,38 @@ def _windows(link: DrivenLink, pushed_nm: FloatArray, *, has_gap: bool) -> Windo
     """Stretches in which the gear is more than a spring; None without any."""
     settle = round(SETTLED_S * link.rate_hz)
     lead = round(LEAD_S * link.rate_hz)
-    side = np.sign(pushed_nm)
-    turns = np.diff(side) != 0
-    if not has_gap:
+    longest_hold = round(LONGEST_HOLD_S * link.rate_hz)
+    if has_gap:
+        side = np.sign(pushed_nm)
+        is_turn = np.diff(side) != 0
+    else:
         # Without a gap only friction does more than a spring: where the motor turns, and where the
         # link is held.
-        moving = np.where(np.abs(link.speed_rad_s) > STICKING_RAD_S, np.sign(link.speed_rad_s), 0.0)
-        turns = (np.diff(moving) != 0) & (link.dry_nm[:-1] > 0.0)
-    events = np.flatnonzero(turns | _short_holds(link, round(LONGEST_HOLD_S * link.rate_hz))[:-1])
-    events = events[(events > lead) & (events < len(pushed_nm) - 2)]
+        is_moving = np.abs(link.speed_rad_s) > STICKING_RAD_S
+        direction = np.where(is_moving, np.sign(link.speed_rad_s), 0.0)
+        has_friction = link.dry_nm > 0.0
+        is_turn = (np.diff(direction) != 0) & has_friction[:-1]
+    is_held = _short_holds(link, longest_hold)
+    events = np.flatnonzero(is_turn | is_held[:-1])
+    last_sample = len(pushed_nm) - 2
+    events = events[(events > lead) & (events < last_sample)]
     if not len(events):
         return None
-    apart = np.flatnonzero(np.diff(events) > settle + lead) + 1
-    begin = events[np.concatenate(([0], apart))] - lead
-    last = events[np.concatenate((apart - 1, [len(events) - 1]))]
-    end = np.minimum(last + settle, len(pushed_nm) - 2)
-    order = np.argsort(begin - end)
-    return Windows(begin[order], (end - begin)[order])
+    # Events whose windows overlap are in one.
+    gaps = np.flatnonzero(np.diff(events) > settle + lead)
+    first_events = np.concatenate(([0], gaps + 1))
+    last_events = np.concatenate((gaps, [len(events) - 1]))
+    begin = events[first_events] - lead
+    end = np.minimum(events[last_events] + settle, last_sample)
+    length = end - begin
+    order = np.argsort(-length)
+    return Windows(begin[order], length[order])
 
 
 def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
-    """Samples of the times at rest in which friction holds the link and that last at most so long,
-    shape (k,).
-    """
-    is_held = (np.abs(link.speed_rad_s) <= STICKING_RAD_S) & (link.dry_nm > 0.0)
+    """Whether friction holds the link at rest, for at most so many samples, shape (k,)."""
+    is_at_rest = np.abs(link.speed_rad_s) <= STICKING_RAD_S
+    is_held = is_at_rest & (link.dry_nm > 0.0)
     edges = np.flatnonzero(np.diff(is_held, prepend=False, append=False))
     for first, end in edges.reshape(-1, 2).tolist():
         if end - first > longest:
@@ -196,24 +205,23 @@ def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
 def _follow(
     link: DrivenLink, inertia_kg_m2: FloatArray, gears: Gears, around: Twists, windows: Windows
 ) -> None:
-    """Integrate the link in the windows, and write it over what was known around them:
-    these are the largest arrays of a search, and there is no second copy of them.
+    """Integrate the link in the windows, and write it over what was known around them.
+
+    These are the largest arrays of a search, and there is no second copy of them.
     """
     rate_hz = link.rate_hz
-    # A flank too stiff for the steps is as good as one that they resolve.
-    stiffest = 1.0 / (np.min(inertia_kg_m2) * (2.0 * STEP_RAD * MOST_STEPS * rate_hz) ** 2)
-    gap = gears.half_gap_rad[:, None]
-    compliance = np.maximum(gears.compliance_rad_nm, stiffest)[:, None]
-    fastest_rad_s = 1.0 / float(np.sqrt(np.min(inertia_kg_m2) * np.min(compliance)))
-    steps = min(MOST_STEPS, int(np.ceil(fastest_rad_s / rate_hz / STEP_RAD)))
-    step_s = 1.0 / (steps * rate_hz)
-    has_friction = bool(np.any(link.dry_nm > 0.0))
-    begin = windows.begin
-    twist = around.twist_rad[:, begin]
-    rate = (around.twist_rad[:, begin + 1] - around.twist_rad[:, begin - 1]) * (0.5 * rate_hz)
     twisted = around.twist_rad
     bent = around.acceleration_rad_s2
     passed = around.passed_nm
+    gap = gears.half_gap_rad[:, None]
+    resolved, steps = _resolved(gears.compliance_rad_nm, float(np.min(inertia_kg_m2)), rate_hz)
+    compliance = resolved[:, None]
+    step_s = 1.0 / (steps * rate_hz)
+    has_friction = bool(np.any(link.dry_nm > 0.0))
+    begin = windows.begin
+    twist = twisted[:, begin]
+    around_begin = twisted[:, begin + 1] - twisted[:, begin - 1]
+    rate = around_begin * (0.5 * rate_hz)
     # Means from one sample to the next lie half a sample late: each sample gets that of the means
     # on its two sides.
     bend_before = np.zeros_like(rate)
@@ -245,12 +253,29 @@ def _follow(
             delta += step_s * speed
         mean_bend = (speed - speed_before) * rate_hz
         mean_flank = flanks / steps
-        bent[:, at] = mean_bend if sample == 0 else 0.5 * (bend_before[:, :running] + mean_bend)
-        passed[:, at] = (
-            mean_flank if sample == 0 else 0.5 * (flank_before[:, :running] + mean_flank)
-        )
+        if sample == 0:
+            bent[:, at] = mean_bend
+            passed[:, at] = mean_flank
+        else:
+            bent[:, at] = 0.5 * (bend_before[:, :running] + mean_bend)
+            passed[:, at] = 0.5 * (flank_before[:, :running] + mean_flank)
         bend_before = mean_bend
         flank_before = mean_flank
+
+
+def _resolved(
+    compliance_rad_nm: FloatArray, least_inertia_kg_m2: float, rate_hz: float
+) -> tuple[FloatArray, int]:
+    """Compliances that the steps resolve, and how many steps of a sample they take.
+
+    A flank too stiff for the steps is as good as one that they resolve: ω² = 1/(c M).
+    """
+    largest_rad_s = 2.0 * STEP_RAD * MOST_STEPS * rate_hz
+    stiffest = 1.0 / (least_inertia_kg_m2 * largest_rad_s**2)
+    compliance = np.maximum(compliance_rad_nm, stiffest)
+    fastest_rad_s = 1.0 / float(np.sqrt(least_inertia_kg_m2 * np.min(compliance)))
+    needed = int(np.ceil(fastest_rad_s / rate_hz / STEP_RAD))
+    return compliance, min(MOST_STEPS, needed)
 
 
 def _flank(
@@ -260,14 +285,15 @@ def _flank(
     compliance_rad_nm: FloatArray,
     damping_nm_s_rad: FloatArray,
 ) -> FloatArray:
-    """What a spring passes; of a gear with a gap, what a flank does:
-    nothing in the gap, and it never pulls.
-    """
-    pressed = twist_rad - np.clip(twist_rad, -half_gap_rad, half_gap_rad)
-    spring = pressed / compliance_rad_nm + damping_nm_s_rad * rate_rad_s
-    pushing = np.where(pressed > 0.0, np.maximum(spring, 0.0), np.minimum(spring, 0.0))
-    in_touch = np.where(pressed == 0.0, 0.0, pushing)
-    return np.asarray(np.where(half_gap_rad > 0.0, in_touch, spring))
+    """What a spring passes; with a gap, what a flank does: nothing in it, and it never pulls."""
+    within_gap_rad = np.clip(twist_rad, -half_gap_rad, half_gap_rad)
+    pressed_rad = twist_rad - within_gap_rad
+    spring_nm = pressed_rad / compliance_rad_nm + damping_nm_s_rad * rate_rad_s
+    forward_nm = np.maximum(spring_nm, 0.0)
+    backward_nm = np.minimum(spring_nm, 0.0)
+    pushing_nm = np.where(pressed_rad > 0.0, forward_nm, backward_nm)
+    flank_nm = np.where(pressed_rad == 0.0, 0.0, pushing_nm)
+    return np.asarray(np.where(half_gap_rad > 0.0, flank_nm, spring_nm))
 
 
 def torque_of_twist(signals: Signals, axis: int, twist_rad: FloatArray) -> FloatArray:
@@ -281,11 +307,11 @@ def torque_of_twist(signals: Signals, axis: int, twist_rad: FloatArray) -> Float
     if signals.arm is None:
         return np.zeros_like(signals.load_torque_nm)
     count = len(twist_rad)
+    samples = np.arange(count)
     every = max(1, round(POSTURE_S * signals.rate_hz))
-    postures = np.unique(np.append(np.arange(0, count, every), count - 1))
+    postures = np.unique(np.append(samples[::every], count - 1))
     by_position, by_velocity = signals.arm.load_derivatives(axis, postures)
     rate_rad_s = np.gradient(twist_rad) * signals.rate_hz
-    samples = np.arange(count)
     added = np.empty_like(signals.load_torque_nm)
     for joint in range(len(added)):
         stiffness = np.interp(samples, postures, by_position[joint])
@@ -301,8 +327,7 @@ def spring_torque(
     compliance_rad_nm: float,
     damping_ratio: float,
 ) -> FloatArray:
-    """Torque y that a spring passes to a link, (ÿ + 2ζω ẏ)/ω² + y = τ with ω² = 1/(c M),
-    shape (k,).
+    """Torque y that a spring passes: (ÿ + 2ζω ẏ)/ω² + y = τ with ω² = 1/(c M), shape (k,).
 
     By the trapezoidal rule, which is stable at any rate, with its steps stretched to keep the mean
     resonance. It starts at rest. A compliance of 0 or a link without inertia passes τ.
@@ -317,16 +342,28 @@ def spring_torque(
     mean = float(np.mean(inertia_kg_m2))
     if not mean * compliance_rad_nm > 0.0:
         return torque_nm
-    mean_rad_s = min(1.0 / float(np.sqrt(mean * compliance_rad_nm)), RESOLVED * np.pi * rate_hz)
-    steps_hz = mean_rad_s / (2.0 * np.tan(mean_rad_s / (2.0 * rate_hz)))
-    square = mean_rad_s**2 * mean / np.maximum(inertia_kg_m2[1:-1], LEAST_SHARE * mean)
-    damping, quarter = damping_ratio * np.sqrt(square) * steps_hz, square / 4.0
+    resonance_rad_s = 1.0 / float(np.sqrt(mean * compliance_rad_nm))
+    fastest_rad_s = RESOLVED * np.pi * rate_hz
+    mean_rad_s = min(resonance_rad_s, fastest_rad_s)
+    # Steps of 1/h with tan(ω/(2 rate)) = ω/(2 h)
+    half_step = mean_rad_s / (2.0 * rate_hz)
+    steps_hz = mean_rad_s / (2.0 * np.tan(half_step))
+    inertia = np.maximum(inertia_kg_m2[1:-1], LEAST_SHARE * mean)
+    square = mean_rad_s**2 * mean / inertia
+    # (h² + ζωh + ω²/4) y_k + (ω²/2 − 2 h²) y_k−1 + (h² − ζωh + ω²/4) y_k−2
+    #     = ω²/4 (τ_k + 2 τ_k−1 + τ_k−2)
+    damping = damping_ratio * np.sqrt(square) * steps_hz
+    quarter = square / 4.0
     last = steps_hz**2 + damping + quarter
     # y_k, y_k−1 and y_k−2 in each row: a triangular system with two bands.
     band = np.ones((3, len(torque_nm)), order="F")
+    before = 2.0 * quarter - 2.0 * steps_hz**2
+    two_before = steps_hz**2 - damping + quarter
     band[1, 0] = 0.0
-    band[1, 1:-1] = (2.0 * quarter - 2.0 * steps_hz**2) / last
-    band[2, :-2] = (steps_hz**2 - damping + quarter) / last
+    band[1, 1:-1] = before / last
+    band[2, :-2] = two_before / last
+    smoothed_nm = torque_nm[2:] + 2.0 * torque_nm[1:-1] + torque_nm[:-2]
     driven = torque_nm.copy()
-    driven[2:] = quarter / last * (torque_nm[2:] + 2.0 * torque_nm[1:-1] + torque_nm[:-2])
-    return np.asarray(lapack.dtbtrs(band, driven[:, None], uplo="L", diag="U")[0][:, 0])
+    driven[2:] = quarter / last * smoothed_nm
+    solution, _ = lapack.dtbtrs(band, driven[:, None], uplo="L", diag="U")
+    return np.asarray(solution[:, 0])

@@ -5,6 +5,7 @@ They fit structure that no named effect explains.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -17,14 +18,10 @@ from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
 INTERVALS = 6
-"""Intervals that the variable's range is divided into;
-cubic B-splines over them have three more coefficients.
-"""
+"""Intervals of the variable's range; cubic B-splines over them have three more coefficients."""
 MOTOR_VARIABLES = frozenset({Abscissa.CURRENT, Abscissa.TORQUE_RATE})
 FOLDED = frozenset({Abscissa.VELOCITY, Abscissa.OTHER_VELOCITY})
-"""Variables taken by magnitude: dry friction jumps at zero,
-and no smooth function of v follows a jump.
-"""
+"""Variables taken by magnitude: no smooth function of v follows dry friction's jump at zero."""
 LINEAR_IN_MODEL = frozenset({(Abscissa.VELOCITY, 1), (Abscissa.LOAD, 0), (Abscissa.CURRENT, 0)})
 """Variable and `signed` of p · x that is declared: viscous friction, and a change of the gain."""
 PERIODIC_ORDERS = (1, 2, 3, 4, 6)
@@ -86,42 +83,57 @@ class Smooth(Effect):
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """One linear parameter a combination."""
-        return tuple(
-            Column(f"part {number}", "Nm") for number in range(1, self._combinations().shape[1] + 1)
-        )
+        count = self._combinations().shape[1]
+        return tuple(Column(f"part {number}", "Nm") for number in range(1, count + 1))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (p, k)."""
-        x = signals.variable(self.variable, axis, self.other_axis - 1 if self.other_axis else None)
-        sign = np.sign(x if self.variable in FOLDED else signals.velocity_rad_s[axis])
-        basis = self.shapes(np.abs(x) if self.variable in FOLDED else x)
-        return np.asarray(basis * sign if self.signed else basis)
+        other_axis: int | None = None
+        if self.other_axis:
+            other_axis = self.other_axis - 1
+        x = signals.variable(self.variable, axis, other_axis)
+        turning = signals.velocity_rad_s[axis]
+        if self.variable in FOLDED:
+            turning = x
+            x = np.abs(x)
+        columns = self.shapes(x)
+        if self.signed:
+            columns = columns * np.sign(turning)
+        return columns
 
     def shapes(self, x: FloatArray) -> FloatArray:
         """Functions S_k at values of x, of a velocity its magnitude, shape (p, k)."""
-        return np.asarray(self._combinations().T @ cubic_basis(x, self.lower, self.upper))
+        basis = cubic_basis(x, self.lower, self.upper)
+        return np.asarray(self._combinations().T @ basis)
 
     def _combinations(self) -> FloatArray:
-        """Weights of the B-splines in each S_k, shape (INTERVALS + 3, p),
-        orthogonal to those of the declared terms.
+        """Weights of the B-splines in each S_k, shape (INTERVALS + 3, p).
 
-        The B-splines' weights of a constant are all one, those of x itself rise evenly (Greville).
+        They are orthogonal to those of the declared terms. The weights of a constant are all one,
+        those of x itself rise evenly (Greville).
         """
         if self.variable is Abscissa.OTHER_VELOCITY and self.signed:
             # Dry friction of another joint is not declared on this one
             return np.eye(INTERVALS + 3)
+        powers = 1
         if (self.variable, self.signed) in LINEAR_IN_MODEL:
             powers = 2
-        else:
-            powers = 1
         declared = np.vander(np.arange(INTERVALS + 3.0), powers)
-        return np.asarray(np.linalg.qr(declared, mode="complete")[0][:, powers:])
+        complete, _ = np.linalg.qr(declared, mode="complete")
+        return np.asarray(complete[:, powers:])
+
+
+def _waves() -> Iterator[Column]:
+    for order in PERIODIC_ORDERS:
+        yield Column(f"cosine {order}", "Nm")
+        yield Column(f"sine {order}", "Nm")
 
 
 @dataclass(frozen=True, slots=True)
 class Periodic(Effect):
-    """τ = Σ a_k cos kθ + b_k sin kθ, θ the motor's angle, k in PERIODIC_ORDERS;
-    times sign(q̇) where `signed`.
+    """τ = Σ a_k cos kθ + b_k sin kθ, θ the motor's angle, k in PERIODIC_ORDERS.
+
+    It is multiplied by sign(q̇) where `signed`.
 
     Source: Fourier series of any torque, or friction, that repeats with the motor.
     """
@@ -130,25 +142,29 @@ class Periodic(Effect):
     side = GearSide.MOTOR
     declares = Property.PERIODIC_IN_MOTOR_ANGLE
     abscissa = Abscissa.MOTOR_ANGLE
-    coefficients = tuple(
-        Column(f"{part} {order}", "Nm") for order in PERIODIC_ORDERS for part in ("cosine", "sine")
-    )
+    coefficients = tuple(_waves())
 
     signed: Switch = 0  #: 1 where it turns with the direction of motion, else 0
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2 · orders, k)."""
         waves = self.shapes(signals.motor_position_rad[axis])
-        return np.asarray(waves * np.sign(signals.velocity_rad_s[axis]) if self.signed else waves)
+        if self.signed:
+            waves = waves * np.sign(signals.velocity_rad_s[axis])
+        return waves
 
     def shapes(self, x: FloatArray) -> FloatArray:
         """Functions cos kθ and sin kθ at values x of θ [rad], shape (p, k)."""
-        return np.stack([wave for order in PERIODIC_ORDERS for wave in cos_sin(order * x)])
+        waves: list[FloatArray] = []
+        for order in PERIODIC_ORDERS:
+            waves += cos_sin(order * x)
+        return np.stack(waves)
 
 
 def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:
     """Uniform cubic B-splines, shape (INTERVALS + 3, k); they sum to one."""
-    place = np.clip((x - lower) / (upper - lower), 0.0, 1.0) * INTERVALS
+    share = np.clip((x - lower) / (upper - lower), 0.0, 1.0)
+    place = share * INTERVALS
     interval = np.minimum(place.astype(np.int64), INTERVALS - 1)
     u = place - interval
     parts = (
@@ -157,9 +173,11 @@ def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:
         -3.0 * u**3 + 3.0 * u**2 + 3.0 * u + 1.0,
         u**3,
     )
-    basis = np.zeros((INTERVALS + 3, len(x)))
+    count = len(x)
+    samples = np.arange(count)
+    basis = np.zeros((INTERVALS + 3, count))
     for offset, part in enumerate(parts):
-        basis[interval + offset, np.arange(len(x))] = part / 6.0
+        basis[interval + offset, samples] = part / 6.0
     return basis
 
 

@@ -1,6 +1,4 @@
-"""Compare the estimators, their filters and their scaling,
-and find the essential parameters (paper §4.2).
-"""
+"""Comparison of estimators, their filters and scaling; the essential parameters (paper §4.2)."""
 
 from __future__ import annotations
 
@@ -21,9 +19,7 @@ from ident.estimators.maximum_likelihood import iv, ml
 from ident.model.model import Model
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
-"""Factors of both cut-offs: an estimator that follows the data alone has the same gains over two
-octaves.
-"""
+"""Factors of both cut-offs: an estimator of the data alone has the same gains over two octaves."""
 
 
 RATIO = 20.0  #: r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise
@@ -68,14 +64,18 @@ class EstimatorComparison:
         return self.trials[: len(ESTIMATORS)]
 
     def spread_percent(self, estimator: str) -> FloatArray | None:
-        """Largest less smallest gain over the filters, in per cent of their mean, shape (m,);
-        None with a failure.
-        """
-        gains = [trial.gains for trial in self.trials if trial.estimator == estimator]
-        if any(gain is None for gain in gains):
-            return None
-        values = np.stack([gain for gain in gains if gain is not None])
-        return np.asarray(100.0 * np.ptp(values, axis=0) / np.abs(values.mean(axis=0)))
+        """Range of gains over the filters [% of their mean], shape (m,); None with a failure."""
+        gains: list[FloatArray] = []
+        for trial in self.trials:
+            if trial.estimator != estimator:
+                continue
+            if trial.gains is None:
+                return None
+            gains.append(trial.gains)
+        by_filter = np.stack(gains)
+        gain_range = np.ptp(by_filter, axis=0)
+        mean = by_filter.mean(axis=0)
+        return np.asarray(100.0 * gain_range / np.abs(mean))
 
 
 def try_estimators(
@@ -97,17 +97,15 @@ def try_estimators(
     """
     trials: list[EstimatorTrial] = []
     for factor in sorted(CUTOFF_FACTORS, key=lambda factor: factor != 1.0):
+        position_hz = factor * conditioning.position_cutoff_hz
+        decimation_hz = factor * conditioning.decimation_cutoff_hz
         filters = replace(
-            conditioning,
-            position_cutoff_hz=factor * conditioning.position_cutoff_hz,
-            decimation_cutoff_hz=factor * conditioning.decimation_cutoff_hz,
+            conditioning, position_cutoff_hz=position_hz, decimation_cutoff_hz=decimation_hz
         )
-        progress(
-            f"estimators under {filters.position_cutoff_hz:g} Hz / "
-            f"{filters.decimation_cutoff_hz:g} Hz"
-        )
+        progress(f"estimators under {position_hz:g} Hz / {decimation_hz:g} Hz")
         try:
-            system = regrouped(reduce_runs(model, runs(), filters, instruments=True))
+            reduced = reduce_runs(model, runs(), filters, instruments=True)
+            system = regrouped(reduced)
         except IdentificationError as error:
             if factor == 1.0:
                 raise
@@ -119,39 +117,37 @@ def try_estimators(
             except IdentificationError as error:
                 trials.append(_failed(name, filters, error))
                 continue
-            trials.append(
-                EstimatorTrial(
-                    estimator=name,
-                    position_cutoff_hz=filters.position_cutoff_hz,
-                    decimation_cutoff_hz=filters.decimation_cutoff_hz,
-                    gains=estimate.gains,
-                    std=estimate.gains_std,
-                    relative_error_percent=estimate.relative_error(system).total,
-                )
+            error_percent = estimate.relative_error(system).total
+            trial = EstimatorTrial(
+                estimator=name,
+                position_cutoff_hz=position_hz,
+                decimation_cutoff_hz=decimation_hz,
+                gains=estimate.gains,
+                std=estimate.gains_std,
+                relative_error_percent=error_percent,
             )
+            trials.append(trial)
     return EstimatorComparison(tuple(trials))
 
 
 def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> EstimatorTrial:
     return EstimatorTrial(
-        estimator,
-        filters.position_cutoff_hz,
-        filters.decimation_cutoff_hz,
-        None,
-        None,
-        None,
+        estimator=estimator,
+        position_cutoff_hz=filters.position_cutoff_hz,
+        decimation_cutoff_hz=filters.decimation_cutoff_hz,
+        gains=None,
+        std=None,
+        relative_error_percent=None,
         reason=str(error),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """A base parameter that was taken out, and its relative standard deviation at that step (eq.
-    11) [%].
-    """
+    """A base parameter that was taken out."""
 
-    name: str
-    std_percent: float
+    name: str  #: of the parameter
+    std_percent: float  #: its relative standard deviation at that step (eq. 11) [%]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,11 +164,11 @@ class Essential:
 def essential(
     system: System, estimator: Callable[[System], Estimate], ratio: float = RATIO
 ) -> Essential:
-    """Take out the base parameter with the largest relative σ, estimate again,
-    until max/min of them is below r_σ.
+    """Take out base parameters with a large relative σ, one by one.
 
-    Gains, columns of effects and the payload's parameters are no base parameters of the robot: they
-    stay.
+    The one with the largest leaves, and the others are estimated again, until max/min of them is
+    below r_σ. Gains, columns of effects and the payload's parameters are no base parameters of
+    the robot: they stay.
 
     Args:
         system: with all base parameters.
@@ -191,31 +187,47 @@ def essential(
     removed: list[Removal] = []
     current = system
     estimate = estimator(system)
+    base_count = len(system.base.independent)
     while True:
-        candidates = sum(index < len(system.base.independent) for index in kept)
-        relative = relative_std_percent(estimate.parameters, estimate.parameters_std)[:candidates]
-        if candidates < 2 or float(np.max(relative)) < ratio * float(np.min(relative)):
+        candidates = sum(index < base_count for index in kept)
+        std_percent = relative_std_percent(estimate.parameters, estimate.parameters_std)
+        std_percent = std_percent[:candidates]
+        if candidates < 2:
             break
-        worst = int(np.argmax(relative))
-        removed.append(Removal(system.columns[kept[worst]].name, float(relative[worst])))
+        if float(np.max(std_percent)) < ratio * float(np.min(std_percent)):
+            break
+        worst = int(np.argmax(std_percent))
+        name = system.columns[kept[worst]].name
+        removed.append(Removal(name, float(std_percent[worst])))
         current = current.holding({worst: 0.0})
         del kept[worst]
         estimate = estimator(current)
-    count = system.axis_count
-    every = len(system.unknowns)
-    places = [*kept, *range(len(system.columns), every)]
-    parameters = np.zeros(every)
-    parameters[places] = estimate.parameters
-    within = [*range(count), *(count + place for place in places)]
-    covariance = np.zeros((count + every,) * 2)
-    covariance[np.ix_(within, within)] = estimate.covariance
-    whole = replace(
-        estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance
-    )
+    whole = _among_all_unknowns(estimate, system, kept)
     return Essential(current, estimate, tuple(removed), whole)
+
+
+def _among_all_unknowns(estimate: Estimate, system: System, kept: list[int]) -> Estimate:
+    """Estimate with the columns that were taken out: zero and certain.
+
+    Args:
+        estimate: without them.
+        system: with all of them.
+        kept: columns of the robot that were not taken out; those of payloads are behind them.
+    """
+    gain_count = system.axis_count
+    count = len(system.unknowns)
+    places = [*kept, *range(len(system.columns), count)]
+    parameters = np.zeros(count)
+    parameters[places] = estimate.parameters
+    entries = [*range(gain_count), *(gain_count + place for place in places)]
+    size = gain_count + count
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(entries, entries)] = estimate.covariance
+    return replace(estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance)
 
 
 def relative_std_percent(values: FloatArray, std: FloatArray) -> FloatArray:
     """100 σ/|χ| (eq. 11) [%]; infinite for a value of zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.nan_to_num(100.0 * std / np.abs(values), nan=np.inf, posinf=np.inf)
+        percent = 100.0 * std / np.abs(values)
+    return np.nan_to_num(percent, nan=np.inf, posinf=np.inf)

@@ -137,8 +137,9 @@ One of a joint at rest leaves none.
 
 
 LARGEST_SCATTER = 0.03
-"""Relative σ of every gain that is no trace:
-recordings that do not contradict each other give 1 % on most axes.
+"""Relative σ of every gain that is no trace.
+
+Recordings that do not contradict each other give 1 % on most axes.
 """
 
 
@@ -150,48 +151,64 @@ def _diagnoses(
 ) -> Sequence[Diagnosis]:
     """Refuse mistakes, and name all others; see `diagnose`."""
     system = found.system
+    channels = found.channels
     estimate = judged_estimate(system, found.estimate)
+    gains_fixed = estimate.gains_fixed
     refuse_mistakes(system, estimate, axes, nameplate)
-    diagnoses = [
-        *fault_diagnoses(found.channels, axes),
-        *held_diagnoses(found.channels, axes),
-        *clip_diagnoses(found.channels, axes),
-        *limit_diagnoses(found.channels, axes),
-    ]
-    if nameplate is not None and not estimate.gains_fixed:
+    diagnoses: list[Diagnosis] = []
+    diagnoses += fault_diagnoses(channels, axes)
+    diagnoses += held_diagnoses(channels, axes)
+    diagnoses += clip_diagnoses(channels, axes)
+    diagnoses += limit_diagnoses(channels, axes)
+    if nameplate is not None and not gains_fixed:
         diagnoses += gain_diagnoses(estimate, nameplate, axes)
     diagnoses += estimator_diagnoses(found.estimate, estimate, axes)
     likeliest = estimate
-    if estimate.gains_fixed:
+    given_gains = 0
+    if gains_fixed:
+        given_gains = len(estimate.gains)
         with suppress(IdentificationError):
             likeliest = ml(system, estimate.gains)
-    given = len(estimate.gains) if estimate.gains_fixed else 0
+    gains = likeliest.gains
+    parameters = likeliest.parameters
     payloads = list(weight_diagnoses(system, estimate))
-    payloads += payload_diagnoses(system, likeliest.gains, likeliest.parameters, given)
+    payloads += payload_diagnoses(system, gains, parameters, given_gains)
     # A payload that differs is the cause, an axis error only its trace.
-    diagnoses += payloads or error_diagnoses(found.model, system, estimate, axes)
-    unseen = found.holdout
-    if unseen is not None:
-        payloads = list(payload_diagnoses(unseen, likeliest.gains, likeliest.parameters))
-        diagnoses += payloads or error_diagnoses(
-            found.model, unseen, estimate, axes, unseen.seen_runs
-        )
+    if payloads:
+        diagnoses += payloads
+    else:
+        diagnoses += error_diagnoses(found.model, system, estimate, axes)
+    holdout = found.holdout
+    if holdout is not None:
+        payloads = list(payload_diagnoses(holdout, gains, parameters))
+        if payloads:
+            diagnoses += payloads
+        else:
+            runs = holdout.seen_runs
+            diagnoses += error_diagnoses(found.model, holdout, estimate, axes, runs)
     if effort_limit is not None:
         diagnoses += torque_diagnoses(system, estimate, effort_limit)
-    scatter = estimate.gains_std / np.abs(estimate.gains)
-    has_scatter = not estimate.gains_fixed and float(np.min(scatter)) > LARGEST_SCATTER
-    if has_scatter or any(one.name in TRACES_OF_STILL_JOINTS for one in diagnoses):
-        diagnoses = [*still_diagnoses(found.channels, axes), *diagnoses]
-    return (*diagnoses, *condition_diagnoses(found.estimate))
+    if _may_have_still_joints(estimate, diagnoses):
+        diagnoses = [*still_diagnoses(channels, axes), *diagnoses]
+    diagnoses += condition_diagnoses(found.estimate)
+    return diagnoses
+
+
+def _may_have_still_joints(estimate: Estimate, diagnoses: Sequence[Diagnosis]) -> bool:
+    """Whether a fit has traces of an encoder that stood still while its joint moved."""
+    if not estimate.gains_fixed:
+        scatter = estimate.gains_std / np.abs(estimate.gains)
+        if float(np.min(scatter)) > LARGEST_SCATTER:
+            return True
+    return any(one.name in TRACES_OF_STILL_JOINTS for one in diagnoses)
 
 
 def judged_estimate(system: System, estimate: Estimate) -> Estimate:
-    """Return the estimate by which recordings are judged:
-    ``ml``, or with fixed gains IDIM-WLS, whatever was asked for.
+    """Return the estimate that judges recordings: ``ml``, or with fixed gains ``wls``.
 
-    The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not
-    see that moves contradict each other; those of ``ml`` do. With fixed gains IDIM-WLS always has
-    an estimate.
+    It does not depend on the estimator that was asked for. The deviations of the linear estimates
+    are those of independent rows (eqs. 10, 23) and do not see that moves contradict each other;
+    those of ``ml`` do. With fixed gains ``wls`` (IDIM-WLS) always has an estimate.
 
     Args:
         system: the equations.
@@ -216,72 +233,92 @@ def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
     if not estimate.gains_fixed or not system.knows_payload:
         return
     ratio, std = weight_ratio(system, estimate)
-    if ratio - std > WEIGHT_RATIO or ratio + std < 1.0 / WEIGHT_RATIO:
-        loaded = sorted({run for run, mounting in system.cluster_runs if mounting >= 0})
-        yield Diagnosis(
-            "payload-differs",
-            tuple(system.runs[run] for run in loaded),
-            (),
-            f"{ratio:.2g} times the declared weight of the payload, by these gains",
-            f"1, and within a factor of {WEIGHT_RATIO:g}",
-            "was it mounted in these runs? are its mass and the fixed gains right?",
-        )
+    is_too_heavy = ratio - std > WEIGHT_RATIO
+    is_too_light = ratio + std < 1.0 / WEIGHT_RATIO
+    if not is_too_heavy and not is_too_light:
+        return
+    loaded = {run for run, mounting in system.cluster_runs if mounting >= 0}
+    runs = tuple(system.runs[run] for run in sorted(loaded))
+    evidence = f"{ratio:.2g} times the declared weight of the payload, by these gains"
+    expected = f"1, and within a factor of {WEIGHT_RATIO:g}"
+    advice = "was it mounted in these runs? are its mass and the fixed gains right?"
+    yield Diagnosis("payload-differs", runs, (), evidence, expected, advice)
 
 
 def gain_diagnoses(
     estimate: Estimate, nameplate: FloatArray, axes: Sequence[str]
 ) -> Iterator[Diagnosis]:
-    """Compare free gains with the nameplate:
-    signs, and sizes outside GAIN_RANGE by more than GAIN_SIGMAS σ.
+    """Compare free gains with the nameplate: signs, and sizes outside GAIN_RANGE.
 
-    A gain that the moves hardly show is named as well where it may be zero, or where its number is
-    absurd.
+    A size is outside by more than GAIN_SIGMAS σ. A gain that the moves hardly show is named as well
+    where it may be zero, or where its number is absurd.
     """
-    ratio = estimate.gains / nameplate
-    known = estimate.gains_std < np.abs(estimate.gains) / GAIN_SIGMAS
-    for axis in np.flatnonzero(known & (ratio < 0.0)).tolist():
-        yield Diagnosis(
-            "current-reversed",
-            (),
-            (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}",
-            f"the sign of the nameplate, {nameplate[axis]:.4g}",
-            "does the drive, or the import, count this current the other way?",
-        )
-    margin = GAIN_SIGMAS * np.abs(estimate.gains_std / nameplate)
-    is_off = outside(np.abs(ratio), margin, GAIN_RANGE)
-    is_absurd = (ratio < 0.0) | outside(np.abs(ratio), 0.0, (1.0 / ABSURD_RATIO, ABSURD_RATIO))
-    is_absurd |= np.abs(estimate.gains) < UNSEEN_SIGMAS * estimate.gains_std
-    for axis in np.flatnonzero(~known & ~is_off & is_absurd).tolist():
-        yield Diagnosis(
-            GAIN_UNSEEN,
-            (),
-            (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}, nameplate "
-            f"{nameplate[axis]:.4g}",
-            f"a gain that is more than {GAIN_SIGMAS:g} σ from zero",
-            "these moves hardly show this gain: record faster and wider moves of this axis, loaded "
-            "too, and fit them together with these; do not use this gain",
-        )
+    gains = estimate.gains
+    std = estimate.gains_std
+    size = np.abs(gains)
+    ratio = gains / nameplate
+    ratio_size = np.abs(ratio)
+    ratio_margin = GAIN_SIGMAS * np.abs(std / nameplate)
+    has_other_sign = ratio < 0.0
+    is_known = std < size / GAIN_SIGMAS
+    is_off = outside(ratio_size, ratio_margin, GAIN_RANGE)
+    may_be_zero = size < UNSEEN_SIGMAS * std
+    absurd_range = (1.0 / ABSURD_RATIO, ABSURD_RATIO)
+    is_absurd = has_other_sign | outside(ratio_size, 0.0, absurd_range)
+    is_unseen = ~is_known & ~is_off & (is_absurd | may_be_zero)
+    for axis in np.flatnonzero(is_known & has_other_sign).tolist():
+        yield _reversed_current(axes[axis], _gain_text(estimate, axis), nameplate[axis])
+    for axis in np.flatnonzero(is_unseen).tolist():
+        yield _unseen_gain(axes[axis], _gain_text(estimate, axis), nameplate[axis])
     for axis in np.flatnonzero(is_off).tolist():
-        gain = f"{estimate.gains[axis]:.4g} ± {estimate.gains_std[axis]:.2g}"
-        yield Diagnosis(
-            "gain-off-nameplate",
-            (),
-            (axes[axis],),
-            f"a gain of {gain}, {ratio[axis]:.3g} times the nameplate",
-            f"{range_text(GAIN_RANGE)} of {nameplate[axis]:.4g}, within {GAIN_SIGMAS:g} σ",
-            "is the nameplate of this axis, its gear ratio, the scale of its current, the "
-            "payload's mass, or a length of the URDF wrong? measure the lengths: on a serial arm "
-            "no data show them",
-        )
+        evidence = f"{_gain_text(estimate, axis)}, {ratio[axis]:.3g} times the nameplate"
+        yield _gain_off_nameplate(axes[axis], evidence, nameplate[axis])
+
+
+def _gain_text(estimate: Estimate, axis: int) -> str:
+    """A gain with its σ, for a message."""
+    gain = estimate.gains[axis]
+    std = estimate.gains_std[axis]
+    return f"a gain of {gain:.4g} ± {std:.2g}"
+
+
+def _reversed_current(axis: str, gain_text: str, nameplate: float) -> Diagnosis:
+    """A gain whose sign is not that of the nameplate."""
+    expected = f"the sign of the nameplate, {nameplate:.4g}"
+    advice = "does the drive, or the import, count this current the other way?"
+    return Diagnosis("current-reversed", (), (axis,), gain_text, expected, advice)
+
+
+def _unseen_gain(axis: str, gain_text: str, nameplate: float) -> Diagnosis:
+    """A gain that is no result."""
+    evidence = f"{gain_text}, nameplate {nameplate:.4g}"
+    expected = f"a gain that is more than {GAIN_SIGMAS:g} σ from zero"
+    advice = (
+        "these moves hardly show this gain: record faster and wider moves of this axis, loaded "
+        "too, and fit them together with these; do not use this gain"
+    )
+    return Diagnosis(GAIN_UNSEEN, (), (axis,), evidence, expected, advice)
+
+
+def _gain_off_nameplate(axis: str, evidence: str, nameplate: float) -> Diagnosis:
+    """A gain whose size is outside GAIN_RANGE of the nameplate."""
+    expected = f"{range_text(GAIN_RANGE)} of {nameplate:.4g}, within {GAIN_SIGMAS:g} σ"
+    advice = (
+        "is the nameplate of this axis, its gear ratio, the scale of its current, the "
+        "payload's mass, or a length of the URDF wrong? measure the lengths: on a serial arm "
+        "no data show them"
+    )
+    return Diagnosis("gain-off-nameplate", (), (axis,), evidence, expected, advice)
 
 
 def outside(
     values: FloatArray, margin: FloatArray | float, bounds: tuple[float, float]
 ) -> BoolArray:
     """Whether numbers are outside a range by more than a margin; NaN is not."""
-    return np.asarray((values + margin < bounds[0]) | (values - margin > bounds[1]))
+    lowest, highest = bounds
+    is_below = values + margin < lowest
+    is_above = values - margin > highest
+    return np.asarray(is_below | is_above)
 
 
 def scale_diagnoses(
@@ -291,8 +328,7 @@ def scale_diagnoses(
     axes: Sequence[str],
     runs: tuple[str, ...],
 ) -> Iterator[Diagnosis]:
-    """Compare the torque of a run, from its currents and the gains of a calibration,
-    with what that predicts.
+    """Compare the torque of a run, by the gains of a calibration, with what that predicts.
 
     A scale is named where it is outside CURRENT_RANGE by more than GAIN_SIGMAS σ and explains the
     axis: another payload changes the torque of an axis, too, but leaves 28 % and more of it beside
@@ -305,27 +341,17 @@ def scale_diagnoses(
         runs: name of the run.
     """
     for axis, name in enumerate(axes):
-        found = current_scale(measured_nm[axis, use[axis]], predicted_nm[axis, use[axis]])
-        evidence = f"{found.ratio:.3g} times the predicted torque"
-        if found.ratio < 0.0 and found.left**2 < 1.0 - ALIKE:
-            yield Diagnosis(
-                "current-reversed",
-                runs,
-                (name,),
-                evidence,
-                "1",
-                "does the drive, or the import, count this current the other way?",
-            )
-        is_off = outside(np.abs(found.ratio), GAIN_SIGMAS * found.std, CURRENT_RANGE)
-        if is_off and 100.0 * found.left < LARGEST_AXIS_ERROR_PERCENT:
-            yield Diagnosis(
-                "current-off-scale",
-                runs,
-                (name,),
-                evidence,
-                f"1, and {range_text(CURRENT_RANGE)} after years",
-                "is the current in another unit (mA) than in the fit, or of another drive?",
-            )
+        used = use[axis]
+        scale = current_scale(measured_nm[axis, used], predicted_nm[axis, used])
+        evidence = f"{scale.ratio:.3g} times the predicted torque"
+        if scale.ratio < 0.0 and scale.left**2 < 1.0 - ALIKE:
+            advice = "does the drive, or the import, count this current the other way?"
+            yield Diagnosis("current-reversed", runs, (name,), evidence, "1", advice)
+        is_off = outside(np.abs(scale.ratio), GAIN_SIGMAS * scale.std, CURRENT_RANGE)
+        if is_off and 100.0 * scale.left < LARGEST_AXIS_ERROR_PERCENT:
+            expected = f"1, and {range_text(CURRENT_RANGE)} after years"
+            advice = "is the current in another unit (mA) than in the fit, or of another drive?"
+            yield Diagnosis("current-off-scale", runs, (name,), evidence, expected, advice)
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,13 +372,18 @@ def current_scale(measured_nm: FloatArray, predicted_nm: FloatArray) -> TorqueSc
     size = float(np.sum(measured_nm**2))
     if product == 0.0 or len(products) < SCALE_BLOCKS:
         return TorqueScale(np.nan, np.nan, 1.0)
+    # The ratio without each stretch of time in turn, and σ by the jackknife
     starts = np.arange(SCALE_BLOCKS) * len(products) // SCALE_BLOCKS
-    others = (product - np.add.reduceat(products, starts)) / (
-        square - np.add.reduceat(squares, starts)
+    other_products = product - np.add.reduceat(products, starts)
+    other_squares = square - np.add.reduceat(squares, starts)
+    variance = (SCALE_BLOCKS - 1) * np.var(other_products / other_squares)
+    # min over the ratio of ‖measured - ratio · predicted‖² / ‖measured‖²
+    left_share = 1.0 - product**2 / (square * size)
+    return TorqueScale(
+        ratio=product / square,
+        std=float(np.sqrt(variance)),
+        left=float(np.sqrt(max(0.0, left_share))),
     )
-    std = float(np.sqrt((SCALE_BLOCKS - 1) * np.var(others)))
-    left = float(np.sqrt(max(0.0, 1.0 - product**2 / (square * size))))
-    return TorqueScale(product / square, std, left)
 
 
 _OF_LEAST_SQUARES = (
@@ -365,9 +396,7 @@ REMEDIES_OF_DISAGREEMENT = {
     "moves hardly show, bends "
     "tls more; `find_effects` looks for effects",
 }
-"""What to do where an estimator's gain is far from that of ml;
-iv need not agree with it (`diagnose`).
-"""
+"""What to do where an estimator's gain is far from ml's; iv need not agree with it (`diagnose`)."""
 
 
 def estimator_diagnoses(
@@ -376,22 +405,22 @@ def estimator_diagnoses(
     """Compare the gains of another estimator with those of ml on the same equations."""
     if estimate.gains_fixed or estimate is likeliest:
         return
-    change = np.abs(estimate.gains - likeliest.gains)
-    far = (change > GAIN_DIFFERENCE * np.abs(likeliest.gains)) & (
-        change > GAIN_SIGMAS * likeliest.gains_std
-    )
-    for axis in np.flatnonzero(far).tolist():
-        percent = 100.0 * change[axis] / abs(likeliest.gains[axis])
-        yield Diagnosis(
-            "estimators-disagree",
-            (),
-            (axes[axis],),
-            f"a gain of {estimate.gains[axis]:.4g} by {estimate.method.value}, {percent:.0f} % "
-            f"from {likeliest.gains[axis]:.4g} ± {likeliest.gains_std[axis]:.2g} by ml on the same "
-            "rows",
-            f"at most {100.0 * GAIN_DIFFERENCE:.0f} %, or {GAIN_SIGMAS:g} σ",
-            REMEDIES_OF_DISAGREEMENT[estimate.method],
+    likely_gains = likeliest.gains
+    likely_std = likeliest.gains_std
+    change = np.abs(estimate.gains - likely_gains)
+    is_large = change > GAIN_DIFFERENCE * np.abs(likely_gains)
+    is_significant = change > GAIN_SIGMAS * likely_std
+    expected = f"at most {100.0 * GAIN_DIFFERENCE:.0f} %, or {GAIN_SIGMAS:g} σ"
+    for axis in np.flatnonzero(is_large & is_significant).tolist():
+        gain = estimate.gains[axis]
+        likely_gain = likely_gains[axis]
+        percent = 100.0 * change[axis] / abs(likely_gain)
+        evidence = (
+            f"a gain of {gain:.4g} by {estimate.method.value}, {percent:.0f} % "
+            f"from {likely_gain:.4g} ± {likely_std[axis]:.2g} by ml on the same rows"
         )
+        advice = REMEDIES_OF_DISAGREEMENT[estimate.method]
+        yield Diagnosis("estimators-disagree", (), (axes[axis],), evidence, expected, advice)
 
 
 # Errors, torques and condition
@@ -404,11 +433,10 @@ def error_diagnoses(
     axes: Sequence[str],
     runs: tuple[str, ...] = (),
 ) -> Iterator[Diagnosis]:
-    """Name axes whose error is above LARGEST_AXIS_ERROR_PERCENT;
-    arguments as for `axis_error_diagnoses`.
-    """
+    """Name axes whose error is large; arguments as for `axis_error_diagnoses`."""
     size, left = joint_torques(system, estimate)
-    yield from axis_error_diagnoses(size, left, idle_joints(model, size, left), axes, runs)
+    idle = idle_joints(model, size, left)
+    yield from axis_error_diagnoses(size, left, idle, axes, runs)
 
 
 def axis_error_diagnoses(
@@ -423,30 +451,23 @@ def axis_error_diagnoses(
         axes: their names.
         runs: that the fit has not seen, empty for its own.
     """
-    for axis in np.flatnonzero(100.0 * left > LARGEST_AXIS_ERROR_PERCENT * size).tolist():
-        found = (
-            f"an error of {left[axis]:.2g} in {size[axis]:.2g} Nm (or N), "
-            f"{100.0 * left[axis] / size[axis]:.3g} %"
-        )
+    is_large = 100.0 * left > LARGEST_AXIS_ERROR_PERCENT * size
+    for axis in np.flatnonzero(is_large).tolist():
+        name = axes[axis]
+        percent = 100.0 * left[axis] / size[axis]
+        error = f"an error of {left[axis]:.2g} in {size[axis]:.2g} Nm (or N), {percent:.3g} %"
         if idle[axis]:
-            yield Diagnosis(
-                "axis-idle",
-                runs,
-                (axes[axis],),
-                f"{found}, nothing beside the torques of the other axes",
-                "a torque above the noise",
-                "this axis carries too little here to judge it: load it, or move it faster",
-            )
+            evidence = f"{error}, nothing beside the torques of the other axes"
+            expected = "a torque above the noise"
+            advice = "this axis carries too little here to judge it: load it, or move it faster"
+            yield Diagnosis("axis-idle", runs, (name,), evidence, expected, advice)
         else:
-            yield Diagnosis(
-                "axis-error",
-                runs,
-                (axes[axis],),
-                found,
-                f"some 3 to 15 %, below {LARGEST_AXIS_ERROR_PERCENT:g} %",
+            expected = f"some 3 to 15 %, below {LARGEST_AXIS_ERROR_PERCENT:g} %"
+            advice = (
                 "look for what contradicts the model on this axis: its current channel and sign, "
-                "gear ratio, payload, friction or an effect that is not declared (`find_effects`)",
+                "gear ratio, payload, friction or an effect that is not declared (`find_effects`)"
             )
+            yield Diagnosis("axis-error", runs, (name,), error, expected, advice)
 
 
 def torque_diagnoses(
@@ -454,33 +475,31 @@ def torque_diagnoses(
 ) -> Iterator[Diagnosis]:
     """Compare the torques with the effort limits of the URDF: a unit puts all of them above."""
     torque, _ = joint_torques(system, estimate)
-    if np.any(np.isfinite(effort_limit)) and np.all(
-        torque[np.isfinite(effort_limit)] > TORQUE_RATIO * effort_limit[np.isfinite(effort_limit)]
-    ):
-        yield Diagnosis(
-            "torque-above-limit",
-            (),
-            (),
-            f"torques of {numbers_text(torque)} Nm (or N; root mean square)",
-            f"less than the effort limits of the URDF, {numbers_text(effort_limit)}",
+    has_limit = np.isfinite(effort_limit)
+    if not np.any(has_limit):
+        return
+    if np.all(torque[has_limit] > TORQUE_RATIO * effort_limit[has_limit]):
+        evidence = f"torques of {numbers_text(torque)} Nm (or N; root mean square)"
+        expected = f"less than the effort limits of the URDF, {numbers_text(effort_limit)}"
+        advice = (
             "are the currents in mA and read as A, is the payload's mass in g and read as kg, or "
-            "the URDF wrong?",
+            "the URDF wrong?"
         )
+        yield Diagnosis("torque-above-limit", (), (), evidence, expected, advice)
 
 
 def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
     """Name equations whose parameters mean nothing outside these moves."""
-    if not estimate.condition <= LARGEST_CONDITION:
-        yield Diagnosis(
-            "ill-conditioned",
-            (),
-            (),
-            f"a condition number of {estimate.condition:.2g}",
-            f"100 to 1e5, below {LARGEST_CONDITION:.0e}",
-            "single parameters mean nothing here, and another motion is not predicted: move all "
-            "axes together, through more of their range, and see whether the URDF rounds its "
-            "angles (1.57 in place of pi/2)",
-        )
+    if estimate.condition <= LARGEST_CONDITION:
+        return
+    evidence = f"a condition number of {estimate.condition:.2g}"
+    expected = f"100 to 1e5, below {LARGEST_CONDITION:.0e}"
+    advice = (
+        "single parameters mean nothing here, and another motion is not predicted: move all "
+        "axes together, through more of their range, and see whether the URDF rounds its "
+        "angles (1.57 in place of pi/2)"
+    )
+    yield Diagnosis("ill-conditioned", (), (), evidence, expected, advice)
 
 
 # Channels
@@ -490,8 +509,9 @@ def condition_diagnoses(estimate: Estimate) -> Iterator[Diagnosis]:
 def exchanged_channels(
     model: Model, runs: Iterable[Run], conditioning: Conditioning, axes: Sequence[str]
 ) -> Diagnosis | None:
-    """Whether another order of the channels explains each motor that it moves clearly better,
-    in all runs together.
+    """Name an order of the channels that explains each motor that it moves clearly better.
+
+    All runs are judged together.
 
     Args:
         model, conditioning: of the fit.
@@ -519,32 +539,39 @@ def exchange_shown_by(evidence: ChannelEvidence, axes: Sequence[str]) -> Diagnos
     errors = evidence.errors
     if not np.all((errors > 0.0) & np.isfinite(errors)):
         return None
-    best = scipy.optimize.linear_sum_assignment(np.log(errors))[1].tolist()
-    moved = [motor for motor, channel in enumerate(best) if motor != channel]
-    if not moved or not all(evidence.is_clearly_better(motor, best[motor]) for motor in moved):
+    # The order with the smallest product of errors
+    _, best_channels = scipy.optimize.linear_sum_assignment(np.log(errors))
+    moved: list[str] = []
+    reasons: list[str] = []
+    for motor, channel in enumerate(best_channels.tolist()):
+        if motor == channel:
+            continue
+        if not evidence.is_clearly_better(motor, channel):
+            return None
+        name = axes[motor]
+        error_percent = 100.0 * errors[motor, channel]
+        own_error_percent = 100.0 * errors[motor, motor]
+        moved.append(name)
+        reasons.append(
+            f"the motion of {name} explains the current of {axes[channel]} (error "
+            f"{error_percent:.2g} %) rather than its own ({own_error_percent:.2g} %)"
+        )
+    if not moved:
         return None
-    return Diagnosis(
-        "channels-exchanged",
-        (),
-        tuple(axes[motor] for motor in moved),
-        "; ".join(
-            f"the motion of {axes[motor]} explains the current of {axes[best[motor]]} (error "
-            f"{100.0 * errors[motor, best[motor]]:.2g} %) rather than its own "
-            f"({100.0 * errors[motor, motor]:.2g} %)"
-            for motor in moved
-        ),
-        "each current to follow from the motion of its own axis",
+    expected = "each current to follow from the motion of its own axis"
+    advice = (
         "exchange these currents: the drives' node numbers in the cell, and record again, because "
         "a log keeps those that it was recorded with; or the columns of the import, and import "
-        "again",
+        "again"
     )
+    evidence_text = "; ".join(reasons)
+    return Diagnosis("channels-exchanged", (), tuple(moved), evidence_text, expected, advice)
 
 
 def require_explained_currents(
     run: Run, model: Model, conditioning: Conditioning, axes: Sequence[str]
 ) -> None:
-    """Refuse a recording with currents that look like sizes,
-    unless the equations of their motors explain them.
+    """Refuse a recording with currents that look like sizes and that no motor's equation explains.
 
     A load that is always carried may come down to zero again and again, with little friction to
     take its current below. Its motor's equation explains it then, and does not explain a size.
@@ -574,12 +601,11 @@ def require_explained_currents(
 def unsigned_channels(
     model: Model, runs: Sequence[Run], conditioning: Conditioning, axes: Sequence[str]
 ) -> CurrentUnsigned | None:
-    """Whether a current that has one sign in all runs is a size:
-    while its motor turns both ways nothing explains it.
+    """Name currents that have one sign in all runs and that nothing explains: sizes.
 
-    A load that is always carried has one sign, too, but the equation of its motor explains it. This
-    finds a size that `ident.data.unsigned_current` does not, because friction takes its current
-    through zero between two samples.
+    Their motors turn both ways. A load that is always carried has one sign, too, but the equation
+    of its motor explains it. This finds a size that `ident.data.unsigned_current` does not, because
+    friction takes its current through zero between two samples.
 
     Arguments as for `exchanged_channels`.
 
@@ -588,22 +614,26 @@ def unsigned_channels(
     """
     if model.is_redundant:
         return None
-    one_sided = np.all([one_sided_currents(run, model.drive_train.ratio) for run in runs], axis=0)
+    gear_ratio = model.drive_train.ratio
+    by_run = [one_sided_currents(run, gear_ratio) for run in runs]
+    one_sided = np.all(by_run, axis=0)
     if not one_sided.any():
         return None
     own_errors = np.diag(channel_errors(model, runs, conditioning))
-    unsigned = np.flatnonzero(one_sided & (100.0 * own_errors > LARGEST_AXIS_ERROR_PERCENT))
+    is_unexplained = 100.0 * own_errors > LARGEST_AXIS_ERROR_PERCENT
+    unsigned = np.flatnonzero(one_sided & is_unexplained)
     if not len(unsigned):
         return None
-    names = tuple(axes[axis] for axis in unsigned.tolist())
-    return CurrentUnsigned(
-        ", ".join(run.name for run in runs), names, missing_sign(runs[0].current_a[:, unsigned])
-    )
+    run_names = ", ".join(run.name for run in runs)
+    axis_names = tuple(axes[axis] for axis in unsigned.tolist())
+    evidence = missing_sign(runs[0].current_a[:, unsigned])
+    return CurrentUnsigned(run_names, axis_names, evidence)
 
 
 def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> FloatArray:
-    """Share of the current k that the equation of motor i leaves,
-    every gain and parameter of its own, shape (m, m).
+    """Share of the current k that the equation of motor i leaves, shape (m, m).
+
+    Each pair has gains and parameters of its own.
 
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
@@ -621,26 +651,23 @@ class ChannelEvidence:
     block_shares: FloatArray
 
     def is_clearly_better(self, motor: int, channel: int) -> bool:
-        """Whether a motor explains another current better than its own,
-        by CHANNEL_FALL and in the blocks alike.
-        """
-        fall = float(np.log(self.errors[motor, motor] / self.errors[motor, channel]))
-        if not fall >= CHANNEL_FALL:
+        """Whether a motor explains another current clearly better, and in most blocks of moves."""
+        error_ratio = self.errors[motor, motor] / self.errors[motor, channel]
+        if not np.log(error_ratio) >= CHANNEL_FALL:
             return False
         own = self.block_shares[:, motor, motor]
         other = self.block_shares[:, motor, channel]
         # The mean of a block is added on both sides, so that a block of few rows does not decide.
         usual = float(np.mean(other))
-        falls = 0.5 * np.log((own + usual) / (other + usual))
-        std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
-        return bool(np.mean(falls) > CHANNEL_T * std)
+        share_ratio = (own + usual) / (other + usual)
+        falls = 0.5 * np.log(share_ratio)
+        std_of_mean = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
+        return bool(np.mean(falls) > CHANNEL_T * std_of_mean)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelTriangles:
-    """Rows of one run as triangles: the equation of each motor beside the currents of all,
-    in blocks of moves.
-    """
+    """Triangles of one run: each motor's equation beside all currents, in blocks of moves."""
 
     #: R of each motor's columns and of all currents, by block; None of a block without rows.
     factors: tuple[tuple[FloatArray | None, ...], ...]
@@ -662,13 +689,15 @@ def channel_triangles(model: Model, run: Run, conditioning: Conditioning) -> Cha
     for rows in rows_of(model, data, conditioning):
         block_of_row = rows.move % CHANNEL_BLOCKS
         for motor, used in enumerate(rows.motor_use):
+            own_factors = factors[motor]
             mixed = motor_columns(train.to_motor[motor], rows.standard.__getitem__)
+            own_columns = mixed[support[motor]]
             # One body for all mountings will do
             payload = mixed[model.flange] * (run.payload is not None)
-            columns = np.concatenate((mixed[support[motor]], payload, rows.current))
+            columns = np.concatenate((own_columns, payload, rows.current))
             for block in np.unique(block_of_row[used]).tolist():
-                chosen = columns[:, used & (block_of_row == block)]
-                factors[motor][block] = qr_update(factors[motor][block], chosen)
+                in_block = used & (block_of_row == block)
+                own_factors[block] = qr_update(own_factors[block], columns[:, in_block])
             row_counts[motor] += np.count_nonzero(used)
     return ChannelTriangles(tuple(map(tuple, factors)), row_counts)
 
@@ -681,7 +710,8 @@ def channel_evidence(
     Raises:
         DataUnfit: as of `ident.equations.reduction.reduce_runs`.
     """
-    return explain_channels([channel_triangles(model, run, conditioning) for run in runs])
+    triangles = [channel_triangles(model, run, conditioning) for run in runs]
+    return explain_channels(triangles)
 
 
 def explain_channels(runs: Sequence[ChannelTriangles]) -> ChannelEvidence:
@@ -698,16 +728,24 @@ def explain_channels(runs: Sequence[ChannelTriangles]) -> ChannelEvidence:
         blocks = _joined_blocks([run.factors[motor] for run in runs])
         if not blocks:
             continue
-        whole = triangle(blocks.values(), next(iter(blocks.values())).shape[1])
-        if row_counts[motor] <= whole.shape[1]:
+        first_block = next(iter(blocks.values()))
+        width = first_block.shape[1]
+        rows = row_counts[motor]
+        if rows <= width:
             continue
-        first = whole.shape[1] - count
-        size = np.linalg.norm(whole[:, first:], axis=0)
-        errors[motor] = np.linalg.norm(whole[first:, first:], axis=0) / size
-        errors[motor] *= np.sqrt(row_counts[motor] / (row_counts[motor] - first))
-        explained = scipy.linalg.lstsq(whole[:first, :first], whole[:first, first:])[0]
+        # R = [[R_w, R_i], [0, R_left]]: the motor's own columns, then the currents of all
+        own_width = width - count
+        own = slice(None, own_width)
+        currents = slice(own_width, None)
+        whole = triangle(blocks.values(), width)
+        size = np.linalg.norm(whole[:, currents], axis=0)
+        left_size = np.linalg.norm(whole[currents, currents], axis=0)
+        freedom = np.sqrt(rows / (rows - own_width))
+        errors[motor] = left_size / size
+        errors[motor] *= freedom
+        solution = scipy.linalg.lstsq(whole[own, own], whole[own, currents])[0]
         for number, factor in blocks.items():
-            left = factor[:, first:] - factor[:, :first] @ explained
+            left = factor[:, currents] - factor[:, own] @ solution
             shares[number, motor] = np.sum(left**2, axis=0) / size**2
     return ChannelEvidence(errors, shares)
 
@@ -721,7 +759,8 @@ def _joined_blocks(factors: Sequence[Sequence[FloatArray | None]]) -> dict[int, 
     for run_number, of_run in enumerate(factors):
         for block, factor in enumerate(of_run):
             if factor is not None:
-                parts.setdefault((block + run_number) % CHANNEL_BLOCKS, []).append(factor)
+                shifted_block = (block + run_number) % CHANNEL_BLOCKS
+                parts.setdefault(shifted_block, []).append(factor)
     joined: dict[int, FloatArray] = {}
     for block in sorted(parts):
         own = parts[block]

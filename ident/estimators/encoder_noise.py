@@ -1,5 +1,4 @@
-"""Noise of encoders whose misfit is tested:
-how large it is for certain, and how it is correlated in time.
+"""Noise of encoders whose misfit is tested: its certain size and its correlation in time.
 
 The certain part is what counts and differences from sample to sample show. A misfit that is far
 above it has a cause.
@@ -50,8 +49,9 @@ class MisfitNoise:
         first = 0
         for run in self.runs:
             last = first + len(run.std)
-            turned = run.ways.T @ rows[first:last]
-            parts.append((turned.T / run.std).T)
+            along_ways = run.ways.T @ rows[first:last]
+            white = along_ways.T / run.std
+            parts.append(white.T)
             first = last
         return np.concatenate(parts)
 
@@ -74,60 +74,98 @@ def estimate_noise(
         jacobian: of independent numbers, shape (r, p).
         right: what they are fitted to, shape (r,).
     """
-    best_criterion = _criterion(np.ones(len(right)), jacobian, right)
-    best = _white([one.basis.shape[0] * one.basis.shape[2] for one in directions])
+    rows = np.column_stack((jacobian, right))
+    uncorrelated = np.ones(len(right))
+    best_criterion = _criterion(uncorrelated, rows)
+    best = _white(directions)
     for time_s in CORRELATION_S:
-        decomposed = [_decomposed(one, time_s) for one in directions]
-        values = np.concatenate([one[0] for one in decomposed])
-        turned = _turned([one[1] for one in decomposed], np.column_stack((jacobian, right)))
+        spectra = [_spectrum(run, time_s) for run in directions]
+        eigenvalues = np.concatenate([spectrum.values for spectrum in spectra])
+        rows_along_ways = _along_ways(spectra, rows)
         for share in CORRELATED:
-            variance = 1.0 - share + share * values
-            criterion = _criterion(variance, turned[:, :-1], turned[:, -1])
+            variance = _variance(eigenvalues, share)
+            criterion = _criterion(variance, rows_along_ways)
             if criterion < best_criterion:
                 best_criterion = criterion
-                best = _correlated(decomposed, share)
+                best = _correlated(spectra, share)
     return best
 
 
-def _white(counts: Sequence[int]) -> MisfitNoise:
-    runs = tuple(RunNoise(np.eye(count), np.ones(count)) for count in counts)
-    return MisfitNoise(runs, float(sum(counts)))
+def _variance(eigenvalues: FloatArray, share: float) -> FloatArray:
+    """Variances (1 − a) + a λ along the eigenvectors, in units of σ²."""
+    return 1.0 - share + share * eigenvalues
 
 
-def _decomposed(run: RunDirections, correlation_s: float) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues and eigenvectors of exp(−|t − s|/τ) B_tᵀ B_s, shapes (r,) and (r, r)."""
+def _white(directions: Sequence[RunDirections]) -> MisfitNoise:
+    """Noise that is not correlated at all."""
+    runs: list[RunNoise] = []
+    total = 0
+    for run in directions:
+        samples, _, count = run.basis.shape
+        size = samples * count
+        runs.append(RunNoise(np.eye(size), np.ones(size)))
+        total += size
+    return MisfitNoise(tuple(runs), float(total))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spectrum:
+    """Eigenvalues and eigenvectors of exp(−|t − s|/τ) B_tᵀ B_s in one run."""
+
+    values: FloatArray  #: shape (r,)
+    ways: FloatArray  #: a column each, shape (r, r)
+
+
+def _spectrum(run: RunDirections, correlation_s: float) -> _Spectrum:
     apart_s = np.abs(run.time_s[:, None] - run.time_s[None, :])
     decay = np.exp(-apart_s / correlation_s)
     # One row for each sample and direction: the products of all of them are one matrix product.
     samples, motors, count = run.basis.shape
     rows = np.swapaxes(run.basis, 1, 2).reshape(samples * count, motors)
-    correlation = (rows @ rows.T) * np.repeat(np.repeat(decay, count, axis=0), count, axis=1)
+    decay_of_samples = np.repeat(decay, count, axis=0)
+    decay_of_rows = np.repeat(decay_of_samples, count, axis=1)
+    correlation = (rows @ rows.T) * decay_of_rows
     values, ways = np.linalg.eigh(correlation)
-    return np.maximum(values, SMALLEST_EIGENVALUE), ways
+    return _Spectrum(np.maximum(values, SMALLEST_EIGENVALUE), ways)
 
 
-def _turned(ways: Sequence[FloatArray], rows: FloatArray) -> FloatArray:
-    ends = np.cumsum([len(one) for one in ways])
-    parts = np.split(rows, ends[:-1])
-    return np.concatenate([one.T @ part for one, part in zip(ways, parts, strict=True)])
+def _along_ways(spectra: Sequence[_Spectrum], rows: FloatArray) -> FloatArray:
+    """Rows of all runs, in components along the eigenvectors of their run."""
+    components: list[FloatArray] = []
+    first = 0
+    for spectrum in spectra:
+        last = first + len(spectrum.values)
+        components.append(spectrum.ways.T @ rows[first:last])
+        first = last
+    return np.concatenate(components)
 
 
-def _criterion(variance: FloatArray, jacobian: FloatArray, right: FloatArray) -> float:
-    """Twice the negative restricted log-likelihood, σ² at its maximum, but for a constant."""
+def _criterion(variance: FloatArray, rows: FloatArray) -> float:
+    """Twice the negative restricted log-likelihood, σ² at its maximum, but for a constant.
+
+    Args:
+        variance: of each row, shape (r,).
+        rows: the jacobian and what it is fitted to, shape (r, p + 1).
+    """
     scale = 1.0 / np.sqrt(variance)
-    triangle = np.linalg.qr(scale[:, None] * np.column_stack((jacobian, right)), mode="r")
-    diagonal = np.abs(np.diag(triangle))
-    free = len(right) - jacobian.shape[1]
+    triangle = np.linalg.qr(scale[:, None] * rows, mode="r")
     tiny = np.finfo(np.float64).tiny
-    of_residual = 2.0 * free * np.log(max(diagonal[-1], tiny))
-    of_fit = 2.0 * np.sum(np.log(np.maximum(diagonal[:-1], tiny)))
-    return float(np.sum(np.log(variance)) + of_residual + of_fit)
+    diagonal = np.abs(np.diag(triangle))
+    of_fitted = np.maximum(diagonal[:-1], tiny)
+    of_residual = max(diagonal[-1], tiny)
+    # log det C + log det JᵀC⁻¹J + (r − p) log ‖residual‖², by the diagonal of R
+    row_count, width = rows.shape
+    freedom = row_count - (width - 1)
+    residual_term = 2.0 * freedom * np.log(of_residual)
+    fit_term = 2.0 * np.sum(np.log(of_fitted))
+    return float(np.sum(np.log(variance)) + residual_term + fit_term)
 
 
-def _correlated(decomposed: Sequence[tuple[FloatArray, FloatArray]], share: float) -> MisfitNoise:
+def _correlated(spectra: Sequence[_Spectrum], share: float) -> MisfitNoise:
     runs: list[RunNoise] = []
-    for values, ways in decomposed:
-        runs.append(RunNoise(ways, np.sqrt(1.0 - share + share * values)))
+    for spectrum in spectra:
+        std = np.sqrt(_variance(spectrum.values, share))
+        runs.append(RunNoise(spectrum.ways, std))
     variance = np.concatenate([run.std**2 for run in runs])
     # A mean square of n numbers with these variances scatters as one of this many independent ones
     # (Satterthwaite).

@@ -1,5 +1,4 @@
-"""Zeros, lengths and base places of a robot with more encoders than degrees of freedom,
-from its positions alone.
+"""Geometry of a robot with more encoders than degrees of freedom, from its positions alone.
 
 The pose that fits the m encoders best leaves a misfit of m − d numbers a sample, e(θ) in the
 directions in which it can be. Where the description is right, it is the encoders' noise. θ are the
@@ -24,7 +23,7 @@ are made white by it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -66,8 +65,9 @@ SETTLED = 1e-10  #: Change at which the iteration ends [rad, or of the robot's s
 SETTLED_SIGMAS = 0.1
 SMALLEST_SINGULAR = 1e-9  #: Relative to the largest: rounding
 LARGEST_STD = 1e-2
-"""Direction of zeros and lengths with a larger σ [rad, or of the robot's size], half a degree:
-it cannot be seen.
+"""Largest σ of a direction of zeros and lengths that can be seen: half a degree.
+
+In rad, or of the robot's size.
 """
 TESTED_STD = 1e-3
 """Directions of all numbers together with a larger σ test no explanation: they would be estimated
@@ -103,15 +103,14 @@ class Positions:
 
     def every(self, stride: int) -> Positions:
         """Return every so many positions."""
-        return Positions(
-            self.run,
-            self.time_s[::stride],
-            self.position_rad[::stride],
-            self.before_rad[::stride],
-            self.after_rad[::stride],
-            self.interval_s,
-            self.motion[::stride],
-            self.count_rad,
+        chosen = slice(None, None, stride)
+        return replace(
+            self,
+            time_s=self.time_s[chosen],
+            position_rad=self.position_rad[chosen],
+            before_rad=self.before_rad[chosen],
+            after_rad=self.after_rad[chosen],
+            motion=self.motion[chosen],
         )
 
 
@@ -147,12 +146,11 @@ class GeometryFinding:
 
     @property
     def corrections(self) -> tuple[GeometryEstimate, ...]:
-        """Causes that can be corrected in the description:
-        none where an encoder is late, or may be instead.
-        """
+        """Causes that can be corrected in the description: none where an encoder may be late."""
         for explanation in (self.causes, *self.alternatives):
-            if any(one.parameter.kind is GeometryKind.DELAY for one in explanation):
-                return ()
+            for cause in explanation:
+                if cause.parameter.kind is GeometryKind.DELAY:
+                    return ()
         return self.causes
 
     @property
@@ -162,26 +160,26 @@ class GeometryFinding:
 
 
 def thinned(run: Run) -> Positions:
-    """Choose positions of a run that are SPACING_S apart,
-    valid on every axis with the samples around them.
-    """
+    """Choose positions that are SPACING_S apart, valid on every axis and with what is around."""
     position_rad = np.asarray(run.position_rad, dtype=np.float64)
     time_s = np.asarray(run.time_s, dtype=np.float64)
     samples, axes = position_rad.shape
+    interval_s = 1.0 / run.rate_hz
     every = max(1, round(SPACING_S * run.rate_hz))
     half = max(LEAST_WINDOW, round(WINDOW_S * run.rate_hz))
     usable: BoolArray = np.ones(samples, dtype=np.bool_)
     if run.valid is not None:
         usable = np.asarray(np.all(run.valid, axis=1))
+    is_usable_around = _all_around(usable, half)
     chosen = np.arange(half, samples - half, every)
-    chosen = chosen[_all_around(usable, half)[chosen]]
-    around = np.arange(-half, half + 1)
-    interval_s = 1.0 / run.rate_hz
-    powers = np.vander(around * interval_s, DEGREE + 1, increasing=True)
-    fitting = np.linalg.pinv(powers)[1:]
+    chosen = chosen[is_usable_around[chosen]]
     motion = np.zeros((len(chosen), axes, DEGREE))
-    for offset, weight in zip(around, fitting.T, strict=True):
-        motion += position_rad[chosen + offset][:, :, None] * weight
+    offsets = np.arange(-half, half + 1)
+    weights = _polynomial_weights(np.asarray(offsets * interval_s, dtype=np.float64))
+    for offset, weight in zip(offsets, weights, strict=True):
+        moved_rad = position_rad[chosen + offset]
+        motion += moved_rad[:, :, None] * weight
+    counts = [_smallest_step(position_rad[usable, axis]) for axis in range(axes)]
     return Positions(
         run=run.name,
         time_s=time_s[chosen],
@@ -190,28 +188,38 @@ def thinned(run: Run) -> Positions:
         after_rad=position_rad[chosen + 1],
         interval_s=interval_s,
         motion=motion,
-        count_rad=np.array([_smallest_step(position_rad[usable, axis]) for axis in range(axes)]),
+        count_rad=np.array(counts),
     )
+
+
+def _polynomial_weights(time_s: FloatArray) -> FloatArray:
+    """Weight of each sample in the coefficients of t, t², … by least squares, (w, DEGREE)."""
+    powers = np.vander(time_s, DEGREE + 1, increasing=True)
+    fitting = np.linalg.pinv(powers)
+    return np.asarray(fitting[1:].T)
 
 
 def _all_around(usable: BoolArray, half: int) -> BoolArray:
     """Whether all samples within half a window of each are usable, shape (k,)."""
-    unusable = np.concatenate(([0], np.cumsum(~usable)))
-    first = np.maximum(np.arange(len(usable)) - half, 0)
-    last = np.minimum(np.arange(len(usable)) + half + 1, len(usable))
-    return np.asarray(unusable[last] == unusable[first])
+    count = len(usable)
+    samples = np.arange(count)
+    unusable_before = np.concatenate(([0], np.cumsum(~usable)))
+    first = np.maximum(samples - half, 0)
+    end = np.minimum(samples + half + 1, count)
+    return np.asarray(unusable_before[end] == unusable_before[first])
 
 
 def _smallest_step(values: FloatArray) -> float:
     """Smallest difference between two values that is not rounding; zero without any."""
     steps = np.diff(np.unique(values))
     steps = steps[steps > SMALLEST_COUNT_RAD]
-    return float(steps.min(initial=np.inf)) if len(steps) else 0.0
+    if not len(steps):
+        return 0.0
+    return float(steps.min())
 
 
 def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFinding | None:
-    """Compare the description with the encoders, and look for the fewest numbers of it that are
-    wrong.
+    """Compare the description with the encoders: find the fewest numbers of it that are wrong.
 
     Args:
         model: of the description.
@@ -230,27 +238,33 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
     if count < LEAST_POSITIONS:
         return None
     directions = model.robot.axis_count - model.assembly.mobility
-    stride = -(-count * directions // MOST_ROWS)
-    problem = _Problem.of(model, [one.every(stride) for one in runs if len(one.time_s)])
+    stride = -(-count * directions // MOST_ROWS)  # rounded up
+    thinner = [run.every(stride) for run in runs if len(run.time_s)]
+    problem = _Problem.of(model, thinner)
     as_described = np.zeros(len(problem.parameters))
-    described = problem.misfit(as_described)
-    misfit = float(np.sqrt(np.mean(described**2)))
-    square = float(described @ described)
-    is_significant = problem.excess(square, 0, problem.noise_std(as_described)) > SMALLEST_MISFIT
-    chosen: list[tuple[int, ...]] = []
+    described_misfit = problem.misfit(as_described)
+    misfit = float(np.sqrt(np.mean(described_misfit**2)))
+    square = float(described_misfit @ described_misfit)
+    noise_std = problem.noise_std(as_described)
+    is_significant = problem.excess(square, 0, noise_std) > SMALLEST_MISFIT
+    explanations: list[tuple[int, ...]] = []
     causes: tuple[int, ...] = ()
     left = misfit
     if is_significant:
-        chosen, fitted = _explained(problem, _whole(problem))
-        causes = chosen[0] if chosen else ()
-        if causes:
-            square = fitted.misfit_square_of(causes)
+        explanations, fitted = _explained(problem, _whole(problem))
+        if explanations:
+            causes = explanations[0]
+            left_square = fitted.misfit_square_of(causes)
         else:
-            square = fitted.square_of_description()
-        left = float(np.sqrt(square / problem.rows))
+            left_square = fitted.square_of_description()
+        left = float(np.sqrt(left_square / problem.rows))
     else:
         fitted = _with_noise(problem, as_described)
     estimates, covariance = _estimates(fitted, causes)
+    alternatives: list[tuple[GeometryEstimate, ...]] = []
+    for other in explanations[1:]:
+        other_estimates, _ = _estimates(fitted, other)
+        alternatives.append(other_estimates)
     return GeometryFinding(
         misfit=misfit,
         misfit_left=left,
@@ -258,7 +272,7 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
         is_significant=is_significant,
         causes=estimates,
         covariance=covariance,
-        alternatives=tuple(_estimates(fitted, other)[0] for other in chosen[1:]),
+        alternatives=tuple(alternatives),
         every=fitted.every(),
         unobservable=fitted.unobservable(),
     )
@@ -279,18 +293,19 @@ class _Problem:
 
     @classmethod
     def of(cls, model: Model, runs: Sequence[Positions]) -> _Problem:
+        """Find the poses that fit the encoders best with the described geometry."""
         robot = model.robot
-        size_m = model.assembly.size_m
-        axis_unit = np.array(
-            [1.0 if joint.kind is JointKind.REVOLUTE else size_m for joint in robot.axes]
-        )
+        kinds = [joint.kind for joint in robot.axes]
+        is_revolute = np.array([kind is JointKind.REVOLUTE for kind in kinds])
+        axis_unit = np.where(is_revolute, 1.0, model.assembly.size_m)
         of_description = (*geometry_parameters(robot), *base_places(robot))
-        units = [unit_of(model, one) for one in of_description]
-        speed = np.concatenate([one.motion[:, :, 0] for one in runs]) / axis_unit
-        fastest = np.sqrt(np.mean(speed**2, axis=0))
-        units += [1.0 / max(float(one), SMALLEST_SINGULAR) for one in fastest]
-        axes_rad = np.concatenate([one.position_rad for one in runs])
+        units = [unit_of(model, parameter) for parameter in of_description]
+        speed = _speeds(runs) / axis_unit
+        mean_speed = np.sqrt(np.mean(speed**2, axis=0))
+        units += [1.0 / max(float(one), SMALLEST_SINGULAR) for one in mean_speed]
+        axes_rad = np.concatenate([run.position_rad for run in runs])
         near_rad = positions(robot, model.assembly, axes_rad)
+        basis = _misfit_directions(model, near_rad, axis_unit)
         return cls(
             model=model,
             parameters=(*of_description, *encoder_delays(robot)),
@@ -298,7 +313,7 @@ class _Problem:
             runs=tuple(runs),
             axis_unit=axis_unit,
             near_rad=near_rad,
-            basis=_misfit_directions(model, near_rad, axis_unit),
+            basis=basis,
         )
 
     @property
@@ -315,9 +330,13 @@ class _Problem:
     @property
     def directions(self) -> list[RunDirections]:
         """When and in which directions each run shows a misfit."""
-        ends = np.cumsum([len(one.time_s) for one in self.runs])
-        parts = np.split(self.basis, ends[:-1])
-        return [RunDirections(run.time_s, part) for run, part in zip(self.runs, parts, strict=True)]
+        directions: list[RunDirections] = []
+        first = 0
+        for run in self.runs:
+            last = first + len(run.time_s)
+            directions.append(RunDirections(run.time_s, self.basis[first:last]))
+            first = last
+        return directions
 
     def misfit(self, changes: FloatArray, offset: int = 0) -> FloatArray:
         """e with changes of all parameters in their units, shape (k (m − d),).
@@ -325,26 +344,34 @@ class _Problem:
         ``offset`` -1 or 1 is for the samples before or after.
         """
         axes_rad = self._recorded(changes, offset)
-        return self._apart(axes_rad, self._closed(self._changed(changes), axes_rad))
+        position_rad = self._closed(self._changed(changes), axes_rad)
+        return self._apart(axes_rad, position_rad)
 
     def _recorded(self, changes: FloatArray, offset: int = 0) -> FloatArray:
         """Positions of the axes, those of late encoders at the time of the others, shape (k, m)."""
-        delays_s = (changes * self.unit)[-self.model.robot.axis_count :]
+        axis_count = self.model.robot.axis_count
+        delays_s = (changes * self.unit)[-axis_count:]
         parts: list[FloatArray] = []
         for run in self.runs:
-            recorded = {-1: run.before_rad, 0: run.position_rad, 1: run.after_rad}[offset]
-            at_s = np.full(len(delays_s), offset * run.interval_s)
-            parts.append(recorded + _moved(run.motion, at_s + delays_s) - _moved(run.motion, at_s))
+            match offset:
+                case -1:
+                    recorded_rad = run.before_rad
+                case 1:
+                    recorded_rad = run.after_rad
+                case _:
+                    recorded_rad = run.position_rad
+            at_s = np.full(axis_count, offset * run.interval_s)
+            here_rad = _moved(run.motion, at_s)
+            undelayed_rad = _moved(run.motion, at_s + delays_s)
+            parts.append(recorded_rad + undelayed_rad - here_rad)
         return np.concatenate(parts)
 
     def _changed(self, changes: FloatArray) -> Robot:
         """Robot with changes of all parameters in their units."""
-        numbers = zip(self.parameters, changes * self.unit, strict=True)
-        described = [
-            GeometryChange(one, float(change))
-            for one, change in numbers
-            if one.kind is not GeometryKind.DELAY
-        ]
+        described: list[GeometryChange] = []
+        for parameter, change in zip(self.parameters, changes * self.unit, strict=True):
+            if parameter.kind is not GeometryKind.DELAY:
+                described.append(GeometryChange(parameter, float(change)))
         return with_geometry(self.model.robot, described)
 
     def _closed(self, robot: Robot, axes_rad: FloatArray) -> FloatArray:
@@ -353,24 +380,29 @@ class _Problem:
 
     def _apart(self, axes_rad: FloatArray, position_rad: FloatArray) -> FloatArray:
         """e of poses, shape (k (m − d),)."""
-        apart = axes_rad - position_rad[:, list(self.model.robot.axis_joints)]
+        motors = list(self.model.robot.axis_joints)
+        apart = axes_rad - position_rad[:, motors]
         return self._in_directions(apart)
 
     def _in_directions(self, apart: FloatArray) -> FloatArray:
-        """Differences of the axes [rad or m], shape (k, m), in the directions of a misfit,
-        shape (k (m − d),).
+        """Differences of the axes along the directions of a misfit, shape (k (m − d),).
+
+        Args:
+            apart: of each axis [rad or m], shape (k, m).
         """
-        return np.asarray(np.einsum("kmr,km->kr", self.basis, apart / self.axis_unit).ravel())
+        # e_kr = Σ_m B_kmr a_km
+        misfit = np.einsum("kmr,km->kr", self.basis, apart / self.axis_unit)
+        return np.asarray(misfit.ravel())
 
     def linearised(
         self, changes: FloatArray, chosen: Sequence[int]
     ) -> tuple[FloatArray, FloatArray]:
-        """e and its derivatives to some parameters, in their units, shapes (k (m − d),)
-        and (k (m − d), p).
+        """e and its derivatives to some parameters, shapes (k (m − d),) and (k (m − d), p).
 
-        With P = I − A (AᵀA)⁻¹ Aᵀ, a zero moves e by P e_j, a delay by P e_j q̇_j, and a length or
-        place by −P times what the motors' joints move where x stays: J_d dq_d = −∂φ/∂θ. φ is linear
-        in lengths and places, so that a difference of it is exact.
+        The parameters are in their units. With P = I − A (AᵀA)⁻¹ Aᵀ, a zero moves e by P e_j, a
+        delay by P e_j q̇_j, and a length or place by −P times what the motors' joints move where x
+        stays: J_d dq_d = −∂φ/∂θ. φ is linear in lengths and places, so that a difference of it is
+        exact.
         """
         robot = self._changed(changes)
         assembly = self.model.assembly
@@ -381,27 +413,33 @@ class _Problem:
         position_rad = self._closed(robot, axes_rad)
         closing = loops(robot, position_rad, assembly.size_m)
         to_joints, q, r = _to_joints(self.model, closing.jacobian)
+        # P = I − Q Qᵀ, Q an orthonormal basis of the motors' possible motion
         onto = np.linalg.qr(to_joints[:, motors]).Q
         hidden = np.eye(len(motors)) - onto @ np.swapaxes(onto, 1, 2)
-        speed = np.concatenate([one.motion[:, :, 0] for one in self.runs])
+        speed = _speeds(self.runs)
         columns: list[FloatArray] = []
         for index in chosen:
             parameter = self.parameters[index]
             unit = float(self.unit[index])
             match parameter.kind:
                 case GeometryKind.ZERO:
-                    column = hidden[:, :, names.index(parameter.joint)]
+                    axis = names.index(parameter.joint)
+                    column = hidden[:, :, axis]
                 case GeometryKind.DELAY:
                     axis = names.index(parameter.joint)
                     column = hidden[:, :, axis] * speed[:, [axis]]
                 case _:
-                    longer = with_geometry(robot, (GeometryChange(parameter, STEP * unit),))
-                    gap = loops(longer, position_rad, assembly.size_m).residual - closing.residual
+                    step = STEP * unit
+                    longer = with_geometry(robot, (GeometryChange(parameter, step),))
+                    longer_closing = loops(longer, position_rad, assembly.size_m)
+                    gap = longer_closing.residual - closing.residual
+                    # Qᵀ Δφ in each sample
+                    turned_gap = np.einsum("kcr,kc->kr", q, gap)
+                    solution = np.linalg.solve(r, turned_gap[..., None])
                     moved = np.zeros(position_rad.shape)
-                    moved[:, rest] = -np.linalg.solve(
-                        r, np.einsum("kcr,kc->kr", q, gap)[..., None]
-                    )[..., 0]
-                    column = -np.einsum("kij,kj->ki", hidden, moved[:, motors]) / (STEP * unit)
+                    moved[:, rest] = -solution[..., 0]
+                    # −P dq_d of the motors' joints
+                    column = -np.einsum("kij,kj->ki", hidden, moved[:, motors]) / step
             columns.append(unit * self._in_directions(column))
         return self._apart(axes_rad, position_rad), np.stack(columns, axis=1)
 
@@ -415,11 +453,16 @@ class _Problem:
         earlier = self.misfit(changes, -1)
         now = self.misfit(changes)
         later = self.misfit(changes, 1)
-        by_differences = float(np.mean((earlier - 2.0 * now + later) ** 2)) / 6.0
-        counts = np.concatenate([np.tile(one.count_rad, (len(one.time_s), 1)) for one in self.runs])
+        # White noise of variance σ² has second differences of variance 6 σ².
+        differences = earlier - 2.0 * now + later
+        variance_by_differences = float(np.mean(differences**2)) / 6.0
+        # Rounding to counts c has variance c²/12; each axis has its share of a direction.
+        counts = [np.tile(run.count_rad, (len(run.time_s), 1)) for run in self.runs]
+        scaled_counts = np.concatenate(counts) / self.axis_unit
         share = np.sum(self.basis**2, axis=2) / self.basis.shape[2]
-        by_counts = float(np.mean(np.sum(share * (counts / self.axis_unit) ** 2, axis=1))) / 12.0
-        return float(np.sqrt(max(by_differences, by_counts)))
+        count_squares = np.sum(share * scaled_counts**2, axis=1)
+        variance_by_counts = float(np.mean(count_squares)) / 12.0
+        return float(np.sqrt(max(variance_by_differences, variance_by_counts)))
 
     def excess(self, square: float, count: int, noise_std: float) -> float:
         """Root mean square of a misfit beyond the known noise [rad, or of the robot's size].
@@ -430,14 +473,23 @@ class _Problem:
             noise_std: of a misfit; each sample gives one difference, so that it is known as well as
                 the misfit is.
         """
-        free = self.rows - count
-        limit = float(scipy.stats.f.isf(PROBABILITY, free, self.rows))
-        return float(np.sqrt(max(square / free - limit * noise_std**2, 0.0)))
+        freedom = self.rows - count
+        limit = float(scipy.stats.f.isf(PROBABILITY, freedom, self.rows))
+        noise_square = limit * noise_std**2
+        excess_square = square / freedom - noise_square
+        return float(np.sqrt(max(excess_square, 0.0)))
+
+
+def _speeds(runs: Sequence[Positions]) -> FloatArray:
+    """Speed of the axes at each position of all runs [rad/s or m/s], shape (k, m)."""
+    return np.concatenate([run.motion[:, :, 0] for run in runs])
 
 
 def _moved(motion: FloatArray, time_s: FloatArray) -> FloatArray:
     """Motion from a position over a time of each axis, shape (m,): shape (k, m)."""
-    powers = time_s[:, None] ** np.arange(1, DEGREE + 1)
+    exponents = np.arange(1, DEGREE + 1)
+    powers = time_s[:, None] ** exponents
+    # Σ_n c_kmn t_mⁿ
     return np.asarray(np.einsum("kmn,mn->km", motion, powers))
 
 
@@ -447,21 +499,25 @@ def _to_joints(model: Model, jacobian: FloatArray) -> tuple[FloatArray, FloatArr
     rest = list(model.assembly.dependent)
     samples, _, joints = jacobian.shape
     q, r = np.linalg.qr(jacobian[:, :, rest])
+    # dq_d = −J_d⁻¹ J_x dx
+    turned = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
     to_joints = np.zeros((samples, joints, len(x)))
     to_joints[:, x] = np.eye(len(x))
-    to_joints[:, rest] = -np.linalg.solve(r, np.swapaxes(q, 1, 2) @ jacobian[:, :, x])
+    to_joints[:, rest] = -np.linalg.solve(r, turned)
     return to_joints, q, r
 
 
 def _misfit_directions(model: Model, position_rad: FloatArray, axis_unit: FloatArray) -> FloatArray:
-    """Orthonormal directions of the axes in which no motion goes, in their units, shape (k, m,
-    m − d).
+    """Orthonormal directions of the axes in which no motion goes, shape (k, m, m − d).
+
+    They are in the units of the axes.
     """
     closing = loops(model.robot, position_rad, model.assembly.size_m)
     to_joints, _, _ = _to_joints(model, closing.jacobian)
     to_motors = to_joints[:, list(model.robot.axis_joints)]
     mobility = model.assembly.mobility
-    hidden = np.linalg.qr(to_motors, mode="complete").Q[:, :, mobility:]
+    complete = np.linalg.qr(to_motors, mode="complete").Q
+    hidden = complete[:, :, mobility:]
     return np.asarray(np.linalg.qr(hidden / axis_unit[:, None]).Q)
 
 
@@ -479,19 +535,29 @@ class _Visible:
         _, singular, ways = np.linalg.svd(columns, full_matrices=False)
         is_real = singular > SMALLEST_SINGULAR * singular[0]
         is_known = np.sqrt(variance) < largest_std * singular
-        return cls(singular, ways, int(np.sum(is_real & is_known)))
+        seen = int(np.sum(is_real & is_known))
+        return cls(singular, ways, seen)
+
+    @property
+    def seen_ways(self) -> FloatArray:
+        """Those that these positions show, a column each, shape (p, seen)."""
+        return self.ways[: self.seen].T
+
+    @property
+    def hidden_ways(self) -> FloatArray:
+        """The others, a row each, shape (p − seen, p)."""
+        return self.ways[self.seen :]
 
     def estimate(self, columns: FloatArray, right: FloatArray) -> FloatArray:
         """Least squares of what is seen; the rest stays as it is described."""
-        ways = self.ways[: self.seen].T
-        return np.asarray(ways @ np.linalg.lstsq(columns @ ways, right, rcond=None)[0])
+        ways = self.seen_ways
+        amounts = np.linalg.lstsq(columns @ ways, right, rcond=None)[0]
+        return np.asarray(ways @ amounts)
 
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """e ≈ J θ − y around an estimate, reduced to triangles,
-    and the noise of all numbers together.
-    """
+    """e ≈ J θ − y around an estimate, reduced to triangles, and the noise of all numbers."""
 
     problem: _Problem
     jacobian: FloatArray  #: J, shape (k (m − d), p)
@@ -510,8 +576,10 @@ class _Linearised:
         cls, problem: _Problem, changes: FloatArray, noise: MisfitNoise | None, noise_std: float
     ) -> _Linearised:
         """Linearise around changes of all parameters in their units."""
-        misfit, jacobian = problem.linearised(changes, range(len(problem.parameters)))
-        return cls.of(problem, jacobian, jacobian @ changes - misfit, noise, noise_std)
+        every = range(len(problem.parameters))
+        misfit, jacobian = problem.linearised(changes, every)
+        right = jacobian @ changes - misfit
+        return cls.of(problem, jacobian, right, noise, noise_std)
 
     @classmethod
     def of(
@@ -524,16 +592,20 @@ class _Linearised:
     ) -> _Linearised:
         """Reduce a linear problem."""
         rows = np.column_stack((jacobian, right))
-        white = rows if noise is None else noise.white(rows)
+        white = rows
+        if noise is not None:
+            white = noise.white(rows)
         triangle = np.asarray(np.linalg.qr(white, mode="r"))
         columns = triangle[:, :-1]
+        white_right = triangle[:, -1]
         variance = 0.0
         visible = _Visible.of(columns, variance, TESTED_STD)
         square = 0.0
         while True:
-            left = triangle[:, -1] - columns @ visible.estimate(columns, triangle[:, -1])
+            left = white_right - columns @ visible.estimate(columns, white_right)
             square = float(left @ left)
-            variance = square / max(problem.rows - visible.seen, 1)
+            freedom = max(problem.rows - visible.seen, 1)
+            variance = square / freedom
             new = _Visible.of(columns, variance, TESTED_STD)
             if new.seen >= visible.seen:
                 break
@@ -552,10 +624,12 @@ class _Linearised:
         )
 
     def moved_to(self, changes: FloatArray) -> _Linearised:
-        """Take the misfit of other changes, with the derivatives from here:
-        they differ by the size of the changes.
+        """Take the misfit of other changes, with the derivatives from here.
+
+        They differ by the size of the changes.
         """
-        right = self.jacobian @ changes - self.problem.misfit(changes)
+        misfit = self.problem.misfit(changes)
+        right = self.jacobian @ changes - misfit
         return _Linearised.of(self.problem, self.jacobian, right, self.noise, self.noise_std)
 
     @property
@@ -570,9 +644,8 @@ class _Linearised:
     def candidates(self) -> tuple[int, ...]:
         """Indices of the parameters that alone change a misfit."""
         length = np.linalg.norm(self._columns, axis=0)
-        return tuple(
-            int(index) for index in np.flatnonzero(np.sqrt(self.variance) < TESTED_STD * length)
-        )
+        is_known = np.sqrt(self.variance) < TESTED_STD * length
+        return tuple(np.flatnonzero(is_known).tolist())
 
     def whole(self) -> FloatArray:
         """All changes as far as they are seen, in their units."""
@@ -587,41 +660,49 @@ class _Linearised:
         """Σ of the white e² that is left when only these numbers change."""
         left = self._right
         if chosen:
-            left = left - self._columns[:, list(chosen)] @ self.solution(chosen)
+            columns = self._columns[:, list(chosen)]
+            left = left - columns @ self.solution(chosen)
         return float(left @ left)
 
     def misfit_square_of(self, chosen: Sequence[int]) -> float:
         """Σe² that is left when only these numbers change."""
         left = self.misfit_triangle[:, -1]
         if chosen:
-            left = left - self.misfit_triangle[:, list(chosen)] @ self.solution(chosen)
+            columns = self.misfit_triangle[:, list(chosen)]
+            left = left - columns @ self.solution(chosen)
         return float(left @ left)
 
     def square_of_description(self) -> float:
         """Σe² that is left when all zeros and lengths change."""
         columns = self.misfit_triangle[:, list(self.problem.described)]
         right = self.misfit_triangle[:, -1]
-        left = right - columns @ np.linalg.lstsq(columns, right, rcond=SMALLEST_SINGULAR)[0]
+        solution = np.linalg.lstsq(columns, right, rcond=SMALLEST_SINGULAR)[0]
+        left = right - columns @ solution
         return float(left @ left)
 
     def explains(self, chosen: Sequence[int]) -> bool:
-        """Whether these numbers alone leave no more than all that can be seen,
-        and no more than noise.
-        """
+        """Whether these numbers alone leave no more than all that is seen, and than noise."""
         seen = self.visible.seen
-        others = max(seen - len(chosen), 1)
-        excess = (self.square_of(chosen) - self.whole_square) / others
-        independent = self.problem.rows if self.noise is None else self.noise.effective
-        limit = float(scipy.stats.f.isf(PROBABILITY, others, max(independent - seen, 1.0)))
-        if excess > limit * self.variance:
+        other_count = max(seen - len(chosen), 1)
+        independent: float = self.problem.rows
+        if self.noise is not None:
+            independent = self.noise.effective
+        freedom = max(independent - seen, 1.0)
+        limit = float(scipy.stats.f.isf(PROBABILITY, other_count, freedom))
+        # F test: the mean square that the other numbers would take
+        taken_by_others = (self.square_of(chosen) - self.whole_square) / other_count
+        if taken_by_others > limit * self.variance:
             return False
-        excess = self.problem.excess(self.misfit_square_of(chosen), len(chosen), self.noise_std)
-        described = float(np.sqrt(self.misfit_square_of(()) / self.problem.rows))
+        square = self.misfit_square_of(chosen)
+        excess = self.problem.excess(square, len(chosen), self.noise_std)
+        described_square = self.misfit_square_of(())
+        described = float(np.sqrt(described_square / self.problem.rows))
         return excess <= min(TOLERATED_MISFIT, TOLERATED_SHARE * described)
 
     def covariance(self, chosen: Sequence[int]) -> FloatArray:
         """Covariance of the chosen changes, in their units."""
-        upper = np.linalg.qr(self.triangle[:, list(chosen)], mode="r")
+        columns = self.triangle[:, list(chosen)]
+        upper = np.linalg.qr(columns, mode="r")
         inverse = np.linalg.inv(upper)
         return np.asarray(self.variance * (inverse @ inverse.T))
 
@@ -637,55 +718,55 @@ class _Linearised:
         columns = self._columns[:, described]
         visible = self._description
         values = visible.estimate(columns, self._right)
-        ways = visible.ways[: visible.seen].T
         left = self._right - columns @ values
-        variance = float(left @ left) / max(self.problem.rows - visible.seen, 1)
-        variances = variance * np.sum((ways / visible.singular[: visible.seen]) ** 2, axis=1)
-        hidden = np.sum(visible.ways[visible.seen :] ** 2, axis=0) > SMALLEST_SINGULAR
-        std = np.where(hidden, np.inf, np.sqrt(variances))
+        freedom = max(self.problem.rows - visible.seen, 1)
+        variance = float(left @ left) / freedom
+        # σ² Σ (v_i/s_i)² over the directions that are seen
+        seen_singular = visible.singular[: visible.seen]
+        per_noise = visible.seen_ways / seen_singular
+        variances = variance * np.sum(per_noise**2, axis=1)
+        hidden_share = np.sum(visible.hidden_ways**2, axis=0)
+        is_hidden = hidden_share > SMALLEST_SINGULAR
+        stds = np.where(is_hidden, np.inf, np.sqrt(variances))
         unit = self.problem.unit[described]
-        numbers = zip(
-            self.problem.parameters[: len(described)], values * unit, std * unit, strict=True
-        )
-        return tuple(
-            GeometryEstimate(parameter, float(value), float(one))
-            for parameter, value, one in numbers
-        )
+        values *= unit
+        stds *= unit
+        parameters = self.problem.parameters[: len(described)]
+        estimates: list[GeometryEstimate] = []
+        for parameter, value, std in zip(parameters, values, stds, strict=True):
+            estimates.append(GeometryEstimate(parameter, float(value), float(std)))
+        return tuple(estimates)
 
     def unobservable(self) -> tuple[str, ...]:
-        """Directions that the positions do not show,
-        by the numbers that have the largest part in them.
-        """
-        visible = self._description
-        return tuple(self._direction(way) for way in visible.ways[visible.seen :])
+        """Directions that the positions do not show, by the numbers with the largest part."""
+        return tuple(self._direction(way) for way in self._description.hidden_ways)
 
     def _direction(self, way: FloatArray) -> str:
-        largest = np.abs(way).max()
+        least_share = 0.1 * np.abs(way).max()
         described = self.problem.parameters[: len(way)]
-        parts = [
-            f"{share:+.2f} {parameter.name}"
-            for share, parameter in zip(way, described, strict=True)
-            if abs(share) > 0.1 * largest
-        ]
+        parts: list[str] = []
+        for share, parameter in zip(way, described, strict=True):
+            if abs(share) > least_share:
+                parts.append(f"{share:+.2f} {parameter.name}")
         return ", ".join(parts)
 
 
 def _whole(problem: _Problem) -> _Linearised:
-    """Linearise around the estimate of all numbers;
-    directions that are not seen stay as they are described.
-    """
+    """Linearise around the estimate of all numbers; directions that are not seen stay."""
     as_described = np.zeros(len(problem.parameters))
-    near = _settled(_Linearised.at(problem, as_described, None, 0.0), as_described)
+    start = _Linearised.at(problem, as_described, None, 0.0)
+    near = _settled(start, as_described)
     fitted = _with_noise(problem, near.whole())
     return _settled(fitted, fitted.whole())
 
 
 def _with_noise(problem: _Problem, changes: FloatArray) -> _Linearised:
     """Linearise near an estimate, with the noise that is left there."""
-    fitted = _Linearised.at(problem, changes, None, problem.noise_std(changes))
-    ways = fitted.visible.ways[: fitted.visible.seen].T
-    noise = estimate_noise(problem.directions, fitted.jacobian @ ways, fitted.right)
-    return _Linearised.of(problem, fitted.jacobian, fitted.right, noise, fitted.noise_std)
+    noise_std = problem.noise_std(changes)
+    fitted = _Linearised.at(problem, changes, None, noise_std)
+    seen_jacobian = fitted.jacobian @ fitted.visible.seen_ways
+    noise = estimate_noise(problem.directions, seen_jacobian, fitted.right)
+    return _Linearised.of(problem, fitted.jacobian, fitted.right, noise, noise_std)
 
 
 def _settled(start: _Linearised, changes: FloatArray) -> _Linearised:
@@ -693,51 +774,57 @@ def _settled(start: _Linearised, changes: FloatArray) -> _Linearised:
     fitted = start
     for _ in range(ITERATIONS):
         new = fitted.whole()
-        step = float(np.linalg.norm(fitted.triangle[:, :-1] @ (new - changes)))
+        columns = fitted.triangle[:, :-1]
+        misfit_step = float(np.linalg.norm(columns @ (new - changes)))
         changes = new
         fitted = fitted.moved_to(changes)
-        if step < SETTLED + SETTLED_SIGMAS * np.sqrt(float(fitted.variance)):
+        row_std = np.sqrt(float(fitted.variance))
+        if misfit_step < SETTLED + SETTLED_SIGMAS * row_std:
             break
     return fitted
 
 
 def _explained(problem: _Problem, start: _Linearised) -> tuple[list[tuple[int, ...]], _Linearised]:
-    """Choices of the fewest numbers that explain the misfit, the best first,
-    linearised around the best of them.
+    """Choices of the fewest numbers that explain the misfit, the best first.
+
+    The problem that is returned is linearised around the best of them.
     """
     for size in range(1, MOST_CAUSES + 1):
         fitted = start
         best: tuple[int, ...] = ()
         # What is best is known after it was estimated itself: all numbers together are elsewhere.
         for _ in range(MOST_TURNS):
-            ranked = sorted(combinations(fitted.candidates, size), key=fitted.square_of)
-            if not ranked or ranked[0] == best:
+            choices = combinations(fitted.candidates, size)
+            new_best = min(choices, key=fitted.square_of, default=best)
+            if new_best == best:
                 break
-            best = ranked[0]
-            fitted = start.moved_to(_refined(problem, fitted, best))
+            best = new_best
+            changes = _refined(problem, fitted, best)
+            fitted = start.moved_to(changes)
         if best and fitted.explains(best):
-            others = [
-                one
-                for one in combinations(fitted.candidates, size)
-                if one != best and fitted.explains(one)
-            ]
-            return [best, *sorted(others, key=fitted.square_of)], fitted
+            others: list[tuple[int, ...]] = []
+            for choice in combinations(fitted.candidates, size):
+                if choice != best and fitted.explains(choice):
+                    others.append(choice)
+            others.sort(key=fitted.square_of)
+            return [best, *others], fitted
     return [], start
 
 
 def _refined(problem: _Problem, fitted: _Linearised, chosen: tuple[int, ...]) -> FloatArray:
     """Estimate the chosen numbers by Gauss-Newton; the others stay as they are described."""
+    places = list(chosen)
     changes = np.zeros(len(problem.parameters))
-    changes[list(chosen)] = fitted.solution(chosen)
+    changes[places] = fitted.solution(chosen)
     for _ in range(ITERATIONS):
         misfit, jacobian = problem.linearised(changes, chosen)
-        rows = np.column_stack((jacobian, misfit))
-        if fitted.noise is None:
-            white = rows
-        else:
-            white = fitted.noise.white(rows)
-        step = -np.linalg.lstsq(white[:, :-1], white[:, -1], rcond=None)[0]
-        changes[list(chosen)] += step
+        white = np.column_stack((jacobian, misfit))
+        if fitted.noise is not None:
+            white = fitted.noise.white(white)
+        columns = white[:, :-1]
+        white_misfit = white[:, -1]
+        step = -np.linalg.lstsq(columns, white_misfit, rcond=None)[0]
+        changes[places] += step
         if float(np.max(np.abs(step))) < SETTLED:
             break
     return changes
@@ -752,10 +839,9 @@ def _estimates(
     unit = fitted.problem.unit[list(chosen)]
     covariance = fitted.covariance(chosen) * np.outer(unit, unit)
     values = fitted.solution(chosen) * unit
-    std = np.sqrt(np.diag(covariance))
-    numbers = zip(chosen, values, std, strict=True)
-    found = tuple(
-        GeometryEstimate(fitted.problem.parameters[index], float(value), float(one))
-        for index, value, one in numbers
-    )
-    return found, covariance
+    stds = np.sqrt(np.diag(covariance))
+    estimates: list[GeometryEstimate] = []
+    for index, value, std in zip(chosen, values, stds, strict=True):
+        parameter = fitted.problem.parameters[index]
+        estimates.append(GeometryEstimate(parameter, float(value), float(std)))
+    return tuple(estimates), covariance

@@ -105,16 +105,14 @@ def identify(
     instants: list[Instants] = []
     channels: list[RunChannels] = []
     kept: list[BuiltRun] = []
-    built = rows_of_runs(
-        model, used, conditioning, instruments=method is Method.IV and not model.is_redundant
-    )
+    needs_instruments = method is Method.IV
+    has_instruments = needs_instruments and not model.is_redundant
+    built = rows_of_runs(model, used, conditioning, instruments=has_instruments)
     built = noting_channels(built, model, axes, channels)
-    with_instants = noting_instants(built, model, conditioning, instants)
-    standard = reduce_built(
-        model,
-        keeping(with_instants, kept) if keep_rows else with_instants,
-        instruments=method is Method.IV,
-    )
+    built = noting_instants(built, model, conditioning, instants)
+    if keep_rows:
+        built = keeping(built, kept)
+    standard = reduce_built(model, built, instruments=needs_instruments)
     if not standard.runs:
         raise DataUnfit(
             "", "no run was given; expected one without load and one with a weighed payload"
@@ -123,29 +121,17 @@ def identify(
     system = regrouped(standard)
     del standard  # its clusters hold every column
     with with_unit_causes(channels, model, axes), with_channel_causes(channels, axes):
-        require_distinct(system, gains=known_gains is None)
-        estimate = estimate_with(method, system, known_gains)
-        jackknifed = estimate
-        if known_gains is None:
-            # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and
-            # do not see that moves contradict each other; ml's do, where it has an estimate.
-            with suppress(IdentificationError):
-                jackknifed = estimate if method.is_of_currents else ml(system)
-            require_seen_payload(jackknifed, system)
-        if known_gains is not None:
-            require_weight(system, estimate)
-            require_signs(system, estimate, axes)
-        if judge:
-            idle = idle_joints(model, *joint_torques(system, estimate))
-            require_plausible(jackknifed, estimate.relative_error(system), axes, idle)
-    left_out = with_signed_currents(
-        each_run(holdout, names, system.payloads), model, conditioning, axes
-    )
-    built = noting_channels(rows_of_runs(model, left_out, conditioning), model, axes, [])
-    rest = reduce_built(
-        model, keeping(built, kept) if keep_rows else built, payloads=system.payloads
-    )
-    unseen = regrouped(rest, system.base, system.payload_columns) if rest.runs else None
+        estimate = _checked_estimate(system, method, known_gains, axes, judge=judge)
+    left_out = each_run(holdout, names, system.payloads)
+    left_out = with_signed_currents(left_out, model, conditioning, axes)
+    built = rows_of_runs(model, left_out, conditioning)
+    built = noting_channels(built, model, axes, [])
+    if keep_rows:
+        built = keeping(built, kept)
+    rest = reduce_built(model, built, payloads=system.payloads)
+    unseen: System | None = None
+    if rest.runs:
+        unseen = regrouped(rest, system.base, system.payload_columns)
     found = Identification(
         model,
         conditioning,
@@ -158,10 +144,51 @@ def identify(
     if not keep_rows:
         return found
     datasets = tuple(data for data, _ in kept)
-    observation = observe(model, datasets, conditioning, system, [rows for _, rows in kept])
+    rows = [rows_of_run for _, rows_of_run in kept]
+    observation = observe(model, datasets, conditioning, system, rows)
     found = replace(found, gathered=(datasets, observation))
     limits = limited_currents(observation, estimate)
-    return _without_limited_currents(found, datasets, limits, known_gains) if limits else found
+    if not limits:
+        return found
+    return _without_limited_currents(found, datasets, limits, known_gains)
+
+
+def _checked_estimate(
+    system: System,
+    method: Method,
+    fixed_gains: FloatArray | None,
+    axes: Sequence[str],
+    *,
+    judge: bool,
+) -> Estimate:
+    """Run an estimator, and refuse an estimate that its data contradict.
+
+    Args:
+        system: of the fit.
+        method: estimator.
+        fixed_gains: known gains, shape (m,).
+        axes: name of each axis.
+        judge: the errors too.
+    """
+    require_distinct(system, gains=fixed_gains is None)
+    estimate = estimate_with(method, system, fixed_gains)
+    jackknifed = estimate
+    if fixed_gains is None:
+        # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and
+        # do not see that moves contradict each other; ml's do, where it has an estimate.
+        if not method.is_of_currents:
+            with suppress(IdentificationError):
+                jackknifed = ml(system)
+        require_seen_payload(jackknifed, system)
+    else:
+        require_weight(system, estimate)
+        require_signs(system, estimate, axes)
+    if judge:
+        size, left = joint_torques(system, estimate)
+        idle = idle_joints(system.model, size, left)
+        error = estimate.relative_error(system)
+        require_plausible(jackknifed, error, axes, idle)
+    return estimate
 
 
 def _known_gains(fixed_gains: ArrayLike | None, model: Model) -> FloatArray | None:
@@ -182,8 +209,7 @@ def _without_limited_currents(
     limits: Sequence[LimitedCurrent],
     fixed_gains: FloatArray | None,
 ) -> Identification:
-    """Fit again without the samples in which a drive gave less current than its reference asked
-    for.
+    """Fit again without the samples in which a drive gave less current than its reference.
 
     Args:
         found: the fit with all samples.
@@ -201,19 +227,24 @@ def _without_limited_currents(
     rows = [tuple(rows_of(model, data, conditioning)) for data in kept]
     built = list(zip(kept, rows, strict=True))
     fit_runs = len(found.channels)
-    system = regrouped(reduce_built(model, built[:fit_runs], instruments=method is Method.IV))
+    standard = reduce_built(model, built[:fit_runs], instruments=method is Method.IV)
+    system = regrouped(standard)
     holdout = found.holdout
     if holdout is not None:
         rest = reduce_built(model, built[fit_runs:], payloads=system.payloads)
         holdout = regrouped(rest, system.base, system.payload_columns)
-    noted = zip(found.channels, datasets[:fit_runs], strict=True)
+    estimate = estimate_with(method, system, fixed_gains)
+    observation = observe(model, kept, conditioning, system, rows)
+    channels: list[RunChannels] = []
+    for of_run, data in zip(found.channels, datasets[:fit_runs], strict=True):
+        channels.append(noting_limits(of_run, data, limits))
     return replace(
         found,
         system=system,
         holdout=holdout,
-        estimate=estimate_with(method, system, fixed_gains),
-        gathered=(kept, observe(model, kept, conditioning, system, rows)),
-        channels=tuple(noting_limits(channels, data, limits) for channels, data in noted),
+        estimate=estimate,
+        gathered=(kept, observation),
+        channels=tuple(channels),
     )
 
 
@@ -299,11 +330,11 @@ def each_run(
                 Payload,
                 "write Payload(name, mounting, known)",
             )
-            if payloads is not None and run.payload.mounting not in (
-                known.mounting for known in payloads
-            ):
-                mounting = f"mounting {run.payload.mounting!r}, which no run of the fit carries"
-                raise DataUnfit(run.name, f"held out with {mounting}: it stays unknown")
+            if payloads is not None:
+                mountings = {known.mounting for known in payloads}
+                if run.payload.mounting not in mountings:
+                    mounting = f"mounting {run.payload.mounting!r}, which no run of the fit carries"
+                    raise DataUnfit(run.name, f"held out with {mounting}: it stays unknown")
         yield run
 
 
@@ -317,12 +348,15 @@ def with_signed_currents(
     """
     for run in runs:
         yield run
+        valid = run.valid
+        if valid is not None:
+            valid = np.asarray(valid, dtype=np.bool_)
         arrays = replace(
             run,
             time_s=np.asarray(run.time_s, dtype=np.float64),
             position_rad=np.asarray(run.position_rad, dtype=np.float64),
             current_a=np.asarray(run.current_a, dtype=np.float64),
-            valid=None if run.valid is None else np.asarray(run.valid, dtype=np.bool_),
+            valid=valid,
         )
         require_explained_currents(arrays, model, conditioning, axes)
 
@@ -335,13 +369,19 @@ def estimate_with(
     Raises:
         DataUnfit: ``tls`` with fixed gains: it has nothing to correct then.
     """
-    if method is Method.TLS:
-        if fixed_gains is not None:
-            raise DataUnfit(
-                ", ".join(system.runs),
-                "tls needs free gains; with fixed gains choose ls, wls, ml or iv",
-            )
-        return tls(system)
-    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml, Method.IV: iv}[method](
-        system, fixed_gains
-    )
+    match method:
+        case Method.LS:
+            return ls(system, fixed_gains)
+        case Method.WLS:
+            return wls(system, fixed_gains)
+        case Method.ML:
+            return ml(system, fixed_gains)
+        case Method.IV:
+            return iv(system, fixed_gains)
+        case Method.TLS:
+            if fixed_gains is not None:
+                raise DataUnfit(
+                    ", ".join(system.runs),
+                    "tls needs free gains; with fixed gains choose ls, wls, ml or iv",
+                )
+            return tls(system)

@@ -1,6 +1,4 @@
-"""Linear estimators of the paper: IDIM-LS, IDIM-WLS (eqs. 7-11, 15, 16) and IDIM-TLS (eqs.
-17-23).
-"""
+"""Linear estimators of the paper: IDIM-LS, IDIM-WLS (eqs. 7-11, 15, 16), IDIM-TLS (eqs. 17-23)."""
 
 from __future__ import annotations
 
@@ -16,13 +14,9 @@ from ident.estimators.method import Method
 from ident.model.base import independent_columns
 
 MISJUDGED_RATIO = 1.5
-"""Of `parameters_over_noise`: below it the smallest singular value is not the noise of a
-current.
-"""
+"""Of `parameters_over_noise`: below it the smallest singular value is no noise of a current."""
 NO_COLUMN = 1e-8
-"""Norm of a column, relative to the largest of the same joint,
-below which the joint does not have this column.
-"""
+"""Norm below which a joint does not have a column, relative to its largest one."""
 
 
 def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -35,7 +29,8 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     Raises:
         DataUnfit: free gains without a known payload: every gain could be scaled at will.
     """
-    return _solve(system, np.ones(system.axis_count), Method.LS, fixed_gains)
+    weight = np.ones(system.axis_count)
+    return _solve(system, weight, Method.LS, fixed_gains)
 
 
 def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -43,7 +38,8 @@ def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 
     Arguments and errors as for ``ls``.
     """
-    return _solve(system, 1.0 / wls_row_std(system, fixed_gains), Method.WLS, fixed_gains)
+    weight = 1.0 / wls_row_std(system, fixed_gains)
+    return _solve(system, weight, Method.WLS, fixed_gains)
 
 
 def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatArray:
@@ -63,37 +59,44 @@ def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatA
 
 
 def joint_error_std(triangles: Triangles, gains: FloatArray) -> FloatArray:
-    """Standard deviation of the error of each joint's own equations,
-    solved by least squares (§2.2), shape (n,) [Nm].
+    """Standard deviation of the error of each joint's own equations (§2.2), shape (n,) [Nm].
+
+    They are solved by least squares.
 
     Args:
         triangles: of each joint's rows of W_tot.
         gains: known gains [Nm/A], shape (m,).
     """
     count = len(gains)
-    deviations = []
+    deviations: list[float] = []
     for factor, rows in zip(triangles.factors, triangles.rows.tolist(), strict=True):
+        currents = factor[:, :count]
+        known = factor[:, -1]
         own = _own_columns(factor[:, count:-1])
-        torque = factor[:, :count] @ gains + factor[:, -1]
+        torque = currents @ gains + known
+        # Y − Q Qᵀ Y: what the columns of W do not explain
         basis, _ = np.linalg.qr(own)
-        error = float(np.linalg.norm(torque - basis @ (basis.T @ torque)))
-        deviations.append(_deviation(error, factor, rows - own.shape[1]))
+        explained = basis @ (basis.T @ torque)
+        error_size = float(np.linalg.norm(torque - explained))
+        freedom = rows - own.shape[1]
+        deviations.append(_deviation(error_size, factor, freedom))
     return np.array(deviations)
 
 
 def _own_columns(columns: FloatArray) -> FloatArray:
     """Columns that the equations of one joint distinguish, shape (r, c) → (r, ≤c)."""
-    return columns[:, independent_columns(columns, smallest=NO_COLUMN)]
+    independent = independent_columns(columns, smallest=NO_COLUMN)
+    return columns[:, independent]
 
 
 def _deviation(size: float, factor: FloatArray, freedom: int) -> float:
-    """Standard deviation of an error of this size;
-    without noise it is rounding error, without rows infinite.
-    """
+    """Standard deviation of an error of this size: at least rounding; without rows infinite."""
     if not factor.any():
         return np.inf
-    rounding = np.finfo(np.float64).eps * float(np.linalg.norm(factor))
-    return max(size, rounding) / float(np.sqrt(max(freedom, 1)))
+    epsilon = np.finfo(np.float64).eps
+    rounding = epsilon * float(np.linalg.norm(factor))
+    root = float(np.sqrt(max(freedom, 1)))
+    return max(size, rounding) / root
 
 
 def _solve(
@@ -101,15 +104,19 @@ def _solve(
 ) -> Estimate:
     count = system.axis_count
     triangles = system.joints
+    has_fixed_gains = fixed is not None
+    # W_tot = [V | −W | −W_uL | −W_kL χ_kL]
     stacked = triangles.stacked(weight)
+    known = stacked[:, -1]
     if fixed is None:
         require_known_payload(system)
         matrix = stacked[:, :-1]
-        right = -stacked[:, -1]
+        right = -known
         first_estimated = 0
     else:
+        currents = stacked[:, :count]
         matrix = -stacked[:, count:-1]
-        right = stacked[:, :count] @ fixed + stacked[:, -1]
+        right = currents @ fixed + known
         first_estimated = count
     solution, inverse = solve(matrix, right)
     if fixed is None:
@@ -118,22 +125,26 @@ def _solve(
         full = np.concatenate((fixed, solution, [1.0]))
     rows = int(triangles.rows.sum())
     unknown_count = matrix.shape[1]
+    freedom = max(rows - unknown_count, 1)
     # Eq. (9) on the weighted rows, then eq. (10).
-    squares = float(np.sum((stacked @ full) ** 2))
-    variance = squares / max(rows - unknown_count, 1)
-    covariance = np.zeros((len(full) - 1, len(full) - 1))
+    residual = stacked @ full
+    variance = float(np.sum(residual**2)) / freedom
+    width = len(full) - 1
+    covariance = np.zeros((width, width))
     covariance[first_estimated:, first_estimated:] = variance * inverse
-    weighted = system.weighted_singular_values(full, unknown_count, gains=fixed is None)
+    weighted = system.weighted_singular_values(full, unknown_count, gains=not has_fixed_gains)
+    condition = float(weighted[0] / weighted[-1])
+    axis_noise = triangles.residual_std(full, unknown_count)
     return Estimate(
         method=method,
         gains=full[:count],
-        gains_fixed=fixed is not None,
+        gains_fixed=has_fixed_gains,
         unknowns=system.unknowns,
         parameters=full[count:-1],
         covariance=covariance,
-        axis_noise=triangles.residual_std(full, unknown_count),
+        axis_noise=axis_noise,
         singular_values=singular_values(matrix),
-        condition=float(weighted[0] / weighted[-1]),
+        condition=condition,
         rows=rows,
     )
 
@@ -154,8 +165,9 @@ class Scaling(Enum):
 
 
 def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
-    """Total least squares: the right singular vector of W_tot's smallest singular value,
-    last entry one (eq. 18).
+    """Total least squares (eq. 18).
+
+    The solution is the right singular vector of W_tot's smallest singular value, last entry one.
 
     Args:
         system: of at least one loaded and one unloaded run.
@@ -168,10 +180,14 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
     """
     require_known_payload(system)
     triangles = system.joints
-    row_std = tls_row_std(system, scaling)
-    vector, covariance, singular = _smallest(triangles, 1.0 / row_std, scaling.has_unit_columns)
+    weight = 1.0 / tls_row_std(system, scaling)
+    vector, covariance, singular = _smallest(triangles, weight, scaling.has_unit_columns)
     count = system.axis_count
-    weighted = system.weighted_singular_values(vector, len(vector) - 1, gains=True)
+    unknown_count = len(vector) - 1
+    axis_noise = triangles.residual_std(vector, unknown_count)
+    weighted = system.weighted_singular_values(vector, unknown_count, gains=True)
+    condition = float(weighted[0] / weighted[-1])
+    rows = int(triangles.rows.sum())
     return Estimate(
         method=Method.TLS,
         gains=vector[:count],
@@ -179,16 +195,15 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
         unknowns=system.unknowns,
         parameters=vector[count:-1],
         covariance=covariance,
-        axis_noise=triangles.residual_std(vector, len(vector) - 1),
+        axis_noise=axis_noise,
         singular_values=singular,
-        condition=float(weighted[0] / weighted[-1]),
-        rows=int(triangles.rows.sum()),
+        condition=condition,
+        rows=rows,
     )
 
 
 def joint_data_std(triangles: Triangles) -> FloatArray:
-    """Standard deviation σ_W^j of the data in the equations of each joint (eq.
-    22 and §3.3), shape (n,).
+    """Standard deviation σ_W^j of the data in each joint's equations (§3.3), shape (n,).
 
     It is the smallest singular value of these equations over √(r − c). In eq. (22) c is the number
     of columns, which must be independent. In the equations of one joint they are not: most
@@ -200,11 +215,12 @@ def joint_data_std(triangles: Triangles) -> FloatArray:
     Args:
         triangles: of each joint's rows of W_tot.
     """
-    deviations = []
+    deviations: list[float] = []
     for factor, rows in zip(triangles.factors, triangles.rows.tolist(), strict=True):
         own = _own_columns(factor)
         smallest = float(singular_values(own).min(initial=np.inf))
-        deviations.append(_deviation(smallest, factor, rows - own.shape[1]))
+        freedom = rows - own.shape[1]
+        deviations.append(_deviation(smallest, factor, freedom))
     return np.array(deviations)
 
 
@@ -222,22 +238,24 @@ def misjudged_joints(system: System) -> tuple[int, ...]:
     if system.model.is_redundant:
         return ()
     ratios = parameters_over_noise(system)
-    return tuple(np.flatnonzero(ratios < MISJUDGED_RATIO).tolist())
+    misjudged = np.flatnonzero(ratios < MISJUDGED_RATIO)
+    return tuple(misjudged.tolist())
 
 
 def parameters_over_noise(system: System) -> FloatArray:
-    """Smallest singular value of each joint's equations without its currents,
-    relative to that with them, shape (n,).
+    """Ratio of each joint's smallest singular values, without and with its currents, shape (n,).
 
     Where noise of the currents determines σ_W^j, everything that the moves show of the parameters
     is well above it.
     """
-    ratios = []
+    ratios: list[float] = []
     for factor in system.joints.factors:
         own = independent_columns(factor, smallest=NO_COLUMN)
         parameters = [column for column in own if column >= system.axis_count]
-        smallest_of_all = singular_values(factor[:, own]).min(initial=np.inf)
-        smallest_of_parameters = singular_values(factor[:, parameters]).min(initial=np.inf)
+        of_all = singular_values(factor[:, own])
+        of_parameters = singular_values(factor[:, parameters])
+        smallest_of_all = of_all.min(initial=np.inf)
+        smallest_of_parameters = of_parameters.min(initial=np.inf)
         ratio = np.inf
         if np.isfinite(smallest_of_all):
             ratio = smallest_of_parameters / smallest_of_all
@@ -246,8 +264,9 @@ def parameters_over_noise(system: System) -> FloatArray:
 
 
 def tls_row_std(system: System, scaling: Scaling = Scaling.ROWS) -> FloatArray:
-    """Standard deviation by which ``tls`` divides the rows of each joint, shape (n,);
-    arguments as for ``tls``.
+    """Standard deviation by which ``tls`` divides the rows of each joint, shape (n,).
+
+    Arguments as for ``tls``.
     """
     triangles = system.joints
     even = np.ones(len(triangles.factors))
@@ -262,23 +281,26 @@ def tls_row_std(system: System, scaling: Scaling = Scaling.ROWS) -> FloatArray:
 def _smallest(
     triangles: Triangles, weight: FloatArray, unit_columns: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Solution with last entry one, its covariance (eq.
-    23), and the singular values of the scaled W_tot.
-    """
+    """Solution with last entry one, its covariance (eq. 23), and singular values of W_tot."""
     stacked = triangles.stacked(weight)
     norms = np.ones(stacked.shape[1])
     if unit_columns:
         norms = np.linalg.norm(stacked, axis=0)
     scaled = stacked / norms
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
-    vector = vt[-1] / vt[-1, -1]
+    left_singular = u[:, -1]
+    smallest = s[-1]
+    right_singular = vt[-1]
+    scaled_solution = right_singular / right_singular[-1]
     rows = int(triangles.rows.sum())
-    unknowns = len(vector)
-    data_std = s[-1] / np.sqrt(max(rows - unknowns, 1))  # eq. (22)
-    compatible = scaled - s[-1] * np.outer(u[:, -1], vt[-1])  # eq. (20)
-    first = compatible[:, :-1]
-    size = 1.0 + float(np.sum(vector[:-1] ** 2))
-    _, inverse = solve(first, scaled[:, -1])
-    scaled_covariance = data_std**2 * size * inverse  # eq. (23)
-    back = norms[-1] / norms[:-1]
-    return vector * norms[-1] / norms, scaled_covariance * np.outer(back, back), s
+    freedom = max(rows - len(scaled_solution), 1)
+    data_std = smallest / np.sqrt(freedom)  # eq. (22)
+    compatible = scaled - smallest * np.outer(left_singular, right_singular)  # eq. (20)
+    _, inverse = solve(compatible[:, :-1], scaled[:, -1])
+    squared_size = 1.0 + float(np.sum(scaled_solution[:-1] ** 2))
+    scaled_covariance = data_std**2 * squared_size * inverse  # eq. (23)
+    # Back to the columns before they were scaled
+    column_scale = norms[-1] / norms[:-1]
+    solution = scaled_solution * norms[-1] / norms
+    covariance = scaled_covariance * np.outer(column_scale, column_scale)
+    return solution, covariance, s

@@ -57,7 +57,8 @@ def limited_currents(observation: Observation, estimate: Estimate) -> tuple[Limi
     for motor, torque_nm in enumerate(motor_torque_nm):
         use = observation.motor_use[motor]
         reference_a = observation.current[motor, use]
-        limit_a = _limit(reference_a, torque_nm[use] / estimate.gains[motor])
+        predicted_a = torque_nm[use] / estimate.gains[motor]
+        limit_a = _limit(reference_a, predicted_a)
         if limit_a is not None:
             found.append(LimitedCurrent(motor, limit_a))
     return tuple(found)
@@ -73,7 +74,8 @@ def limited_samples(data: Dataset, limits: Sequence[LimitedCurrent]) -> BoolArra
     """Samples of a run whose reference is near a limit, or beyond it, shape (k, m)."""
     limited = np.zeros_like(data.valid)
     for one in limits:
-        limited[:, one.motor] = np.abs(data.current_a[:, one.motor]) > SAFE * one.limit_a
+        reference_a = data.current_a[:, one.motor]
+        limited[:, one.motor] = np.abs(reference_a) > SAFE * one.limit_a
     return limited
 
 
@@ -89,9 +91,9 @@ def noting_limits(
     """
     moving = data.motor_moving & data.valid
     limited = limited_samples(data, limits) & moving
-    percent = (
-        100.0 * np.count_nonzero(limited, axis=0) / np.maximum(np.count_nonzero(moving, axis=0), 1)
-    )
+    limited_counts = np.count_nonzero(limited, axis=0)
+    moving_counts = np.count_nonzero(moving, axis=0)
+    percent = 100.0 * limited_counts / np.maximum(moving_counts, 1)
     torque_limits = np.full(len(percent), np.nan)
     for one in limits:
         torque_limits[one.motor] = one.limit_a
@@ -105,20 +107,24 @@ def _limit(reference_a: FloatArray, predicted_a: FloatArray) -> float | None:
     size_a = np.abs(reference_a)
     along_a = predicted_a * np.sign(reference_a)
     missing_a = size_a - along_a
-    noise_a = float(np.median(np.abs(missing_a - np.median(missing_a)))) / 0.6745
+    # σ of normal noise by its median absolute deviation
+    deviation_a = np.abs(missing_a - np.median(missing_a))
+    noise_a = float(np.median(deviation_a)) / 0.6745
     is_missing = missing_a > BEYOND_SIGMAS * noise_a
     if np.count_nonzero(is_missing) < LEAST_ROWS:
         return None
-    limit_a = float(np.median(along_a[is_missing]))
-    on_plateau = np.abs(along_a[is_missing] - limit_a) <= PLATEAU * limit_a
-    slope = float(np.polyfit(size_a[is_missing], along_a[is_missing], 1)[0])
-    well_beyond = size_a > (1.0 + 2.0 * PLATEAU) * limit_a
-    is_limit = (
-        limit_a > 0.0
-        and slope <= LARGEST_SLOPE
-        and float(np.mean(on_plateau)) >= LEAST_ON_PLATEAU
-        and float(np.max(along_a)) <= (1.0 + 2.0 * PLATEAU) * limit_a
-        and np.count_nonzero(well_beyond) >= LEAST_ROWS
-        and float(np.mean(is_missing[well_beyond])) >= LEAST_MISSING
-    )
-    return limit_a if is_limit else None
+    given_a = along_a[is_missing]
+    limit_a = float(np.median(given_a))
+    plateau_end_a = (1.0 + 2.0 * PLATEAU) * limit_a
+    is_well_beyond = size_a > plateau_end_a
+    if limit_a <= 0.0 or np.count_nonzero(is_well_beyond) < LEAST_ROWS:
+        return None
+    is_on_plateau = np.abs(given_a - limit_a) <= PLATEAU * limit_a
+    slope, _ = np.polyfit(size_a[is_missing], given_a, 1)
+    is_flat = slope <= LARGEST_SLOPE and np.mean(is_on_plateau) >= LEAST_ON_PLATEAU
+    # Nothing is given beyond the plateau, and nearly every reference there misses something.
+    nothing_beyond = np.max(along_a) <= plateau_end_a
+    misses_beyond = np.mean(is_missing[is_well_beyond]) >= LEAST_MISSING
+    if is_flat and nothing_beyond and misses_beyond:
+        return limit_a
+    return None

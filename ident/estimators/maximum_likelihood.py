@@ -83,6 +83,7 @@ def _maximum_likelihood(
 ) -> Estimate:
     """Estimate from one system; σ from the residuals of the recorded one."""
     require_rows(system)
+    has_fixed_gains = fixed_gains is not None
     if fixed_gains is None:
         require_known_payload(system)
         gains, iterations = _gauss_newton(system)
@@ -93,29 +94,30 @@ def _maximum_likelihood(
         free = len(system.unknowns)
     parameters, noise = system.currents.settled(gains, free)
     full = np.concatenate((gains, parameters, [1.0]))
-    weighted = system.weighted_singular_values(full, free, gains=fixed_gains is None)
+    weighted = system.weighted_singular_values(full, free, gains=not has_fixed_gains)
+    condition = float(weighted[0] / weighted[-1])
     covariance = jackknife_covariance(
-        system, gains, parameters, noise, gains_fixed=fixed_gains is not None, recorded=recorded
+        system, gains, parameters, noise, gains_fixed=has_fixed_gains, recorded=recorded
     )
+    axis_noise = recorded.currents.noise(gains, parameters, free, noise)
+    rows = int(system.currents.rows.sum())
     return Estimate(
         method=method,
         gains=gains,
-        gains_fixed=fixed_gains is not None,
+        gains_fixed=has_fixed_gains,
         unknowns=system.unknowns,
         parameters=parameters,
         covariance=covariance,
-        axis_noise=recorded.currents.noise(gains, parameters, free, noise),
+        axis_noise=axis_noise,
         singular_values=weighted,
-        condition=float(weighted[0] / weighted[-1]),
-        rows=int(system.currents.rows.sum()),
+        condition=condition,
+        rows=rows,
         iterations=iterations,
     )
 
 
 def _gauss_newton(system: System) -> tuple[FloatArray, int]:
-    """Gains by variable projection: χ is eliminated for each of them,
-    so that only m unknowns are iterated.
-    """
+    """Gains by variable projection: χ is eliminated, so that only m unknowns are iterated."""
     currents = system.currents
     gains = _start(system)
     noise = np.ones(system.axis_count)
@@ -132,13 +134,16 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
         if step < STEP_TOLERANCE:
             return gains, iteration
         while True:
-            damped_gram = gram + damping * np.diag(np.diag(gram))
+            diagonal = np.diag(np.diag(gram))
+            damped_gram = gram + damping * diagonal
             relative = np.linalg.solve(damped_gram, gradient)
             trial = gains / (1.0 + relative)
-            if np.all(np.sign(trial) == np.sign(gains)):
+            keeps_signs = np.sign(trial) == np.sign(gains)
+            if np.all(keeps_signs):
                 parameters = currents.whitened(trial, noise).parameters(trial)
                 trial_cost = currents.cost(trial, parameters, noise)
-                if trial_cost <= costs[-1] + 1e-12 * abs(costs[-1]):
+                rounding = 1e-12 * abs(costs[-1])
+                if trial_cost <= costs[-1] + rounding:
                     break
             damping *= 10.0
             if damping > LARGEST_DAMPING:
@@ -152,9 +157,7 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
 
 
 def _start(system: System) -> FloatArray:
-    """Gains of the linear estimate under which the data are most likely:
-    each of them is the best on some data.
-    """
+    """Gains of the likeliest linear estimate: each of them is the best on some data."""
     currents = system.currents
     even = np.ones(system.axis_count)
 
@@ -165,7 +168,8 @@ def _start(system: System) -> FloatArray:
     estimates = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
     usable = []
     for estimate in estimates:
-        if np.all(np.isfinite(estimate.gains)) and np.all(estimate.gains != 0.0):
+        is_usable = np.isfinite(estimate.gains) & (estimate.gains != 0.0)
+        if np.all(is_usable):
             usable.append(estimate.gains)
     if not usable:
         names = tuple(f"gain {motor + 1}" for motor in range(system.axis_count))

@@ -29,9 +29,10 @@ TIED = 0.7  #: Of the largest share: two runs of one mounting contradict each ot
 #: Sum of squares that the likelier one of two hypotheses leaves, relative to the other
 CLEARLY_LESS = 0.9
 SEEN = 0.02  #: Least share of a column that must remain beside all others, to be estimated
-OF_A_BODY = np.array([0.04] * 6 + [0.2] * 3 + [1.0])
-"""Sizes of the ten parameters of 1 kg that is 0.2 m off the flange:
-with few moves, what such a body shows most.
+OF_A_BODY = np.array([0.04, 0.04, 0.04, 0.04, 0.04, 0.04, 0.2, 0.2, 0.2, 1.0])
+"""Sizes of the ten parameters of 1 kg that is 0.2 m off the flange.
+
+With few moves, what such a body shows most is estimated.
 """
 LEAST_MOVES = 3  #: For each direction in which a run's payload is estimated
 
@@ -57,8 +58,7 @@ class PayloadDifference:
 def payload_diagnoses(
     system: System, gains: FloatArray, parameters: FloatArray, held: int | None = None
 ) -> Iterator[Diagnosis]:
-    """Name payloads whose masses contradict each other,
-    or runs that carry another payload than they say.
+    """Name contradicting masses of payloads, or runs that carry another one than they say.
 
     Arguments as for `payload_differences`.
 
@@ -74,15 +74,19 @@ def payload_diagnoses(
     worst = max(found, key=lambda one: one.share, default=None)
     if worst is None:
         return
-    tied = [one for one in found if one.share >= TIED * worst.share or held is None]
-    if held is not None:
-        tied = _without_unlikely_bare_runs(tied)
+    is_unseen = held is None
+    if is_unseen:
+        tied = found
+    else:
+        least_share = TIED * worst.share
+        tied = _without_unlikely_bare_runs([one for one in found if one.share >= least_share])
         worst = max(tied, key=lambda one: one.share)
     runs = tuple(one.run for one in tied)
+    percent = 100.0 * worst.share
+    mass_kg = worst.difference[9]
     evidence = (
-        f"on the flange a body that differs by {100.0 * worst.share:.0f} % of the payload's "
-        f"torque, its mass by {worst.difference[9]:+.2g} kg (by chance with p = "
-        f"{worst.probability:.0e})"
+        f"on the flange a body that differs by {percent:.0f} % of the payload's torque, its mass "
+        f"by {mass_kg:+.2g} kg (by chance with p = {worst.probability:.0e})"
     )
     expected = "the same body, mounted in the same way, in all runs that say so"
     if len(runs) > 1:
@@ -90,42 +94,43 @@ def payload_diagnoses(
     remedy = (
         "was it mounted in this run, and not turned? give each way of mounting a name of its own"
     )
-    if held is not None and worst.share > WRONG_SHARE:
-        raise PayloadDiffers(
-            f"run {', '.join(runs)}", found=evidence, expected=expected, remedy=remedy
-        )
+    if not is_unseen and worst.share > WRONG_SHARE:
+        place = f"run {', '.join(runs)}"
+        raise PayloadDiffers(place, found=evidence, expected=expected, remedy=remedy)
     yield Diagnosis("payload-differs", runs, (), evidence, expected, remedy)
 
 
 def likeliest_masses(
     system: System, gains: FloatArray, parameters: FloatArray, found: Sequence[PayloadDifference]
 ) -> MassContradiction | None:
-    """Return the contradiction of masses, unless another payload in a single run leaves clearly
-    less.
+    """Return contradicting masses, unless another payload in one run leaves clearly less.
 
     Args:
         system, gains, parameters: of a fit with free gains.
         found: of `payload_differences`.
     """
     masses = contradicting_masses(system, gains, parameters)
-    if masses is None or any(one.left < CLEARLY_LESS * masses.left for one in found):
+    if masses is None:
+        return None
+    clearly_less = CLEARLY_LESS * masses.left
+    if any(one.left < clearly_less for one in found):
         return None
     return masses
 
 
 def _without_unlikely_bare_runs(tied: list[PayloadDifference]) -> list[PayloadDifference]:
     """Leave out runs without load where another payload in a loaded run explains as much."""
-    loaded = [one.left for one in tied if one.loaded]
-    if not loaded:
+    left_by_loaded = [one.left for one in tied if one.loaded]
+    if not left_by_loaded:
         return tied
-    return [one for one in tied if one.loaded or one.left < CLEARLY_LESS * min(loaded)]
+    clearly_less = CLEARLY_LESS * min(left_by_loaded)
+    return [one for one in tied if one.loaded or one.left < clearly_less]
 
 
 def payload_differences(
     system: System, gains: FloatArray, parameters: FloatArray, held: int | None = None
 ) -> list[PayloadDifference]:
-    """Estimate what each run carries beside what it should, with all other unknowns,
-    and return what is not chance.
+    """Estimate what each run carries beside what it should; return what is not chance.
 
     A payload has the columns of the link that carries it. With δ for one run alone and all unknowns
     x,
@@ -155,9 +160,9 @@ def payload_differences(
     else:
         first_unknown = held
         least_share = LEAST_SHARE
-    moves = _normalised(
-        _move_equations(system, gains, parameters, first_unknown, with_weight=bool(held))
-    )
+    has_given_gains = bool(held)
+    moves = _move_equations(system, gains, parameters, first_unknown, with_weight=has_given_gains)
+    moves = _normalised(moves)
     fit = _normal_equations(moves)
     found: list[PayloadDifference] = []
     for run in range(len(system.runs)):
@@ -206,14 +211,14 @@ def _move_equations(
     noise = system.currents.noise(gains, parameters)
     moves = []
     for index, cluster in enumerate(system.clusters):
-        by_motor = list(
-            motor_jacobians(cluster, system.preload_of(index), gains, parameters, noise)
-        )
+        preload = system.preload_of(index)
+        by_motor = list(motor_jacobians(cluster, preload, gains, parameters, noise))
         jacobian = np.concatenate([of_motor[0] for of_motor in by_motor])
         residual = np.concatenate([of_motor[1] for of_motor in by_motor])
         unknowns = jacobian[:, first_unknown:]
         if with_weight:
-            unknowns = np.column_stack((unknowns, _payload_column(system, index, gains, noise)))
+            weight = _payload_column(system, index, gains, noise)
+            unknowns = np.column_stack((unknowns, weight))
         flange = jacobian[:, first_base:last_base] @ base_to_flange
         moves.append(_MoveEquations(unknowns, residual, flange))
     return moves
@@ -227,26 +232,29 @@ def _payload_column(system: System, index: int, gains: FloatArray, noise: FloatA
         return currents.whitened(gains, noise).known
     by_motor = []
     for rows, gain, std in zip(cluster, gains, noise, strict=True):
-        by_motor.append(rows[:, -1] / (gain * std))
+        known_torque = rows[:, -1]
+        by_motor.append(known_torque / (gain * std))
     return np.concatenate(by_motor)
 
 
 def _normalised(moves: Sequence[_MoveEquations]) -> list[_MoveEquations]:
     """Equations with the columns of J divided by their norms over all moves."""
-    squares = np.sum([np.sum(move.jacobian**2, axis=0) for move in moves], axis=0)
-    norms = np.sqrt(squares)
+    squares_by_move = [np.sum(move.jacobian**2, axis=0) for move in moves]
+    norms = np.sqrt(np.sum(squares_by_move, axis=0))
     norms = np.where(norms > 0.0, norms, 1.0)
     return [replace(move, jacobian=move.jacobian / norms) for move in moves]
 
 
 def _normal_equations(moves: Sequence[_MoveEquations]) -> _NormalEquations:
-    gram = np.sum([move.jacobian.T @ move.jacobian for move in moves], axis=0)
-    score = np.sum([move.jacobian.T @ move.residual for move in moves], axis=0)
+    grams = [move.jacobian.T @ move.jacobian for move in moves]
+    scores = [move.jacobian.T @ move.residual for move in moves]
+    squares_by_move = [np.sum(move.residual**2) for move in moves]
+    gram = np.sum(grams, axis=0)
     inverse = gram
     if len(gram):
         inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
-    squares = float(np.sum([np.sum(move.residual**2) for move in moves]))
-    return _NormalEquations(inverse, score, squares)
+    squares = float(np.sum(squares_by_move))
+    return _NormalEquations(inverse, np.sum(scores, axis=0), squares)
 
 
 def _difference_in(
@@ -267,52 +275,61 @@ def _difference_in(
         parameters: of the fit, shape (p,).
         least_share: torque of the difference that is reported, relative to the payload's.
     """
-    inside = [index for index, (owner, _) in enumerate(system.cluster_runs) if owner == run]
+    owners = [owner for owner, _ in system.cluster_runs]
+    inside = [index for index, owner in enumerate(owners) if owner == run]
     if len(inside) < MIN_MOVES_TO_LEAVE_OUT:
         return None
     own_moves = [moves[index] for index in inside]
     # XᵀX, XᵀJ and Xᵀe of this run, for a body of OF_A_BODY.
+    body_size = OF_A_BODY[:, None]
+    crosses = [move.flange.T @ move.jacobian for move in own_moves]
+    scores = [move.flange.T @ move.residual for move in own_moves]
     flange = np.concatenate([move.flange for move in own_moves]) * OF_A_BODY
-    cross = (
-        np.sum([move.flange.T @ move.jacobian for move in own_moves], axis=0) * OF_A_BODY[:, None]
-    )
-    own_score = np.sum([move.flange.T @ move.residual for move in own_moves], axis=0) * OF_A_BODY
+    cross = np.sum(crosses, axis=0) * body_size
+    own_score = np.sum(scores, axis=0) * OF_A_BODY
 
     # Directions of δ that remain visible beside all other unknowns: eigenvectors of the Schur
-    # complement.
-    visible, directions = np.linalg.eigh(flange.T @ flange - cross @ fit.inverse @ cross.T)
+    # complement XᵀX − XᵀJ (JᵀJ)⁻¹ JᵀX.
+    schur_complement = flange.T @ flange - cross @ fit.inverse @ cross.T
+    visible, directions = np.linalg.eigh(schur_complement)
     alone = np.sum((flange @ directions) ** 2, axis=0)
-    is_visible = (visible > SEEN * alone) & (visible > 1e-9 * visible[-1])
+    is_beside_others = visible > SEEN * alone
+    is_real = visible > 1e-9 * visible[-1]
     largest_count = len(inside) // LEAST_MOVES
-    chosen = np.flatnonzero(is_visible)[-largest_count:]
+    chosen = np.flatnonzero(is_beside_others & is_real)[-largest_count:]
     if not len(chosen):
         return None
     visible = visible[chosen]
     directions = directions[:, chosen]
-    amount = directions.T @ (own_score - cross @ (fit.inverse @ fit.score)) / visible
-    body_per_amount = directions * OF_A_BODY[:, None]
+    score_beside_others = own_score - cross @ (fit.inverse @ fit.score)
+    amount = directions.T @ score_beside_others / visible
+    body_per_amount = directions * body_size
     difference = body_per_amount @ amount
 
-    mounting = system.cluster_runs[inside[0]][1]
+    _, mounting = system.cluster_runs[inside[0]]
     # In a run without load, relative to the first payload.
     body = _payload_parameters(system, parameters)[max(0, mounting)]
+    residual = np.concatenate([move.residual for move in own_moves])
+    residual_size = float(np.linalg.norm(residual))
     torque = float(np.linalg.norm(flange @ (difference / OF_A_BODY)))
-    share = torque / float(np.linalg.norm(flange @ (body / OF_A_BODY)))
-    residual_size = float(np.linalg.norm(np.concatenate([move.residual for move in own_moves])))
+    payload_torque = float(np.linalg.norm(flange @ (body / OF_A_BODY)))
+    share = torque / payload_torque
     if share < least_share or torque < LEAST_OF_RESIDUAL * residual_size:
         return None
-    other_unknowns = fit.inverse @ (fit.score - cross.T @ (directions @ amount))
+    score_beside_body = fit.score - cross.T @ (directions @ amount)
+    other_unknowns = fit.inverse @ score_beside_body
     probability = _chance(moves, inside, body_per_amount, amount, other_unknowns)
     if probability * len(system.runs) >= LARGEST_PROBABILITY:
         return None
     explained = float(np.sum(visible * amount**2))
+    left = 1.0 - explained / fit.squares
     return PayloadDifference(
         run=system.runs[run],
         difference=difference,
         share=share,
         probability=probability,
         loaded=mounting >= 0,
-        left=1.0 - explained / fit.squares,
+        left=left,
     )
 
 
@@ -343,17 +360,22 @@ def _chance(
         columns[:, :other_count] = move.jacobian
         if index in members:
             columns[:, other_count:] = move.flange @ body_per_amount
+        left = move.residual - columns @ step
         grams[index] = columns.T @ columns
-        scores[index] = columns.T @ (move.residual - columns @ step)
-    shifts = left_out_shifts(grams, scores)[:, other_count:]
+        scores[index] = columns.T @ left
+    all_shifts = left_out_shifts(grams, scores)
+    shifts = all_shifts[:, other_count:]
     centred = shifts - shifts.mean(axis=0)
-    covariance = (len(moves) - 1) / len(moves) * (centred.T @ centred)
+    # The jackknife: (n − 1)/n Σ (δ_i − δ̄)(δ_i − δ̄)ᵀ
+    jackknife_factor = (len(moves) - 1) / len(moves)
+    covariance = jackknife_factor * (centred.T @ centred)
     wald = float(amount @ np.linalg.solve(covariance, amount))
     # T² (n − q) / (q (n − 1)) has an F distribution with q and n − q degrees of freedom.
     move_count = len(inside)
     directions = len(amount)
     freedom = move_count - directions
-    f_value = freedom / (directions * (move_count - 1)) * wald
+    scale = freedom / (directions * (move_count - 1))
+    f_value = scale * wald
     return float(scipy.special.fdtrc(directions, freedom, f_value))
 
 
@@ -362,8 +384,9 @@ def _payload_parameters(system: System, parameters: FloatArray) -> list[FloatArr
     first = len(system.columns)
     bodies = []
     for payload, indices in zip(system.payloads, system.payload_columns, strict=True):
+        last = first + len(indices)
         body = payload.known_parameters
-        body[list(indices)] = parameters[first : first + len(indices)]
-        first += len(indices)
+        body[list(indices)] = parameters[first:last]
+        first = last
         bodies.append(body)
     return bodies

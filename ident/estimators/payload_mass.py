@@ -61,39 +61,45 @@ def mass_responses(system: System, estimate: Estimate) -> tuple[MassResponse, ..
     """
     if estimate.gains_fixed:
         return ()
-    bodies: dict[str, list[int]] = {}
-    for mounting, payload in enumerate(system.payloads):
-        if MASS in payload.known:
-            bodies.setdefault(payload.name, []).append(mounting)
-    columns = [_mass_column(system, mountings) for mountings in bodies.values()]
-    known = [
-        (name, column) for name, column in zip(bodies, columns, strict=True) if column is not None
-    ]
-    if not known:
+    names: list[str] = []
+    masses_kg: list[float] = []
+    columns: list[_MassColumn] = []
+    for name, mountings in _mountings_of_bodies(system).items():
+        column = _mass_column(system, mountings)
+        if column is not None:
+            names.append(name)
+            masses_kg.append(system.payloads[mountings[0]].known[MASS])
+            columns.append(column)
+    if not columns:
         return ()
-    mass_alone = all(set(payload.known) <= {MASS} for payload in system.payloads)
-    if len(known) == 1 and mass_alone and estimate.method in (Method.LS, Method.WLS):
-        ((name, _),) = known
+    is_proportional = all(set(payload.known) <= {MASS} for payload in system.payloads)
+    if len(columns) == 1 and is_proportional and estimate.method in (Method.LS, Method.WLS):
         # The last column of W_tot is proportional to m, so the solution is too; the weights of wls
         # only change alike.
-        mass_kg = system.payloads[bodies[name][0]].known[MASS]
-        shifts = np.concatenate((estimate.gains, estimate.parameters))[:, None] / mass_kg
+        solution = np.concatenate((estimate.gains, estimate.parameters))
+        shifts = solution[:, None] / masses_kg[0]
     else:
-        extended = _with_columns(system, [column for _, column in known])
-        shifts = _responses(extended, estimate, len(known))
-    responses = []
-    for number, (name, _) in enumerate(known):
-        mass_kg = system.payloads[bodies[name][0]].known[MASS]
-        gain_per_kg = shifts[: system.axis_count, number]
-        parameters_per_kg = shifts[system.axis_count :, number]
+        extended = _with_columns(system, columns)
+        shifts = _responses(extended, estimate, len(columns))
+    responses: list[MassResponse] = []
+    for name, mass_kg, per_kg in zip(names, masses_kg, shifts.T, strict=True):
+        gain_per_kg = per_kg[: system.axis_count]
+        parameters_per_kg = per_kg[system.axis_count :]
         responses.append(MassResponse(name, mass_kg, gain_per_kg, parameters_per_kg))
     return tuple(responses)
 
 
+def _mountings_of_bodies(system: System) -> dict[str, list[int]]:
+    """Mountings of each body whose mass is known, by its name."""
+    bodies: dict[str, list[int]] = {}
+    for mounting, payload in enumerate(system.payloads):
+        if MASS in payload.known:
+            bodies.setdefault(payload.name, []).append(mounting)
+    return bodies
+
+
 MotorColumns = list[tuple[FloatArray, ...]]
-"""A column of W on the rows of each motor, cluster by cluster;
-on the rows of the demanded motion likewise.
-"""
+"""A column of W on the rows of each motor, cluster by cluster; on demanded motion likewise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,41 +111,49 @@ class _MassColumn:
 
 
 def _mass_column(system: System, mountings: Sequence[int]) -> _MassColumn | None:
-    """Torque of each motor per kg of a payload, zero where it is not mounted;
-    None where it cannot be rebuilt.
-    """
-    mass_alone = all(set(system.payloads[mounting].known) == {MASS} for mounting in mountings)
-    weights = None if mass_alone else _weights(system)
-    if weights is None and not mass_alone:
-        return None
+    """Torque of each motor per kg of a payload; None where it cannot be rebuilt.
 
-    def on(parts: Sequence[tuple[FloatArray, ...]], leading: int) -> MotorColumns:
+    It is zero where the payload is not mounted.
+    """
+    known = [set(system.payloads[mounting].known) for mounting in mountings]
+    is_mass_alone = all(names == {MASS} for names in known)
+    base_weights: FloatArray | None = None
+    if not is_mass_alone:
+        base_weights = _base_weights(system)
+        if base_weights is None:
+            return None
+
+    def per_kg(motor: FloatArray, mounting: int, leading: int) -> FloatArray:
+        """The column on the rows of one motor; base columns begin at `leading`."""
+        if mounting not in mountings:
+            return np.zeros(len(motor))
+        if base_weights is None:
+            known_torque = motor[:, -1]
+            return np.asarray(known_torque / system.payloads[mounting].known[MASS])
+        base_columns = motor[:, leading : leading + len(base_weights)]
+        return np.asarray(base_columns @ base_weights)
+
+    def on_rows(parts: Sequence[tuple[FloatArray, ...]], leading: int) -> MotorColumns:
         made: MotorColumns = []
         for (_, mounting), rows in zip(system.cluster_runs, parts, strict=True):
-            own: list[FloatArray] = []
-            for motor in rows:
-                if mounting not in mountings:
-                    own.append(np.zeros(len(motor)))
-                elif weights is None:
-                    own.append(motor[:, -1] / system.payloads[mounting].known[MASS])
-                else:
-                    own.append(motor[:, leading : leading + len(weights)] @ weights)
-            made.append(tuple(own))
+            made.append(tuple(per_kg(motor, mounting, leading) for motor in rows))
         return made
 
-    return _MassColumn(
-        on(system.clusters, system.leading), on(system.instruments, 0) if system.instruments else []
-    )
+    clusters = on_rows(system.clusters, system.leading)
+    instruments: MotorColumns = []
+    if system.instruments:
+        instruments = on_rows(system.instruments, 0)
+    return _MassColumn(clusters, instruments)
 
 
-def _weights(system: System) -> FloatArray | None:
-    """Sum of base columns that is the column of the payload link's mass;
-    None where some are not in the system.
-    """
+def _base_weights(system: System) -> FloatArray | None:
+    """Weights of base columns in that of the payload link's mass; None where some are missing."""
     base = system.base
-    if tuple(column.name for column in system.columns[: len(base.names)]) != base.names:
+    leading_columns = system.columns[: len(base.names)]
+    if tuple(column.name for column in leading_columns) != base.names:
         return None
-    return base.grouping[:, system.model.flange][:, LINK_PARAMETERS.index(MASS)]
+    flange = base.grouping[:, system.model.flange]
+    return flange[:, LINK_PARAMETERS.index(MASS)]
 
 
 def _with_columns(system: System, added: Sequence[_MassColumn]) -> System:
@@ -147,51 +161,49 @@ def _with_columns(system: System, added: Sequence[_MassColumn]) -> System:
 
     def widened(
         parts: Sequence[tuple[FloatArray, ...]], columns: Sequence[MotorColumns]
-    ) -> MotorColumns:
+    ) -> tuple[tuple[FloatArray, ...], ...]:
         made: MotorColumns = []
         for cluster, rows in enumerate(parts):
             own: list[FloatArray] = []
             for motor, matrix in enumerate(rows):
                 new = np.stack([column[cluster][motor] for column in columns], axis=1)
-                own.append(np.concatenate((matrix[:, :-1], new, matrix[:, -1:]), axis=1))
+                unknown = matrix[:, :-1]
+                known = matrix[:, -1:]
+                own.append(np.concatenate((unknown, new, known), axis=1))
             made.append(tuple(own))
-        return made
+        return tuple(made)
 
-    clusters = tuple(widened(system.clusters, [column.clusters for column in added]))
+    clusters = widened(system.clusters, [column.clusters for column in added])
     instruments: tuple[tuple[FloatArray, ...], ...] = ()
     if system.instruments:
-        instruments = tuple(widened(system.instruments, [column.instruments for column in added]))
-    motors = tuple(triangle(rows, rows[0].shape[1]) for rows in zip(*clusters, strict=True))
-    return replace(
-        system,
-        clusters=clusters,
-        instruments=instruments,
-        motors=Triangles(motors, system.motors.rows),
-    )
+        instruments = widened(system.instruments, [column.instruments for column in added])
+    factors = tuple(triangle(rows, rows[0].shape[1]) for rows in zip(*clusters, strict=True))
+    motors = Triangles(factors, system.motors.rows)
+    return replace(system, clusters=clusters, instruments=instruments, motors=motors)
 
 
 def _responses(extended: System, estimate: Estimate, count: int) -> FloatArray:
-    """dθ/dm of (gains, parameters) for each of the last `count` columns of W, shape (m + p,
-    count).
-    """
-    if estimate.method is Method.IV and extended.instruments:
+    """dθ/dm of (gains, parameters) for the last `count` columns of W, shape (m + p, count)."""
+    method = estimate.method
+    if method is Method.IV and extended.instruments:
         extended = extended.on_instruments()
     gains = estimate.gains
+    gain_count = len(gains)
     values = np.concatenate((estimate.parameters, np.zeros(count)))
-    if estimate.method.is_of_currents:
+    if method.is_of_currents:
         # That of these equations: on instruments it is not that of the recorded motion, which the
         # estimate has.
         noise = extended.currents.noise(gains, values)
-    elif estimate.method is Method.LS:
+    elif method is Method.LS:
         noise = 1.0 / np.abs(gains)
-    elif estimate.method is Method.WLS:
+    elif method is Method.WLS:
         noise = wls_row_std(extended) / np.abs(gains)
     else:
         noise = tls_row_std(extended) / np.abs(gains)
     currents = extended.currents
     whitened = currents.whitened(gains, noise)
     drive = whitened.drive
-    if estimate.method.is_of_currents or estimate.method is Method.TLS:
+    if method.is_of_currents or method is Method.TLS:
         residual = whitened.residual(gains, values)
         drive = currents.corrected(gains, noise, whitened, residual)
     parameters = whitened.linear[:, :-count]
@@ -201,8 +213,10 @@ def _responses(extended: System, estimate: Estimate, count: int) -> FloatArray:
     jacobian = np.concatenate((drive, -parameters[:, is_free]), axis=1)
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0.0] = 1.0
-    moved = np.linalg.lstsq(jacobian / scale, masses, rcond=None)[0] / scale[:, None]
-    shifts = np.zeros((len(gains) + len(estimate.parameters), count))
-    shifts[: len(gains)] = moved[: len(gains)]
-    shifts[len(gains) + np.flatnonzero(is_free)] = moved[len(gains) :]
+    scaled_shifts = np.linalg.lstsq(jacobian / scale, masses, rcond=None)[0]
+    free_shifts = scaled_shifts / scale[:, None]
+    shifts = np.zeros((gain_count + len(is_free), count))
+    free_parameters = gain_count + np.flatnonzero(is_free)
+    shifts[:gain_count] = free_shifts[:gain_count]
+    shifts[free_parameters] = free_shifts[gain_count:]
     return shifts

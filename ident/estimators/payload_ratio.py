@@ -51,16 +51,16 @@ class MassContradiction:
         """Both sides are named: the torques show the ratio alone."""
         names = " and ".join((self.body, *self.others))
         beside = " and ".join(self.others)
-        return Diagnosis(
-            "masses-contradict",
-            (),
-            (),
+        evidence = (
             f"the masses of {names} contradict each other: by the torques {self.body} is "
-            f"{self.ratio:.2f} ± {self.std:.2f} times as heavy beside {beside} as declared",
-            "masses that the torques confirm",
-            f"weigh {names} again, and look what was mounted in each run; a wrong mass of any of "
-            "them makes every gain wrong",
+            f"{self.ratio:.2f} ± {self.std:.2f} times as heavy beside {beside} as declared"
         )
+        expected = "masses that the torques confirm"
+        advice = (
+            f"weigh {names} again, and look what was mounted in each run; a wrong mass of any of "
+            "them makes every gain wrong"
+        )
+        return Diagnosis("masses-contradict", (), (), evidence, expected, advice)
 
 
 def contradicting_masses(
@@ -73,11 +73,9 @@ def contradicting_masses(
         gains, parameters: of the fit, shapes (m,) and (p,).
     """
     bodies = _known_bodies(system)
-    if (
-        len(bodies) < 2
-        or system.model.is_redundant
-        or len(system.clusters) < MIN_MOVES_TO_LEAVE_OUT
-    ):
+    if len(bodies) < 2 or system.model.is_redundant:
+        return None
+    if len(system.clusters) < MIN_MOVES_TO_LEAVE_OUT:
         return None
     found: list[MassContradiction] = []
     for body, mountings in bodies.items():
@@ -137,7 +135,9 @@ def _with_factor(
         scores = trial_scores
         left = trial_left
     factor = float(values[-1])
-    std = float(np.sqrt(scatter_of(left_out_shifts(grams, scores))[-1, -1]))
+    shifts = left_out_shifts(grams, scores)
+    covariance = scatter_of(shifts)
+    std = float(np.sqrt(covariance[-1, -1]))
     moves = len(clusters)
     probability = 2.0 * float(scipy.special.stdtr(moves - 1, -abs(factor) / std))
     if abs(factor) < LEAST_CHANGE or probability * (len(others) + 1) > LARGEST_PROBABILITY:
@@ -146,16 +146,16 @@ def _with_factor(
 
 
 def _extended(system: System, mountings: Sequence[int]) -> list[list[FloatArray]]:
-    """Rows of each cluster and motor, with what is known of one body as a column before the
-    last.
-    """
+    """Rows of each cluster and motor, with what is known of one body in the last column but one."""
     clusters: list[list[FloatArray]] = []
     for (_, mounting), rows in zip(system.cluster_runs, system.clusters, strict=True):
         is_mounted = float(mounting in mountings)
         own: list[FloatArray] = []
         for motor in rows:
-            of_body = is_mounted * motor[:, -1:]
-            own.append(np.concatenate((motor[:, :-1], of_body, motor[:, -1:]), axis=1))
+            unknown = motor[:, :-1]
+            known = motor[:, -1:]
+            of_body = is_mounted * known
+            own.append(np.concatenate((unknown, of_body, known), axis=1))
         clusters.append(own)
     return clusters
 
@@ -179,6 +179,9 @@ def _normal_equations(
 
 def _solved(gram: FloatArray, score: FloatArray) -> FloatArray:
     """Step of least squares, in units in which every unknown is seen equally well."""
-    unit = 1.0 / np.sqrt(np.where(np.diag(gram) > 0.0, np.diag(gram), 1.0))
-    scaled = gram * np.outer(unit, unit)
-    return unit * np.asarray(np.linalg.lstsq(scaled, score * unit, rcond=None)[0])
+    squares = np.diag(gram)
+    squares = np.where(squares > 0.0, squares, 1.0)
+    unit = 1.0 / np.sqrt(squares)
+    scaled_gram = gram * np.outer(unit, unit)
+    scaled_step = np.linalg.lstsq(scaled_gram, score * unit, rcond=None)[0]
+    return unit * np.asarray(scaled_step)

@@ -1,11 +1,11 @@
-"""Gains by linear algebra alone, for a look after each move:
-total least squares that corrects the currents.
+"""Gains by linear algebra alone, for a look after each move.
 
-The rows of motor i are g_i v_i − (T W χ + T W_uL χ_uL)_i = (T W_kL χ_kL)_i + g_i e_i. Only the
-current v_i has an error, e_i ~ (0, σ_i²), as in `ident.estimators.maximum_likelihood`. Rows are
-divided by an expected error g_i σ_i. Columns without errors come first in one QR factorisation of
-all rows (mixed LS-TLS: Golub, Hoffman & Stewart, Linear Algebra Appl. 88/89 (1987); Van Huffel &
-Vandewalle, The Total Least Squares Problem, §3.5)::
+Total least squares corrects the currents alone. The rows of motor i are
+g_i v_i − (T W χ + T W_uL χ_uL)_i = (T W_kL χ_kL)_i + g_i e_i. Only the current v_i has an error,
+e_i ~ (0, σ_i²), as in `ident.estimators.maximum_likelihood`. Rows are divided by an expected error
+g_i σ_i. Columns without errors come first in one QR factorisation of all rows (mixed LS-TLS: Golub,
+Hoffman & Stewart, Linear Algebra Appl. 88/89 (1987); Van Huffel & Vandewalle, The Total Least
+Squares Problem, §3.5)::
 
                                       [ R_χχ  R_χk  R_χV ]
     Q [ −T W  −T W_uL | −T W_kL χ_kL | V ] = [       R_kk  R_kV ]
@@ -78,7 +78,8 @@ class QuickGains:
         """σ of each gain [% of it], shape (m,); None where they are not known yet."""
         if self.gains is None or self.gains_std is None:
             return None
-        return np.asarray(100.0 * self.gains_std / np.abs(self.gains))
+        size = np.abs(self.gains)
+        return np.asarray(100.0 * self.gains_std / size)
 
 
 def quick_gains(standard: System) -> QuickGains:
@@ -89,35 +90,37 @@ def quick_gains(standard: System) -> QuickGains:
     """
     if not _has_payload(standard):
         return QuickGains(None, None, Unknown.NO_PAYLOAD)
-    resting = np.flatnonzero(standard.joints.rows == 0)
-    if len(resting):
-        return QuickGains(None, None, Unknown.NO_MOTION, tuple(resting.tolist()))
+    resting = tuple(np.flatnonzero(standard.joints.rows == 0).tolist())
+    if resting:
+        return QuickGains(None, None, Unknown.NO_MOTION, resting)
     system = regrouped(standard)
     missing = _missing(system)
     if missing is not None:
         return missing
     gains, std = _gains_with_std(system)
-    smallest = np.min(std / np.abs(gains))
-    if not smallest <= LARGEST_GAIN_STD:  # also where it is NaN
+    smallest_relative_std = np.min(std / np.abs(gains))
+    if not smallest_relative_std <= LARGEST_GAIN_STD:  # also where it is NaN
         return QuickGains(None, None, Unknown.PAYLOAD_UNSEEN)
     return QuickGains(gains, std)
 
 
 def _missing(system: System) -> QuickGains | None:
     """Say what these equations lack for an estimate; None where they lack nothing."""
-    if not any(bool(np.any(factor[:, -1])) for factor in system.motors.factors):
+    has_weight = [bool(np.any(factor[:, -1])) for factor in system.motors.factors]
+    if not any(has_weight):
         return QuickGains(None, None, Unknown.NO_PAYLOAD)
     try:
         require_distinct(system, gains=False)
     except RankDeficient:
         return QuickGains(None, None, Unknown.NOT_DISTINGUISHED)
     currents = np.abs(system.currents.drive).sum(axis=0)
-    dead = np.flatnonzero(currents == 0.0)
-    if len(dead):
-        return QuickGains(None, None, Unknown.NO_CURRENT, tuple(dead.tolist()))
-    few = np.flatnonzero(system.motors.rows <= len(system.unknowns))
-    if len(few):
-        return QuickGains(None, None, Unknown.FEW_ROWS, tuple(few.tolist()))
+    dead = tuple(np.flatnonzero(currents == 0.0).tolist())
+    if dead:
+        return QuickGains(None, None, Unknown.NO_CURRENT, dead)
+    has_few_rows = system.motors.rows <= len(system.unknowns)
+    few = tuple(np.flatnonzero(has_few_rows).tolist())
+    if few:
+        return QuickGains(None, None, Unknown.FEW_ROWS, few)
     if len(system.clusters) < MIN_MOVES_TO_LEAVE_OUT:
         return QuickGains(None, None, Unknown.FEW_MOVES)
     return None
@@ -126,7 +129,8 @@ def _missing(system: System) -> QuickGains | None:
 def _has_payload(standard: System) -> bool:
     """Whether any row of a system in standard parameters was recorded with a payload."""
     first = standard.axis_count + len(standard.columns)
-    return any(bool(np.any(factor[:, first:-1])) for factor in standard.joints.factors)
+    of_payload = [factor[:, first:-1] for factor in standard.joints.factors]
+    return any(bool(np.any(columns)) for columns in of_payload)
 
 
 def _gains_with_std(system: System) -> tuple[FloatArray, FloatArray]:
@@ -140,7 +144,8 @@ def _gains_with_std(system: System) -> tuple[FloatArray, FloatArray]:
     free = len(gains) + len(parameters)
     noise_a = system.currents.noise(gains, parameters, free)
     covariance = jackknife_covariance(system, gains, parameters, noise_a, gains_fixed=False)
-    return gains, np.sqrt(np.diag(covariance)[: len(gains)])
+    variances = np.diag(covariance)
+    return gains, np.sqrt(variances[: len(gains)])
 
 
 def mixed_tls(system: System) -> tuple[FloatArray, FloatArray]:
@@ -155,9 +160,8 @@ def mixed_tls(system: System) -> tuple[FloatArray, FloatArray]:
     rows = np.maximum(system.motors.rows, 1)
     # At first all rows have the same weight, and each current the same share of noise.
     weight = np.ones(system.axis_count)
-    error_in_gains = np.array(
-        [float(factor[:, 0] @ factor[:, 0]) for factor in system.motors.factors]
-    )
+    currents = [factor[:, 0] for factor in system.motors.factors]
+    error_in_gains = np.array([float(current @ current) for current in currents])
     for _ in range(PASSES):
         gains, parameters = _solve_once(system, weight, error_in_gains)
         weight = np.sqrt(rows) / _residual_norms(system, gains, parameters)
@@ -177,11 +181,13 @@ def _solve_once(
             gain, shape (m,).
     """
     count = system.axis_count
-    parts = []
+    parts: list[FloatArray] = []
     for motor, factor in enumerate(system.motors.factors):
         drive = np.zeros((len(factor), count))
         drive[:, motor] = factor[:, 0]
-        parts.append(weight[motor] * np.concatenate((-factor[:, 1:], drive), axis=1))
+        torque = factor[:, 1:]
+        rows = np.concatenate((-torque, drive), axis=1)
+        parts.append(weight[motor] * rows)
     stacked = np.concatenate(parts)
     # Index of the column −T W_kL χ_kL; those of the gains follow it
     payload = stacked.shape[1] - count - 1
@@ -196,19 +202,28 @@ def _solve_once(
     direction = directions[-1]
     # The payload has the coefficient one, so `scale` in scaled columns: R_kk scale + R_kV (size
     # direction) = 0.
-    weight_of_payload = upper[payload, payload] * scale[payload]
+    payload_scale = scale[payload]
+    weight_of_payload = upper[payload, payload] * payload_scale
     size = -weight_of_payload / (upper[payload, of_gains] @ direction)
-    known = np.concatenate((scale[payload : payload + 1], size * direction))
-    parameters, _ = solve(upper[:payload, :payload], -upper[:payload, payload:] @ known)
-    return size * direction / scale[of_gains], parameters / scale[:payload]
+    scaled_gains = size * direction
+    # R_χχ χ = −(R_χk + R_χV g)
+    of_parameters = slice(None, payload)
+    known = np.concatenate(([payload_scale], scaled_gains))
+    right = -upper[of_parameters, payload:] @ known
+    scaled_parameters, _ = solve(upper[of_parameters, of_parameters], right)
+    gains = scaled_gains / scale[of_gains]
+    parameters = scaled_parameters / scale[of_parameters]
+    return gains, parameters
 
 
 def _residual_norms(system: System, gains: FloatArray, parameters: FloatArray) -> FloatArray:
     """‖g_i v_i − (T W χ)_i − …‖ of each motor, shape (m,); never less than rounding."""
-    norms = []
+    epsilon = np.finfo(np.float64).eps
+    norms: list[float] = []
     for gain, factor in zip(gains, system.motors.factors, strict=True):
         solution = np.concatenate(([gain], -parameters, [-1.0]))
         left = float(np.linalg.norm(factor @ solution))
-        rounding = np.finfo(np.float64).eps * float(np.linalg.norm(factor * solution))
+        term_size = float(np.linalg.norm(factor * solution))
+        rounding = epsilon * term_size
         norms.append(max(left, rounding))
     return np.array(norms)

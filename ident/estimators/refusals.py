@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,9 +56,7 @@ beside the 30 Nm of a shoulder is below every friction. The wrist of a real robo
 and more.
 """
 EXCHANGE = 0.4
-"""Least fall of the logarithm of the motors' errors, in sum,
-of a fixed gain with the other sign.
-"""
+"""Least fall of Σ log of the motors' errors, of a fixed gain with the other sign."""
 #: Largest rise of the same, where it decides nothing and the sign of the friction must
 LEVEL = 0.05
 SMALL_ERROR = 0.02  #: Relative error of a motor below which its current needs no other explanation
@@ -92,8 +91,10 @@ def refuse_mistakes(
         require_signs(system, estimate, axes)
     else:
         require_seen_payload(estimate, system)
-    idle = idle_joints(system.model, *joint_torques(system, estimate))
-    require_plausible(estimate, estimate.relative_error(system), axes, idle)
+    size, left = joint_torques(system, estimate)
+    idle = idle_joints(system.model, size, left)
+    error = estimate.relative_error(system)
+    require_plausible(estimate, error, axes, idle)
     if nameplate is not None and not estimate.gains_fixed:
         require_roles(estimate.gains, nameplate)
         require_units(estimate.gains, nameplate)
@@ -141,8 +142,7 @@ def with_channel_causes(runs: Sequence[RunChannels], axes: Sequence[str]) -> Ite
 def with_unit_causes(
     runs: Sequence[RunChannels], model: Model, axes: Sequence[str]
 ) -> Iterator[None]:
-    """Say where a fit does not settle, or sees no payload,
-    that the recordings seem to be in other units.
+    """Name other units of the recordings where a fit does not settle, or sees no payload.
 
     Args:
         runs: of the fit.
@@ -167,8 +167,7 @@ def with_unit_causes(
 
 
 def require_travel(run: RunChannels, model: Model, axes: Sequence[str]) -> None:
-    """Refuse positions of an axis that go far beyond what its joint allows,
-    and fit in it as degrees or millimetres.
+    """Refuse positions far beyond what a joint allows, that fit in it as degrees or millimetres.
 
     A joint without limits in its description is not judged.
 
@@ -190,33 +189,39 @@ def require_travel(run: RunChannels, model: Model, axes: Sequence[str]) -> None:
             unit = "m"
             converted = 1e-3 * moved
             remedy = "are these millimetres (divide this column by 1000)?"
-        if converted <= TRAVEL_TOLERANCE * joint.travel:
-            raise UnitsMistaken(
-                f"run {run.run!r}, axis {axes[axis]}",
-                found=f"positions that move by {moved:.4g} {unit}",
-                expected=f"at most {joint.travel:.4g} {unit}, the travel of this joint in the URDF",
-                remedy=f"{remedy} if neither, correct the limits in the URDF",
-            )
+        if converted > TRAVEL_TOLERANCE * joint.travel:
+            continue
+        place = f"run {run.run!r}, axis {axes[axis]}"
+        found = f"positions that move by {moved:.4g} {unit}"
+        expected = f"at most {joint.travel:.4g} {unit}, the travel of this joint in the URDF"
+        raise UnitsMistaken(
+            place,
+            found=found,
+            expected=expected,
+            remedy=f"{remedy} if neither, correct the limits in the URDF",
+        )
 
 
 def unlikely_units(runs: Sequence[RunChannels], model: Model, axes: Sequence[str]) -> str:
     """Say that angles or currents are larger than those of robots; empty where none is."""
-    is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in model.robot.axes])
+    kinds = [joint.kind for joint in model.robot.axes]
+    is_revolute = np.array([kind is JointKind.REVOLUTE for kind in kinds])
     for run in runs:
         turned_rad = np.where(is_revolute, run.range, 0.0)
         widest = int(np.argmax(turned_rad))
-        if turned_rad[widest] > WIDEST_RANGE_RAD:
+        widest_rad = turned_rad[widest]
+        if widest_rad > WIDEST_RANGE_RAD:
             return (
-                f"found {axes[widest]} turning by {turned_rad[widest]:.4g} rad in run {run.run!r}; "
+                f"found {axes[widest]} turning by {widest_rad:.4g} rad in run {run.run!r}; "
                 "expected a joint's angle in rad: are these degrees, counts, or the motor's angle "
                 "before the gear?"
             )
         largest = int(np.argmax(run.limits))
-        if run.limits[largest] > LARGEST_CURRENT_A:
+        largest_a = run.limits[largest]
+        if largest_a > LARGEST_CURRENT_A:
             return (
-                f"found a current of {run.limits[largest]:.4g} A of {axes[largest]} in run "
-                f"{run.run!r}; expected amperes: are these milliamperes, or thousandths of the "
-                "rated current?"
+                f"found a current of {largest_a:.4g} A of {axes[largest]} in run {run.run!r}; "
+                "expected amperes: are these milliamperes, or thousandths of the rated current?"
             )
     return ""
 
@@ -236,18 +241,24 @@ def require_seen_payload(estimate: Estimate, system: System) -> None:
             LEAST_WEIGHT.
         MassesContradict: the first, because the masses of several payloads contradict each other.
     """
-    relative = estimate.gains_std / np.abs(estimate.gains)
-    rows = system.joints.factors
-    torque = [
-        LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains)
-        for factor in rows
-    ]
-    weightless = all(
-        np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True)
-    )
-    if weightless or not float(np.min(relative)) <= LARGEST_GAIN_STD:
-        require_agreeing_masses(system, estimate)
-        raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
+    relative_std = estimate.gains_std / np.abs(estimate.gains)
+    is_scale_known = float(np.min(relative_std)) <= LARGEST_GAIN_STD
+    if is_scale_known and _has_weight(system, estimate.gains):
+        return
+    require_agreeing_masses(system, estimate)
+    std_percent = tuple(float(100.0 * value) for value in relative_std)
+    raise PayloadUnseen(std_percent, system.runs)
+
+
+def _has_weight(system: System, gains: FloatArray) -> bool:
+    """Whether the known payload has LEAST_WEIGHT of the torque of a joint."""
+    for factor in system.joints.factors:
+        # ‖W_kL χ_kL‖ beside ‖V g‖ of the joint
+        payload = np.linalg.norm(factor[:, -1])
+        torque = np.linalg.norm(factor[:, : len(gains)] @ gains)
+        if not payload < LEAST_WEIGHT * torque:
+            return True
+    return False
 
 
 def require_agreeing_masses(system: System, estimate: Estimate) -> None:
@@ -256,13 +267,19 @@ def require_agreeing_masses(system: System, estimate: Estimate) -> None:
     Raises:
         MassesContradict: they do, and that explains more than another payload in a single run.
     """
-    found = payload_differences(system, estimate.gains, estimate.parameters, 0)
-    masses = likeliest_masses(system, estimate.gains, estimate.parameters, found)
-    if masses is not None:
-        one = masses.diagnosis
-        raise MassesContradict(
-            "the payloads", found=one.found, expected=one.expected, remedy=one.remedy
-        )
+    gains = estimate.gains
+    parameters = estimate.parameters
+    differences = payload_differences(system, gains, parameters, 0)
+    masses = likeliest_masses(system, gains, parameters, differences)
+    if masses is None:
+        return
+    diagnosis = masses.diagnosis
+    raise MassesContradict(
+        "the payloads",
+        found=diagnosis.found,
+        expected=diagnosis.expected,
+        remedy=diagnosis.remedy,
+    )
 
 
 def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
@@ -271,21 +288,25 @@ def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
     Raises:
         RolesExchanged: every sign is opposite to that of the nameplate.
     """
-    if np.all(np.sign(gains) == -np.sign(nameplate)):
-        raise RolesExchanged(
-            "all drive gains",
-            found=numbers_text(gains),
-            expected=f"the signs of the nameplate: {numbers_text(nameplate)}",
-            remedy="were the payload's run and the run without load exchanged (look at "
-            "`Run.payload` of each run), or do all currents count the other way?",
-        )
+    is_reversed = np.sign(gains) == -np.sign(nameplate)
+    if not np.all(is_reversed):
+        return
+    expected = f"the signs of the nameplate: {numbers_text(nameplate)}"
+    remedy = (
+        "were the payload's run and the run without load exchanged (look at "
+        "`Run.payload` of each run), or do all currents count the other way?"
+    )
+    raise RolesExchanged(
+        "all drive gains", found=numbers_text(gains), expected=expected, remedy=remedy
+    )
 
 
 def require_plausible(
     estimate: Estimate, error: RelativeError, axes: Sequence[str], idle: BoolArray | None = None
 ) -> None:
-    """Refuse a fit whose model contradicts its data:
-    no number of it can be believed, however small its σ.
+    """Refuse a fit whose model contradicts its data.
+
+    No number of it can be believed, however small its σ.
 
     The payload's weight sets the sign of all gains. Taken from the wrong runs it reverses them, and
     all torques with them: the residual stays the same, but the dry friction of every joint then
@@ -304,45 +325,72 @@ def require_plausible(
         RolesExchanged: dry friction is negative on every joint, on most of them by more than five
             σ.
     """
-    unknown = estimate.gains_std > np.abs(estimate.gains)
-    excess = np.array(error.axes) / np.where(unknown, LARGEST_UNKNOWN_PERCENT, LARGEST_AXIS_PERCENT)
-    if idle is not None:
-        excess[idle & ~unknown] = 0.0
+    _require_small_error(estimate, error, axes, idle)
+    _require_braking_friction(estimate)
+
+
+def _require_small_error(
+    estimate: Estimate, error: RelativeError, axes: Sequence[str], idle: BoolArray | None
+) -> None:
+    """Refuse relative errors above their limits, and a gain that has collapsed."""
+    std = estimate.gains_std
     size = np.abs(estimate.gains)
+    is_unknown = std > size
+    largest_percent = np.where(is_unknown, LARGEST_UNKNOWN_PERCENT, LARGEST_AXIS_PERCENT)
+    excess = np.array(error.axes) / largest_percent
+    if idle is not None:
+        excess[idle & ~is_unknown] = 0.0
     excess[size < COLLAPSED_GAIN * size.max()] = np.inf
-    worst = 0 if np.isnan(excess).all() else int(np.nanargmax(excess))
-    if not (error.total <= LARGEST_TOTAL_PERCENT and excess[worst] <= 1.0):
-        raise ModelContradicted(
-            "the fit",
-            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on "
-            f"axis {axes[worst]}, with a gain of {estimate.gains[worst]:.3g} ± "
-            f"{estimate.gains_std[worst]:.2g}",
-            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis "
-            f"{LARGEST_AXIS_PERCENT:g} %, {LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller "
-            "than its σ",
-            remedy="look for what contradicts the model: two channels exchanged"
-            " (`exchanged_channels` tests it)"
-            " or one reversed, a wrong drive train, gravity or URDF, positions not in rad, a "
-            "payload or drawing that is not of the body that was mounted",
-        )
+    worst = 0
+    if not np.isnan(excess).all():
+        worst = int(np.nanargmax(excess))
+    # NaN is no small error
+    if error.total <= LARGEST_TOTAL_PERCENT and excess[worst] <= 1.0:
+        return
+    gain = estimate.gains[worst]
+    found = (
+        f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on "
+        f"axis {axes[worst]}, with a gain of {gain:.3g} ± {std[worst]:.2g}"
+    )
+    expected = (
+        f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis "
+        f"{LARGEST_AXIS_PERCENT:g} %, {LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller "
+        "than its σ"
+    )
+    remedy = (
+        "look for what contradicts the model: two channels exchanged"
+        " (`exchanged_channels` tests it)"
+        " or one reversed, a wrong drive train, gravity or URDF, positions not in rad, a "
+        "payload or drawing that is not of the body that was mounted"
+    )
+    raise ModelContradicted("the fit", found=found, expected=expected, remedy=remedy)
+
+
+def _require_braking_friction(estimate: Estimate) -> None:
+    """Refuse dry friction that drives every joint, on most of them by more than five σ."""
+    names: list[str] = []
+    frictions: list[float] = []
+    upper_bounds: list[float] = []
     parameters = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
-    dry = [
-        (one.name, v, std)
-        for one, v, std in parameters
-        if one.name.startswith("fs") and one.name[2:].isdigit()
-    ]
-    if (
-        dry
-        and all(v < 0.0 for _, v, _ in dry)
-        and np.median([v + 5.0 * std for _, v, std in dry]) < 0.0
-    ):
-        raise RolesExchanged(
-            "the dry friction of all joints",
-            found=", ".join(f"{name} = {v:.3g} ± {std:.2g}" for name, v, std in dry),
-            expected="above 0, because friction takes energy",
-            remedy="were the payload's run and the run without load exchanged? do fixed gains have "
-            "the right sign?",
-        )
+    for unknown, value, std in parameters:
+        if unknown.name.startswith("fs") and unknown.name[2:].isdigit():
+            names.append(f"{unknown.name} = {value:.3g} ± {std:.2g}")
+            frictions.append(value)
+            upper_bounds.append(value + 5.0 * std)
+    if not frictions or not max(frictions) < 0.0:
+        return
+    if not np.median(upper_bounds) < 0.0:
+        return
+    remedy = (
+        "were the payload's run and the run without load exchanged? do fixed gains have "
+        "the right sign?"
+    )
+    raise RolesExchanged(
+        "the dry friction of all joints",
+        found=", ".join(names),
+        expected="above 0, because friction takes energy",
+        remedy=remedy,
+    )
 
 
 # Units and signs
@@ -362,18 +410,14 @@ def require_units(gains: FloatArray, nameplate: FloatArray) -> None:
         cause = "is the payload's mass in g and read as kg, or are the currents in kA?"
     else:
         return
-    raise UnitsMistaken(
-        "all drive gains",
-        found=f"{numbers_text(ratio)} times the nameplate",
-        expected=f"{range_text(GAIN_RANGE)}, and within a factor of {UNIT_RATIO:g} on one "
-        "axis at least",
-        remedy=cause,
-    )
+    found = f"{numbers_text(ratio)} times the nameplate"
+    usual = range_text(GAIN_RANGE)
+    expected = f"{usual}, and within a factor of {UNIT_RATIO:g} on one axis at least"
+    raise UnitsMistaken("all drive gains", found=found, expected=expected, remedy=cause)
 
 
 def require_weight(system: System, estimate: Estimate) -> None:
-    """Refuse fixed gains with which a weighed payload has another weight,
-    by a factor that only a unit has.
+    """Refuse fixed gains by which a payload's weight is off by a factor that only a unit has.
 
     Raises:
         UnitsMistaken: more than UNIT_RATIO times, or less than 1/UNIT_RATIO of what was declared.
@@ -381,41 +425,51 @@ def require_weight(system: System, estimate: Estimate) -> None:
     if not system.knows_payload:
         return
     ratio, std = weight_ratio(system, estimate)
-    if ratio - std > UNIT_RATIO or ratio + std < 1.0 / UNIT_RATIO:
+    is_too_heavy = ratio - std > UNIT_RATIO
+    is_too_light = ratio + std < 1.0 / UNIT_RATIO
+    if is_too_heavy or is_too_light:
+        remedy = (
+            "are the currents in mA and read as A, is its mass in g and read as kg, or was "
+            "it not mounted?"
+        )
         raise UnitsMistaken(
             "the weight of the payload",
             found=f"{ratio:.3g} times the declared one, by these gains",
             expected=f"1, and within a factor of {UNIT_RATIO:g} at least",
-            remedy="are the currents in mA and read as A, is its mass in g and read as kg, or was "
-            "it not mounted?",
+            remedy=remedy,
         )
 
 
 def weight_ratio(system: System, estimate: Estimate) -> tuple[float, float]:
     """Size of W_kL χ_kL that the currents ask for with given gains, and WEIGHT_SIGMAS of its σ."""
+    gains = estimate.gains
+    row_count = int(system.motors.rows.sum())
     if system.model.is_redundant:  # no motor has an equation of its own
-        whitened = system.currents.whitened(estimate.gains, np.ones(len(estimate.gains)))
+        unit_noise = np.ones(len(gains))
+        whitened = system.currents.whitened(gains, unit_noise)
         torque = np.column_stack((whitened.linear, whitened.known))
-        right = whitened.drive @ estimate.gains
-        return _last(torque, right, int(system.motors.rows.sum()))
-    # Weighted by the size of each current: the residuals of a fit with a wrong weight say nothing
-    # about noise.
-    factors = [
-        factor / max(float(np.linalg.norm(factor[:, 0])), 1e-300)
-        for factor in system.motors.factors
-    ]
-    rows = np.concatenate(factors)
-    scale = np.concatenate(
-        [np.full(len(f), 1.0 / g) for f, g in zip(factors, estimate.gains, strict=True)]
-    )
-    return _last(rows[:, 1:] * scale[:, None], rows[:, 0], int(system.motors.rows.sum()))
+        right = whitened.drive @ gains
+        return _last_unknown(torque, right, row_count)
+    # I = (1/g) (W χ + W_kL χ_kL) of each motor. Weighted by the size of each current: the residuals
+    # of a fit with a wrong weight say nothing about noise.
+    columns: list[FloatArray] = []
+    currents: list[FloatArray] = []
+    for factor, gain in zip(system.motors.factors, gains, strict=True):
+        current_size = float(np.linalg.norm(factor[:, 0]))
+        weighted = factor / max(current_size, 1e-300)
+        inverse_gain = 1.0 / gain
+        columns.append(weighted[:, 1:] * inverse_gain)
+        currents.append(weighted[:, 0])
+    return _last_unknown(np.concatenate(columns), np.concatenate(currents), row_count)
 
 
-def _last(columns: FloatArray, right: FloatArray, rows: int) -> tuple[float, float]:
+def _last_unknown(columns: FloatArray, right: FloatArray, rows: int) -> tuple[float, float]:
     """Size of the last unknown by least squares, and WEIGHT_SIGMAS of its σ."""
     solution, inverse = solve(columns, right)
-    left = float(np.sum((right - columns @ solution) ** 2)) / rows
-    return abs(float(solution[-1])), WEIGHT_SIGMAS * float(np.sqrt(left * inverse[-1, -1]))
+    residual = right - columns @ solution
+    noise_variance = float(np.sum(residual**2)) / rows
+    std = float(np.sqrt(noise_variance * inverse[-1, -1]))
+    return abs(float(solution[-1])), WEIGHT_SIGMAS * std
 
 
 def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> None:
@@ -425,44 +479,27 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
         CurrentReversed: with the other sign the errors fall by EXCHANGE, or they stay and the
             friction, which drove the axis, brakes it.
     """
-
-    def tried(signs: FloatArray) -> tuple[float, FloatArray]:
-        """Σ log of the motors' errors, and the friction of each axis in σ."""
-        one = wls(system, estimate.gains * signs)
-        friction = np.zeros(len(axes))
-        for column, value, std in zip(
-            one.unknowns, one.parameters, one.parameters_std, strict=True
-        ):
-            if (of_friction := FRICTION.match(column.name)) is not None:
-                number = int(of_friction[2]) - 1
-                friction[number if of_friction[1] else joints.index(number)] += value / std
-        errors = np.maximum(system.currents.noise(one.gains, one.parameters), smallest)
-        return float(np.sum(np.log(errors))), friction
-
-    joints = system.model.robot.axis_joints
-    redundant = system.model.is_redundant
-    # Where a motor's rows have its current
-    own = range(len(axes)) if redundant else [0] * len(axes)
-    size = np.array(
-        [np.linalg.norm(f[:, column]) for f, column in zip(system.motors.factors, own, strict=True)]
-    )
-    smallest = SMALL_ERROR * size / np.sqrt(np.maximum(system.motors.rows, 1))
-    smallest[smallest == 0.0] = 1.0  # a motor without current
-    signs = np.ones(len(axes))
-    before, friction = tried(signs)
+    least_errors = _least_current_errors(system)
+    best = _try_signs(system, estimate.gains, np.ones(len(axes)), least_errors)
     for _ in axes:
-        better = []
+        better: list[_SignTrial] = []
         for axis in range(len(axes)):
-            trial = signs * np.where(np.arange(len(axes)) == axis, -1.0, 1.0)
-            after, braking = tried(trial)
-            driven = friction[axis] < -FRICTION_SIGMAS < FRICTION_SIGMAS < braking[axis]
-            if after - before < (LEVEL if driven else -EXCHANGE):
-                better.append((after, axis, trial, braking))
+            signs = best.signs.copy()
+            signs[axis] = -signs[axis]
+            trial = _try_signs(system, estimate.gains, signs, least_errors)
+            is_driven = best.friction[axis] < -FRICTION_SIGMAS
+            is_braked_after = trial.friction[axis] > FRICTION_SIGMAS
+            largest_rise = -EXCHANGE
+            if is_driven and is_braked_after:
+                largest_rise = LEVEL
+            if trial.log_error - best.log_error < largest_rise:
+                better.append(trial)
         if not better:
             break
-        before, _, signs, friction = min(better, key=lambda one: one[:2])
+        best = min(better, key=lambda trial: trial.log_error)
+    signs = best.signs
     # Without a payload the data fix the signs up to a common one, which friction shows
-    if np.median(friction) < 0.0:
+    if np.median(best.friction) < 0.0:
         signs = -signs
     turned = [axis for axis, sign in zip(axes, signs, strict=True) if sign < 0.0]
     if 0 < len(turned) < len(axes):
@@ -475,23 +512,69 @@ def require_signs(system: System, estimate: Estimate, axes: Sequence[str]) -> No
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _SignTrial:
+    """A fit with some of the fixed gains reversed."""
+
+    signs: FloatArray  #: of the gains, 1 or -1, shape (m,)
+    log_error: float  #: Σ log of the motors' errors
+    friction: FloatArray  #: of each axis, in σ; negative where it drives, shape (m,)
+
+
+def _try_signs(
+    system: System, gains: FloatArray, signs: FloatArray, least_errors: FloatArray
+) -> _SignTrial:
+    """Fit with gains of other signs; errors of motors count as `least_errors` at least."""
+    joints = system.model.robot.axis_joints
+    estimate = wls(system, gains * signs)
+    friction = np.zeros(len(gains))
+    parameters = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+    for unknown, value, std in parameters:
+        match = FRICTION.match(unknown.name)
+        if match is None:
+            continue
+        axis = int(match[2]) - 1
+        is_of_motor = bool(match[1])
+        if not is_of_motor:
+            axis = joints.index(axis)
+        friction[axis] += value / std
+    noise = system.currents.noise(estimate.gains, estimate.parameters)
+    errors = np.maximum(noise, least_errors)
+    log_error = float(np.sum(np.log(errors)))
+    return _SignTrial(signs, log_error, friction)
+
+
+def _least_current_errors(system: System) -> FloatArray:
+    """SMALL_ERROR of each motor's current, root mean square [A], shape (m,)."""
+    sizes: list[float] = []
+    for motor, factor in enumerate(system.motors.factors):
+        own = 0
+        if system.model.is_redundant:  # its rows have the currents of all motors
+            own = motor
+        sizes.append(float(np.linalg.norm(factor[:, own])))
+    row_counts = np.maximum(system.motors.rows, 1)
+    least = SMALL_ERROR * np.array(sizes) / np.sqrt(row_counts)
+    least[least == 0.0] = 1.0  # a motor without current
+    return least
+
+
 # Torques
 
 
 def joint_torques(system: System, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Torque of each joint, and what the model leaves of it:
-    root mean squares [Nm or N], both of shape (m,).
-    """
-    gains = np.concatenate((estimate.gains, np.zeros(len(estimate.parameters) + 1)))
-    whole = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
-    rows = np.maximum(system.joints.rows, 1)
-    size, left = (np.sqrt(system.joints.square_sum(vector) / rows) for vector in (gains, whole))
+    """Torque of each joint and what the model leaves of it, rms [Nm or N], shape (m,) each."""
+    joints = system.joints
+    no_parameters = np.zeros(len(estimate.parameters) + 1)
+    gains_alone = np.concatenate((estimate.gains, no_parameters))
+    solution = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
+    row_counts = np.maximum(joints.rows, 1)
+    size = np.sqrt(joints.square_sum(gains_alone) / row_counts)
+    left = np.sqrt(joints.square_sum(solution) / row_counts)
     return size, left
 
 
 def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
-    """Joints whose torque and error are nothing beside the torque of another joint of the kind,
-    shape (m,).
+    """Joints with next to no torque and error beside another joint of the kind, shape (m,).
 
     Args:
         model: of the fit.
@@ -499,7 +582,9 @@ def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
     """
     kinds = np.array([joint.kind.value for joint in model.robot.axes])
     largest = np.array([size[kinds == kind].max() for kind in kinds])
-    return (size < IDLE_TORQUE * largest) & (left < IDLE_ERROR * largest)
+    has_no_torque = size < IDLE_TORQUE * largest
+    has_no_error = left < IDLE_ERROR * largest
+    return has_no_torque & has_no_error
 
 
 def numbers_text(values: FloatArray) -> str:

@@ -1,5 +1,4 @@
-"""Gross mistakes of geometry: gravity that points elsewhere, a position that counts the other way,
-a zero far off.
+"""Gross mistakes of geometry: another gravity, a position that counts the other way, a far zero.
 
 Each makes the equations of most motors wrong at once, and its traces look like those of wrong
 currents: a gain of the wrong sign, a large error, an iteration that does not converge. So geometry
@@ -33,7 +32,7 @@ where the joint moves little.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -72,8 +71,9 @@ LEAST_T = 4.0  #: Least mean of the falls of the parts, in σ of that mean
 SMALLEST_TURN_DEG = 10.0
 LARGEST_DIRECTION_STD_DEG = 10.0  #: A direction that is less certain is not named
 ALIKE_FALL = 0.85
-"""Share of the largest fall above which a hypothesis is as good:
-a mirror image of an arm has the same torques.
+"""Share of the largest fall above which a hypothesis is as good.
+
+A mirror image of an arm has the same torques.
 """
 LARGEST_FACTOR = 3.0  #: Of a gain beside its nameplate and the other gains
 SCREENED_ROWS = 500  #: Rows of all runs together with which every recording is screened
@@ -82,11 +82,10 @@ ZERO_TURNS_DEG = (45.0, 90.0, 135.0, 180.0, -135.0, -90.0, -45.0)
 ZERO_REACH_RAD = 0.5  #: How far it goes from there
 ZERO_TOLERANCE_RAD = 2e-3
 SMALL_ZERO = float(np.deg2rad(ZERO_TURNS_DEG[0])) - ZERO_REACH_RAD
-"""Largest small correction of a zero [rad or m]:
-from there on, the search for large ones finds it.
-"""
+"""Largest small correction of a zero [rad or m]; the search for large ones finds any larger."""
 SUSPECT_ERROR = 0.2
-"""Error of the worst current, of its size, from which another zero is looked for:
+"""Error of the worst current, of its size, from which another zero is looked for.
+
 45° of a joint that bears anything leave more.
 """
 #: Fall of the errors of the fits themselves, as LEAST_FALL, above which predictions are judged
@@ -129,17 +128,18 @@ class PositionReading:
         """Motion of all axes in this reading."""
         signs = np.ones(motion.position_rad.shape[1])
         signs[self.axis] = self.sign
-        return Motion(
-            self.positions(motion.position_rad),
-            motion.velocity_rad_s * signs,
-            motion.acceleration_rad_s2 * signs,
-        )
+        position_rad = self.positions(motion.position_rad)
+        velocity_rad_s = motion.velocity_rad_s * signs
+        acceleration_rad_s2 = motion.acceleration_rad_s2 * signs
+        return Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
 
     def text(self, axes: Sequence[str]) -> str:
         """The mistake in words."""
+        name = axes[self.axis]
         if self.sign < 0.0:
-            return f"{axes[self.axis]} reversed"
-        return f"the zero of {axes[self.axis]} off by about {np.rad2deg(self.zero_rad):+.0f} deg"
+            return f"{name} reversed"
+        zero_deg = np.rad2deg(self.zero_rad)
+        return f"the zero of {name} off by about {zero_deg:+.0f} deg"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,8 +153,10 @@ class GravityFound:
     @property
     def turned_deg(self) -> float:
         """Angle between the two [deg]."""
-        cosine = self.declared_m_s2 @ self.found_m_s2 / float(np.sum(self.declared_m_s2**2))
-        return float(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        declared_square = float(np.sum(self.declared_m_s2**2))
+        cosine = self.declared_m_s2 @ self.found_m_s2 / declared_square
+        angle_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+        return float(np.rad2deg(angle_rad))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,9 +173,7 @@ class TurnedGeometry:
     after_percent: FloatArray  #: the same in this geometry
 
     def model(self, declared: Model) -> Model:
-        """The model with this gravity; for another reading of a position see
-        `corrected_positions`.
-        """
+        """The model with this gravity; for readings of a position see `corrected_positions`."""
         if self.gravity is None:
             return declared
         return with_gravity(declared, self.gravity.found_m_s2)
@@ -191,50 +191,34 @@ class TurnedGeometry:
             axes: their names.
             runs: that it was found in, empty for those of a fit.
         """
-        until_right = RUN_UNTIL_RIGHT if runs else UNTIL_RIGHT
-        which_is_wrong = f"{WHICH_IS_WRONG}: {until_right}"
-        errors = f"errors of {_percents(self.after_percent)} % of the currents of left-out moves"
-        declared = f"{_percents(self.before_percent)} % as declared"
-        alike = [one.text(axes) for one in self.readings[0 if self.gravity is not None else 1 :]]
+        until_right = UNTIL_RIGHT
+        if runs:
+            until_right = RUN_UNTIL_RIGHT
+        after = _percents(self.after_percent)
+        before = _percents(self.before_percent)
+        errors = f"errors of {after} % of the currents of left-out moves, {before} % as declared"
+        alike = self.readings
+        if self.gravity is None:
+            alike = alike[1:]
         if alike:
-            others = f"; explained as well by {' or '.join(alike)}"
-        else:
-            others = ""
+            others = " or ".join(reading.text(axes) for reading in alike)
+            errors = f"{errors}; explained as well by {others}"
         if self.gravity is not None:
-            found = self.gravity
-            std_m_s2 = float(np.linalg.norm(found.found_m_s2) * np.deg2rad(found.std_deg))
-            suggested_m_s2 = suggested_gravity(found.found_m_s2, np.full(3, std_m_s2))
-            remedy = (
-                "how is the base mounted? correct `gravity_m_s2` of the cell: "
-                f"{_numbers(suggested_m_s2)} m/s² by these recordings; {until_right}"
-            )
-            unit = found.found_m_s2 / np.linalg.norm(found.found_m_s2)
-            return Diagnosis(
-                GRAVITY_TURNED,
-                runs,
-                (),
-                f"gravity along {_numbers(unit)}, turned by {found.turned_deg:.1f} ± "
-                f"{found.std_deg:.1f} deg from what the cell says, with {errors}, "
-                f"{declared}{others}",
-                f"gravity along the declared {_numbers(found.declared_m_s2)}",
-                which_is_wrong if alike else remedy,
-            )
+            diagnosis = _turned_gravity_diagnosis(self.gravity, errors, until_right)
+        elif self.readings[0].sign > 0.0:
+            diagnosis = _turned_zero_diagnosis(self.readings[0], axes, errors, until_right)
+        else:
+            # Other readings that explain the same do not change what to do here.
+            return self._reversed_position_diagnosis(axes, runs, errors, until_right)
+        if alike:
+            diagnosis = replace(diagnosis, remedy=f"{WHICH_IS_WRONG}: {until_right}")
+        return replace(diagnosis, runs=runs)
+
+    def _reversed_position_diagnosis(
+        self, axes: Sequence[str], runs: tuple[str, ...], errors: str, until_right: str
+    ) -> Diagnosis:
         reading = self.readings[0]
         name = axes[reading.axis]
-        if reading.sign > 0.0:
-            turn = f"{np.rad2deg(reading.zero_rad):+.0f} deg"
-            remedy = (
-                f"add about {turn} to `zero_offset_deg` of {name} in the cell file, or move the "
-                f"zero in the controller, and fit again: {until_right}"
-            )
-            return Diagnosis(
-                ZERO_TURNED,
-                runs,
-                (name,),
-                f"{reading.text(axes)}: so read, its position leaves {errors}, {declared}{others}",
-                "positions whose zero is that of the URDF",
-                which_is_wrong if alike else remedy,
-            )
         if reading.axis in self.reversed_currents:
             remedy = (
                 f"reverse the <axis> of the joint of {name} in the URDF; or, in the cell file, its "
@@ -247,15 +231,41 @@ class TurnedGeometry:
                 "a prismatic axis), and leave its nameplate gain; of an import with `side: joint`, "
                 "name it in `reversed` of `position`"
             )
-        return Diagnosis(
-            POSITION_REVERSED,
-            runs,
-            (name,),
-            f"a position that counts the other way: so read, it leaves {errors}, "
-            f"{declared}{others}",
-            "each position to count about the axis of its joint in the URDF",
-            f"{remedy}; {until_right}",
-        )
+        evidence = f"a position that counts the other way: so read, it leaves {errors}"
+        expected = "each position to count about the axis of its joint in the URDF"
+        advice = f"{remedy}; {until_right}"
+        return Diagnosis(POSITION_REVERSED, runs, (name,), evidence, expected, advice)
+
+
+def _turned_gravity_diagnosis(found: GravityFound, errors: str, until_right: str) -> Diagnosis:
+    size_m_s2 = np.linalg.norm(found.found_m_s2)
+    std_m_s2 = float(size_m_s2 * np.deg2rad(found.std_deg))
+    suggested_m_s2 = suggested_gravity(found.found_m_s2, np.full(3, std_m_s2))
+    direction = _numbers(found.found_m_s2 / size_m_s2)
+    evidence = (
+        f"gravity along {direction}, turned by {found.turned_deg:.1f} ± {found.std_deg:.1f} deg "
+        f"from what the cell says, with {errors}"
+    )
+    expected = f"gravity along the declared {_numbers(found.declared_m_s2)}"
+    remedy = (
+        "how is the base mounted? correct `gravity_m_s2` of the cell: "
+        f"{_numbers(suggested_m_s2)} m/s² by these recordings; {until_right}"
+    )
+    return Diagnosis(GRAVITY_TURNED, (), (), evidence, expected, remedy)
+
+
+def _turned_zero_diagnosis(
+    reading: PositionReading, axes: Sequence[str], errors: str, until_right: str
+) -> Diagnosis:
+    name = axes[reading.axis]
+    zero_deg = np.rad2deg(reading.zero_rad)
+    evidence = f"{reading.text(axes)}: so read, its position leaves {errors}"
+    expected = "positions whose zero is that of the URDF"
+    remedy = (
+        f"add about {zero_deg:+.0f} deg to `zero_offset_deg` of {name} in the cell file, or move "
+        f"the zero in the controller, and fit again: {until_right}"
+    )
+    return Diagnosis(ZERO_TURNED, (), (name,), evidence, expected, remedy)
 
 
 def _percents(values: FloatArray) -> str:
@@ -264,12 +274,14 @@ def _percents(values: FloatArray) -> str:
 
 def _numbers(values: FloatArray) -> str:
     rounded = np.round(values, 2) + 0.0  # no minus before a zero
-    return "[" + ", ".join(f"{value:.2f}" for value in rounded) + "]"
+    numbers = ", ".join(f"{value:.2f}" for value in rounded)
+    return f"[{numbers}]"
 
 
 def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
     """The same model under another gravity."""
-    return replace(model, robot=replace(model.robot, gravity_m_s2=gravity_m_s2))
+    robot = replace(model.robot, gravity_m_s2=gravity_m_s2)
+    return replace(model, robot=robot)
 
 
 @takes(model=Model, instants=Sequence)
@@ -311,29 +323,31 @@ def find_turned_geometry(
     better = [one for one in better if one.stands_beside(small)]
     if not better:
         return None
-    best = max(one.fall(before) for one in better)
-    alike = [one for one in better if one.fall(before) >= ALIKE_FALL * best]
-    # A mirror image of an arm needs more reversed currents than the mistake itself does. Where a
-    # zero half a turn away explains the same as another gravity, the mounting is named first: it is
-    # declared once for the whole arm.
-    alike.sort(
-        key=lambda one: (one.contradictions(nameplate), one.gravity is None, -one.fall(before))
-    )
+    largest_fall = max(one.fall(before) for one in better)
+    alike_fall = ALIKE_FALL * largest_fall
+    alike = [one for one in better if one.fall(before) >= alike_fall]
+
+    def order(one: Judged) -> tuple[float, bool, float]:
+        # A mirror image of an arm needs more reversed currents than the mistake itself does. Where
+        # a zero half a turn away explains the same as another gravity, the mounting is named first:
+        # it is declared once for the whole arm.
+        return one.contradictions(nameplate), one.gravity is None, -one.fall(before)
+
+    alike.sort(key=order)
     chosen = alike[0]
+    for correction in small:
+        if correction.fall(before) >= alike_fall and not chosen.is_better(correction):
+            alike.append(correction)
     fewest = chosen.contradictions(nameplate)
-    alike += [
-        one for one in small if one.fall(before) >= ALIKE_FALL * best and not chosen.is_better(one)
-    ]
-    readings = [
-        one.reading
-        for one in alike
-        if one.reading is not None and one.contradictions(nameplate) == fewest
-    ]
-    against = np.flatnonzero(chosen.fit.per_unit * nameplate < 0.0)
+    readings: list[PositionReading] = []
+    for one in alike:
+        if one.reading is not None and one.contradictions(nameplate) == fewest:
+            readings.append(one.reading)
+    has_other_sign = chosen.fit.per_unit * nameplate < 0.0
     return TurnedGeometry(
         gravity=chosen.gravity,
         readings=tuple(readings),
-        reversed_currents=tuple(against.tolist()),
+        reversed_currents=tuple(np.flatnonzero(has_other_sign).tolist()),
         before_percent=before.percent,
         after_percent=chosen.percent,
     )
@@ -341,7 +355,8 @@ def find_turned_geometry(
 
 def _thinned(instants: Sequence[Instants]) -> tuple[Instants, ...]:
     """Keep SCREENED_ROWS of all runs together, evenly spaced."""
-    step = -(-sum(len(one.move) for one in instants) // SCREENED_ROWS)
+    count = sum(len(one.move) for one in instants)
+    step = -(-count // SCREENED_ROWS)  # rounded up
     return tuple(one.every(step) for one in instants)
 
 
@@ -365,20 +380,22 @@ def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArra
     as_read = improved(square, rows, start, reference, FIT_ROUNDS)
     limit = _log_error(square, as_read) - SUSPECT_FALL
     current_square = square[:, -1, -1]
-    errors = np.sqrt(
-        left_over(square, as_read) / np.where(current_square > 0.0, current_square, 1.0)
-    )
+    current_square = np.where(current_square > 0.0, current_square, 1.0)
+    errors = np.sqrt(left_over(square, as_read) / current_square)
     is_gross = float(errors.max()) > SUSPECT_ERROR
     any_gravity = weighed.square[:, 0]
-    if _log_error(any_gravity, improved(any_gravity, rows, start, reference, FIT_ROUNDS)) < limit:
+    fit = improved(any_gravity, rows, start, reference, FIT_ROUNDS)
+    if _log_error(any_gravity, fit) < limit:
         return True
     for reading in _readings(model):
         if reading.sign > 0.0 and not is_gross:
             continue
         with suppress(ModelError):  # the loops of a closed chain cannot be closed so
-            square = products_of_reading(model, instants, reading, part_count=1).square[:, 0]
+            products = products_of_reading(model, instants, reading, part_count=1)
+            square = products.square[:, 0]
             near = start.in_reading(reading)
-            if _log_error(square, improved(square, rows, near, reference, FIT_ROUNDS)) < limit:
+            fit = improved(square, rows, near, reference, FIT_ROUNDS)
+            if _log_error(square, fit) < limit:
                 return True
     return False
 
@@ -394,16 +411,16 @@ def _turned_zeros(model: Model, axis: int) -> tuple[PositionReading, ...]:
     """Readings of an angle from other zeros; none of a prismatic joint."""
     if model.robot.axes[axis].kind is JointKind.PRISMATIC:
         return ()
-    return tuple(
-        PositionReading(axis, zero_rad=float(np.deg2rad(turn_deg))) for turn_deg in ZERO_TURNS_DEG
-    )
+    zeros_rad = np.deg2rad(ZERO_TURNS_DEG)
+    return tuple(PositionReading(axis, zero_rad=zero_rad) for zero_rad in zeros_rad.tolist())
 
 
 def _best_zero(
     model: Model, instants: Sequence[Instants], axis: int, start: MotorFit, reference: FloatArray
 ) -> PositionReading | None:
-    """The reading of an angle whose fit leaves least;
-    None of a prismatic joint, or where no loop can be closed so.
+    """The reading of an angle whose fit leaves least.
+
+    There is none of a prismatic joint, or where no loop can be closed so.
 
     Args:
         model: the declared model.
@@ -424,12 +441,13 @@ def _best_zero(
     if not np.any(np.isfinite(levels)):
         return None
     near = begins[int(np.argmin(levels))]
-    bounds = (near - ZERO_REACH_RAD, near + ZERO_REACH_RAD)
-    found = scipy.optimize.minimize_scalar(
-        left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD}
-    )
-    best = float(found.x) if found.fun < min(levels) else near
-    return PositionReading(axis, zero_rad=best if best <= np.pi else best - 2.0 * np.pi)
+    zero_rad, level = _least(left, near - ZERO_REACH_RAD, near + ZERO_REACH_RAD)
+    best = near
+    if level < min(levels):
+        best = zero_rad
+    if best > np.pi:
+        best -= 2.0 * np.pi
+    return PositionReading(axis, zero_rad=best)
 
 
 def _other_readings(
@@ -457,12 +475,14 @@ def _other_readings(
         square = products.square.sum(axis=1)
         rows = products.rows.sum(axis=1)
         fit = improved(square, rows, near, reference, FIT_ROUNDS)
-        fitted = np.maximum(np.sqrt(left_over(square, fit)), before.smallest)
-        falls = np.log(before.floored_error / fitted)
+        error = np.sqrt(left_over(square, fit))
+        floored_error = np.maximum(error, before.smallest)
+        falls = np.log(before.floored_error / floored_error)
         # Prediction is never better than the fit: most hypotheses end here
         if np.sum(falls) < LEAST_FALL:
             continue
-        judged.append(replace(judge_hypothesis(products, near, reference), reading=reading))
+        predicted = judge_hypothesis(products, near, reference)
+        judged.append(replace(predicted, reading=reading))
     return judged
 
 
@@ -473,8 +493,9 @@ def _small_corrections(
     start: MotorFit,
     reference: FloatArray,
 ) -> list[Judged]:
-    """Judge the best small correction of gravity, and of each zero;
-    none that grows beyond what is small.
+    """Judge the best small correction of gravity, and of each zero.
+
+    Those that grow beyond what is small are left out.
 
     Args:
         model: the declared model.
@@ -485,9 +506,8 @@ def _small_corrections(
     """
     judged = list[Judged]()
     declared = model.robot.gravity_m_s2
-    tilted = _judged_gravity(
-        weighed, declared, _descended(weighed, declared, start, reference), reference
-    )
+    solution = _descended(weighed, declared, start, reference)
+    tilted = _judged_gravity(weighed, declared, solution, reference)
     if tilted.gravity is not None and tilted.gravity.turned_deg < SMALLEST_TURN_DEG:
         judged.append(tilted)
     few = _thinned(instants)
@@ -496,9 +516,8 @@ def _small_corrections(
             reading = _small_zero(model, few, axis, start, reference)
             if reading is not None:
                 products = products_of_reading(model, instants, reading)
-                judged.append(
-                    replace(judge_hypothesis(products, start, reference), reading=reading)
-                )
+                predicted = judge_hypothesis(products, start, reference)
+                judged.append(replace(predicted, reading=reading))
         except ModelError:  # the loops of a closed chain cannot be closed so
             continue
     return judged
@@ -518,15 +537,22 @@ def _small_zero(
     def left(zero: float) -> float:
         return _left_with_zero(model, instants, axis, zero, start, reference)
 
-    bounds = (-SMALL_ZERO, SMALL_ZERO)
-    found = scipy.optimize.minimize_scalar(
-        left, bounds=bounds, method="bounded", options={"xatol": ZERO_TOLERANCE_RAD}
-    )
-    zero = float(found.x)
+    zero, _ = _least(left, -SMALL_ZERO, SMALL_ZERO)
     is_at_bound = SMALL_ZERO - abs(zero) < 2.0 * ZERO_TOLERANCE_RAD
     if is_at_bound:
         return None
     return PositionReading(axis, zero_rad=zero)
+
+
+def _least(left: Callable[[float], float], lower: float, upper: float) -> tuple[float, float]:
+    """Zero between two others that leaves least [rad or m], and what it leaves."""
+    found = scipy.optimize.minimize_scalar(
+        left,
+        bounds=(lower, upper),
+        method="bounded",
+        options={"xatol": ZERO_TOLERANCE_RAD},
+    )
+    return float(found.x), float(found.fun)
 
 
 def _left_with_zero(
@@ -544,21 +570,20 @@ def _left_with_zero(
     Raises:
         ModelError: the loops of a closed chain cannot be closed so.
     """
-    products = products_of_reading(
-        model, instants, PositionReading(axis, zero_rad=zero), part_count=1
-    )
+    reading = PositionReading(axis, zero_rad=zero)
+    products = products_of_reading(model, instants, reading, part_count=1)
     square = products.square[:, 0]
     rows = products.rows.sum(axis=1)
-    return _log_error(square, improved(square, rows, start, reference, FIT_ROUNDS))
+    fit = improved(square, rows, start, reference, FIT_ROUNDS)
+    return _log_error(square, fit)
 
 
 def _turned_gravity(
     weighed: GravityProducts, declared: FloatArray, start: MotorFit, reference: FloatArray
 ) -> Judged | None:
     """Judge the best direction of gravity; None where it is near the declared one, or uncertain."""
-    judged = _judged_gravity(
-        weighed, declared, best_gravity(weighed, declared, start, reference), reference
-    )
+    solution = best_gravity(weighed, declared, start, reference)
+    judged = _judged_gravity(weighed, declared, solution, reference)
     gravity = judged.gravity
     if gravity is None or gravity.std_deg > LARGEST_DIRECTION_STD_DEG:
         return None
@@ -573,8 +598,7 @@ def _judged_gravity(
     solution: tuple[FloatArray, MotorFit],
     reference: FloatArray,
 ) -> Judged:
-    """Judge a direction of gravity by predictions of each part of the moves,
-    σ of it by a jackknife.
+    """Judge a direction of gravity by predictions of each part of the moves; σ by a jackknife.
 
     Args:
         weighed: products for any direction of gravity.
@@ -583,16 +607,18 @@ def _judged_gravity(
         reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
     """
     found, fit = solution
-    left_out = [_without(weighed, part, found, fit, reference) for part in range(PARTS)]
-    directions = np.array([gravity for gravity, _ in left_out])
-    unit = directions / np.linalg.norm(found)
-    scatter = (PARTS - 1) * np.cov(unit.T, ddof=0)  # of the jackknife
-    std_deg = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(scatter)[-1])))
-    gravity = GravityFound(declared, found, std_deg)
+    directions = list[FloatArray]()
     left = list[FloatArray]()
-    for part, (of_others, fit_of_others) in enumerate(left_out):
+    for part in range(PARTS):
+        of_others, fit_of_others = _without(weighed, part, found, fit, reference)
         own = weighed.turned(weighed.square[:, part], of_others)
+        directions.append(of_others)
         left.append(left_over(own, fit_of_others))
+    unit = np.array(directions) / np.linalg.norm(found)
+    covariance = (PARTS - 1) * np.cov(unit.T, ddof=0)  # of the jackknife
+    largest_variance = np.linalg.eigvalsh(covariance)[-1]
+    std_deg = float(np.rad2deg(np.sqrt(largest_variance)))
+    gravity = GravityFound(declared, found, std_deg)
     current_square = weighed.directed(found).current_square
     return Judged(fit, np.stack(left, axis=1), current_square, gravity=gravity)
 
@@ -601,13 +627,18 @@ def _without(
     weighed: GravityProducts, part: int, found: FloatArray, fit: MotorFit, reference: FloatArray
 ) -> tuple[FloatArray, MotorFit]:
     """Gravity and fit without one part of the moves, from those of all."""
-    others = weighed.square.sum(axis=1) - weighed.square[:, part]
-    rows = weighed.rows.sum(axis=1) - weighed.rows[:, part]
+    all_parts = weighed.square.sum(axis=1)
+    all_rows = weighed.rows.sum(axis=1)
+    others = all_parts - weighed.square[:, part]
+    rows = all_rows - weighed.rows[:, part]
     gravity = found
+    square = weighed.turned(others, gravity)
     for _ in range(NEXT_ROUNDS):
-        fit = improved(weighed.turned(others, gravity), rows, fit, reference, NEXT_ROUNDS)
-        gravity = _moved(gravity, weighed.turn(others, gravity, fit))
-    return gravity, improved(weighed.turned(others, gravity), rows, fit, reference, NEXT_ROUNDS)
+        fit = improved(square, rows, fit, reference, NEXT_ROUNDS)
+        step = weighed.turn(others, gravity, fit)
+        gravity = _moved(gravity, step)
+        square = weighed.turned(others, gravity)
+    return gravity, improved(square, rows, fit, reference, NEXT_ROUNDS)
 
 
 def best_gravity(
@@ -637,8 +668,9 @@ def best_gravity(
 def _descended(
     weighed: GravityProducts, gravity: FloatArray, near: MotorFit, reference: FloatArray
 ) -> tuple[FloatArray, MotorFit]:
-    """Gravity that explains all rows best near another one, by Gauss-Newton, and its fit;
-    arguments as before.
+    """Gravity that explains all rows best near another one, by Gauss-Newton, and its fit.
+
+    Arguments as for `best_gravity`.
     """
     square = weighed.square.sum(axis=1)
     level, fit = _fit_under(weighed, gravity, near, reference)
@@ -707,15 +739,19 @@ def is_confirmed(
         gains_fixed: the fit holds them.
         before_percent: relative error of the fit as declared; None where it was refused.
     """
-    signs = np.ones(len(gains))
-    signs[list(geometry.reversed_currents)] = -1.0
-    method = Method.WLS if gains_fixed else Method.ML
-    fixed = gains * signs if gains_fixed else None
-    corrected = _corrected(geometry, runs)
+    method = Method.ML
+    fixed: FloatArray | None = None
+    if gains_fixed:
+        method = Method.WLS
+        signs = np.ones(len(gains))
+        signs[list(geometry.reversed_currents)] = -1.0
+        fixed = gains * signs
+    corrected_model = geometry.model(model)
+    corrected_runs = _corrected(geometry, runs)
     try:
         found = identify(
-            geometry.model(model),
-            corrected,
+            corrected_model,
+            corrected_runs,
             conditioning,
             method=method,
             fixed_gains=fixed,
@@ -723,16 +759,16 @@ def is_confirmed(
         )
     except IdentificationError:
         return False
-    if before_percent is None:
-        limit = LARGEST_TOTAL_PERCENT
-    else:
+    limit = LARGEST_TOTAL_PERCENT
+    if before_percent is not None:
         limit = before_percent
     return found.training_error.total < limit
 
 
 def _corrected(geometry: TurnedGeometry, runs: Iterable[Run]) -> Iterator[Run]:
     for run in runs:
-        yield replace(run, position_rad=geometry.corrected_positions(run.position_rad))
+        position_rad = geometry.corrected_positions(run.position_rad)
+        yield replace(run, position_rad=position_rad)
 
 
 # Judgement
@@ -751,8 +787,9 @@ class Judged:
 
     @property
     def smallest(self) -> FloatArray:
-        """Error below which a current needs no other explanation, root of the sum of squares,
-        shape (m,).
+        """Error below which a current needs no other explanation, shape (m,).
+
+        It is the root of a sum of squares, as `floored_error`.
         """
         size = np.sqrt(self.current_square.sum(axis=1))
         return np.asarray(np.where(size > 0.0, SMALL_ERROR * size, 1.0))
@@ -760,7 +797,8 @@ class Judged:
     @property
     def floored_error(self) -> FloatArray:
         """Error of each motor, at least the smallest, shape (m,)."""
-        return np.asarray(np.maximum(np.sqrt(self.left.sum(axis=1)), self.smallest))
+        error = np.sqrt(self.left.sum(axis=1))
+        return np.asarray(np.maximum(error, self.smallest))
 
     @property
     def percent(self) -> FloatArray:
@@ -771,10 +809,9 @@ class Judged:
         return np.asarray(100.0 * np.sqrt(share))
 
     def fall(self, before: Judged) -> float:
-        """Fall of the logarithm of the errors from those of another hypothesis,
-        in sum over the motors.
-        """
-        return float(np.sum(np.log(before.floored_error / self.floored_error)))
+        """Fall of the logarithm of the errors from another hypothesis, in sum over the motors."""
+        falls = np.log(before.floored_error / self.floored_error)
+        return float(np.sum(falls))
 
     def is_better(self, before: Judged) -> bool:
         """Whether the errors fall by LEAST_FALL, and in the parts alike."""
@@ -782,18 +819,19 @@ class Judged:
             return False
         # The mean error of a part is added on both sides, so that a part of few rows does not
         # decide.
-        usual = np.minimum(before.floored_error, self.floored_error)[:, None] ** 2 / PARTS
+        smaller_error = np.minimum(before.floored_error, self.floored_error)
+        usual = smaller_error[:, None] ** 2 / PARTS
         ratio = (before.left + usual) / (self.left + usual)
         falls = 0.5 * np.sum(np.log(ratio), axis=0)
-        std = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
-        return bool(np.mean(falls) > LEAST_T * std)
+        std_of_mean = float(np.std(falls, ddof=1)) / np.sqrt(len(falls))
+        return bool(np.mean(falls) > LEAST_T * std_of_mean)
 
     def stands_beside(self, small: Sequence[Judged]) -> bool:
-        """Whether a hypothesis is better than all small corrections;
-        a turn of gravity, whether none is better than it.
+        """Whether a hypothesis is better than all small corrections.
 
-        Gravity that is turned by 15° is another explanation of the same size as a zero that is off
-        by 15°. Where the joints before this one hardly move, nothing tells the two apart.
+        A turn of gravity stands where none of them is better than it. Gravity that is turned by 15°
+        is another explanation of the same size as a zero that is off by 15°. Where the joints
+        before this one hardly move, nothing tells the two apart.
         """
         if self.gravity is not None:
             return not any(one.is_better(self) for one in small)
@@ -805,9 +843,10 @@ class Judged:
         That of a reversed axis counts half: where the axis of the URDF points the other way, both
         are reversed.
         """
-        against = self.fit.per_unit * gains < 0.0
-        count = float(np.count_nonzero(against))
-        if self.reading is not None and self.reading.sign < 0.0 and against[self.reading.axis]:
+        has_other_sign = self.fit.per_unit * gains < 0.0
+        count = float(np.count_nonzero(has_other_sign))
+        reading = self.reading
+        if reading is not None and reading.sign < 0.0 and has_other_sign[reading.axis]:
             count -= 0.5
         return count
 
@@ -826,8 +865,10 @@ def judge_hypothesis(products: Products, start: MotorFit, reference: FloatArray)
     left = np.zeros(products.rows.shape)
     for part in range(PARTS):
         own = products.square[:, part]
-        others = improved(square - own, rows - products.rows[:, part], fit, reference, NEXT_ROUNDS)
-        left[:, part] = left_over(own, others)
+        other_square = square - own
+        other_rows = rows - products.rows[:, part]
+        fit_of_others = improved(other_square, other_rows, fit, reference, NEXT_ROUNDS)
+        left[:, part] = left_over(own, fit_of_others)
     return Judged(fit, left, products.current_square)
 
 
@@ -844,9 +885,7 @@ class MotorFit:
     weight: FloatArray  #: 1/σ² of each motor's current [1/A²], shape (m,)
 
     def in_reading(self, reading: PositionReading) -> MotorFit:
-        """The fit from which that of a reading begins:
-        friction brakes the motion of a reversed position.
-        """
+        """The fit from which that of a reading begins: friction brakes its reversed motion too."""
         signs = np.ones(len(self.per_unit))
         signs[reading.axis] = reading.sign
         return replace(self, per_unit=self.per_unit * signs)
@@ -860,16 +899,21 @@ def first_fit(model: Model, products: Products, reference: FloatArray) -> MotorF
         reference: 1/|g| of the nameplate [A/Nm or A/N], shape (m,).
     """
     square = products.square.sum(axis=1)
-    friction = [index for index, column in enumerate(model.columns) if FRICTION.match(column.name)]
+    names = [column.name for column in model.columns]
+    friction = [index for index, name in enumerate(names) if FRICTION.match(name)]
     dry = model.dry_friction_columns[list(model.drive_train.joints)]
     signs = np.ones(len(square))
     for motor, own in enumerate(square):
-        alone = _solved(own[:-1, :-1], own[:-1, -1])
-        if own[friction, dry[motor]] @ alone[friction] < 0.0:
+        # The motor's equation alone; its friction along the sign of its velocity
+        parameters = _solved(own[:-1, :-1], own[:-1, -1])
+        along_motion = own[friction, dry[motor]] @ parameters[friction]
+        if along_motion < 0.0:
             signs[motor] = -1.0
-    size = products.current_square.sum(axis=1)
-    weight = products.rows.sum(axis=1) / np.where(size > 0.0, size, 1.0)
-    return MotorFit(signs * reference, np.zeros(square.shape[1] - 1), weight)
+    current_square = products.current_square.sum(axis=1)
+    current_square = np.where(current_square > 0.0, current_square, 1.0)
+    weight = products.rows.sum(axis=1) / current_square
+    no_parameters = np.zeros(square.shape[1] - 1)
+    return MotorFit(signs * reference, no_parameters, weight)
 
 
 def improved(
@@ -886,52 +930,64 @@ def improved(
     """
     of_columns = square[:, :-1, :-1]
     with_current = square[:, :-1, -1]
-    current = square[:, -1, -1]
     fit = start
     for _ in range(rounds):
+        # χ of Σ_i w_i s_i² WᵀW χ = Σ_i w_i s_i Wᵀv_i
         normal = np.einsum("i,iab->ab", fit.weight * fit.per_unit**2, of_columns)
-        parameters = _solved(normal, (fit.weight * fit.per_unit) @ with_current)
-        torque = (of_columns @ parameters) @ parameters
+        right = (fit.weight * fit.per_unit) @ with_current
+        parameters = _solved(normal, right)
+        # s_i = vᵀWχ / ‖Wχ‖², as far as the nameplate allows
+        torque_square = (of_columns @ parameters) @ parameters
         mixed = with_current @ parameters
-        per_unit = mixed / np.where(torque > 0.0, torque, 1.0)
+        per_unit = mixed / np.where(torque_square > 0.0, torque_square, 1.0)
         ratio = np.maximum(np.abs(per_unit) / reference, 1e-12)
         common = float(np.exp(np.median(np.log(ratio))))
         limited = np.clip(ratio / common, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR)
-        per_unit = np.where(per_unit < 0.0, -1.0, 1.0) * reference * limited
-        fit = MotorFit(per_unit, common * parameters, fit.weight)
-        left = np.maximum(left_over(square, fit), SMALL_ERROR**2 * current)
-        left[left == 0.0] = 1.0  # a motor without current
+        signs = np.where(per_unit < 0.0, -1.0, 1.0)
+        fit = MotorFit(signs * reference * limited, common * parameters, fit.weight)
+        left = _floored_left(square, fit)
         fit = replace(fit, weight=np.maximum(rows, 1) / left)
     return fit
 
 
 def left_over(square: FloatArray, fit: MotorFit) -> FloatArray:
-    """What a fit leaves of each motor's current [A²], sums of squares, shape (m,);
-    arguments as for `improved`.
+    """What a fit leaves of each motor's current [A²], sums of squares, shape (m,).
+
+    Arguments as for `improved`.
     """
-    torque = (square[:, :-1, :-1] @ fit.parameters) @ fit.parameters
-    mixed = square[:, :-1, -1] @ fit.parameters
-    explained = 2.0 * fit.per_unit * mixed - fit.per_unit**2 * torque
-    return np.maximum(square[:, -1, -1] - explained, 0.0)
+    of_columns = square[:, :-1, :-1]
+    with_current = square[:, :-1, -1]
+    current_square = square[:, -1, -1]
+    # ‖v − s Wχ‖² = ‖v‖² − (2 s vᵀWχ − s² ‖Wχ‖²)
+    torque_square = (of_columns @ fit.parameters) @ fit.parameters
+    mixed = with_current @ fit.parameters
+    explained = 2.0 * fit.per_unit * mixed - fit.per_unit**2 * torque_square
+    return np.maximum(current_square - explained, 0.0)
+
+
+def _floored_left(square: FloatArray, fit: MotorFit) -> FloatArray:
+    """The same, at least that of SMALL_ERROR."""
+    current_square = square[:, -1, -1]
+    left = np.maximum(left_over(square, fit), SMALL_ERROR**2 * current_square)
+    left[left == 0.0] = 1.0  # a motor without current
+    return left
 
 
 def _log_error(square: FloatArray, fit: MotorFit) -> float:
     """Logarithm of the motors' errors, in sum; arguments as for `improved`."""
-    floor = SMALL_ERROR**2 * square[:, -1, -1]
-    left = np.maximum(left_over(square, fit), floor)
-    left[left == 0.0] = 1.0  # a motor without current
+    left = _floored_left(square, fit)
     return 0.5 * float(np.sum(np.log(left)))
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve normal equations in columns of unit length, with RIDGE;
-    columns of rounding errors get zero.
-    """
+    """Solve normal equations with RIDGE in unit columns; those of rounding errors get zero."""
     size = np.sqrt(np.diag(normal))
-    size[size <= SMALLEST_COLUMN * size.max(initial=0.0)] = np.inf
+    is_rounding = size <= SMALLEST_COLUMN * size.max(initial=0.0)
+    size[is_rounding] = np.inf
     scaled = normal / np.outer(size, size)
     scaled[np.diag_indices_from(scaled)] += RIDGE
-    return np.asarray(scipy.linalg.solve(scaled, right / size, assume_a="pos") / size)
+    solution = scipy.linalg.solve(scaled, right / size, assume_a="pos")
+    return np.asarray(solution / size)
 
 
 # Products of columns
@@ -952,9 +1008,7 @@ class Products:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GravityProducts:
-    """Products of the columns [A | G_x | G_y | G_z | v_i] of each motor,
-    each part of the moves for itself.
-    """
+    """Products of the columns [A | G_x | G_y | G_z | v_i] of each motor, by part of the moves."""
 
     square: FloatArray  #: shape (m, PARTS, c + 3 f + 1, c + 3 f + 1)
     rows: IntArray  #: shape (m, PARTS)
@@ -963,7 +1017,8 @@ class GravityProducts:
     @property
     def columns(self) -> int:
         """Number c of columns of A."""
-        return int(self.square.shape[-1]) - 1 - 3 * len(self.weighty)
+        width = int(self.square.shape[-1])
+        return width - 1 - 3 * len(self.weighty)
 
     def along(self, component: int) -> slice:
         """Columns G_k."""
@@ -975,22 +1030,28 @@ class GravityProducts:
         return Products(self.turned(self.square, gravity_m_s2), self.rows)
 
     def turned(self, square: FloatArray, gravity_m_s2: FloatArray) -> FloatArray:
-        """Products of [W(g) | v_i] from those of [A | G_x | G_y | G_z | v_i], shapes (…,
-        c + 3 f + 1, c + 3 f + 1).
+        """Products of [W(g) | v_i] from those of [A | G_x | G_y | G_z | v_i].
+
+        Args:
+            square: of shape (…, c + 3 f + 1, c + 3 f + 1).
+            gravity_m_s2: g, shape (3,).
         """
-        last = square.shape[-1] - 1
+        *leading, width, _ = square.shape
+        last = width - 1
+        weighty = self.weighty
+        rows_of_weighty = weighty[:, None]
         kept = np.append(np.arange(self.columns), last)
         out = square[..., kept[:, None], kept]
-        heavy = np.zeros((*square.shape[:-2], len(self.weighty), last + 1))
+        # Σ_k g_k G_kᵀ [A | G_x | G_y | G_z | v_i]
+        heavy = np.zeros((*leading, len(weighty), width))
         for component, size in enumerate(gravity_m_s2):
             heavy += size * square[..., self.along(component), :]
-        with_all = heavy[..., kept]
-        out[..., self.weighty, :] += with_all
-        out[..., :, self.weighty] += np.swapaxes(with_all, -1, -2)
+        with_kept = heavy[..., kept]
+        out[..., weighty, :] += with_kept
+        out[..., :, weighty] += np.swapaxes(with_kept, -1, -2)
         for component, size in enumerate(gravity_m_s2):
-            out[..., self.weighty[:, None], self.weighty] += (
-                size * heavy[..., self.along(component)]
-            )
+            with_component = heavy[..., self.along(component)]
+            out[..., rows_of_weighty, weighty] += size * with_component
         return out
 
     def turn(self, square: FloatArray, gravity_m_s2: FloatArray, fit: MotorFit) -> FloatArray:
@@ -1001,23 +1062,28 @@ class GravityProducts:
             gravity_m_s2: at which it is taken.
             fit: for this gravity.
         """
-        last = square.shape[-1] - 1
+        width = square.shape[-1]
+        last = width - 1
         count = self.columns
         size = float(np.linalg.norm(gravity_m_s2))
         # Two directions across gravity, (3, 2)
         sideways = scipy.linalg.null_space(gravity_m_s2[None])
-        basis = np.zeros((last + 1, count + 3))
+        # Columns [W(g) | derivatives to the two | v_i] from [A | G_x | G_y | G_z | v_i]
+        basis = np.zeros((width, count + 3))
         basis[:count, :count] = np.eye(count)
         basis[last, -1] = 1.0
+        every_row = np.arange(width)
+        moments = size * fit.parameters[self.weighty]
         for component in range(3):
-            rows = np.arange(last + 1)[self.along(component)]
+            rows = every_row[self.along(component)]
             basis[rows, self.weighty] = gravity_m_s2[component]
-            moments = size * fit.parameters[self.weighty]
             basis[rows, count : count + 2] = moments[:, None] * sideways[component]
-        whole = np.einsum("i,iab->ab", fit.weight * fit.per_unit**2, square)
-        whole[:, -1] = (fit.weight * fit.per_unit) @ square[:, :, -1]
-        whole[-1, :] = whole[:, -1]
-        projected = basis.T @ whole @ basis
+        # Σ_i w_i s_i² of the columns' products, Σ_i w_i s_i of those with the current
+        normal = np.einsum("i,iab->ab", fit.weight * fit.per_unit**2, square)
+        with_current = (fit.weight * fit.per_unit) @ square[:, :, -1]
+        normal[:, -1] = with_current
+        normal[-1, :] = with_current
+        projected = basis.T @ normal @ basis
         solution = _solved(projected[:-1, :-1], projected[:-1, -1])
         return np.asarray(sideways @ solution[-2:])
 
@@ -1038,22 +1104,22 @@ def gravity_products(
     mountings = _mountings(instants)
     weightless = with_gravity(model, np.zeros(3))
     pulled = [with_gravity(model, unit) for unit in np.eye(3)]
-    payload_columns = len(model.columns) + len(LINK_PARAMETERS) * np.arange(len(mountings))
-    first = np.append(model.link_columns[:, 0], payload_columns)
-    weighty = (first[:, None] + np.array(WEIGHTY)).ravel()
+    body_numbers = np.arange(len(mountings))
+    payload_columns = len(model.columns) + len(LINK_PARAMETERS) * body_numbers
+    first_of_body = np.append(model.link_columns[:, 0], payload_columns)
+    weighty = (first_of_body[:, None] + np.array(WEIGHTY)).ravel()
     squares = list[FloatArray]()
     rows = list[IntArray]()
     for one, parts in zip(instants, _parts(instants, part_count), strict=True):
-        still = np.zeros_like(one.motion.position_rad)
-        rest = Motion(one.motion.position_rad, still, still)
-        moving = _motor_columns(weightless, one, one.motion, mountings)
-        at_rest = [_motor_columns(unit, one, rest, mountings)[:, weighty] for unit in pulled]
-        square, counted = _products(
-            np.concatenate((moving, *at_rest, one.current_a[:, None]), axis=1),
-            one,
-            parts,
-            part_count,
-        )
+        position_rad = one.motion.position_rad
+        still = np.zeros_like(position_rad)
+        rest = Motion(position_rad, still, still)
+        columns = [_motor_columns(weightless, one, one.motion, mountings)]
+        for in_unit_gravity in pulled:
+            of_weight = _motor_columns(in_unit_gravity, one, rest, mountings)
+            columns.append(of_weight[:, weighty])
+        columns.append(one.current_a[:, None])
+        square, counted = _products(np.concatenate(columns, axis=1), one, parts, part_count)
         squares.append(square)
         rows.append(counted)
     return GravityProducts(np.sum(squares, axis=0), np.sum(rows, axis=0), weighty)
@@ -1071,8 +1137,10 @@ def products_of_reading(
     squares = list[FloatArray]()
     rows = list[IntArray]()
     for one, parts in zip(instants, _parts(instants, part_count), strict=True):
-        moving = _motor_columns(model, one, reading.motion(one.motion), mountings)
-        columns = np.concatenate((moving, one.current_a[:, None]), axis=1)
+        motion = reading.motion(one.motion)
+        of_torque = _motor_columns(model, one, motion, mountings)
+        current = one.current_a[:, None]
+        columns = np.concatenate((of_torque, current), axis=1)
         square, counted = _products(columns, one, parts, part_count)
         squares.append(square)
         rows.append(counted)
@@ -1080,14 +1148,16 @@ def products_of_reading(
 
 
 def _parts(instants: Sequence[Instants], part_count: int) -> list[IntArray]:
-    """Which part each row of each run is in:
-    moves with rows that count, dealt out in turn over all runs.
+    """Which part each row of each run is in; -1 for a row that does not count.
+
+    Moves with rows that count are dealt out in turn over all runs.
     """
     dealt = 0
     parts = list[IntArray]()
     for one in instants:
         of_rows = np.full(len(one.move), -1)
-        for move in np.unique(one.move[one.use.any(axis=0)]):
+        counts = one.use.any(axis=0)
+        for move in np.unique(one.move[counts]):
             of_rows[one.move == move] = dealt % part_count
             dealt += 1
         parts.append(of_rows)
@@ -1101,26 +1171,25 @@ def _mountings(instants: Sequence[Instants]) -> list[str]:
 def _motor_columns(
     model: Model, one: Instants, motion: Motion, mountings: Sequence[str]
 ) -> FloatArray:
-    """Columns (T W)_i of the standard parameters, then of the body of each mounting, shape (m, c,
-    k).
-    """
+    """Columns (T W)_i of the standard parameters, then of each mounting's body, (m, c, k)."""
     standard = model.regressor(motion, loaded=one.mounting is not None)
-    bodies = np.zeros((len(standard), len(LINK_PARAMETERS) * len(mountings), standard.shape[2]))
+    joints, _, samples = standard.shape
+    body_size = len(LINK_PARAMETERS)
+    bodies = np.zeros((joints, body_size * len(mountings), samples))
     if one.mounting is not None:
-        first = len(LINK_PARAMETERS) * mountings.index(one.mounting)
-        bodies[:, first : first + len(LINK_PARAMETERS)] = standard[:, model.flange]
+        first = body_size * mountings.index(one.mounting)
+        bodies[:, first : first + body_size] = standard[:, model.flange]
     columns = np.concatenate((standard, bodies), axis=1)
+    # Σ_j T_ij W_jck
     return np.asarray(np.tensordot(model.drive_train.to_motor, columns, axes=1))
 
 
 def _products(
     columns: FloatArray, one: Instants, parts: IntArray, part_count: int
 ) -> tuple[FloatArray, IntArray]:
-    """Products of the columns of each motor over its rows of each part, and how many rows;
-    from shape (m, c, k).
-    """
-    count = len(columns)
-    square = np.zeros((count, part_count, columns.shape[1], columns.shape[1]))
+    """Products of each motor's columns, shape (m, c, k), over its rows of each part; row counts."""
+    count, width, _ = columns.shape
+    square = np.zeros((count, part_count, width, width))
     rows = np.zeros((count, part_count), dtype=np.int64)
     for motor, of_motor in enumerate(columns):
         loading = np.flatnonzero(of_motor.any(axis=1))  # a wrist carries few links
