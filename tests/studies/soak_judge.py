@@ -5,10 +5,11 @@ machine took from the programs at that time (tests/vcan/host_watch.py). Nothing 
 imported. A value is lost where the log has no sample of a period, or marks the value as missing.
 It is the host's loss
 
-- if the programs of the recording waited for processors for half a period or more around that
-  period, or the kernel dropped packets because a queue was full;
-- or if the listener lacks the value as well, although SYNC came on schedule: the answer came after
-  the next SYNC, or not at all.
+- if the machine took half a period or more from the programs around that period: they waited for a
+  processor, or the processors were slow or gone; or if the kernel dropped packets because a queue
+  was full;
+- or if the listener lacks the value as well, although SYNC came on schedule: by the stamps, the
+  answer came after the next SYNC was due, or not at all.
 
 Every other loss is ours: the listener has the value and the log has not, or SYNC was late without
 anybody taking the processor from its sender. A value that is marked only because the answer before
@@ -37,6 +38,15 @@ host's.
 """
 PUNCTUAL_PERIODS = 0.5
 """A SYNC that is followed by the next one sooner left the axes too little time."""
+USUAL_PERCENT = 50
+SLOW = 1.5
+"""The usual time of the watch's piece of work is its median; up to so many times that, it is not
+slow.
+"""
+DUE_PERIODS = 50
+"""The schedule of a SYNC that the recorder sends by the clock is that of the most punctual one of
+so many periods before it: the clocks of recorder and bus may drift.
+"""
 END_CYCLES = 8
 """A recording that supervision ended is judged by its last cycles."""
 END_S = 1.5
@@ -57,7 +67,7 @@ class LossKind(Enum):
     """How a value is lost."""
 
     NO_SYNC = "no SYNC in its period"
-    LATE = "no answer on the bus before the next SYNC"
+    LATE = "no answer on the bus before the next SYNC was due"
     UNREAD = "the answer was on the bus in time"
     DOUBTFUL = "marked because the answer before it was late"
     UNCOUNTED = "a SYNC without a sample and without a gap in the cycles"
@@ -101,43 +111,28 @@ class Host:
     """What the machine took from the watched programs.
 
     Args:
-        ticks: of the watch, in the order of their times.
+        ticks: of the watch, by processor and time.
     """
 
     def __init__(self, ticks: Sequence[Tick]) -> None:
         table = np.array(ticks, dtype=np.int64).reshape(-1, len(Tick._fields))
         columns = dict(zip(Tick._fields, table.T, strict=True))
-        self._end_ns = columns["time_ns"]
-        # A wait is counted when it ends: it began before that tick.
-        waits = np.maximum(columns["waited_ns"], columns["late_ns"])
-        self._waited_ns = waits
-        self._waited_from_ns = self._end_ns - columns["since_ns"] - columns["waited_ns"]
-        # Stolen time is counted in ticks of the kernel.
-        self._stolen_ns = columns["stolen_ns"]
-        self._stolen_from_ns = self._end_ns - columns["since_ns"] - STEAL_NS
-        self._dropped = columns["dropped"]
-        longest_ns = self._end_ns - np.minimum(self._waited_from_ns, self._stolen_from_ns)
-        self._reach_ns = int(longest_ns.max(initial=0))
+        self._processors = []
+        for cpu in np.unique(columns["cpu"]):
+            own = columns["cpu"] == cpu
+            self._processors.append(_Processor({name: kept[own] for name, kept in columns.items()}))
 
     def taken_ns(self, begin_ns: int, end_ns: int) -> int:
-        """Return the time that was taken from the programs between two times [ns since 1970]."""
-        first = int(np.searchsorted(self._end_ns, begin_ns))
-        last = int(np.searchsorted(self._end_ns, end_ns + self._reach_ns, side="right"))
-        chosen = slice(first, last)
-        ends = self._end_ns[chosen]
-        waited = _within(
-            self._waited_ns[chosen], self._waited_from_ns[chosen], ends, begin_ns, end_ns
-        )
-        stolen = _within(
-            self._stolen_ns[chosen], self._stolen_from_ns[chosen], ends, begin_ns, end_ns
-        )
-        return int(np.maximum(waited, stolen).sum())
+        """Return the time that was taken from the programs between two times [ns since 1970]:
+        their waiting, and what the slowest processor lost.
+        """
+        waited_ns = [one.waited_ns(begin_ns, end_ns) for one in self._processors]
+        lost_ns = [one.lost_ns(begin_ns, end_ns) for one in self._processors]
+        return sum(waited_ns) + max(lost_ns, default=0)
 
     def dropped(self, begin_ns: int, end_ns: int) -> int:
         """Return the number of packets that the kernel dropped between two times."""
-        first = int(np.searchsorted(self._end_ns, begin_ns))
-        last = int(np.searchsorted(self._end_ns, end_ns, side="right"))
-        return int(self._dropped[first : last + 1].sum())
+        return sum(one.dropped(begin_ns, end_ns) for one in self._processors)
 
     def starves(self, begin_ns: int, end_ns: int, period_ns: int) -> bool:
         """Return whether the host explains a loss between two times."""
@@ -146,17 +141,60 @@ class Host:
         return self.taken_ns(begin_ns, end_ns) >= STARVED_PERIODS * period_ns
 
 
-def _within(
-    taken_ns: NDArray[np.int64],
-    from_ns: NDArray[np.int64],
-    until_ns: NDArray[np.int64],
-    begin_ns: int,
-    end_ns: int,
-) -> NDArray[np.int64]:
-    """Return how much of each taken time may lie between two times [ns]."""
-    shared_ns = np.minimum(until_ns, end_ns) - np.maximum(from_ns, begin_ns)
-    within_ns: NDArray[np.int64] = np.minimum(taken_ns, np.maximum(shared_ns, 0))
-    return within_ns
+class _Processor:
+    """The ticks of one processor, by column."""
+
+    def __init__(self, columns: Mapping[str, NDArray[np.int64]]) -> None:
+        self._columns = columns
+        self._end_ns = columns["time_ns"]
+        self._begin_ns = self._end_ns - columns["since_ns"]
+        # Work that takes twice its usual time means that half of the time was taken.
+        usual_ns = np.percentile(columns["work_ns"], USUAL_PERCENT)
+        taken_share = np.maximum(0.0, 1.0 - SLOW * usual_ns / columns["work_ns"])
+        slow_ns = (taken_share * columns["since_ns"]).astype(np.int64)
+        self._slow_ns = np.maximum(slow_ns, columns["late_ns"])
+        # A wait is counted when it ends, stolen time in ticks of the kernel: both began before.
+        self._waited_from_ns = self._begin_ns - columns["waited_ns"]
+        self._stolen_from_ns = self._begin_ns - STEAL_NS
+        earliest_ns = np.minimum(self._waited_from_ns, self._stolen_from_ns)
+        self._reach_ns = int((self._end_ns - earliest_ns).max(initial=0))
+
+    def _chosen(self, begin_ns: int, end_ns: int) -> slice:
+        """Return the ticks that may have something of the time between two times."""
+        first = int(np.searchsorted(self._end_ns, begin_ns))
+        last = int(np.searchsorted(self._end_ns, end_ns + self._reach_ns, side="right"))
+        return slice(first, last)
+
+    def _within(
+        self,
+        taken_ns: NDArray[np.int64],
+        from_ns: NDArray[np.int64],
+        begin_ns: int,
+        end_ns: int,
+    ) -> NDArray[np.int64]:
+        """Return how much of each tick's taken time may lie between two times [ns]."""
+        chosen = self._chosen(begin_ns, end_ns)
+        until_ns = np.minimum(self._end_ns[chosen], end_ns)
+        shared_ns = until_ns - np.maximum(from_ns[chosen], begin_ns)
+        within_ns: NDArray[np.int64] = np.minimum(taken_ns[chosen], np.maximum(shared_ns, 0))
+        return within_ns
+
+    def waited_ns(self, begin_ns: int, end_ns: int) -> int:
+        """Return the waiting time of the programs between two times [ns]."""
+        waited_ns = self._columns["waited_ns"]
+        return int(self._within(waited_ns, self._waited_from_ns, begin_ns, end_ns).sum())
+
+    def lost_ns(self, begin_ns: int, end_ns: int) -> int:
+        """Return the time that the processor itself lost between two times [ns]."""
+        slow_ns = self._within(self._slow_ns, self._begin_ns, begin_ns, end_ns)
+        stolen_ns = self._within(self._columns["stolen_ns"], self._stolen_from_ns, begin_ns, end_ns)
+        return int(np.maximum(slow_ns, stolen_ns).sum())
+
+    def dropped(self, begin_ns: int, end_ns: int) -> int:
+        """Return the number of packets dropped between two times."""
+        first = int(np.searchsorted(self._end_ns, begin_ns))
+        last = int(np.searchsorted(self._end_ns, end_ns, side="right"))
+        return int(self._columns["dropped"][first : last + 1].sum())
 
 
 def judge_losses(
@@ -183,7 +221,7 @@ def judge_losses(
     verdict = Verdict(wrong=len(found.violations), neighbours=found.neighbours)
     verdict.notes = found.violations[:5]
     if found.syncs:
-        _Losses(log, frames, Host(ticks), period_ns, nodes, found.syncs).judge(verdict)
+        _Losses(log, frames, Host(ticks), period_ns, nodes, found.syncs, in_order).judge(verdict)
     return verdict
 
 
@@ -198,6 +236,7 @@ class _Losses:
         period_ns: int,
         nodes: Mapping[int, int],
         places: Sequence[int],
+        by_clock: bool,
     ) -> None:
         self._log = log
         self._frames = frames
@@ -206,6 +245,7 @@ class _Losses:
         self._nodes = nodes
         self._samples = [number for number, place in enumerate(places) if place >= 0]
         self._places = places
+        self._by_clock = by_clock  # cycles end when the next SYNC is due
         self._before: dict[int, Cause] = {}  # of the axes that the sample before has not
 
     def judge(self, verdict: Verdict) -> None:
@@ -261,10 +301,11 @@ class _Losses:
         losses = []
         cycle = int(self._log.cycle[number])
         end = self._end_of(number)
+        due_ns = self._due_ns(at)
         heard = {
             frame.identifier & 0x7F
             for frame in self._frames[self._places[number] : end]
-            if frame.identifier & ~0x7F == TPDO1
+            if frame.identifier & ~0x7F == TPDO1 and frame.time_ns < due_ns
         }
         starves = self._starves_around(at)
         for axis, node in self._nodes.items():
@@ -274,7 +315,7 @@ class _Losses:
             cause = Cause.OURS
             if node in heard:
                 kind = LossKind.UNREAD
-            lost_by_listener = kind is LossKind.LATE and self._is_punctual(number, end)
+            lost_by_listener = kind is LossKind.LATE and self._is_punctual(number, end, due_ns)
             if starves or lost_by_listener:
                 cause = Cause.HOST
             if kind is LossKind.UNREAD and axis in before:
@@ -284,11 +325,28 @@ class _Losses:
             losses.append(Loss(cycle, kind, cause))
         return losses
 
-    def _is_punctual(self, number: int, end: int) -> bool:
+    def _due_ns(self, at: int) -> int:
+        """Return the time until which answers to the SYNC of a sample are waited for."""
+        number = self._samples[at]
+        end = self._end_of(number)
+        end_ns = self._time_ns(number) + self._period_ns
+        if end < len(self._frames):
+            end_ns = self._frames[end].time_ns
+        if not self._by_clock:
+            return end_ns
+        near = self._samples[max(0, at - DUE_PERIODS) : at + 1]
+        cycle = int(self._log.cycle[number])
+        schedule_ns = [
+            self._time_ns(one) + (cycle - int(self._log.cycle[one])) * self._period_ns
+            for one in near
+        ]
+        return min(end_ns, min(schedule_ns) + self._period_ns)
+
+    def _is_punctual(self, number: int, end: int, due_ns: int) -> bool:
         """Return whether a SYNC left the axes their time until the next one."""
         if end >= len(self._frames):
             return True
-        left_ns = self._frames[end].time_ns - self._time_ns(number)
+        left_ns = due_ns - self._time_ns(number)
         return left_ns >= PUNCTUAL_PERIODS * self._period_ns
 
     def _left_out(self, number: int, following: int) -> list[Loss]:

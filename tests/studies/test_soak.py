@@ -4,6 +4,7 @@ the watch on this machine; and what the soak does next.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -30,6 +31,7 @@ from tests.vcan.log_reader import Recorded
 from tests.vcan.test_judgement import AXES, CYCLES, FIRST, NODES, PERIOD_NS, START_NS, made
 
 ROOT = Path(__file__).parents[2]
+WORK_NS = 20_000  #: Of the watch, in a tick
 STRUCK = 12  #: Cycle of the planted loss
 
 
@@ -41,10 +43,12 @@ class Scene:
     bus: list[list[Frame]]
     ticks: list[Tick]
 
+    by_clock: bool = False  #: whether the recorder sends SYNC by the clock, as on a hub
+
     def judged(self) -> Verdict:
         """The verdict on it."""
         frames = [frame for cycle in self.bus for frame in cycle]
-        return judge_losses(self.log, frames, self.ticks, PERIOD_NS, NODES)
+        return judge_losses(self.log, frames, self.ticks, PERIOD_NS, NODES, in_order=self.by_clock)
 
     def mark_missing(self, cycle: int, axis: int) -> None:
         """Mark a value as missing in the log, which repeats the one before."""
@@ -82,7 +86,11 @@ def scene() -> Scene:
     log, bus = made()
     begin_ns = bus[0][0].time_ns - 10 * PERIOD_NS
     end_ns = bus[-1][0].time_ns + 10 * PERIOD_NS
-    ticks = [Tick(at_ns, TICK_NS, 0, 0, 0, 0) for at_ns in range(begin_ns, end_ns, TICK_NS)]
+    ticks = [
+        Tick(at_ns, TICK_NS, 0, WORK_NS, 0, 0, 0, cpu)
+        for cpu in range(2)
+        for at_ns in range(begin_ns, end_ns, TICK_NS)
+    ]
     return Scene(replace(log, valid=False), bus, ticks)
 
 
@@ -115,6 +123,33 @@ def unread_while_stolen(made_scene: Scene) -> None:
     """As before, while the hypervisor has the processor."""
     made_scene.mark_missing(STRUCK, 1)
     made_scene.take(STRUCK, stolen_ns=PERIOD_NS)
+
+
+def unread_while_slow(made_scene: Scene) -> None:
+    """As before, while one processor runs at a tenth of its speed, and no counter shows it."""
+    made_scene.mark_missing(STRUCK, 1)
+    begin_ns = made_scene.sync_ns(STRUCK)
+    for number, tick in enumerate(made_scene.ticks):
+        if tick.cpu == 1 and begin_ns <= tick.time_ns < begin_ns + PERIOD_NS:
+            made_scene.ticks[number] = tick._replace(work_ns=10 * WORK_NS)
+
+
+def unread_while_sleeper_is_late(made_scene: Scene) -> None:
+    """As before, while even the highest priority does not wake."""
+    made_scene.mark_missing(STRUCK, 1)
+    made_scene.take(STRUCK, since_ns=PERIOD_NS, late_ns=PERIOD_NS - TICK_NS)
+
+
+def late_by_the_stamps(made_scene: Scene) -> None:
+    """On a hub SYNC is late, and an answer comes before it, but after it was due."""
+    made_scene.by_clock = True
+    following = made_scene.bus[FIRST + STRUCK + 1]
+    late_ns = PERIOD_NS // 3
+    moved = [frame._replace(time_ns=frame.time_ns + late_ns) for frame in following]
+    made_scene.bus[FIRST + STRUCK + 1] = moved
+    own = made_scene.bus[FIRST + STRUCK]
+    own[2] = own[2]._replace(time_ns=moved[0].time_ns - 1000)
+    made_scene.mark_missing(STRUCK, 1)
 
 
 def unread_with_full_queue(made_scene: Scene) -> None:
@@ -193,6 +228,9 @@ PLANTED: tuple[tuple[Callable[[Scene], None], int, int, dict[LossKind, int]], ..
     (unread, 1, 0, {LossKind.UNREAD: 1}),
     (unread_while_starved, 0, 1, {LossKind.UNREAD: 1}),
     (unread_while_stolen, 0, 1, {LossKind.UNREAD: 1}),
+    (unread_while_slow, 0, 1, {LossKind.UNREAD: 1}),
+    (unread_while_sleeper_is_late, 0, 1, {LossKind.UNREAD: 1}),
+    (late_by_the_stamps, 0, 1, {LossKind.LATE: 1}),
     (unread_with_full_queue, 0, 1, {LossKind.UNREAD: 1}),
     (unread_with_short_wait, 1, 0, {LossKind.UNREAD: 1}),
     (unread_with_early_wait, 1, 0, {LossKind.UNREAD: 1}),
@@ -288,8 +326,11 @@ def test_the_watch_counts_what_two_busy_programs_take_from_a_third(tmp_path: Pat
                 program.wait()
     ticks = watched(tmp_path / "host")
     assert all(one.since_ns > 0 for one in ticks)
-    times = [one.time_ns for one in ticks]
-    assert times == sorted(times)
+    assert [(one.cpu, one.time_ns) for one in ticks] == sorted(
+        (one.cpu, one.time_ns) for one in ticks
+    )
+    assert {one.cpu for one in ticks} == os.sched_getaffinity(0)
+    assert all(one.work_ns > 0 for one in ticks)
 
 
 def wait_for(path: Path, done: Callable[[list[Tick]], bool]) -> None:
