@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo figaroh test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study mutation-study
+.PHONY: help setup demo figaroh test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study soak drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study mutation-study
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -46,6 +46,7 @@ help:
 	@echo "make write-fault-study  kills, errors and short writes at every changing system call of apply, rollback, recalibrate and calibrate (docs/evidence/write-path.md); VERBS=\"apply calibrate\" EVERY=3 MINUTES=20; resumable, an hour"
 	@echo "make guard-study  the axes of a recorder killed by kill -9, with a foreign node on every id from 1 to 127; minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
+	@echo "make soak    recordings at rising rates beside an open console and screens that nobody reads: what the host lost, and what we lost (docs/evidence/stream.md); MINUTES=60 REALTIME=1; resumable, more than an hour"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
 	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; time skews that are printed; ten minutes"
@@ -279,6 +280,10 @@ guard-study: setup
 console-study: setup vcan-tools
 	@mkdir -p out
 	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.vcan.run $(BIN)/python -m tests.studies.console_study
+
+# Where there is no vcan0, over a hub on 127.0.0.1. REALTIME=1, as root, for a machine with other work.
+soak: setup
+	$(BIN)/python -m tests.studies.soak --results docs/evidence/data/soak.csv $(if $(MINUTES),--minutes $(MINUTES)) $(if $(REALTIME),--realtime)
 
 # Counts phrases; fails above 2 % of the baseline. Not part of `make check` until the language pass is done.
 words: setup

@@ -134,6 +134,7 @@ class ChaosBus:
     """A bus between the processes of a round."""
 
     port: int | None = None  #: of the hub; None is the kernel's vcan0
+    pid: int | None = None  #: process of the hub
 
     @property
     def address(self) -> str:

@@ -104,7 +104,7 @@ def hub_running() -> Iterator[ChaosBus]:
     os.close(write_end)
     try:
         with os.fdopen(read_end, encoding="ascii") as pipe:
-            yield ChaosBus(int(pipe.readline()))
+            yield ChaosBus(int(pipe.readline()), pid)
     finally:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)

@@ -45,8 +45,10 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 @contextmanager
-def console(cell: Path) -> Iterator[subprocess.Popen[str]]:
-    """A console in a process of its own, and a reader of its page in this one."""
+def console(cell: Path, *, unread: bool = False) -> Iterator[subprocess.Popen[str]]:
+    """A console in a process of its own, and a reader of its page in this one;
+    `unread`: one more page, which nobody reads.
+    """
     command = [sys.executable, "-m", "daq", "console", str(cell)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -54,9 +56,13 @@ def console(cell: Path) -> Iterator[subprocess.Popen[str]]:
         assert found is not None
         thread = threading.Thread(target=_read, args=(found[1], found[2]), daemon=True)
         thread.start()
+        connection = HTTPConnection(found[1])
         try:
+            if unread:
+                connection.request("GET", f"{found[2]}curves")
             yield process
         finally:
+            connection.close()
             process.send_signal(signal.SIGINT)
             process.wait(timeout=60)
             thread.join(10)

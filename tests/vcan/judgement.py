@@ -50,6 +50,8 @@ class Comparison:
     values: int = 0  #: that are bit for bit those of a frame
     flagged: int = 0  #: values that are marked as missing
     neighbours: int = 0  #: values of the cycle before or after, in a log that is refused for that
+    #: by sample, the place of its SYNC among the frames; -1 without one
+    syncs: list[int] = field(default_factory=list)
     violations: list[str] = field(default_factory=list)
 
     @property
@@ -209,7 +211,7 @@ def _compare(
     foreign: set[int],
     in_order: bool,
 ) -> Comparison:
-    found = Comparison(len(log.cycle))
+    found = Comparison(len(log.cycle), syncs=[_place_of(place, syncs) for place in own])
     say = found.violations.append
     doubtful = in_order and (log.valid is None or TWICE in log.reason)
     for number, place in enumerate(own):
@@ -247,6 +249,13 @@ def _compare(
         for axis, node in nodes.items():
             _compare_axis(log, found, number, axis, window.get(node, []), near.get(node, []))
     return found
+
+
+def _place_of(number: int, syncs: Sequence[int]) -> int:
+    """Return the place of a SYNC among the frames, by its number; -1 stays."""
+    if number < 0:
+        return number
+    return syncs[number]
 
 
 def _answers(frames: Sequence[Frame], nodes: set[int]) -> dict[int, list[bytes]]:
