@@ -44,10 +44,10 @@ every test executes would take an hour otherwise. The last is for a line that no
 its own process.
 """
 
-SLOWER = 5.0
+SLOWER = 3.0
 """A test that takes this many times its duration is taken as caught in an endless loop."""
 
-START_S = 300.0
+START_S = 90.0
 START_PROCESSOR_S = 20.0
 """Time and processor time for a run of pytest to start and to collect, on a busy machine."""
 
