@@ -207,7 +207,10 @@ class Bench:
             noticed_by = self._first_that_fails_with(planted, waiting)
             if not noticed_by or not self._fails_without_fault(noticed_by, waiting):
                 return noticed_by
-            waiting = [test for test in waiting if not _is_of(test, noticed_by)]
+            others = [test for test in waiting if not _is_of(test, noticed_by)]
+            if len(others) == len(waiting):
+                return ""
+            waiting = others
         return ""
 
     def _first_that_fails_with(self, planted: Planted, tests: list[str]) -> str:
