@@ -61,14 +61,14 @@ class CoverageMap:
         executing = contexts.get(line, [])
         if executing and "" not in executing:
             return _tests_among(executing)
-        found = set(executing)
+        found: set[str] = set()
         source = (self.tree / file).read_text()
         for reader in lines_that_read(source, line):
             found.update(contexts.get(reader, []))
         if not _tests_among(found):
             for of_line in contexts.values():
                 found.update(of_line)
-        return _tests_among(found)
+        return _tests_among({*found, *executing})
 
     def duration_s(self, tests: Iterable[str]) -> float:
         """Sum of the durations of tests."""
