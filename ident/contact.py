@@ -1,5 +1,4 @@
-"""External torque of the joints: what the motors supply beyond the prediction, its band,
-and a threshold for alarms.
+"""External torque of the joints beyond the prediction, its band, and a threshold for alarms.
 
     τ_ext = V g − (W χ + W_L χ_L + E c)
 

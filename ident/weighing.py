@@ -1,5 +1,4 @@
-"""Weigh the body on the flange with a calibration:
-mass, centre of mass and inertia, each with its σ.
+"""Weigh the body on the flange with a calibration: mass, centre and inertia, each with its σ.
 
 With the gains g held, the ten parameters p of the body (paper §2.4) are the least-squares solution
 of the motors' equations, rows divided by the deviation σ_i of motor i's residual,
