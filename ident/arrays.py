@@ -29,46 +29,43 @@ def as_array(
     meaning: str = "",
     refuse: Refusal = ModelError,
 ) -> FloatArray:
-    """Convert an argument to finite numbers of a shape, any if empty;
-    otherwise raise what ``refuse`` makes.
-    """
+    """Convert an argument to finite numbers of a shape, any if empty; else raise ``refuse(…)``."""
     if isinstance(values, Mapping):
         keys = ", ".join(map(repr, values))
+        order = meaning or "in the order of the axes"
         raise refuse(
-            f"{label} is a dictionary with the keys {keys:.60}; expected numbers, "
-            f"{meaning or 'in the order of the axes'}; write [{label}[name] for name in axes]"
+            f"{label} is a dictionary with the keys {keys:.60}; expected numbers, {order}; "
+            f"write [{label}[name] for name in axes]"
         )
     if values is not None:
         require_real(label, values, refuse, str(shape or "real numbers"))
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise refuse(
-            f"{label} is no array of numbers: {error}; expected {shape or 'numbers'}"
-        ) from error
+        expected = shape or "numbers"
+        raise refuse(f"{label} is no array of numbers: {error}; expected {expected}") from error
     if shape and array.shape != shape:
+        remedy = meaning
         if array.shape == shape[::-1]:
-            turned = "; transpose it?"
-        else:
-            turned = ""
-        raise refuse(f"{label} has shape {array.shape}; expected {shape}, {meaning}{turned}")
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
+            remedy = f"{meaning}; transpose it?"
+        raise refuse(f"{label} has shape {array.shape}; expected {shape}, {remedy}")
+    not_finite = np.argwhere(~np.isfinite(array))
+    if len(not_finite):
         if array.ndim == 0:
             raise refuse(f"{label} is {values!r}; expected an array of numbers")
-        first = f"sample {bad[0][0]}" + (f", axis {bad[0][1] + 1}" if array.ndim > 1 else "")
-        raise refuse(
-            f"{label} holds {len(bad)} non-finite values, the first in {first}; give numbers"
-        )
+        sample, *axes = not_finite[0].tolist()
+        first = f"sample {sample}"
+        if axes:
+            first = f"{first}, axis {axes[0] + 1}"
+        count = len(not_finite)
+        raise refuse(f"{label} holds {count} non-finite values, the first in {first}; give numbers")
     return array
 
 
 def require_real(
     label: str, values: object, refuse: Refusal, expected: str = "real numbers"
 ) -> None:
-    """Refuse what numpy would convert to real numbers with a loss, or without a word:
-    complex, masked, text.
-    """
+    """Refuse what numpy would convert with a loss, or without a word: complex, masked, text."""
     if np.ma.isMaskedArray(values):
         masked = int(np.count_nonzero(np.ma.getmaskarray(values)))
         if masked:
@@ -79,38 +76,34 @@ def require_real(
     try:
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
-        raise refuse(
-            f"{label} is no array of numbers: {error}; expected {expected}; give each row "
-            "one length"
-        ) from error
-    if array.dtype.kind == "c":
-        raise refuse(
-            f"{label} is of complex numbers ({array.dtype}); expected real ones; give their real "
-            "part: `.real`"
-        )
-    if array.dtype.kind in "SUmM":
-        remedy = "convert it first: `.astype(float)`"
-        raise refuse(
-            f"{label} is no array of numbers: its type is {array.dtype}; expected "
-            f"{expected}; {remedy}"
-        )
-    if array.dtype.kind != "O":
+        remedy = f"expected {expected}; give each row one length"
+        raise refuse(f"{label} is no array of numbers: {error}; {remedy}") from error
+    kind = array.dtype.kind
+    if kind == "c":
+        found = f"complex numbers ({array.dtype})"
+        remedy = "expected real ones; give their real part: `.real`"
+        raise refuse(f"{label} is of {found}; {remedy}")
+    remedy = f"expected {expected}; convert it first: `.astype(float)`"
+    if kind in "SUmM":
+        found = f"its type is {array.dtype}"
+        raise refuse(f"{label} is no array of numbers: {found}; {remedy}")
+    if kind != "O":
         return
     # Data frames with columns of several types give such arrays; numbers in them are as good as
     # any.
     for value in array.ravel():
         if not isinstance(value, Real):
-            found = f"it holds {value!r:.60} of type {type(value).__name__}"
-            remedy = "convert it first: `.astype(float)`"
-            raise refuse(f"{label} is no array of numbers: {found}; expected {expected}; {remedy}")
+            type_name = type(value).__name__
+            found = f"it holds {value!r:.60} of type {type_name}"
+            raise refuse(f"{label} is no array of numbers: {found}; {remedy}")
 
 
 def require_kind(label: str, value: object, kind: type, remedy: str) -> None:
     """Refuse an argument of another type, as a `ModelError`."""
     if not isinstance(value, kind):
-        raise ModelError(
-            f"{label} is of type {type(value).__name__}; expected {kind.__name__}; {remedy}"
-        )
+        found = type(value).__name__
+        expected = kind.__name__
+        raise ModelError(f"{label} is of type {found}; expected {expected}; {remedy}")
 
 
 def require_names(label: str, names: object, count: int | None = None) -> None:
@@ -124,38 +117,37 @@ def require_names(label: str, names: object, count: int | None = None) -> None:
         )
     require_entries(label, names, str, "give a list of names: ['J1', 'J2']")
     given = list(names)  # type: ignore[call-overload]
-    if count is not None and len(given) != count:
+    given_count = len(given)
+    if count is not None and given_count != count:
         raise ModelError(
-            f"{label} has {len(given)} names; expected {count}, one for each axis; found {given}"
+            f"{label} has {given_count} names; expected {count}, one for each axis; found {given}"
         )
-    if label == "axes" and len(set(given)) < len(given):
-        raise ModelError(f"axes are {', '.join(given)}; expected another name for each; rename one")
+    if label == "axes" and len(set(given)) < given_count:
+        listed = ", ".join(given)
+        raise ModelError(f"axes are {listed}; expected another name for each; rename one")
 
 
 def require_entries(label: str, values: object, kind: type, remedy: str) -> None:
-    """Refuse a list whose entries are of another type, as a `ModelError`;
-    an iterator is not looked into.
-    """
+    """Refuse a list with entries of another type, as a `ModelError`; iterators are not read."""
     require_kind(label, values, Iterable, remedy)
     if isinstance(values, (Sequence, np.ndarray)):
+        entry = f"an entry of {label}"
         for value in values:
-            require_kind(f"an entry of {label}", value, kind, remedy)
+            require_kind(entry, value, kind, remedy)
 
 
 def require_number(
     label: str, value: object, *, above: float = -np.inf, remedy: str = "give a number"
 ) -> float:
-    """Return an argument that is one finite number above a bound, as a float;
-    refuse others, as a `ModelError`.
-    """
+    """Return one finite number above a bound as a float; refuse others, as a `ModelError`."""
     is_number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
-    if above == -np.inf:
-        bound = "a finite number"
-    else:
+    bound = "a finite number"
+    if above > -np.inf:
         bound = f"a finite number above {above:g}"
     if not is_number:
+        type_name = type(value).__name__
         raise ModelError(
-            f"{label} is {value!r:.60} of type {type(value).__name__}; expected {bound}; {remedy}"
+            f"{label} is {value!r:.60} of type {type_name}; expected {bound}; {remedy}"
         )
     number = float(value)  # type: ignore[arg-type]  # isinstance does not narrow through the name above
     if not above < number < np.inf:
@@ -164,9 +156,7 @@ def require_number(
 
 
 def require_count(label: str, value: object, *, remedy: str = "give a number such as 0") -> int:
-    """Return an argument that is a whole number, zero or above;
-    refuse others, as a `ModelError`.
-    """
+    """Return a whole number, zero or above; refuse others, as a `ModelError`."""
     is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not is_whole or value < 0:  # type: ignore[operator]
         raise ModelError(
@@ -178,8 +168,9 @@ def require_count(label: str, value: object, *, remedy: str = "give a number suc
 def takes(
     **kinds: type | UnionType,
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
-    """Make a function refuse arguments of another type by name, as a `ModelError`, before it runs;
-    likewise missing arguments, and those that it does not have.
+    """Make a function refuse arguments of another type by name, as a `ModelError`.
+
+    It does so before it runs; likewise missing arguments, and those that it does not have.
 
     Args:
         kinds: of the arguments by their names; the type of others is not looked at. Neither is one
@@ -188,21 +179,22 @@ def takes(
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
         signature = inspect.signature(function)
+        own_name = function.__name__
 
         @wraps(function)
         def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             try:
                 given = signature.bind(*args, **kwargs).arguments
             except TypeError as error:
+                expected = _call_of(own_name, signature)
                 raise ModelError(
-                    f"the call of {function.__name__} does not fit: {error}; expected "
-                    f"{_call_of(function.__name__, signature)}; give its arguments by these names"
+                    f"the call of {own_name} does not fit: {error}; expected {expected}; "
+                    "give its arguments by these names"
                 ) from error
             for name, value in given.items():
                 if name in kinds and not isinstance(value, kinds[name]):
-                    raise ModelError(
-                        _of_another_kind(function.__name__, name, value, kinds[name], signature)
-                    )
+                    message = _of_another_kind(own_name, name, value, kinds[name], signature)
+                    raise ModelError(message)
             return function(*args, **kwargs)
 
         return checked
@@ -213,7 +205,9 @@ def takes(
 def _of_another_kind(
     function: str, name: str, value: object, kind: type | UnionType, signature: inspect.Signature
 ) -> str:
-    expected = kind.__name__ if isinstance(kind, type) else str(kind)
+    expected = str(kind)
+    if isinstance(kind, type):
+        expected = kind.__name__
     found = f"{name} of {function} is of type {type(value).__name__}"
     if kind is np.random.Generator:
         remedy = f"write {name}=np.random.default_rng(0)"
@@ -240,5 +234,10 @@ def _call_of(function: str, signature: inspect.Signature) -> str:
 
 def _short(kind: str) -> str:
     """Names of types without their modules: `ident.data.run.Run | None` is `Run or None`."""
-    names = [name.rsplit(".", 1)[-1] for name in kind.split(" | ")]
-    return " or ".join("None" if name == "NoneType" else name for name in names)
+    names: list[str] = []
+    for dotted in kind.split(" | "):
+        name = dotted.rsplit(".", 1)[-1]
+        if name == "NoneType":
+            name = "None"
+        names.append(name)
+    return " or ".join(names)

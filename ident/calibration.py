@@ -1,6 +1,4 @@
-"""The calibration: drive gains with their uncertainty, parameters,
-effects and where all of it came from.
-"""
+"""The calibration: drive gains with their σ, parameters, effects and the sources of all of it."""
 
 from __future__ import annotations
 
@@ -17,14 +15,17 @@ from ident.data.conditioning import Conditioning
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
 from ident.estimators.estimate import SAME_ERROR, RelativeError
-from ident.model.bodies import LOADED
+from ident.model.bodies import LOADED, Payload
 from ident.physical.full_set import FullSet
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
     from ident.discovery.evidence import Evidence
     from ident.discovery.loop import Step
+    from ident.discovery.search import Finding
     from ident.effects.effect import Effect, PlacedEffect
-    from ident.estimators.estimate import Identification
+    from ident.equations.system import System
+    from ident.estimators.estimate import Estimate, Identification
+    from ident.estimators.payload_mass import MassResponse
 
 EXTRAPOLATED = 1.5
 """Times the largest torque of an effect in the fit that it may have in a prediction: a power of the
@@ -65,8 +66,9 @@ class Parameter:
 
     @property
     def is_payload_friction(self) -> bool:
-        """Whether it is, or leads with, what a payload adds to friction
-        (`Model.friction_by_payload`).
+        """Whether it is, or leads with, what a payload adds to friction.
+
+        See `Model.friction_by_payload`.
         """
         is_of_robot = ":" not in self.name  # behind a colon is the mounting of a payload
         return is_of_robot and self.name.split(" ", 1)[0].endswith(LOADED)
@@ -110,9 +112,7 @@ class AcceptedEffect:
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether it does not raise the error on data that the fit did not use,
-        by more than SAME_ERROR of it.
-        """
+        """Whether it does not raise the error on unseen data by more than SAME_ERROR of it."""
         return self.error_after_percent <= (1.0 + SAME_ERROR) * self.error_before_percent
 
 
@@ -150,19 +150,20 @@ class PayloadMass:
         parameters_per_kg: Sequence[float] = (),
     ) -> PayloadMass:
         """Influence on gains and parameters, without a tolerance, from the derivative of each."""
-        influences = tuple(
-            MassInfluence(gain.axis, float(slope), float(slope * mass_kg / gain.value), 0.0)
-            for slope, gain in zip(gain_per_kg, gains, strict=True)
-        )
+        influences: list[MassInfluence] = []
+        for slope, gain in zip(gain_per_kg, gains, strict=True):
+            relative = slope * mass_kg / gain.value
+            influences.append(MassInfluence(gain.axis, float(slope), float(relative), 0.0))
         rounded = tuple(float(f"{slope:.6g}") for slope in parameters_per_kg)
-        return cls(payload, mass_kg, 0.0, influences, rounded)
+        return cls(payload, mass_kg, 0.0, tuple(influences), rounded)
 
     def weighed_to(self, tolerance_kg: float) -> PayloadMass:
         """Return the same with the tolerance of the weighing."""
-        influences = tuple(
-            replace(one, tolerance_std=abs(one.per_kg) * tolerance_kg) for one in self.gains
-        )
-        return replace(self, tolerance_kg=tolerance_kg, gains=influences)
+        influences: list[MassInfluence] = []
+        for influence in self.gains:
+            std = abs(influence.per_kg) * tolerance_kg
+            influences.append(replace(influence, tolerance_std=std))
+        return replace(self, tolerance_kg=tolerance_kg, gains=tuple(influences))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,9 +184,7 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, slots=True)
 class EncoderMisfit:
-    """How well the encoders of a robot with more of them than degrees of freedom fit its loops,
-    and why not better.
-    """
+    """How well redundant encoders of a robot fit its loops, and why not better."""
 
     described: float  #: root mean square of the misfit with the described geometry [unit]
     #: the same with the explanation; without any, with all zeros and lengths that fit best [unit]
@@ -235,9 +234,7 @@ class CalibratedJoint:
 
 @dataclass(frozen=True, slots=True)
 class CalibratedDrive:
-    """A drive of the robot that a calibration is of;
-    None for a number that its description leaves open.
-    """
+    """A drive of the robot of a calibration; None where its description leaves a number open."""
 
     axis: str  #: name of the axis
     node_id: int | None
@@ -247,9 +244,7 @@ class CalibratedDrive:
 
 @dataclass(frozen=True, slots=True)
 class CalibratedRobot:
-    """The robot that a calibration is of:
-    what tells it from another one of the same name and axes.
-    """
+    """What tells the robot of a calibration from another one of the same name and axes."""
 
     #: of joints, their kinds and order, and the motors of a closed chain, hex; as in a plan
     kinematics_sha256: str
@@ -346,24 +341,25 @@ class Calibration:
 
     @property
     def covariance(self) -> FloatArray | None:
-        """Covariance of (gains, parameters), shape (m + p, m + p);
-        None where the calibration has none.
+        """Covariance of (gains, parameters), shape (m + p, m + p); None without one.
 
         Raises:
             ModelError: its factor has another shape.
         """
-        if self.covariance_factor is None:
+        factor = self.covariance_factor
+        if factor is None:
             return None
-        size = len(self.gains) + len(self.parameters)
-        if [len(row) for row in self.covariance_factor] != list(range(1, size + 1)):
+        gain_count = len(self.gains)
+        parameter_count = len(self.parameters)
+        size = gain_count + parameter_count
+        if [len(row) for row in factor] != list(range(1, size + 1)):
             raise ModelError(
-                f"covariance_factor of the calibration of cell {self.cell!r} has "
-                f"{len(self.covariance_factor)} rows; expected {size} of one to {size} entries, "
-                f"for {len(self.gains)} gains and {len(self.parameters)} parameters: fit the logs "
-                "again"
+                f"covariance_factor of the calibration of cell {self.cell!r} has {len(factor)} "
+                f"rows; expected {size} of one to {size} entries, for {gain_count} gains and "
+                f"{parameter_count} parameters: fit the logs again"
             )
         lower = np.zeros((size, size))
-        lower[np.tril_indices(size)] = np.concatenate(self.covariance_factor)
+        lower[np.tril_indices(size)] = np.concatenate(factor)
         return np.asarray(lower @ lower.T)
 
 
@@ -405,14 +401,18 @@ def calibration_of(
     require_kind("robot", robot, str, "give the name of the robot or cell")
     require_kind("steps", steps, Sequence, "give the result of ident.find_effects")
 
-    last = steps[-1].after if steps else None
+    last: Evidence | None = None
     start = found
-    found = found if last is None else last.identification
-    if last is None and len(found.system.columns) > len(found.system.base.names):
-        effect = (
-            f"the identification holds {found.system.columns[-1].name!r}, a parameter of an effect"
+    if steps:
+        last = steps[-1].after
+        found = last.identification
+    system = found.system
+    if last is None and len(system.columns) > len(system.base.names):
+        name = system.columns[-1].name
+        raise ModelError(
+            f"the identification holds {name!r}, a parameter of an effect; give the one without "
+            "effects, and steps=find_effects(...)"
         )
-        raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
     nameplate_gains = np.atleast_1d(as_array("nameplate", nameplate))
     if nameplate_gains.ndim != 1 or not nameplate_gains.all():
@@ -420,74 +420,99 @@ def calibration_of(
             f"nameplate is {nameplate_gains.tolist()}; expected one gain per axis, none of them "
             "zero: take them from the data sheet, or the identified ones"
         )
-    units = units or ("Nm/A",) * len(axes)
-    if not len(axes) == len(nameplate_gains) == len(units) == len(estimate.gains):
+    axis_count = len(axes)
+    units = units or ("Nm/A",) * axis_count
+    if not axis_count == len(nameplate_gains) == len(units) == len(estimate.gains):
         raise ModelError(
-            f"{len(axes)} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} "
+            f"{axis_count} axis names, {len(nameplate_gains)} nameplate gains and {len(units)} "
             f"units for {len(estimate.gains)} identified gains; expected one of each for each axis"
         )
-    parameters = tuple(
-        Parameter(column.name, float(value + column.about), float(std), column.unit)
-        for column, value, std in zip(
-            estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True
-        )
-    )
+    gains: list[Gain] = []
     identified = zip(axes, estimate.gains, estimate.gains_std, units, nameplate_gains, strict=True)
-    gains = tuple(
-        Gain(axis, float(g), float(std), unit, float(entered))
-        for axis, g, std, unit, entered in identified
-    )
-    responses = mass_responses(found.system, estimate)
-    tolerance_kg: dict[str, float] = {}
-    for payload in found.system.payloads:
-        tolerance_kg[payload.name] = max(
-            payload.mass_tolerance_kg, tolerance_kg.get(payload.name, 0.0)
-        )
+    for axis, gain, std, unit, entered in identified:
+        gains.append(Gain(axis, float(gain), float(std), unit, float(entered)))
+    parameters = _parameters_of(estimate)
     undriven = found.model.robot.undriven_names
-    places = (*axes, *undriven)
+    effects: list[AcceptedEffect] = []
+    own_effects: tuple[Effect, ...] = ()
+    began_s: float | None = None
+    if last is not None:
+        places = (*axes, *undriven)
+        for placed in last.effects:
+            effects.append(_accepted(start, steps, placed, places, parameters))
+        own_effects = _own_effects(last)
+        began_s = session_began_s(last.fit_runs)
+    responses = mass_responses(system, estimate)
     return Calibration(
         cell=robot,
         method=estimate.method.value,
-        gains=gains,
+        gains=tuple(gains),
         parameters=parameters,
-        effects=()
-        if last is None
-        else tuple(_accepted(start, steps, one, places, parameters) for one in last.effects),
+        effects=tuple(effects),
         relative_error_percent=found.training_error,
         holdout_error_percent=found.holdout_error,
         condition=estimate.condition,
         rows=estimate.rows,
         filter=found.conditioning.document(),
-        sources=tuple(
-            Source(
-                ", ".join(found.system.runs),
-                "",
-                "fit",
-                payload=payload.name,
-                mass_kg=payload.known.get("m"),
-                mounting=payload.mounting,
-            )
-            for payload in found.system.payloads
-        ),
+        sources=_sources_of(system),
         configuration_sha256="",
         created="",
         software="",
-        session_began_s=None if last is None else session_began_s(last.fit_runs),
+        session_began_s=began_s,
         covariance_factor=factor_of(estimate.covariance),
         current_residual=found.current_residual,
         passive_joints=undriven,
-        own_effects=() if last is None else _own_effects(last),
-        payload_mass=tuple(
-            PayloadMass.of(
-                one.payload,
-                one.mass_kg,
-                one.gain_per_kg.tolist(),
-                gains,
-                one.parameters_per_kg.tolist(),
-            ).weighed_to(tolerance_kg[one.payload])
-            for one in responses
-        ),
+        own_effects=own_effects,
+        payload_mass=_payload_masses(responses, system.payloads, gains),
     )
+
+
+def _parameters_of(estimate: Estimate) -> tuple[Parameter, ...]:
+    """Parameters of an estimate; of a correction, the whole of it."""
+    parameters: list[Parameter] = []
+    identified = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+    for column, change, std in identified:
+        value = float(change + column.about)
+        parameters.append(Parameter(column.name, value, float(std), column.unit))
+    return tuple(parameters)
+
+
+def _sources_of(system: System) -> tuple[Source, ...]:
+    """A source for each payload, with no file."""
+    runs = ", ".join(system.runs)
+    sources: list[Source] = []
+    for payload in system.payloads:
+        source = Source(
+            name=runs,
+            sha256="",
+            role="fit",
+            payload=payload.name,
+            mass_kg=payload.known.get("m"),
+            mounting=payload.mounting,
+        )
+        sources.append(source)
+    return tuple(sources)
+
+
+def _payload_masses(
+    responses: Sequence[MassResponse], payloads: Sequence[Payload], gains: Sequence[Gain]
+) -> tuple[PayloadMass, ...]:
+    """How the gains depend on the mass of each payload, with the largest tolerance of each."""
+    tolerance_kg: dict[str, float] = {}
+    for payload in payloads:
+        known_kg = tolerance_kg.get(payload.name, 0.0)
+        tolerance_kg[payload.name] = max(payload.mass_tolerance_kg, known_kg)
+    masses: list[PayloadMass] = []
+    for response in responses:
+        mass = PayloadMass.of(
+            response.payload,
+            response.mass_kg,
+            response.gain_per_kg.tolist(),
+            gains,
+            response.parameters_per_kg.tolist(),
+        )
+        masses.append(mass.weighed_to(tolerance_kg[response.payload]))
+    return tuple(masses)
 
 
 def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
@@ -500,12 +525,15 @@ def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
     std = np.sqrt(np.diag(covariance))
     unit = np.where(std > 0.0, std, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
-    upper = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r"))
+    # V √Λ √Λ Vᵀ = Rᵀ R
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    upper = np.asarray(np.linalg.qr(root.T, mode="r"))
     lower = upper.T * unit[:, None]
-    return tuple(
-        tuple(float(f"{value:.6g}") for value in row[: index + 1])
-        for index, row in enumerate(lower)
-    )
+    return tuple(_rounded(row[: index + 1]) for index, row in enumerate(lower))
+
+
+def _rounded(row: FloatArray) -> tuple[float, ...]:
+    return tuple(float(f"{value:.6g}") for value in row)
 
 
 def _own_effects(last: Evidence) -> tuple[Effect, ...]:
@@ -527,23 +555,17 @@ def _accepted(
     from ident.effects.geometry_corrections import is_correction  # noqa: PLC0415
     from ident.effects.own import package_of  # noqa: PLC0415
 
-    # The last turn that added it: an effect may have been dropped and added again.
-    for number, step in reversed(list(enumerate(steps))):
-        before = steps[number - 1].after if number else None
-        finding = step.accepted
-        if (
-            finding is not None
-            and placed in step.after.effects
-            and not (before and placed in before.effects)
-        ):
+    number, finding = _turn_that_added(placed, steps)
+    step = steps[number]
+    error_before = start.holdout_error
+    if number:
+        error_before = steps[number - 1].after.holdout_error
+    held_out = error_before, step.after.holdout_error
+    for verdict in steps[-1].verdicts:
+        if verdict.placed == placed:
+            held_out = verdict.before, verdict.after
             break
-    else:
-        raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
     axis = placed.axis_name(places)
-    held_out = (before or start).holdout_error, step.after.holdout_error
-    verdict = next((one for one in steps[-1].verdicts if one.placed == placed), None)
-    if verdict is not None:
-        held_out = verdict.before, verdict.after
     # A correction of the description is judged by all motors together, and so shown by them.
     has_own_error = axis in places and not is_correction(placed)
     errors: list[float] = []
@@ -558,33 +580,48 @@ def _accepted(
         # Without a run that was held out, the moves that were left out in turn must do.
         errors = [finding.error_before_percent, finding.error_after_percent]
     names = {column.name for column in placed.columns}
+    coefficients = [parameter for parameter in found if parameter.name in names]
+    settings = {name: float(value) for name, value in placed.effect.settings.items()}
+    rivals = [rival.name_among(places) for rival in finding.ambiguity]
+    before_percent, after_percent = errors
     return AcceptedEffect(
         name=placed.effect.name,
         axis=axis,
-        settings={name: float(value) for name, value in placed.effect.settings.items()},
-        coefficients=tuple(parameter for parameter in found if parameter.name in names),
-        error_before_percent=errors[0],
-        error_after_percent=errors[1],
-        ambiguity=tuple(rival.name_among(places) for rival in finding.ambiguity),
+        settings=settings,
+        coefficients=tuple(coefficients),
+        error_before_percent=before_percent,
+        error_after_percent=after_percent,
+        ambiguity=tuple(rivals),
         largest_torque=_largest_torque(steps[-1].after, placed),
         package=package_of(placed.effect),
     )
 
 
+def _turn_that_added(placed: PlacedEffect, steps: Sequence[Step]) -> tuple[int, Finding]:
+    """Index and finding of the last turn that added an effect: it may have been dropped before."""
+    for number in reversed(range(len(steps))):
+        step = steps[number]
+        is_there = placed in step.after.effects
+        was_there = number > 0 and placed in steps[number - 1].after.effects
+        if step.accepted is not None and is_there and not was_there:
+            return number, step.accepted
+    raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
+
+
 def _largest_torque(evidence: Evidence, placed: PlacedEffect) -> tuple[float, ...] | None:
-    """Largest torque of an effect at each axis, over the rows of the fit [Nm; N];
-    None where it is a rate.
-    """
+    """Largest torque of an effect at each axis, in the fit [Nm; N]; None where it is a rate."""
     if placed.effect.is_rate:
         return None
     rows = evidence.training
     estimate = evidence.estimate
-    names = {column.name for column in placed.columns}
     first = len(rows.columns) - rows.effects.shape[1]
-    own = [index for index, column in enumerate(rows.columns[first:]) if column.name in names]
-    of_parameters = [
-        index for index, column in enumerate(estimate.unknowns) if column.name in names
-    ]
-    torque = np.einsum("p,mpr->mr", estimate.parameters[of_parameters], rows.effects[:, own])
+    names = {column.name for column in placed.columns}
+    of_effects = [column.name for column in rows.columns[first:]]
+    of_unknowns = [column.name for column in estimate.unknowns]
+    own = [index for index, name in enumerate(of_effects) if name in names]
+    own_unknowns = [index for index, name in enumerate(of_unknowns) if name in names]
+    coefficients = estimate.parameters[own_unknowns]
+    # τ_mr = Σ_p c_p φ_mpr
+    torque = np.einsum("p,mpr->mr", coefficients, rows.effects[:, own])
     largest = np.max(np.abs(torque), axis=1, where=rows.use, initial=0.0)
     return tuple(float(f"{value:.4g}") for value in largest)

@@ -1,5 +1,4 @@
-"""External torque of the joints: what the motors supply beyond the prediction, its band,
-and a threshold for alarms.
+"""External torque of the joints beyond the prediction, its band, and a threshold for alarms.
 
     τ_ext = V g − (W χ + W_L χ_L + E c)
 
@@ -36,7 +35,7 @@ the average can, too (docs/evidence/contact.md).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
@@ -116,24 +115,24 @@ class ExternalTorque:
     @property
     def contacts(self) -> tuple[Contact, ...]:
         """Stretches beyond the threshold, in order of time."""
-        found = []
-        over = np.abs(self.torque_nm) / self.threshold_nm
-        for axis, beyond in enumerate(self.use & (over > 1.0)):
-            for rows in _stretches(
-                np.flatnonzero(beyond), self.time_s, 2.0 * self.band.correlation_s[axis]
-            ):
-                peak = rows[np.argmax(over[axis, rows])]
-                start_s, end_s = (float(self.time_s[row]) for row in (rows[0], rows[-1]))
-                found.append(
-                    Contact(
-                        axis,
-                        start_s,
-                        end_s,
-                        float(self.torque_nm[axis, peak]),
-                        float(over[axis, peak]),
-                    )
+        found: list[Contact] = []
+        over_threshold = np.abs(self.torque_nm) / self.threshold_nm
+        is_beyond = self.use & (over_threshold > 1.0)
+        for axis, over in enumerate(over_threshold):
+            beyond = np.flatnonzero(is_beyond[axis])
+            gap_s = 2.0 * self.band.correlation_s[axis]
+            for rows in _stretches(beyond, self.time_s, gap_s):
+                peak = rows[np.argmax(over[rows])]
+                contact = Contact(
+                    axis=axis,
+                    start_s=float(self.time_s[rows[0]]),
+                    end_s=float(self.time_s[rows[-1]]),
+                    peak_nm=float(self.torque_nm[axis, peak]),
+                    peak_over_threshold=float(over[peak]),
                 )
-        return tuple(sorted(found, key=lambda contact: contact.start_s))
+                found.append(contact)
+        found.sort(key=lambda contact: contact.start_s)
+        return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,14 +175,23 @@ def external_torque(
         DataUnfit: the run is unfit, or no row of it counts.
         ModelError, EffectRefused: see `ident.predict_torque`.
     """
-    rows = _residual(calibration, model, run, conditioning or calibration.conditioning)
-    itself = band is None
+    if conditioning is None:
+        conditioning = calibration.conditioning
+    residual = _residual(calibration, model, run, conditioning)
+    from_itself = band is None
     left_out = 0
     if band is None:
-        quiet, left_out = _quiet(rows)
+        quiet, left_out = _quiet(residual)
         band = _band([quiet], ALARMS_PER_HOUR)
-    scale = np.einsum("jd,jdr->jr", band.scale, rows.drivers)
-    return ExternalTorque(rows.time_s, rows.torque_nm, scale, rows.use, band, itself, left_out)
+    return ExternalTorque(
+        time_s=residual.time_s,
+        torque_nm=residual.torque_nm,
+        scale_nm=_scale_nm(band.scale, residual),
+        use=residual.use,
+        band=band,
+        from_itself=from_itself,
+        left_out=left_out,
+    )
 
 
 @takes(calibration=Calibration, model=Model, quiet=Iterable, conditioning=Conditioning | None)
@@ -210,8 +218,12 @@ def prediction_band(
     alarms_per_hour = require_number(
         "alarms_per_hour", alarms_per_hour, above=0.0, remedy="give a rate such as 1"
     )
-    filters = conditioning or calibration.conditioning
-    return _band([_residual(calibration, model, run, filters) for run in quiet], alarms_per_hour)
+    if conditioning is None:
+        conditioning = calibration.conditioning
+    residuals: list[_Residual] = []
+    for run in quiet:
+        residuals.append(_residual(calibration, model, run, conditioning))
+    return _band(residuals, alarms_per_hour)
 
 
 def _residual(
@@ -229,64 +241,93 @@ def _residual(
         )
     predicted = predict_torque(calibration, model, data).T
     measured = measured_torque(calibration, model, data.current_a, data.motion()).T
-    torque, needed, speed, acceleration = (
-        filter_(one)
-        for one in (
-            measured - predicted,
-            predicted,
-            data.velocity_rad_s.T,
-            data.acceleration_rad_s2.T,
-        )
-    )
+    torque_nm = filter_(measured - predicted)
+    needed_nm = filter_(predicted)
+    speed = filter_(data.velocity_rad_s.T)
+    acceleration = filter_(data.acceleration_rad_s2.T)
+    # In the order of DRIVERS
     drivers = np.stack(
-        (np.ones_like(torque), np.abs(needed), np.abs(speed), np.abs(acceleration)), axis=1
+        (np.ones_like(torque_nm), np.abs(needed_nm), np.abs(speed), np.abs(acceleration)), axis=1
     )
     centres = filter_.centres(len(data.time_s))
     return _Residual(
-        data.time_s[centres] - data.time_s[0], torque, drivers, use, data.move[centres]
+        time_s=data.time_s[centres] - data.time_s[0],
+        torque_nm=torque_nm,
+        drivers=drivers,
+        use=use,
+        move=data.move[centres],
     )
 
 
-def _quiet(rows: _Residual) -> tuple[_Residual, int]:
+def _scale_nm(scale: FloatArray, residual: _Residual) -> FloatArray:
+    """s_jr = Σ_d (a, b, c, d)_jd drivers_jdr of each joint and row, shape (m, r)."""
+    return np.asarray(np.einsum("jd,jdr->jr", scale, residual.drivers))
+
+
+def _quiet(residual: _Residual) -> tuple[_Residual, int]:
     """The rows without the stretches that are far out on any joint, and the number of these."""
-    scale = _scales([rows], robust=True)
+    scale_nm = _scale_nm(_scales([residual], robust=True), residual)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(
-            rows.use, np.abs(rows.torque_nm) / np.einsum("jd,jdr->jr", scale, rows.drivers), 0.0
-        )
-    moves, of_move = np.unique(rows.move, return_inverse=True)
-    largest = np.stack(
-        [ratio[:, of_move == move].max(axis=1) for move in range(len(moves))], axis=1
-    )
+        ratio = np.abs(residual.torque_nm) / scale_nm
+    ratio = np.where(residual.use, ratio, 0.0)
+    moves, move_of_row = np.unique(residual.move, return_inverse=True)
+    largest = np.zeros((len(ratio), len(moves)))
+    for move in range(len(moves)):
+        of_move = ratio[:, move_of_row == move]
+        largest[:, move] = of_move.max(axis=1)
     lower, upper = np.quantile(largest, (0.25, 0.75), axis=1)
-    loud = np.any(largest > (upper + FAR_OUT * (upper - lower))[:, None], axis=0)
-    use = rows.use & ~loud[of_move]
-    return _Residual(rows.time_s, rows.torque_nm, rows.drivers, use, rows.move), int(loud.sum())
+    fence = upper + FAR_OUT * (upper - lower)
+    is_loud = np.any(largest > fence[:, None], axis=0)
+    use = residual.use & ~is_loud[move_of_row]
+    return replace(residual, use=use), int(is_loud.sum())
 
 
 def _scales(parts: Sequence[_Residual], *, robust: bool = False) -> FloatArray:
-    """(a, b, c, d) of each joint, shape (m, 4); robust:
-    rows beyond four times the scale are left out.
+    """(a, b, c, d) of each joint, shape (m, 4).
+
+    Args:
+        parts: runs.
+        robust: leave out rows beyond four times the scale.
     """
-    out = np.zeros((len(parts[0].use), len(DRIVERS)))
-    for joint in range(len(out)):
-        size = np.concatenate([np.abs(part.torque_nm[joint, part.use[joint]]) for part in parts])
-        drivers = np.concatenate(
-            [part.drivers[joint][:, part.use[joint]] for part in parts], axis=1
-        )
-        if not size.size or not size.any():
-            continue
-        scale = np.full(len(size), np.median(size) or size.mean())
-        unit = drivers.max(axis=1)
-        unit[unit == 0.0] = 1.0
-        for _ in range(4):
-            # A scale near zero would make the weights of a few rows everything.
-            weight = 1.0 / np.maximum(scale, 0.1 * scale.mean())
-            if robust:
-                weight = np.where(size > 4.0 * scale, 0.0, weight)
-            out[joint] = nnls((drivers / unit[:, None] * weight).T, size * weight)[0] / unit
-            scale = out[joint] @ drivers
-    return out
+    scales = np.zeros((len(parts[0].use), len(DRIVERS)))
+    for joint in range(len(scales)):
+        used = [part.use[joint] for part in parts]
+        sizes: list[FloatArray] = []
+        drivers_of_parts: list[FloatArray] = []
+        for part, rows in zip(parts, used, strict=True):
+            sizes.append(np.abs(part.torque_nm[joint, rows]))
+            drivers_of_parts.append(part.drivers[joint][:, rows])
+        size = np.concatenate(sizes)
+        if size.any():
+            drivers = np.concatenate(drivers_of_parts, axis=1)
+            scales[joint] = _scale_of_joint(size, drivers, robust=robust)
+    return scales
+
+
+def _scale_of_joint(size: FloatArray, drivers: FloatArray, *, robust: bool) -> FloatArray:
+    """(a, b, c, d) ≥ 0 of one joint by least squares, weighted by the scale itself, shape (4,).
+
+    Args:
+        size: of the residual, not zero throughout, shape (r,).
+        drivers: shape (4, r).
+        robust: leave out rows beyond four times the scale.
+    """
+    usual_nm = np.median(size) or size.mean()
+    row_scale = np.full(len(size), usual_nm)
+    unit = drivers.max(axis=1)
+    unit[unit == 0.0] = 1.0
+    unit_drivers = drivers / unit[:, None]
+    for _ in range(4):
+        # A scale near zero would make the weights of a few rows everything.
+        least = 0.1 * row_scale.mean()
+        weight = 1.0 / np.maximum(row_scale, least)
+        if robust:
+            is_beyond = size > 4.0 * row_scale
+            weight = np.where(is_beyond, 0.0, weight)
+        in_units, _ = nnls((unit_drivers * weight).T, size * weight)
+        scale = in_units / unit
+        row_scale = scale @ drivers
+    return np.asarray(scale)
 
 
 def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
@@ -294,40 +335,45 @@ def _band(parts: Sequence[_Residual], alarms_per_hour: float) -> Band:
         raise DataUnfit("", "no quiet run was given; expected at least one without contact")
     scale = _scales(parts)
     count = len(scale)
-    factor, threshold, correlation_s, quiet_s = (np.full(count, np.nan) for _ in range(4))
+    factor = np.full(count, np.nan)
+    threshold = np.full(count, np.nan)
+    correlation_s = np.full(count, np.nan)
+    quiet_s = np.full(count, np.nan)
     row_s = float(np.median(np.diff(parts[0].time_s)))
+    # Runs far apart in time: no stretch goes on from one to the next.
+    times_s = np.concatenate([part.time_s + 1e6 * index for index, part in enumerate(parts)])
     for joint in range(count):
-        runs = []
-        for part in parts:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                signed = part.torque_nm[joint] / (scale[joint] @ part.drivers[joint])
-            runs.append(np.where(part.use[joint] & np.isfinite(signed), signed, np.nan))
-        signed = np.concatenate(runs)
-        rows = int(np.isfinite(signed).sum())
-        quiet_s[joint], correlation_s[joint] = rows * row_s, row_s
+        runs = [_ratio_of_joint(part, joint, scale[joint]) for part in parts]
+        ratio = np.concatenate(runs)
+        rows = int(np.isfinite(ratio).sum())
+        quiet_s[joint] = rows * row_s
+        correlation_s[joint] = row_s
         if rows < 2:
             continue
         correlation_s[joint] = row_s * _correlation(runs)
-        factor[joint] = np.nanquantile(np.abs(signed), PREDICTED_SHARE)
-        times = np.concatenate([part.time_s + 1e6 * index for index, part in enumerate(parts)])
-        level = alarm_level(
-            np.abs(signed),
-            times,
-            2.0 * correlation_s[joint],
-            alarms_per_hour / count,
-            quiet_s[joint],
-        )
-        threshold[joint] = np.nan if level is None else level
+        size = np.abs(ratio)
+        factor[joint] = np.nanquantile(size, PREDICTED_SHARE)
+        gap_s = 2.0 * correlation_s[joint]
+        level = alarm_level(size, times_s, gap_s, alarms_per_hour / count, quiet_s[joint])
+        if level is not None:
+            threshold[joint] = level
     return Band(scale, factor, threshold, correlation_s, quiet_s, alarms_per_hour)
+
+
+def _ratio_of_joint(part: _Residual, joint: int, scale: FloatArray) -> FloatArray:
+    """Residual of a joint over its scale, shape (r,); NaN in rows that do not count."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = part.torque_nm[joint] / (scale @ part.drivers[joint])
+    counts = part.use[joint] & np.isfinite(ratio)
+    return np.where(counts, ratio, np.nan)
 
 
 def alarm_level(
     ratio: FloatArray, time_s: FloatArray, gap_s: float, alarms_per_hour: float, observed_s: float
 ) -> float | None:
-    """Level that a signal exceeds, on average, less often an hour than given,
-    extrapolated from its peaks; see the top.
+    """Level that a signal exceeds, on average, less often an hour than given.
 
-    The signal may grow by SCALE_MARGIN.
+    It is extrapolated from the signal's peaks; see the top. The signal may grow by SCALE_MARGIN.
 
     Args:
         ratio: the signal, not negative; NaN where it is not observed, shape (r,).
@@ -339,9 +385,12 @@ def alarm_level(
     Returns:
         the level; None with fewer than MIN_PEAKS peaks.
     """
+    observed = np.nan_to_num(ratio)
     for start in np.nanquantile(ratio, PEAK_QUANTILES).tolist():
-        beyond = np.flatnonzero(np.nan_to_num(ratio) > start)
-        peaks = np.array([ratio[rows].max() for rows in _stretches(beyond, time_s, gap_s)]) - start
+        beyond = np.flatnonzero(observed > start)
+        stretches = _stretches(beyond, time_s, gap_s)
+        largest = np.array([ratio[rows].max() for rows in stretches])
+        peaks = largest - start
         count = len(peaks)
         if count >= ENOUGH_PEAKS:
             break
@@ -350,14 +399,18 @@ def alarm_level(
     mean = float(peaks.mean())
     shape = tail_shape_bound(peaks)
     # The sum of exponential peaks has a gamma distribution: the bound of its scale.
-    scale = (1.0 - shape) * mean * count / float(gammaincinv(count, 1.0 - TAIL_CONFIDENCE))
+    least_sum = float(gammaincinv(count, 1.0 - TAIL_CONFIDENCE))
+    scale = (1.0 - shape) * mean * count / least_sum
     # An hour of signal has so many times more peaks than alarms are allowed.
-    factor = max(1.0, count * 3600.0 / observed_s / alarms_per_hour)
+    peaks_per_hour = count * 3600.0 / observed_s
+    factor = max(1.0, peaks_per_hour / alarms_per_hour)
+    # Level of the generalised Pareto distribution: σ (nˢ − 1)/s, σ log n for s = 0
     if shape < 1e-9:
         beyond_start = np.log(factor)
     else:
         beyond_start = (factor**shape - 1.0) / shape
-    return float(SCALE_MARGIN * (start + scale * beyond_start))
+    level = start + scale * beyond_start
+    return float(SCALE_MARGIN * level)
 
 
 def tail_shape_bound(peaks: FloatArray) -> float:
@@ -379,20 +432,21 @@ def tail_shape_bound(peaks: FloatArray) -> float:
         return 0.0  # equal peaks: no tail
     shape = 2.0 - mean / (mean - 2.0 * weighted)
     k = -float(np.clip(shape, -0.4, 0.4))  # where the asymptotic variance holds
-    variance = (
-        (1.0 + k)
-        * (2.0 + k) ** 2
-        * (1.0 + k + 2.0 * k**2)
-        / ((1.0 + 2.0 * k) * (3.0 + 2.0 * k))
-        / count
-    )
-    return float(np.clip(shape + SHAPE_SIGMAS * np.sqrt(variance), 0.0, LARGEST_SHAPE))
+    # (1 + k)(2 + k)²(1 + k + 2k²) / ((1 + 2k)(3 + 2k) n)
+    numerator = (1.0 + k) * (2.0 + k) ** 2 * (1.0 + k + 2.0 * k**2)
+    denominator = (1.0 + 2.0 * k) * (3.0 + 2.0 * k)
+    variance = numerator / denominator / count
+    upper_bound = shape + SHAPE_SIGMAS * np.sqrt(variance)
+    return float(np.clip(upper_bound, 0.0, LARGEST_SHAPE))
 
 
 def _correlation(runs: Sequence[FloatArray]) -> float:
-    """Rows until the autocorrelation of a signal with gaps (NaN) falls below 1/e, interpolated;
-    at least 1.
+    """Rows until the autocorrelation of a signal falls below 1/e, interpolated; at least 1.
+
+    Args:
+        runs: the signal, NaN in its gaps.
     """
+    limit = np.exp(-1.0)
     before = 1.0
     for lag in range(1, 200):
         first = np.concatenate([run[:-lag] for run in runs])
@@ -400,11 +454,14 @@ def _correlation(runs: Sequence[FloatArray]) -> float:
         both = np.isfinite(first) & np.isfinite(second)
         if both.sum() < 10:
             return float(lag)
-        value = float(first[both] @ second[both]) / float(
-            np.sqrt((first[both] ** 2).sum() * (second[both] ** 2).sum())
-        )
-        if value < np.exp(-1.0):
-            return float(max(1.0, lag - 1 + (before - np.exp(-1.0)) / (before - value)))
+        first = first[both]
+        second = second[both]
+        # Σ x_k x_k+l / √(Σ x_k² Σ x_k+l²)
+        squares = (first**2).sum() * (second**2).sum()
+        value = float(first @ second) / float(np.sqrt(squares))
+        if value < limit:
+            share = (before - limit) / (before - value)
+            return float(max(1.0, lag - 1 + share))
         before = value
     return 200.0
 
@@ -413,4 +470,6 @@ def _stretches(rows: IntArray, time_s: FloatArray, gap_s: float) -> list[IntArra
     """Rows parted where more than a gap lies between two of them."""
     if not len(rows):
         return []
-    return np.split(rows, np.flatnonzero(np.diff(time_s[rows]) > gap_s) + 1)
+    apart_s = np.diff(time_s[rows])
+    last_before_gap = np.flatnonzero(apart_s > gap_s)
+    return np.split(rows, last_before_gap + 1)

@@ -5,17 +5,18 @@ IdentificationError
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
 │   ├── PayloadMissing    no run has a payload of known mass, which free gains need
 │   ├── CurrentUnsigned   drives report the size of the current only
-│   └── ChannelUnfit      a channel shows by itself that it cannot be used: JointStill, CurrentConstant, ReadingsDamaged
+│   └── ChannelUnfit      a channel shows by itself that it cannot be used: JointStill,
+│                         CurrentConstant, ReadingsDamaged
 ├── ModelContradicted     the declared model explains less of the data than it leaves
 │   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
 │   ├── ChannelsExchanged the currents of some axes are each other's
 │   ├── GeometryTurned    gravity, or the position of an axis, points elsewhere than declared
 │   ├── CurrentReversed   a current counts against the sign of its fixed gain
-│   ├── UnitsMistaken     all gains, the payload's weight or positions are off by a factor such as 1000
+│   ├── UnitsMistaken     all gains, the payload's weight or positions are off by a factor of units
 │   └── PayloadDiffers    a run carries another payload than it says
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data do not distinguish some unknowns
-├── PayloadUnseen         runs declared loaded do not differ from the others by the weight of the payload
+├── PayloadUnseen         runs declared loaded do not differ from others by the payload's weight
 ├── PlanUnfit             no moves within limits and time show every gain
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
@@ -23,7 +24,7 @@ IdentificationError
     └── EffectNotInstalled a calibration has an effect of a package that is not installed
 
 What leaves usable numbers is no error but a `Diagnosis`.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 
@@ -49,24 +50,33 @@ class DataUnfit(IdentificationError):
     """The recording cannot be used; several runs are named with commas."""
 
     def __init__(self, run: str, reason: str) -> None:
-        super().__init__(
-            f"runs {run}: {reason}" if ", " in run else f"run {run!r}: {reason}" if run else reason
-        )
+        message = reason
+        if ", " in run:
+            message = f"runs {run}: {reason}"
+        elif run:
+            message = f"run {run!r}: {reason}"
+        super().__init__(message)
         self.run = run
         self.reason = reason
+
+
+def _subject_of(run: str) -> str:
+    """`run bare`, or `runs bare, loaded`."""
+    if ", " in run:
+        return f"runs {run}"
+    return f"run {run}"
 
 
 class PayloadMissing(DataUnfit):
     """No run has a payload of known mass, which free gains need."""
 
     def __init__(self, runs: tuple[str, ...]) -> None:
-        self.subject = f"{'runs' if len(runs) > 1 else 'run'} {', '.join(runs)}"
+        names = ", ".join(runs)
+        self.subject = _subject_of(names)
         self.found = "no run with a payload of known mass"
         self.expected = "at least one; without it all gains could be scaled at will"
         self.remedy = "record one (`Run.payload`), or hold the gains (`fixed_gains`)"
-        super().__init__(
-            ", ".join(runs), f"found {self.found}; expected {self.expected}; {self.remedy}"
-        )
+        super().__init__(names, f"found {self.found}; expected {self.expected}; {self.remedy}")
 
 
 class CurrentUnsigned(DataUnfit):
@@ -74,7 +84,7 @@ class CurrentUnsigned(DataUnfit):
 
     def __init__(self, run: str, axes: tuple[str, ...], missing_sign: str) -> None:
         names = ", ".join(axes)
-        self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
+        self.subject = f"{_subject_of(run)}, axis {names}"
         self.found = (
             f"currents that are never {missing_sign} while the axes move both ways, and that no "
             "load which is always carried explains"
@@ -96,7 +106,7 @@ class ChannelUnfit(DataUnfit):
         self, run: str, axes: tuple[str, ...], *, found: str, expected: str, remedy: str
     ) -> None:
         names = ", ".join(axes)
-        self.subject = f"{'runs' if ', ' in run else 'run'} {run}, axis {names}"
+        self.subject = f"{_subject_of(run)}, axis {names}"
         self.found = found
         self.expected = expected
         self.remedy = remedy
@@ -122,12 +132,13 @@ class CurrentConstant(ChannelUnfit):
     """A motor moves, and its current has one value."""
 
     def __init__(self, run: str, axes: tuple[str, ...], size: float) -> None:
+        found = f"a current of {size:.4g} throughout"
+        if size == 0.0:
+            found = "a current that is zero throughout"
         super().__init__(
             run,
             axes,
-            found="a current that is zero throughout"
-            if size == 0.0
-            else f"a current of {size:.4g} throughout",
+            found=found,
             expected="the changing current of a motor that moves",
             remedy="is its channel connected, and the object or column the right one? record this "
             "run again",
@@ -212,9 +223,12 @@ class PayloadUnseen(IdentificationError):
             "was it mounted in every loaded run, and in no other? is its mass right? where one of "
             "several runs is the wrong one, a fit without it passes"
         )
+        least_percent = min(std_percent)
+        largest_percent = 100.0 * LARGEST_GAIN_STD
+        names = ", ".join(runs)
         super().__init__(
-            f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, "
-            f"expected some 1 %, and on one at most {100.0 * LARGEST_GAIN_STD:g} %: the runs "
+            f"runs {names}: every gain is uncertain by {least_percent:.0f} % or more, "
+            f"expected some 1 %, and on one at most {largest_percent:g} %: the runs "
             "declared loaded and those declared unloaded do not differ by the weight of the "
             "payload, or are positions not in rad, or columns in another order than the joints? "
             f"{question}"
@@ -293,7 +307,9 @@ class EffectNotInstalled(EffectRefused):
         self.effect = effect
         self.axis = axis
         self.package = package
-        self.state = "not registered" if installed else "not installed"
+        self.state = "not installed"
+        if installed:
+            self.state = "not registered"
         self.subject = f"effect {effect!r} on {axis}"
         self.expected = f"{package}, which had it when the calibration was made"
         if other:
@@ -324,9 +340,7 @@ class EffectNotInstalled(EffectRefused):
 
 
 CORRECTION_UNCLEAR = "correction-unclear"
-"""Diagnosis of a description that is wrong, where the moves do not tell which of several
-corrections is right.
-"""
+"""Diagnosis of a wrong description, where the moves do not tell which correction is right."""
 GAIN_UNSEEN = "gain-unseen"  #: Diagnosis of a gain that the moves hardly show
 
 

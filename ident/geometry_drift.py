@@ -1,5 +1,4 @@
-"""Whether the geometry of a robot has changed since its calibration,
-by one run that the fit has not seen.
+"""Whether a robot's geometry has changed since its calibration, by one run it has not seen.
 
 An encoder that lost its zero, or a base that was moved, leaves a part of the prediction's error
 that is the derivative of the whole arm's torque (`ident.effects.geometry_corrections`). Friction
@@ -56,8 +55,7 @@ def geometry_drift(
     use: BoolArray,
     suspected: Collection[PlacedEffect] = (),
 ) -> GeometryDrift | None:
-    """Name the change of the geometry that explains the error of a prediction;
-    None where none does.
+    """Name the change of the geometry that explains the error of a prediction; None without one.
 
     Of several, it is the one that explains most.
 
@@ -77,41 +75,47 @@ def geometry_drift(
     corrections = corrections_of(calibration)
     # What has changed since is counted from the corrected gravity, not from the declared one.
     corrected = fitted_model(calibration, model)
-    model = replace(corrected, robot=replace(corrected.robot, declared_gravity_m_s2=None))
+    robot = replace(corrected.robot, declared_gravity_m_s2=None)
+    model = replace(corrected, robot=robot)
     slow = at_rows(corrected_dataset(data, corrections), conditioning)
-    move = data.move[np.searchsorted(data.time_s, slow.time_s).clip(0, len(data.move) - 1)]
-    standard = model.with_payload(
-        standard_parameters(calibration, model), payload_of(calibration, data)
-    )
+    nearest = np.searchsorted(data.time_s, slow.time_s)
+    move = data.move[nearest.clip(0, len(data.move) - 1)]
+    body = payload_of(calibration, data)
+    standard = model.with_payload(standard_parameters(calibration, model), body)
     gains = np.array([gain.value for gain in calibration.gains])
     signals = declared_signals(
         model, slow, standard, gains, calibration.session_began_s, inertia=False
     )
-    scale = np.array([_rms(row[used]) for row, used in zip(left_nm, use, strict=True)])
-    weight = np.where(use, 1.0 / np.maximum(scale, np.finfo(np.float64).tiny)[:, None], 0.0)
+    tiny = np.finfo(np.float64).tiny
+    error_nm = np.maximum(_rms_of_axes(left_nm, use), tiny)
+    weight = np.where(use, 1.0 / error_nm[:, None], 0.0)
     payload_nm = np.empty((0, *left_nm.shape))
     if data.payload is not None:
-        payload_nm = np.moveaxis(model.regressor(slow.motion())[:, model.flange], 1, 0)
+        regressor = model.regressor(slow.motion())
+        payload_nm = np.moveaxis(regressor[:, model.flange], 1, 0)
     # Of a closed chain the signals have the joints without a motor, too, behind those of the axes.
     velocity = signals.velocity_rad_s[: len(left_nm)]
     nuisance = _nuisance(signals.geared_torque_nm, velocity, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
     torque_nm = model.drive_train.direction.T @ signals.motor_torque_nm
     usual_nm = _usual_error_nm(calibration, torque_nm, use)
-    usual = float(np.sum((usual_nm[:, None] * weight) ** 2))
-    excess = float(np.sum(left**2)) - usual
+    weighted_usual = usual_nm[:, None] * weight
+    usual = float(np.sum(weighted_usual**2))
+    whole = float(np.sum(left**2))
+    excess = whole - usual
     best: GeometryDrift | None = None
     for placed in _candidates(model):
-        is_suspected = placed in suspected
-        if not is_suspected and not excess > 0.0:
-            continue  # the run is predicted as well as what was fitted
-        columns = _beyond(nuisance, placed.effect.columns(signals, placed.axis), weight)
-        if is_suspected:
+        least = max(LEAST_SHARE * excess, SMALLEST_SHARE * whole)
+        if placed in suspected:
             least = 0.0
-        else:
-            least = max(LEAST_SHARE * excess, SMALLEST_SHARE * float(np.sum(left**2)))
+        elif not excess > 0.0:
+            continue  # the run is predicted as well as what was fitted
+        columns_nm = placed.effect.columns(signals, placed.axis)
+        columns = _beyond(nuisance, columns_nm, weight)
         found = _fitted(placed, columns, left, move, excess, least)
-        if found is not None and (best is None or found.explained > best.explained):
+        if found is None:
+            continue
+        if best is None or found.explained > best.explained:
             best = found
     return best
 
@@ -131,34 +135,36 @@ def _nuisance(torque_nm: FloatArray, velocity: FloatArray, payload_nm: FloatArra
         velocity: of each axis, shape (m, r): friction and offset.
         payload_nm: columns of the mounted payload, shape (p, m, r); none without load.
     """
-    own = np.stack((torque_nm, velocity, np.sign(velocity), np.ones_like(velocity)))
-    each = []
-    for axis in range(len(velocity)):
-        for shape in own:
-            each.append(np.eye(len(velocity))[axis][:, None] * shape)
-    return np.concatenate((np.stack(each), payload_nm))
+    direction = np.sign(velocity)
+    constant = np.ones_like(velocity)
+    of_each_axis: list[FloatArray] = []
+    for axis_mask in np.eye(len(velocity)):
+        for signal in (torque_nm, velocity, direction, constant):
+            of_each_axis.append(axis_mask[:, None] * signal)
+    return np.concatenate((np.stack(of_each_axis), payload_nm))
 
 
 def _beyond(nuisance: FloatArray, columns: FloatArray, weight: FloatArray) -> FloatArray:
     """Weighted columns, shape (m, p, r), less what the nuisance explains of them."""
-    weighted = (nuisance * weight).reshape(len(nuisance), -1)
-    scale = np.linalg.norm(weighted, axis=1)
-    basis = weighted[scale > 0.0] / scale[scale > 0.0][:, None]
-    out = np.moveaxis(columns * weight[:, None], 1, 0)
-    flat = out.reshape(len(out), -1)
+    weighted_nuisance = (nuisance * weight).reshape(len(nuisance), -1)
+    size = np.linalg.norm(weighted_nuisance, axis=1)
+    is_seen = size > 0.0
+    basis = weighted_nuisance[is_seen] / size[is_seen][:, None]
+    weighted = np.moveaxis(columns * weight[:, None], 1, 0)
+    flat = weighted.reshape(len(weighted), -1)
     solution = np.linalg.lstsq(basis.T, flat.T, rcond=1e-9)[0]
-    return np.moveaxis((flat - solution.T @ basis).reshape(out.shape), 0, 1)
+    left = flat - solution.T @ basis
+    return np.moveaxis(left.reshape(weighted.shape), 0, 1)
 
 
 def _usual_error_nm(calibration: Calibration, torque_nm: FloatArray, use: BoolArray) -> FloatArray:
-    """Error that a calibration leaves of such torques if nothing has changed,
-    by the error of its fit, shape (m,).
+    """Error of such torques by the calibration's fit, if nothing has changed, shape (m,).
 
-    Not by the held-out run's: that may be the run that is judged.
+    Not by the held-out run: that may be the run that is judged.
     """
-    share = np.nan_to_num(np.array(calibration.relative_error_percent.axes)) / 100.0
-    size_nm = np.array([_rms(row[used]) for row, used in zip(torque_nm, use, strict=True)])
-    return np.asarray(share * size_nm)
+    error_percent = np.array(calibration.relative_error_percent.axes)
+    share = np.nan_to_num(error_percent) / 100.0
+    return np.asarray(share * _rms_of_axes(torque_nm, use))
 
 
 def _fitted(
@@ -179,31 +185,43 @@ def _fitted(
         excess: squared error beyond that of the fit.
         least: squared error that it must explain.
     """
+    # Normal equations: XᵀX over axes and rows, Xᵀe row by row
     gram = np.einsum("mpr,mqr->pq", columns, columns)
     score = np.einsum("mpr,mr->pr", columns, left)
-    if np.linalg.cond(gram) > 1e10 or not np.diag(gram).all():
+    has_columns = np.diag(gram).all()
+    if not has_columns or np.linalg.cond(gram) > 1e10:
         return None
     inverse = np.linalg.inv(gram)
     values = inverse @ score.sum(axis=1)
     rest = left - np.einsum("mpr,p->mr", columns, values)
-    by_row = np.einsum("mpr,mr->pr", columns, rest)
-    clusters = np.unique(move, return_inverse=True)[1]
-    by_move = np.stack([np.bincount(clusters, weights=row) for row in by_row], axis=1)
+    # σ by the scatter of the moves: (XᵀX)⁻¹ Σ_c s_c s_cᵀ (XᵀX)⁻¹, s_c the score of a move
+    rest_score = np.einsum("mpr,mr->pr", columns, rest)
+    _, cluster_of_row = np.unique(move, return_inverse=True)
+    by_parameter = [np.bincount(cluster_of_row, weights=row) for row in rest_score]
+    by_move = np.stack(by_parameter, axis=1)
     if len(by_move) < FEWEST_MOVES:
         return None
-    spread = by_move @ inverse
-    covariance = spread.T @ spread
+    shift_of_move = by_move @ inverse
+    covariance = shift_of_move.T @ shift_of_move
     wald = float(values @ np.linalg.pinv(covariance) @ values)
     whole = float(np.sum(left**2))
     explained = whole - float(np.sum(rest**2))
     if explained < least or wald < CERTAIN_SIGMAS**2:
         return None
-    bounds = zip(values, placed.effect.coefficients, strict=True)
-    if any(not column.least <= value <= column.largest for value, column in bounds):
-        return None
+    for value, column in zip(values, placed.effect.coefficients, strict=True):
+        if not column.least <= value <= column.largest:
+            return None
     share = min(1.0, explained / max(excess, explained))
-    return GeometryDrift(placed, values, np.sqrt(np.diag(covariance)), share, explained)
+    std = np.sqrt(np.diag(covariance))
+    return GeometryDrift(placed, values, std, share, explained)
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+def _rms_of_axes(values: FloatArray, use: BoolArray) -> FloatArray:
+    """Root mean square of each axis over the rows that count, shape (m,); 0 without any."""
+    rms: list[float] = []
+    for row, used in zip(values, use, strict=True):
+        size = 0.0
+        if used.any():
+            size = float(np.sqrt(np.mean(row[used] ** 2)))
+        rms.append(size)
+    return np.array(rms)

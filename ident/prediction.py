@@ -1,6 +1,4 @@
-"""Predict torques and currents of a motion with a calibration,
-without the rows that it was fitted to.
-"""
+"""Predict torques and currents of a motion with a calibration, without the rows of its fit."""
 
 from __future__ import annotations
 
@@ -15,6 +13,7 @@ from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Paramet
 from ident.data.dataset import Dataset
 from ident.effects.effect import (
     ALL_AXES,
+    Effect,
     PlacedEffect,
     at_joints,
     check_settings,
@@ -47,8 +46,7 @@ SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 @takes(calibration=Calibration, model=Model, data=Dataset)
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
-    """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq.
-    17) and the effects.
+    """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (eq. 17) and the effects.
 
     Where a motion goes far beyond those of the fit, the torque of an effect is limited
     (`AcceptedEffect.largest_torque`).
@@ -71,9 +69,8 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     corrections = corrections_of(calibration)
     model = fitted_model(calibration, model)
     data = corrected_dataset(data, corrections)
-    standard = model.with_payload(
-        standard_parameters(calibration, model), payload_of(calibration, data)
-    )
+    body = payload_of(calibration, data)
+    standard = model.with_payload(standard_parameters(calibration, model), body)
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
@@ -82,16 +79,17 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         if is_correction(placed):
             continue  # in the model already
         columns = columns_at(placed.effect, run, placed.axis)
-        at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
-        torque += _bounded(np.einsum("p,npk->nk", coefficients, at_all), accepted)
+        joint_columns = at_joints(placed.effect, placed.axis, columns, model.drive_train)
+        # τ_nk = Σ_p c_p φ_npk
+        of_effect = np.einsum("p,npk->nk", coefficients, joint_columns)
+        torque += _bounded(of_effect, accepted)
     if calibration.effects and model.is_redundant:
         torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
 
 
 def fitted_model(calibration: Calibration, model: Model) -> Model:
-    """The declared model with the corrections of a calibration,
-    with friction by payload where it has identified that.
+    """The declared model with a calibration's corrections, and friction by payload if it has it.
 
     Raises:
         EffectRefused: it holds an effect that does not exist.
@@ -114,27 +112,25 @@ def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
     for accepted in calibration.effects:
         placed, coefficients = placed_effect(accepted, calibration)
         if isinstance(placed.effect, GeometryEffect):
-            found.append(replace(placed, effect=placed.effect.with_applied(coefficients.tolist())))
+            applied = placed.effect.with_applied(coefficients.tolist())
+            found.append(replace(placed, effect=applied))
     return tuple(found)
 
 
 def left_of(placed: PlacedEffect, coefficients: FloatArray) -> tuple[PlacedEffect, FloatArray]:
-    """An effect and its coefficients beside a corrected model:
-    of a correction nothing is left, but its σ.
-    """
+    """An effect and its coefficients beside a corrected model: of a correction only its σ."""
     if not isinstance(placed.effect, GeometryEffect):
         return placed, coefficients
-    applied = replace(placed, effect=placed.effect.with_applied(coefficients.tolist()))
-    return applied, np.zeros_like(coefficients)
+    applied = placed.effect.with_applied(coefficients.tolist())
+    return replace(placed, effect=applied), np.zeros_like(coefficients)
 
 
 def _bounded(torque: FloatArray, accepted: AcceptedEffect) -> FloatArray:
-    """Limit the torque of an effect, shape (n, k), to EXTRAPOLATED times the largest that the fit
-    has seen of it.
-    """
+    """Limit an effect's torque, shape (n, k), to EXTRAPOLATED times the largest of the fit."""
     if accepted.largest_torque is None:
         return torque
-    limit = EXTRAPOLATED * np.array(accepted.largest_torque)[:, None]
+    largest = np.array(accepted.largest_torque)
+    limit = EXTRAPOLATED * largest[:, None]
     return np.clip(torque, -limit, limit)
 
 
@@ -148,15 +144,22 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
         current references [A] at full rate, shape (n_samples, n_axes).
     """
     torque = predict_torque(calibration, model, data)
-    return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
+    return _currents(calibration, model, torque)
+
+
+def _currents(calibration: Calibration, model: Model, torque: FloatArray) -> FloatArray:
+    """Currents (T τ)/g of joint torques, shape (k, m) each."""
+    motor_torque = torque @ model.drive_train.to_motor.T
+    return np.asarray(motor_torque / _gains(calibration, model))
 
 
 @takes(calibration=Calibration, model=Model, motion=Motion | None)
 def measured_torque(
     calibration: Calibration, model: Model, current_a: ArrayLike, motion: Motion | None = None
 ) -> FloatArray:
-    """Convert current references [A] to joint torque [Nm], Y = V g (eq.
-    4 through R), shape (n_samples, n_axes) each.
+    """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R).
+
+    Both have the shape (n_samples, n_axes).
 
     Args:
         calibration: with the gains.
@@ -182,25 +185,23 @@ def measured_torque(
 def measured_current(
     calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion
 ) -> FloatArray:
-    """Return the part of current references that `predict_current` predicts:
-    all, but for internal preload.
+    """Return the part of current references that is predicted: all but internal preload.
 
     Arguments and errors are those of `measured_torque`.
     """
     if not model.is_redundant:
         return np.asarray(current_a)
     torque = measured_torque(calibration, model, current_a, motion)
-    return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
+    return _currents(calibration, model, torque)
 
 
 def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
-    """Standard parameters χ_st that move as the identified base parameters do, without payload,
-    shape (c,).
+    """Standard parameters χ_st that move as the identified base parameters do, shape (c,).
 
-    A base parameter β gathers the columns that depend on its leading one (paper §2.1), W_st χ_st =
-    W β for every χ_st with this β; the simplest one holds β at the leading columns, which name the
-    base parameters, and zero elsewhere. What a payload adds to friction is left out where the model
-    has no friction by payload.
+    They are those without payload. A base parameter β gathers the columns that depend on its
+    leading one (paper §2.1), W_st χ_st = W β for every χ_st with this β; the simplest one holds β
+    at the leading columns, which name the base parameters, and zero elsewhere. What a payload adds
+    to friction is left out where the model has no friction by payload.
 
     Raises:
         ModelError: a parameter is none of this robot's, or groups with others as it does in no
@@ -208,28 +209,31 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
     """
     _gains(calibration, model)  # as many axes
     index = {column.name: number for number, column in enumerate(model.columns)}
-    of_effects = set()
+    of_effects: set[str] = set()
     for effect in calibration.effects:
         for coefficient in effect.coefficients:
             of_effects.add(coefficient.name)
     standard = np.zeros(len(index))
     names: list[str] = []
     for parameter in calibration.parameters:
-        if parameter.name in of_effects or ":" in parameter.name:
+        name = parameter.name
+        is_of_payload = ":" in name
+        if name in of_effects or is_of_payload:
             continue
         if parameter.is_payload_friction and not model.friction_by_payload:
             continue
-        if parameter.name.split():
-            leading = parameter.name.split()[0]
-        else:
-            leading = ""
+        leading = ""
+        words = name.split()
+        if words:
+            leading = words[0]
         if leading not in index:
+            existing = ", ".join(index)
             raise ModelError(
-                f"the calibration of cell {calibration.cell!r} has a parameter {parameter.name!r}; "
-                f"the model of {model.robot.joint_count} joints has {', '.join(index)}"
+                f"the calibration of cell {calibration.cell!r} has a parameter {name!r}; "
+                f"the model of {model.robot.joint_count} joints has {existing}"
             )
         standard[index[leading]] = parameter.value
-        names.append(parameter.name)
+        names.append(name)
     _require_same_robot(calibration, model, names)
     return standard
 
@@ -250,11 +254,13 @@ def _require_same_robot(calibration: Calibration, model: Model, names: Sequence[
 
 
 def mounted_parameters(calibration: Calibration, mounting: str) -> dict[str, Parameter]:
-    """Parameters that a calibration holds of the payload on a mounting,
-    by their names without the mounting.
-    """
-    split = ((*parameter.name.partition(":"), parameter) for parameter in calibration.parameters)
-    return {name: parameter for name, colon, of, parameter in split if colon and of == mounting}
+    """Parameters that a calibration has of a payload, by their names without its mounting."""
+    mounted: dict[str, Parameter] = {}
+    for parameter in calibration.parameters:
+        name, colon, own_mounting = parameter.name.partition(":")
+        if colon and own_mounting == mounting:
+            mounted[name] = parameter
+    return mounted
 
 
 def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -> Payload | None:
@@ -273,22 +279,25 @@ def as_calibrated(calibration: Calibration, payload: Payload | None, run: str) -
         return None
     _require_same_body(calibration, payload, run)
     own = mounted_parameters(calibration, payload.mounting)
+    weighed_kg = payload.known.get("m")
+    given_kg: float | None = None
     mass = own.get("m")
-    weighed = payload.known.get("m")
-    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
+    if mass is not None and mass.std == 0.0:
+        given_kg = mass.value
+    if given_kg is not None and weighed_kg is not None and weighed_kg != given_kg:
         raise DataUnfit(
             run,
-            f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has "
-            f"{mass.value:g} kg: give each way of mounting a name of its own",
+            f"carries {weighed_kg:g} kg on mounting {payload.mounting!r}; the calibration has "
+            f"{given_kg:g} kg: give each way of mounting a name of its own",
         )
-    return replace(
-        payload, known={name: value for name, value in payload.known.items() if name not in own}
-    )
+    known = {name: value for name, value in payload.known.items() if name not in own}
+    return replace(payload, known=known)
 
 
 def other_body(calibration: Calibration, payload: Payload) -> str:
-    """Say which payload a calibration knows on the mounting of another one;
-    empty where it knows none there, or the same by name.
+    """Say which payload a calibration knows on the mounting of another one.
+
+    It is empty where it knows none there, or the same by name.
 
     What it identified on a mounting, first moments and inertia, is that of one body.
 
@@ -329,8 +338,7 @@ def _require_same_body(calibration: Calibration, payload: Payload, run: str) -> 
 def placed_effect(
     accepted: AcceptedEffect, calibration: Calibration
 ) -> tuple[PlacedEffect, FloatArray]:
-    """The effect that a calibration names, on its axis or joint without a motor,
-    and its coefficients, shape (p,).
+    """The effect that a calibration names, where it acts, and its coefficients, shape (p,).
 
     Args:
         accepted: of the calibration.
@@ -340,74 +348,109 @@ def placed_effect(
         EffectNotInstalled: the package that had the effect is not installed.
         EffectRefused: no such effect, setting, axis or coefficient exists.
     """
-    places = calibration.places
-    known = known_effect(accepted.name, calibration.own_effects)
-    if known is None:
-        if accepted.package is not None:
-            raise EffectNotInstalled(
-                accepted.name,
-                accepted.axis,
-                accepted.package,
-                installed=installed_version(accepted.package),
-            )
-        raise EffectRefused(
-            f"there is no effect {accepted.name!r}; there are {', '.join(sorted(known_names()))}"
-        )
-    is_given = any(effect.name == accepted.name for effect in calibration.own_effects)
-    if accepted.package is not None and not is_given and not is_of_package(known, accepted.package):
-        other = package_of(known) or "drivegain"
-        raise EffectNotInstalled(accepted.name, accepted.axis, accepted.package, other=other)
-    everywhere = not known.has_axis and accepted.axis == ALL_AXES
-    if not everywhere and accepted.axis not in places:
-        raise EffectRefused(
-            f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are "
-            f"{', '.join(places)}"
-        )
-    axis = 0 if everywhere else places.index(accepted.axis)
-    if not known.has_axis and axis:
-        raise EffectRefused(
-            f"effect {accepted.name!r} acts on axis {accepted.axis!r}; it acts on {ALL_AXES}"
-        )
-    added = {name: 0.0 for name in known.added_settings if name not in accepted.settings}
-    own = accepted.settings
-    accepted = replace(accepted, settings={**accepted.settings, **added})
-    if set(accepted.settings) != set(known.settings):
-        found, exist = (", ".join(sorted(settings)) or "none" for settings in (own, known.settings))
-        raise EffectRefused(
-            f"effect {accepted.name!r} is given the settings {found}; it has {exist}"
-        )
-    check_settings(known, accepted.settings, axis, len(calibration.gains))
+    known = _known_effect(accepted, calibration)
+    axis = _axis_of(accepted, known, calibration.places)
+    settings = _settings_of(accepted, known)
+    check_settings(known, settings, axis, len(calibration.gains))
     # A file knows one kind of number; an order must be whole.
-    given = {name: setting_kind(known, name)(value) for name, value in accepted.settings.items()}
-    if given != accepted.settings:
+    typed = {name: setting_kind(known, name)(value) for name, value in settings.items()}
+    if typed != settings:
         raise EffectRefused(
-            f"effect {accepted.name!r} is given {accepted.settings}; these must be whole numbers"
+            f"effect {accepted.name!r} is given {settings}; these must be whole numbers"
         )
-    placed = PlacedEffect(known.with_settings(given), axis)
+    placed = PlacedEffect(known.with_settings(typed), axis)
+    return placed, _coefficients_of(accepted, placed)
+
+
+def _known_effect(accepted: AcceptedEffect, calibration: Calibration) -> Effect:
+    """A member of the family that a calibration names.
+
+    Raises:
+        EffectNotInstalled: the package that had the effect is not installed.
+        EffectRefused: there is no such effect.
+    """
+    name = accepted.name
+    package = accepted.package
+    known = known_effect(name, calibration.own_effects)
+    if known is None:
+        if package is None:
+            existing = ", ".join(sorted(known_names()))
+            raise EffectRefused(f"there is no effect {name!r}; there are {existing}")
+        installed = installed_version(package)
+        raise EffectNotInstalled(name, accepted.axis, package, installed=installed)
+    is_given = any(effect.name == name for effect in calibration.own_effects)
+    if package is not None and not is_given and not is_of_package(known, package):
+        other = package_of(known) or "drivegain"
+        raise EffectNotInstalled(name, accepted.axis, package, other=other)
+    return known
+
+
+def _axis_of(accepted: AcceptedEffect, known: Effect, places: Sequence[str]) -> int:
+    """Index of the place that an effect acts on; 0 of one that acts on all axes alike.
+
+    Raises:
+        EffectRefused: there is no such place, or an effect on all axes is given one of them.
+    """
+    if not known.has_axis and accepted.axis == ALL_AXES:
+        return 0
+    found = f"effect {accepted.name!r} acts on axis {accepted.axis!r}"
+    if accepted.axis not in places:
+        existing = ", ".join(places)
+        raise EffectRefused(f"{found}; there are {existing}")
+    axis = places.index(accepted.axis)
+    if not known.has_axis and axis:
+        raise EffectRefused(f"{found}; it acts on {ALL_AXES}")
+    return axis
+
+
+def _settings_of(accepted: AcceptedEffect, known: Effect) -> dict[str, float]:
+    """Settings of an effect; those that a later version added are 0.
+
+    Raises:
+        EffectRefused: others are missing, or do not exist.
+    """
+    settings = dict(accepted.settings)
+    for name in known.added_settings:
+        settings.setdefault(name, 0.0)
+    if set(settings) != set(known.settings):
+        found = ", ".join(sorted(accepted.settings)) or "none"
+        existing = ", ".join(sorted(known.settings)) or "none"
+        raise EffectRefused(
+            f"effect {accepted.name!r} is given the settings {found}; it has {existing}"
+        )
+    return settings
+
+
+def _coefficients_of(accepted: AcceptedEffect, placed: PlacedEffect) -> FloatArray:
+    """Coefficients of an effect in the order of its columns, shape (p,).
+
+    Raises:
+        EffectRefused: some are missing, or do not exist.
+    """
+    needed = [column.name for column in placed.columns]
+    given = [coefficient.name for coefficient in accepted.coefficients]
+    if sorted(given) != sorted(needed):
+        found = ", ".join(given) or "none"
+        expected = ", ".join(needed)
+        raise EffectRefused(
+            f"effect {accepted.name!r} has the coefficients {found}; it needs {expected}"
+        )
     values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
-    expected = tuple(column.name for column in placed.columns)
-    if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
-        found = ", ".join(coefficient.name for coefficient in accepted.coefficients) or "none"
-        raise EffectRefused(
-            f"effect {accepted.name!r} has the coefficients {found}; it needs {', '.join(expected)}"
-        )
-    return placed, np.array([values[name] for name in expected])
+    return np.array([values[name] for name in needed])
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
     count = model.robot.axis_count
-    if len(calibration.gains) != count:
-        raise ModelError(
-            f"the calibration has {len(calibration.gains)} gains, the model {count} joints"
-        )
-    return np.array([gain.value for gain in calibration.gains])
+    gains = [gain.value for gain in calibration.gains]
+    if len(gains) != count:
+        raise ModelError(f"the calibration has {len(gains)} gains, the model {count} joints")
+    return np.array(gains)
 
 
 def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
-    """χ_L of what a run carries: from the run, and what the calibration has identified of its
-    mounting, shape (10,).
+    """χ_L of what a run carries, by the run and the calibration, shape (10,).
 
-    None without load.
+    The calibration has what it has identified of the payload's mounting. None without load.
 
     Raises:
         DataUnfit: the calibration does not know the mounting, knows another payload on it, or knows
@@ -417,32 +460,42 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
     if payload is None:
         return None
     _require_same_body(calibration, payload, data.name)
-    mountings = {
-        name.partition(":")[2]
-        for name in (one.name for one in calibration.parameters)
-        if ":" in name
-    }
+    mountings: set[str] = set()
+    for parameter in calibration.parameters:
+        _, colon, mounting = parameter.name.partition(":")
+        if colon:
+            mountings.add(mounting)
     own = mounted_parameters(calibration, payload.mounting)
     identified = {name: parameter.value for name, parameter in own.items()}
     _check_mounting(payload, identified, mountings, data.name)
-    masses_kg = {source.mass_kg for source in calibration.sources if source.payload == payload.name}
-    mass_kg = payload.known.get("m")
+    if identified:
+        _require_same_mass(calibration, payload, data.name)
+    return payload_parameters(payload, identified)
+
+
+def _require_same_mass(calibration: Calibration, payload: Payload, run: str) -> None:
+    """Refuse another mass than that of the fit.
+
+    What was identified beside one mass, first moments and inertia, is not that of a body of another
+    mass.
+
+    Raises:
+        DataUnfit: the payload has another mass.
+    """
+    own_sources = [source for source in calibration.sources if source.payload == payload.name]
+    masses_kg = {source.mass_kg for source in own_sources}
     fitted_kg = next(iter(masses_kg - {None}), None)
-    # What was identified beside one mass, first moments and inertia, is not that of a body of
-    # another mass.
-    if (
-        identified
-        and mass_kg is not None
-        and fitted_kg
-        and not abs(mass_kg / fitted_kg - 1.0) <= SAME_MASS
-    ):
+    mass_kg = payload.known.get("m")
+    if mass_kg is None or not fitted_kg:
+        return
+    difference = abs(mass_kg / fitted_kg - 1.0)
+    if not difference <= SAME_MASS:
         raise DataUnfit(
-            data.name,
+            run,
             f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {fitted_kg:g} kg as in the "
             f"fit: the calibration holds the rest of its inertia on mounting {payload.mounting!r}; "
             "give another body another mounting",
         )
-    return payload_parameters(payload, identified)
 
 
 def _check_mounting(
@@ -454,10 +507,10 @@ def _check_mounting(
         raise DataUnfit(
             run, f"carries {mounting}, of which the calibration knows nothing; it knows {known}"
         )
-    both = sorted(set(identified) & set(payload.known))
+    both = ", ".join(sorted(set(identified) & set(payload.known)))
     if both:
         same = "the calibration identified the same: give each way of mounting a name of its own"
-        raise DataUnfit(run, f"declares {', '.join(both)} of {mounting}, and {same}")
-    foreign = sorted(set(identified) - set(LINK_PARAMETERS))
+        raise DataUnfit(run, f"declares {both} of {mounting}, and {same}")
+    foreign = ", ".join(sorted(set(identified) - set(LINK_PARAMETERS)))
     if foreign:
-        raise DataUnfit(run, f"{mounting} has parameters that no payload has: {', '.join(foreign)}")
+        raise DataUnfit(run, f"{mounting} has parameters that no payload has: {foreign}")

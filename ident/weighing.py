@@ -1,5 +1,4 @@
-"""Weigh the body on the flange with a calibration:
-mass, centre of mass and inertia, each with its σ.
+"""Weigh the body on the flange with a calibration: mass, centre and inertia, each with its σ.
 
 With the gains g held, the ten parameters p of the body (paper §2.4) are the least-squares solution
 of the motors' equations, rows divided by the deviation σ_i of motor i's residual,
@@ -61,9 +60,7 @@ FRICTION = ("fv", "fs")  #: First letters of friction's columns, of joints and o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowsToWeigh:
-    """Rows of runs without load, then of runs with the body;
-    they serve any calibration of the robot.
-    """
+    """Rows of runs without load, then of runs with the body, for any calibration of the robot."""
 
     model: Model  #: the declared model
     datasets: tuple[Dataset, ...]  #: the runs, without load first
@@ -93,9 +90,7 @@ class Scale:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeighedBody:
-    """A body on the flange; parameters are in its joint's frame and in the order of
-    LINK_PARAMETERS.
-    """
+    """A body on the flange; parameters in its joint's frame, in the order of LINK_PARAMETERS."""
 
     values: FloatArray  #: NaN for a parameter that the motion does not show, shape (10,) [SI]
     #: From leaving out moves, the calibration taken as exact; NaN likewise, shape (10, 10).
@@ -131,9 +126,7 @@ class WeighedBody:
 
     @property
     def mass_reference_std_kg(self) -> float:
-        """Share of σ of m that is the tolerance of the reference masses [kg];
-        0 where none is declared.
-        """
+        """Share of σ of m from the tolerance of the reference masses [kg]; 0 without any."""
         return float(np.sqrt(self.reference_covariance[-1, -1]))
 
     @property
@@ -143,19 +136,22 @@ class WeighedBody:
 
     def centre_in(self, frame: Place) -> tuple[FloatArray, FloatArray]:
         """Centre of mass in a frame that is fixed to that joint, and its σ [m], shape (3,) each."""
-        turned = frame.rotation.T
+        to_frame = frame.rotation.T
         # A coordinate that is not shown spoils those of the frame that depend on it, and no others.
-        used = np.abs(turned) > 1e-12
-        return self._derived(
-            lambda body: np.where(used, turned * (_centre(body) - frame.translation_m), 0.0).sum(
-                axis=1
-            )
-        )
+        depends = np.abs(to_frame) > 1e-12
+
+        def centre_in_frame(body: FloatArray) -> FloatArray:
+            from_origin = _centre(body) - frame.translation_m
+            terms = np.where(depends, to_frame * from_origin, 0.0)
+            return np.asarray(terms.sum(axis=1))
+
+        return self._derived(centre_in_frame)
 
     @property
     def inertia_kg_m2(self) -> tuple[FloatArray, FloatArray]:
-        """Inertia about the centre of mass (Ixx, Ixy, Ixz, Iyy, Iyz, Izz) and its σ [kg m²],
-        shape (6,) each.
+        """Inertia about the centre of mass and its σ [kg m²], shape (6,) each.
+
+        In the order Ixx, Ixy, Ixz, Iyy, Iyz, Izz.
         """
         return self._derived(_about_centre)
 
@@ -170,15 +166,17 @@ class WeighedBody:
         if np.isfinite(self.mass_kg):
             mass = max(abs(self.mass_kg) - 2.0 * self.mass_std_kg, 0.0)
         side = side_of_cube(mass)
-        return np.array([mass * side**2] * 6 + [mass * side] * 3 + [mass])
+        inertias = np.full(6, mass * side**2)
+        moments = np.full(3, mass * side)
+        return np.concatenate((inertias, moments, [mass]))
 
     @property
     def identifiable(self) -> BoolArray:
-        """Parameters known to KNOWN of their value, or to less than what a compact body of this
-        mass has, shape (10,).
+        """Parameters known to KNOWN of their value, or to that of a compact body, shape (10,).
 
-        The second counts for a parameter near zero, the first for one with a long lever, such as
-        Izz about a far joint. The mass itself has the first alone.
+        The second, what a compact body of this mass has, counts for a parameter near zero; the
+        first for one with a long lever, such as Izz about a far joint. The mass itself has the
+        first alone.
         """
         std = np.nan_to_num(self.std, nan=np.inf)
         is_known = std <= KNOWN * np.abs(np.nan_to_num(self.values))
@@ -192,23 +190,35 @@ class WeighedBody:
         with np.errstate(invalid="ignore"):  # NaN is what depends on a parameter that is not shown
             value = quantity(self.values)
             # Complex steps differentiate polynomials and quotients exactly.
-            slope = np.stack(
-                [quantity(self.values + step).imag / 1e-20 for step in 1e-20j * np.eye(10)], axis=1
-            )
+            slopes: list[FloatArray] = []
+            for step in 1e-20j * np.eye(10):
+                stepped = quantity(self.values + step)
+                slopes.append(stepped.imag / 1e-20)
         shown = np.isfinite(self.values)
-        used = slope[:, shown]
-        std = np.sqrt(np.einsum("ij,jk,ik->i", used, self.covariance[np.ix_(shown, shown)], used))
+        slope = np.stack(slopes, axis=1)[:, shown]
+        covariance = self.covariance[np.ix_(shown, shown)]
+        # σ_i² = Σ_jk s_ij C_jk s_ik
+        variance = np.einsum("ij,jk,ik->i", slope, covariance, slope)
+        std = np.sqrt(variance)
         return value, np.where(np.isfinite(value), std, np.nan)
 
 
 def _centre(body: FloatArray) -> FloatArray:
-    return np.asarray(body[6:9] / body[9])
+    first_moments = body[6:9]
+    mass = body[9]
+    return np.asarray(first_moments / mass)
 
 
 def _about_centre(body: FloatArray) -> FloatArray:
+    # I − (‖c‖² 1 − c cᵀ)/m, c the first moments
+    inertia = body[:6]
     x, y, z = body[6:9]
-    steiner = np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
-    return np.asarray(body[:6] - steiner / body[9])
+    mass = body[9]
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    steiner = np.array([yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy])
+    return np.asarray(inertia - steiner / mass)
 
 
 @takes(
@@ -241,8 +251,10 @@ def weigh(
         TooFewMoves: σ needs more moves.
         ModelError, EffectRefused: the calibration is of another robot, or holds an unknown effect.
     """
-    conditioning = conditioning or calibration.conditioning
-    return weigh_rows(calibration, rows_to_weigh(model, loaded, conditioning, bare=bare))
+    if conditioning is None:
+        conditioning = calibration.conditioning
+    rows = rows_to_weigh(model, loaded, conditioning, bare=bare)
+    return weigh_rows(calibration, rows)
 
 
 def rows_to_weigh(
@@ -260,7 +272,8 @@ def rows_to_weigh(
             require_kind(
                 "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
             )
-            made.append(differentiate(replace(run, payload=None), model.drive_train, conditioning))
+            without_payload = replace(run, payload=None)
+            made.append(differentiate(without_payload, model.drive_train, conditioning))
         return made
 
     without = prepared(bare)
@@ -279,14 +292,13 @@ def _rows_of(
     if model.friction_by_payload:
         # What the runs say of their payload is ignored, but their friction is that of a loaded arm.
         regressor = rows.regressor.copy()
-        regressor[:, model.loaded_friction_columns] = (
-            regressor[:, model.friction_columns] * is_mounted
-        )
+        friction = regressor[:, model.friction_columns]
+        regressor[:, model.loaded_friction_columns] = friction * is_mounted
         rows = replace(rows, regressor=regressor)
-    body = tuple(
-        Column(f"{name}:body", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)
-    )
-    rows = rows.extended(body, rows.flange * is_mounted)
+    body: list[Column] = []
+    for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True):
+        body.append(Column(f"{name}:body", unit))
+    rows = rows.extended(tuple(body), rows.flange * is_mounted)
     return RowsToWeigh(model, datasets, bare, rows)
 
 
@@ -301,9 +313,7 @@ def _corrected(given: RowsToWeigh, corrections: tuple[PlacedEffect, ...]) -> Row
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CalibratedValues:
-    """What a calibration says of the robot, in the order of the columns that a body is weighed
-    with.
-    """
+    """What a calibration says of the robot, in the order of the columns of the weighing."""
 
     model: Model  #: with the calibration's corrections of the geometry
     gains: FloatArray  #: shape (m,)
@@ -327,14 +337,15 @@ class _CalibratedValues:
     @property
     def effects_depend_on_body(self) -> bool:
         """Whether the columns of an effect are built from the torques that the model predicts."""
-        return not all(placed.effect.abscissa.is_independent_of_model for placed in self.effects)
+        abscissas = [placed.effect.abscissa for placed in self.effects]
+        return not all(abscissa.is_independent_of_model for abscissa in abscissas)
 
     def signals(self, datasets: Sequence[Dataset], body: FloatArray | None) -> list[Signals]:
         """Signals that the effects are built from, one for each run; none without effects."""
         if not self.effects:
             return []
         parameters = self.model.with_payload(self.standard, body)
-        made = []
+        made: list[Signals] = []
         for data in datasets:
             of_robot = declared_signals(
                 self.model, data, parameters, self.gains, self.session_began_s
@@ -384,50 +395,56 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
     has_moved = system.motors.rows > 0
     # A motor that never moved is as noisy as the others, should further moves need it.
     weight[~has_moved] = np.median(np.abs(weight[has_moved]))
-    whitened = system.currents.whitened(gains, 1.0 / (gains * weight))
+    noise = 1.0 / (gains * weight)
+    whitened = system.currents.whitened(gains, noise)
     columns = whitened.linear
 
     # ∂p/∂(g, fixed parameters): each moves the body by what it moves the right-hand side.
-    right_hand_sides = np.concatenate((whitened.drive, -columns[:, list(solution.fixed)]), axis=1)
-    free_slope = solve(columns[:, list(free)], right_hand_sides)[0]
-    slope = np.zeros((10, motor_count + len(solution.fixed)))
+    fixed = list(solution.fixed)
+    of_fixed = columns[:, fixed]
+    right_hand_sides = np.concatenate((whitened.drive, -of_fixed), axis=1)
+    free_slope, _ = solve(columns[:, list(free)], right_hand_sides)
+    slope = np.zeros((10, motor_count + len(fixed)))
     slope[is_shown] = free_slope[is_of_body]
-    fixed_names = [solution.rows.columns[index].name for index in solution.fixed]
+    fixed_names = [solution.rows.columns[index].name for index in fixed]
     of_calibration = _of_calibration(calibration, gains, slope, fixed_names)
     of_reference = _of_reference_mass(calibration, body, slope, fixed_names)
 
     is_separate = is_shown & ~np.isin(ten, solution.blurred)
     nan_where_unseen = np.where(is_separate, 0.0, np.nan)
     nan_pairs = nan_where_unseen + nan_where_unseen[:, None]
+    covariance = of_moves + of_calibration + of_reference
     unknown_columns = columns[:, solution.unknowns]
+    scale = Scale(
+        model=given.model,
+        unknowns=solution.unknowns,
+        weight=weight,
+        information=unknown_columns.T @ unknown_columns,
+        beside_bare_runs=given.bare > 0,
+    )
     return WeighedBody(
         values=body + nan_where_unseen,
         moves_covariance=of_moves + nan_pairs,
-        covariance=of_moves + of_calibration + of_reference + nan_pairs,
+        covariance=covariance + nan_pairs,
         complete=calibration.covariance_factor is not None,
         moves=len(system.clusters),
         error=_error_with_body(solution, given.loaded, gains),
-        scale=Scale(
-            model=given.model,
-            unknowns=solution.unknowns,
-            weight=weight,
-            information=unknown_columns.T @ unknown_columns,
-            beside_bare_runs=given.bare > 0,
-        ),
+        scale=scale,
         reference_covariance=of_reference + nan_pairs,
     )
 
 
 def _robot_of(calibration: Calibration, model: Model) -> _CalibratedValues:
-    effects = []
-    coefficients = []
+    effects: list[PlacedEffect] = []
+    coefficients: list[FloatArray] = []
     for accepted in calibration.effects:
         placed, values = left_of(*placed_effect(accepted, calibration))
         effects.append(placed)
         coefficients.append(values)
+    gains = [gain.value for gain in calibration.gains]
     return _CalibratedValues(
         model=model,
-        gains=np.array([gain.value for gain in calibration.gains]),
+        gains=np.array(gains),
         standard=standard_parameters(calibration, model),
         effects=tuple(effects),
         coefficients=tuple(coefficients),
@@ -440,7 +457,9 @@ def _solved(robot: _CalibratedValues, given: RowsToWeigh) -> _WeighingSolution:
     without_body = given.datasets[: given.bare]
     with_body = given.datasets[given.bare :]
     bare_signals = robot.signals(without_body, None)
-    passes = MAX_PASSES if robot.effects_depend_on_body else 1
+    passes = 1
+    if robot.effects_depend_on_body:
+        passes = MAX_PASSES
     body = np.zeros(10)
     for _ in range(passes):
         signals = (*bare_signals, *robot.signals(with_body, body))
@@ -465,11 +484,13 @@ def _solved_with(
         rows = rows.extended(placed.columns, torque)
     system = rows.system()
     values = robot.values
+    has_bare_runs = given.bare > 0
     unknowns, free, blurred = _unknowns(
-        system, robot.body_columns, robot.model, beside_bare_runs=given.bare > 0
+        system, robot.body_columns, robot.model, beside_bare_runs=has_bare_runs
     )
     fixed = tuple(index for index in range(len(values)) if index not in free)
-    free_system = system.holding({index: float(values[index]) for index in fixed})
+    fixed_values = {index: float(values[index]) for index in fixed}
+    free_system = system.holding(fixed_values)
     parameters, noise = free_system.currents.settled(robot.gains, len(free))
     values[list(free)] = parameters
     return _WeighingSolution(
@@ -501,24 +522,27 @@ def _error_with_body(
 def _unknowns(
     system: System, ten: IntArray, model: Model, *, beside_bare_runs: bool
 ) -> tuple[IntArray, tuple[int, ...], tuple[int, ...]]:
-    """Columns of the unknowns; those that are independent;
-    those of the body that gather others of its parameters.
+    """Find the columns that a body is weighed by.
+
+    Returns:
+        those of the unknowns; the independent ones among them; those of the body that gather others
+        of its parameters.
     """
     names = [column.name for column in system.columns]
     robot = [index for index in range(len(names)) if index not in ten]
     if not beside_bare_runs:
-        robot = [
-            index for index in robot[: len(model.columns)] if names[index].startswith(FRICTION)
-        ]
-    order = np.array([*robot, *ten])
-    columns = np.concatenate(
-        [factor[:, system.axis_count : -1] for factor in system.joints.factors]
-    )[:, order]
-    base = base_parameters(columns, tuple(names[index] for index in order))
-    free = order[list(base.independent)]
-    regrouped = np.setdiff1d(np.arange(len(order)), base.independent)
-    blurred = np.any(base.grouping[:, regrouped] != 0.0, axis=1)
-    return order, tuple(sorted(free.tolist())), tuple(free[blurred & np.isin(free, ten)].tolist())
+        declared = robot[: len(model.columns)]
+        robot = [index for index in declared if names[index].startswith(FRICTION)]
+    unknowns = np.array([*robot, *ten])
+    parts = [factor[:, system.axis_count : -1] for factor in system.joints.factors]
+    columns = np.concatenate(parts)[:, unknowns]
+    base = base_parameters(columns, tuple(names[index] for index in unknowns))
+    free = unknowns[list(base.independent)]
+    every = np.arange(len(unknowns))
+    dependent = np.setdiff1d(every, base.independent)
+    gathers_others = np.any(base.grouping[:, dependent] != 0.0, axis=1)
+    blurred = free[gathers_others & np.isin(free, ten)]
+    return unknowns, tuple(sorted(free.tolist())), tuple(blurred.tolist())
 
 
 def _of_calibration(
@@ -535,8 +559,10 @@ def _of_calibration(
     count = len(gains)
     covariance = calibration.covariance
     if covariance is None:
-        size = np.abs(slope[:, :count]) @ [gain.std for gain in calibration.gains]
-        together = np.sign(slope[:, :count] @ gains) * size
+        to_gains = slope[:, :count]
+        gains_std = [gain.std for gain in calibration.gains]
+        size = np.abs(to_gains) @ gains_std
+        together = np.sign(to_gains @ gains) * size
         return np.outer(together, together)
     used = _slope_to_calibration(calibration, slope, held)
     return np.asarray(used @ covariance @ used.T)
@@ -545,15 +571,14 @@ def _of_calibration(
 def _slope_to_calibration(
     calibration: Calibration, slope: FloatArray, held: Sequence[str]
 ) -> FloatArray:
-    """∂p/∂(gains, parameters of the calibration), shape (10, n + p),
-    from that to gains and held columns.
-    """
+    """∂p/∂(gains, parameters of the calibration) from that to held columns, shape (10, n + p)."""
     count = len(calibration.gains)
-    place = {name: count + index for index, name in enumerate(held)}
+    columns = {name: column for column, name in enumerate(held, start=count)}
     used = np.zeros((len(slope), count + len(calibration.parameters)))
     used[:, :count] = slope[:, :count]
     for index, parameter in enumerate(calibration.parameters, start=count):
-        column = place.get(parameter.name, place.get(parameter.name.split()[0]))
+        leading_name, *_ = parameter.name.split()
+        column = columns.get(parameter.name, columns.get(leading_name))
         if column is not None:
             used[:, index] = slope[:, column]
     return used
@@ -562,8 +587,7 @@ def _slope_to_calibration(
 def _of_reference_mass(
     calibration: Calibration, body: FloatArray, slope: FloatArray, held: Sequence[str]
 ) -> FloatArray:
-    """Covariance of the ten that comes from the tolerance of the calibration's reference masses,
-    shape (10, 10).
+    """Covariance of the ten from the tolerance of the reference masses, shape (10, 10).
 
     Args:
         calibration: with the derivatives of its gains and parameters to these masses. Without those
@@ -573,19 +597,21 @@ def _of_reference_mass(
         slope: ∂p/∂(g, held parameters), shape (10, n + h).
         held: names of the columns held.
     """
-    out = np.zeros((len(slope), len(slope)))
+    count = len(slope)
+    covariance = np.zeros((count, count))
     used = _slope_to_calibration(calibration, slope, held)
     for reference in calibration.payload_mass:
         if reference.tolerance_kg == 0.0:
             continue
         if len(reference.parameters_per_kg) == len(calibration.parameters):
             gains_per_kg = [gain.per_kg for gain in reference.gains]
-            shift = used @ np.concatenate((gains_per_kg, reference.parameters_per_kg))
+            per_kg = np.concatenate((gains_per_kg, reference.parameters_per_kg))
+            body_per_kg = used @ per_kg
         else:
-            shift = body / reference.mass_kg
-        shift = reference.tolerance_kg * shift
-        out += np.outer(shift, shift)
-    return out
+            body_per_kg = body / reference.mass_kg
+        shift = reference.tolerance_kg * body_per_kg
+        covariance += np.outer(shift, shift)
+    return covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -609,48 +635,57 @@ def moves_that_help(weighed: WeighedBody, extras: Sequence[ExtraMoves]) -> tuple
     Returns:
         an entry for each parameter that some of them bring to WORTH of its σ or less.
     """
+    if not extras:
+        return ()
     scale = weighed.scale
-    place = np.arange(len(scale.unknowns) - 10, len(scale.unknowns))
-    shown = np.sqrt(np.diag(weighed.moves_covariance))
-    alone = _std(scale.information, place)
+    unknown_count = len(scale.unknowns)
+    ten = np.arange(unknown_count - 10, unknown_count)
+    std = np.sqrt(np.diag(weighed.moves_covariance))
+    std_by_rows = _std(scale.information, ten)
     # Rows are correlated, and moves scatter more than rows say: the prediction is of the ratio.
-    usable = np.isfinite(shown) & np.isfinite(alone)
-    if usable.any():
-        factor = float(np.median((shown / alone)[usable]))
-    else:
-        factor = 1.0
-    after = [
-        (extra, factor * _std(scale.information + _information(scale, extra), place))
-        for extra in extras
-    ]
-    found = []
-    for index in np.flatnonzero(~weighed.identifiable):
-        extra, std = min(after, key=lambda one: float(one[1][index]), default=(None, shown))
-        if extra is not None and std[index] <= WORTH * np.nan_to_num(
-            shown[index], nan=np.finfo(np.float64).max
-        ):
-            found.append(
-                Help(LINK_PARAMETERS[index], extra.words, extra.seconds, float(std[index]))
-            )
+    factor = 1.0
+    is_usable = np.isfinite(std) & np.isfinite(std_by_rows)
+    if is_usable.any():
+        ratio = std / std_by_rows
+        factor = float(np.median(ratio[is_usable]))
+    predicted: list[FloatArray] = []
+    for extra in extras:
+        information = scale.information + _information(scale, extra)
+        predicted.append(factor * _std(information, ten))
+    std_with_extra = np.stack(predicted)  # of each extra and parameter
+    largest_std = WORTH * np.nan_to_num(std, nan=np.finfo(np.float64).max)
+    found: list[Help] = []
+    for index in np.flatnonzero(~weighed.identifiable).tolist():
+        best = int(np.argmin(std_with_extra[:, index]))
+        best_std = float(std_with_extra[best, index])
+        if best_std <= largest_std[index]:
+            extra = extras[best]
+            found.append(Help(LINK_PARAMETERS[index], extra.words, extra.seconds, best_std))
     return tuple(found)
 
 
 def _information(scale: Scale, extra: ExtraMoves) -> FloatArray:
     """JᵀJ of moves with the body, and of the same without load where the robot is unknown too."""
-    columns = scale.model.regressor(extra.excitation.motion, loaded=True)
-    count = columns.shape[1]
-    columns = np.concatenate((columns, columns[:, scale.model.flange]), axis=1)
-    motors = np.tensordot(scale.model.drive_train.to_motor * scale.weight[:, None], columns, axes=1)
-    motors *= extra.excitation.use[:, None, :]
-    rows = np.zeros((motors.shape[0] * motors.shape[2], len(scale.unknowns)))
-    inside = scale.unknowns < columns.shape[1]  # effects come after; their torque is small
-    rows[:, inside] = motors[:, scale.unknowns[inside]].transpose(0, 2, 1).reshape(len(rows), -1)
+    model = scale.model
+    unknowns = scale.unknowns
+    of_robot = model.regressor(extra.excitation.motion, loaded=True)
+    of_body = of_robot[:, model.flange]
+    columns = np.concatenate((of_robot, of_body), axis=1)
+    # A_icr = w_i Σ_j T_ij W_jcr
+    weighted_to_motor = model.drive_train.to_motor * scale.weight[:, None]
+    by_motor = np.tensordot(weighted_to_motor, columns, axes=1)
+    by_motor *= extra.excitation.use[:, None, :]
+    motors, column_count, samples = by_motor.shape
+    row_count = motors * samples
+    is_known = unknowns < column_count  # effects come after; their torque is small
+    known = by_motor[:, unknowns[is_known]]
+    rows = np.zeros((row_count, len(unknowns)))
+    rows[:, is_known] = known.transpose(0, 2, 1).reshape(row_count, -1)
     information = rows.T @ rows
     if scale.beside_bare_runs:
-        of_body = (scale.unknowns >= count) | np.isin(
-            scale.unknowns, scale.model.loaded_friction_columns
-        )
-        rows[:, of_body] = 0.0
+        is_of_body = unknowns >= of_robot.shape[1]
+        is_of_load = np.isin(unknowns, model.loaded_friction_columns)
+        rows[:, is_of_body | is_of_load] = 0.0
         information += rows.T @ rows
     return information
 
@@ -659,8 +694,13 @@ def _std(information: FloatArray, wanted: IntArray) -> FloatArray:
     """σ of some unknowns; inf for one that the information does not fix."""
     unit = np.sqrt(np.diag(information))
     # Rounding, which scaled up would look like information
-    unit[unit <= UNSEEN * unit.max()] = np.inf
+    is_rounding = unit <= UNSEEN * unit.max()
+    unit[is_rounding] = np.inf
     values, vectors = np.linalg.eigh(information / np.outer(unit, unit))
-    seen = values > UNSEEN * values[-1]
-    std = np.sqrt((vectors[wanted][:, seen] ** 2) @ (1.0 / values[seen])) / unit[wanted]
-    return np.where((vectors[wanted][:, ~seen] ** 2).sum(axis=1) > 1e-6, np.inf, std)
+    is_seen = values > UNSEEN * values[-1]
+    # σ_i² = Σ_k v_ik²/λ_k over the directions that are seen
+    shares = vectors[wanted] ** 2
+    variance = shares[:, is_seen] @ (1.0 / values[is_seen])
+    std = np.sqrt(variance) / unit[wanted]
+    unseen_share = shares[:, ~is_seen].sum(axis=1)
+    return np.where(unseen_share > 1e-6, np.inf, std)

@@ -44,9 +44,7 @@ class GearSide(Enum):
 
 
 class Property(Enum):
-    """Property that an effect declares of its columns;
-    one test tries to refute it for every entry of EFFECTS.
-    """
+    """Property that an effect declares of its columns; a test tries to refute it for each."""
 
     ODD_IN_VELOCITY = "turns its sign when the motion is reversed in place"
     EVEN_IN_VELOCITY = "keeps its value when the motion is reversed in place"
@@ -72,9 +70,7 @@ class Reported(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Values that a searched parameter can have:
-    far beyond what a search tries, short of an overflow.
-    """
+    """Values that a searched parameter can have: far beyond what a search tries."""
 
     least: float
     largest: float
@@ -88,8 +84,7 @@ AxisNumber = Annotated[int, Range(0, math.inf)]
 
 @dataclass(frozen=True, slots=True)
 class Effect(ABC):
-    """A torque Σ c_k φ_k [Nm; N] that the declared model lacks;
-    derive from it to add an effect of your own.
+    """A torque Σ c_k φ_k [Nm; N] that the declared model lacks; derive from it to add your own.
 
     A subclass is a frozen dataclass. It sets `name`, `declares`, `abscissa` and `coefficients`, and
     defines `columns`, the φ_k. The torque is what the motors must supply, at the joint: a positive
@@ -138,9 +133,7 @@ class Effect(ABC):
 
     @property
     def phrase(self) -> str:
-        """Words for reports, to follow "J3 has": `friction that grows with the load`;
-        its name where empty.
-        """
+        """Words for reports after "J3 has": `friction that grows with the load`; else the name."""
         return ""
 
     @property
@@ -150,9 +143,7 @@ class Effect(ABC):
 
     @property
     def has_axis(self) -> bool:
-        """Whether it is on an axis; what acts on all alike is placed on the first one for order
-        only.
-        """
+        """Whether it is on an axis; what acts on all alike is placed on the first one."""
         return self.side is not GearSide.ALL_MOTORS
 
     @property
@@ -182,8 +173,7 @@ class Effect(ABC):
 
     @property
     def axis_setting(self) -> str:
-        """Name of the setting that is the number of another axis, from 1;
-        empty where there is none.
+        """Name of the setting that is the number of another axis, from 1; empty without one.
 
         Of a torque on two joints it is `other_axis`, unless it says otherwise.
         """
@@ -198,15 +188,12 @@ class Effect(ABC):
 
     @property
     def form_settings(self) -> tuple[str, ...]:
-        """Settings that choose a form of one effect:
-        a search counts an effect in two forms as one.
-        """
+        """Settings that choose a form of one effect: a search counts two forms as one effect."""
         return ()
 
     @property
     def key_settings(self) -> tuple[str, ...]:
-        """Settings in which two effects of one name on one axis must differ for a model to have
-        both.
+        """Settings in which two effects of one name on one axis must differ to be in one model.
 
         All whole numbers that choose no form: cogging of two orders is two effects.
         """
@@ -223,8 +210,7 @@ class Effect(ABC):
 
     @property
     def nearly_declared(self) -> Mapping[str, Range]:
-        """Values of a setting, by its name, with which the effect is nearly a term that the model
-        has.
+        """Values of a setting, by its name, with which the effect is nearly a term of the model.
 
         A refinement stays outside of them, on the side where it begins.
         """
@@ -232,15 +218,12 @@ class Effect(ABC):
 
     @property
     def settings_fault(self) -> str:
-        """What is wrong with its settings together, to follow "effect 'x' is given";
-        empty where nothing is.
-        """
+        """What is wrong with its settings together, after "effect 'x' is given"; else empty."""
         return ""
 
     @property
     def has_rotor_form(self) -> bool:
-        """Whether it is a loss at a gear that can leave the rotor out of the load
-        (`ident.effects.rotor`).
+        """Whether it is a loss at a gear that can leave the rotor out of the load (`rotor`).
 
         Its settings `rotor_inertia_kg_m2` and `with_rotor` are then J, and 1 where the rest of it
         is fitted.
@@ -249,9 +232,7 @@ class Effect(ABC):
 
     @property
     def fits_rotor(self) -> bool:
-        """Whether its last coefficient is the rest of the rotor's inertia,
-        the loss times Ia − J.
-        """
+        """Whether its last coefficient is the rest of the rotor's inertia, a loss times Ia − J."""
         return self.has_rotor_form and bool(self.settings["with_rotor"])
 
     @property
@@ -263,8 +244,7 @@ class Effect(ABC):
 
     @property
     def refined(self) -> tuple[str, ...]:
-        """Settings that are fitted together with the whole model;
-        the values that a family has are where to begin.
+        """Settings that are fitted with the whole model; the family has the values to begin at.
 
         All real settings where it has two or more: kept at a value that somebody gave, they would
         leave a rest that other effects explain, and σ would not know it. Without names here, the
@@ -276,9 +256,7 @@ class Effect(ABC):
 
     @property
     def refined_once_chosen(self) -> tuple[str, ...]:
-        """Settings that are fitted together with the whole model only once the effect was chosen
-        from its family.
-        """
+        """Settings that are fitted with the whole model once the effect was chosen."""
         return self.refined
 
     @property
@@ -291,9 +269,7 @@ class Effect(ABC):
 
     @property
     def reach(self) -> int | None:
-        """How many joints further along the robot the other joint of a pair may be;
-        None for any.
-        """
+        """How many joints further along the robot the other of a pair may be; None for any."""
         return None
 
     @property
@@ -303,21 +279,15 @@ class Effect(ABC):
 
     @property
     def forms(self) -> tuple[Self, ...]:
-        """Simpler forms of the effect, then the effect itself;
-        each form's columns are the first ones of the next.
-        """
+        """Simpler forms, then the effect itself; columns of each are the first of the next."""
         return (self,)
 
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque per unit coefficient [Nm], (p, k);
-        (2, p, k) of two joints, (m, p, k) of all joints or motors.
-        """
+        """Torque per unit coefficient [Nm], (p, k); (2, p, k) on two joints, (m, p, k) on all."""
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
-        """Whether the data can show it on an axis:
-        no time constant is longer than them, and its variable is there.
-        """
+        """Whether the data can show it on an axis: they are long enough, and have its variable."""
         del runs, axis
         return True
 

@@ -1,5 +1,4 @@
-"""The equations of the motors' currents, whitened:
-what maximum likelihood, weighing and error bars stand on.
+"""The whitened equations of the motors' currents, for maximum likelihood, weighing and σ.
 
 The errors are those of the currents, e_i ~ (0, σ_i²). With D = diag(g_i σ_i), and τ the torque that
 links, friction and payload need of each motor, W χ + W_uL χ_uL + W_kL χ_kL through T
@@ -38,8 +37,7 @@ SETTLED = 1e-10  #: Relative change of σ from round to round, below which it no
 
 @dataclass(frozen=True, slots=True)
 class Currents:
-    """e = V g − W χ − W_kL χ_kL, all motors' rows below each other;
-    each row holds the current of its motor alone.
+    """e = V g − W χ − W_kL χ_kL, rows of all motors; each holds the current of its motor alone.
 
     Whitened, each row has noise of one; with preload cov e = P, and ‖e‖² is still that of the
     likelihood, as P is a projection.
@@ -59,16 +57,14 @@ class Currents:
         lengths = [len(factor) for factor in factors]
         motor = np.repeat(np.arange(count), lengths)
         stacked = np.concatenate(factors)
-        rows = np.arange(len(stacked))
-        drive = np.zeros((len(stacked), count))
-        drive[rows, motor] = stacked[:, 0]
-        return cls(
-            drive=drive,
-            linear=stacked[:, 1:-1],
-            known=stacked[:, -1],
-            motor=motor,
-            rows=triangles.rows,
-        )
+        row_count = len(stacked)
+        rows = np.arange(row_count)
+        own_current = stacked[:, 0]
+        linear = stacked[:, 1:-1]
+        known = stacked[:, -1]
+        drive = np.zeros((row_count, count))
+        drive[rows, motor] = own_current
+        return cls(drive=drive, linear=linear, known=known, motor=motor, rows=triangles.rows)
 
     def residual(self, gains: FloatArray, parameters: FloatArray) -> FloatArray:
         """e, shape (k,)."""
@@ -84,7 +80,9 @@ class Currents:
             return least_squares(self.linear, torque)
         columns = np.vstack((self.linear.T, torque))
         factor = triangle_of(columns)
-        return least_squares(factor[:, :-1], factor[:, -1])
+        linear = factor[:, :-1]
+        right = factor[:, -1]
+        return least_squares(linear, right)
 
     def whitened(self, gains: FloatArray, noise: FloatArray) -> Currents:
         """The equations in units of the noise.
@@ -95,9 +93,10 @@ class Currents:
         """
         of_motor = gains * noise
         unit = of_motor[self.motor]
+        row_unit = unit[:, None]
         return Currents(
-            drive=self.drive / unit[:, None],
-            linear=self.linear / unit[:, None],
+            drive=self.drive / row_unit,
+            linear=self.linear / row_unit,
             known=self.known / unit,
             motor=self.motor,
             rows=self.rows,
@@ -106,9 +105,7 @@ class Currents:
     def corrected(
         self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
     ) -> FloatArray:
-        """Drive columns with the corrected currents, shape (k, m):
-        the derivative of e to each gain.
-        """
+        """Drive columns with the corrected currents, shape (k, m): the derivative of e to g."""
         del noise
         rows = np.arange(len(residual))
         corrected = whitened.drive.copy()
@@ -140,18 +137,14 @@ class Currents:
         return np.asarray(np.sqrt(square_sum / freedom))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Cost that an estimate makes least: Σ r_i log ‖e_i‖, with each σ_i at its optimum;
-        with preload for this σ.
-        """
+        """Cost of an estimate, Σ r_i log ‖e_i‖ at the best σ_i; with preload for this σ."""
         del noise
         std = self.noise(gains, parameters)
         size = std * np.sqrt(np.maximum(self.rows, 1.0))
         return float(self.rows @ np.log(size))
 
     def settled(self, gains: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
-        """χ and σ of each current [A] for given gains, shapes (p,) and (m,):
-        a fixed point of a few rounds.
-        """
+        """χ and σ of each current [A] for given gains, (p,) and (m,), by a few rounds."""
         even = np.ones(len(gains))
         parameters = self.whitened(gains, even).parameters(gains)
         noise = self.noise(gains, parameters, free, even)
@@ -166,9 +159,7 @@ class Currents:
 
 @dataclass(frozen=True, slots=True)
 class PreloadedCurrents(Currents):
-    """Motors that can work against each other:
-    as many rows a motor, r, each with the currents of all.
-    """
+    """Motors that can work against each other: r rows a motor, each with the currents of all."""
 
     preload: FloatArray  #: N of each row of a motor, orthonormal, shape (r, m, m − d)
 
@@ -183,12 +174,14 @@ class PreloadedCurrents(Currents):
         count = len(rows)
         rows_of_motor = len(preload)
         stacked = np.concatenate(rows)
+        motor = np.repeat(np.arange(count), rows_of_motor)
+        row_counts = np.full(count, rows_of_motor)
         return cls(
             drive=stacked[:, :count],
             linear=stacked[:, count:-1],
             known=stacked[:, -1],
-            motor=np.repeat(np.arange(count), rows_of_motor),
-            rows=np.full(count, rows_of_motor),
+            motor=motor,
+            rows=row_counts,
             preload=preload,
         )
 
@@ -234,8 +227,7 @@ class PreloadedCurrents(Currents):
         free: int = 0,
         before: FloatArray | None = None,
     ) -> FloatArray:
-        """σ of each current from its corrections, and from the share of its noise that they show,
-        P_ii.
+        """σ of each current from its corrections and the share of its noise that they show, P_ii.
 
         The corrections of a motor have only what the preload has left of its noise (variance
         components: Förstner, Allgemeine Vermessungs-Nachrichten 86 (1979)).
@@ -251,12 +243,14 @@ class PreloadedCurrents(Currents):
             return noise
         whitened = self.whitened(gains, before)
         residual = whitened.residual(gains, parameters)
-        square_sum = np.sum(residual.reshape(count, -1) ** 2, axis=1)
+        of_motors = residual.reshape(count, -1)
+        square_sum = np.sum(of_motors**2, axis=1)
         # Σ_r P_rii, with P = T_D D
         projection = self.transform(gains, before) * (gains * before)
         visible = np.einsum("rii->i", projection)
         freedom = np.maximum(visible - free / count, 1.0)
-        return np.asarray(before * np.sqrt(square_sum / freedom))
+        variance_ratio = square_sum / freedom
+        return np.asarray(before * np.sqrt(variance_ratio))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
         """½ ‖e‖², for this σ."""

@@ -1,6 +1,4 @@
-"""Two systems joined: rows that were reduced one after the other,
-as if all had been reduced at once.
-"""
+"""Two systems joined, as if the rows of both had been reduced at once."""
 
 from __future__ import annotations
 
@@ -33,9 +31,11 @@ def join_systems(first: System, second: System, *, continues_move: bool = False)
         ValueError: they have other unknowns or other payloads.
     """
     if first.unknowns != second.unknowns or first.payloads != second.payloads:
+        first_count = len(first.unknowns)
+        second_count = len(second.unknowns)
         raise ValueError(
-            f"found unknowns {len(first.unknowns)} and {len(second.unknowns)}, payloads "
-            f"{first.payloads} and {second.payloads}; expected the same in both"
+            f"found unknowns {first_count} and {second_count}, payloads {first.payloads} and "
+            f"{second.payloads}; expected the same in both"
         )
     new_runs = tuple(name for name in second.runs if name not in first.runs)
     runs = first.runs + new_runs
@@ -43,18 +43,23 @@ def join_systems(first: System, second: System, *, continues_move: bool = False)
     for run, mounting in second.cluster_runs:
         index = runs.index(second.runs[run])
         cluster_runs.append((index, mounting))
+    joints = _join_triangles(first.joints, second.joints)
+    motors = _join_triangles(first.motors, second.motors)
     joined = replace(
         first,
         runs=runs,
-        joints=_join_triangles(first.joints, second.joints),
-        motors=_join_triangles(first.motors, second.motors),
+        joints=joints,
+        motors=motors,
         clusters=first.clusters + second.clusters,
         cluster_runs=tuple(cluster_runs),
         preload=first.preload + second.preload,
     )
     last = len(first.clusters) - 1
-    if continues_move and cluster_runs[last : last + 1] == cluster_runs[last + 1 : last + 2]:
-        joined = _join_pairs(joined, [last])
+    if continues_move:
+        last_of_first = cluster_runs[last : last + 1]
+        first_of_second = cluster_runs[last + 1 : last + 2]
+        if last_of_first == first_of_second:
+            joined = _join_pairs(joined, [last])
     while len(joined.clusters) > 2 * MAX_CLUSTERS:
         pairs = _neighbours(joined.cluster_runs)
         if not pairs:
@@ -64,16 +69,15 @@ def join_systems(first: System, second: System, *, continues_move: bool = False)
 
 
 def _join_triangles(first: Triangles, second: Triangles) -> Triangles:
-    factors = []
+    factors: list[FloatArray] = []
     for upper, lower in zip(first.factors, second.factors, strict=True):
-        factors.append(triangle((upper, lower), upper.shape[1]))
+        width = upper.shape[1]
+        factors.append(triangle((upper, lower), width))
     return Triangles(tuple(factors), first.rows + second.rows)
 
 
 def _neighbours(cluster_runs: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the first of each pair of clusters that follow each other in one run;
-    no cluster is in two pairs.
-    """
+    """Return the first of each pair of neighbours in one run; no cluster is in two pairs."""
     pairs: list[int] = []
     index = 0
     while index < len(cluster_runs) - 1:
@@ -95,14 +99,14 @@ def _join_pairs(system: System, pairs: Sequence[int]) -> System:
     cluster_runs: list[tuple[int, int]] = []
     preload: list[FloatArray] = []
     index = 0
+    is_redundant = bool(system.preload)
     while index < len(system.clusters):
         cluster = system.clusters[index]
         own_preload = system.preload[index : index + 1]
         cluster_runs.append(system.cluster_runs[index])
         if index in pairs:
-            cluster = _join_clusters(
-                cluster, system.clusters[index + 1], is_redundant=bool(system.preload)
-            )
+            following = system.clusters[index + 1]
+            cluster = _join_clusters(cluster, following, is_redundant=is_redundant)
             own_preload = system.preload[index : index + 2]
             index += 1
         clusters.append(cluster)
@@ -116,10 +120,11 @@ def _join_pairs(system: System, pairs: Sequence[int]) -> System:
 
 def _join_clusters(first: Cluster, second: Cluster, *, is_redundant: bool) -> Cluster:
     """One cluster of two; of a redundant robot with all rows, as each has a preload of its own."""
-    joined = []
+    joined: list[FloatArray] = []
     for upper, lower in zip(first, second, strict=True):
         if is_redundant:
             joined.append(np.concatenate((upper, lower)))
         else:
-            joined.append(triangle((upper, lower), upper.shape[1]))
+            width = upper.shape[1]
+            joined.append(triangle((upper, lower), width))
     return tuple(joined)

@@ -48,8 +48,10 @@ class Jacobian:
 
     def __matmul__(self, step: FloatArray) -> FloatArray:
         """J x, shape (rows,), from x, shape (f,)."""
-        pairs = zip(self.parts, self.seen, strict=True)
-        return np.concatenate([step[seen] @ part for part, seen in pairs])
+        by_motor: list[FloatArray] = []
+        for part, seen in zip(self.parts, self.seen, strict=True):
+            by_motor.append(step[seen] @ part)
+        return np.concatenate(by_motor)
 
     def columns(self, chosen: IntArray) -> FloatArray:
         """Some of its columns, shape (rows, k)."""
@@ -119,9 +121,7 @@ class Linearisation:
         return int(self.cluster.max()) + 1
 
     def of_clusters(self, per_row: IntArray) -> IntArray:
-        """Each cluster's number, shape (clusters,), of numbers of the observation's rows that
-        clusters do not part.
-        """
+        """Each cluster's number, (clusters,), of numbers of rows that clusters do not part."""
         _, first_rows = np.unique(self.cluster, return_index=True)
         return per_row[self.source[first_rows]]
 
@@ -131,21 +131,20 @@ class Linearisation:
         return slice(int(first), int(end))
 
     def shown(self, motor: int) -> float:
-        """Σ P_ii over a motor's rows: their number, less what internal preload hides of the
-        current's noise.
-        """
+        """Σ P_ii over a motor's rows: their number, less what internal preload hides of noise."""
         rows = self.rows_of(motor)
         if self.transform is None:
             return float(rows.stop - rows.start)
         diagonal = self.transform[self.source[rows], motor, motor]  # of T_D = P D⁻¹
-        return float(diagonal.sum() * self.noise[motor] / self.gamma[motor])
+        noise = self.noise[motor]
+        gamma = self.gamma[motor]
+        return float(diagonal.sum() * noise / gamma)
 
     def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
-        """Joint torque columns, shape (m, extra, r), whitened,
-        on the rows of each motor that needs any: (extra, rows).
+        """Whiten columns of joint torque, on the rows of each motor that needs any: (extra, rows).
 
         Args:
-            torque_nm: per unit of each column.
+            torque_nm: per unit of each column, shape (m, extra, r).
             to_motor: T (DriveTrain.to_motor).
         """
         whitened = self.whitened_by_motor(torque_nm, to_motor)
@@ -167,8 +166,9 @@ class Linearisation:
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
             for motor in np.flatnonzero(to_motor[:, joint]).tolist():
                 source = self.source[self.rows_of(motor)]
+                scale = to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
                 own = torque_nm[joint].take(source, axis=1)
-                own *= to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
+                own *= scale
                 if motor in by_motor:
                     own = by_motor[motor] + own
                 by_motor[motor] = own
@@ -177,8 +177,7 @@ class Linearisation:
     def decorrelated_by_motor(
         self, each: Sequence[dict[int, FloatArray]]
     ) -> list[dict[int, FloatArray]]:
-        """Take out of whitened columns what the rows of a run share;
-        all together, because that is faster.
+        """Take out of whitened columns what the rows of a run share; together, which is faster.
 
         Args:
             each: columns on the rows of each motor that needs any, of some candidates, shapes
@@ -202,8 +201,7 @@ class Linearisation:
     def beside_scatter(
         self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray
     ) -> Linearisation:
-        """The same problem where the rows of a run share errors, decorrelated from these;
-        the unknowns stay.
+        """The same problem, decorrelated from errors that rows of a run share; unknowns stay.
 
         Args:
             torque_nm: of one standard deviation of each error, shape (m, k, r).
@@ -219,20 +217,15 @@ class Linearisation:
         residuals: list[FloatArray] = []
         for motor, own in enumerate(rows):
             part = scatter.decorrelate(motor, self.jacobian.parts[motor])
-            residual = scatter.decorrelate(motor, self.residual[None, own])
+            (own_residual,) = scatter.decorrelate(motor, self.residual[None, own])
             parts.append(part)
-            residuals.append(residual[0])
-        return replace(
-            self,
-            jacobian=replace(self.jacobian, parts=tuple(parts)),
-            residual=np.concatenate(residuals),
-            scatter=scatter,
-        )
+            residuals.append(own_residual)
+        jacobian = replace(self.jacobian, parts=tuple(parts))
+        residual = np.concatenate(residuals)
+        return replace(self, jacobian=jacobian, residual=residual, scatter=scatter)
 
     def fitted(self) -> tuple[Linearisation, FloatArray]:
-        """The same around the best fit of its rows, and the step to it, shape (f,),
-        in the scale of the unknowns.
-        """
+        """The same around the best fit of its rows, and the scaled step to it, shape (f,)."""
         hessian = sum_of_squares(self.jacobian)
         hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
         factor = linalg.cho_factor(hessian, lower=True)
@@ -242,9 +235,7 @@ class Linearisation:
         return replace(self, residual=residual), step
 
     def decorrelated(self, columns: FloatArray) -> FloatArray:
-        """V^(−1/2) times columns, shape (rows,);
-        the columns themselves where runs share no errors.
-        """
+        """V^(−1/2) times columns, shape (rows,); V is 1 where runs share no errors."""
         if self.scatter is None:
             return columns
         parts: list[FloatArray] = []
@@ -255,9 +246,7 @@ class Linearisation:
         return np.concatenate(parts)
 
     def correlated(self, columns: FloatArray) -> FloatArray:
-        """V times decorrelated columns, shape (rows,);
-        the columns themselves where runs share no errors.
-        """
+        """V times decorrelated columns, shape (rows,); V is 1 where runs share no errors."""
         if self.scatter is None:
             return columns
         parts: list[FloatArray] = []
@@ -293,7 +282,8 @@ def linearise(
     used = [np.flatnonzero(use) for use in observation.motor_use]
     columns_and_rows = zip(observation.motor_columns(), used, strict=True)
     rows_of_motors = (columns[:, rows].T for columns, rows in columns_and_rows)
-    preload = observation.preload[:, :, used[0]].transpose(2, 0, 1)
+    used_preload = observation.preload[:, :, used[0]]
+    preload = used_preload.transpose(2, 0, 1)
     parts: list[FloatArray] = []
     seen: list[IntArray] = []
     residuals: list[FloatArray] = []
@@ -305,7 +295,8 @@ def linearise(
         squares += np.einsum("rf,rf->f", jacobian, jacobian)  # Σ_r J_rf²
         own = np.flatnonzero(jacobian[:, first:].any(axis=0))
         seen.append(own)
-        parts.append(np.ascontiguousarray(jacobian[:, first + own].T))
+        own_jacobian = jacobian[:, first + own]
+        parts.append(np.ascontiguousarray(own_jacobian.T))
         residuals.append(residual)
         currents.append(current)
     parameter_unit = _inverse_norms(squares[count:])
@@ -319,11 +310,13 @@ def linearise(
     if preload.size:
         every_preload = observation.preload.transpose(2, 0, 1)
         transform = whitening_transform(every_preload, gains, noise)
+    jacobian_of_all = Jacobian(tuple(parts), tuple(seen), width - first)
+    motor = np.repeat(np.arange(count), row_counts)
     return Linearisation(
-        jacobian=Jacobian(tuple(parts), tuple(seen), width - first),
+        jacobian=jacobian_of_all,
         residual=np.concatenate(residuals),
         current=np.concatenate(currents),
-        motor=np.repeat(np.arange(count), row_counts),
+        motor=motor,
         cluster=cluster.astype(np.int64),
         source=source,
         gamma=1.0 / gains,
@@ -368,19 +361,16 @@ def motor_jacobians(
     jacobian = np.concatenate((-corrected, whitened.linear), axis=1)
     current = whitened.drive @ gains
     count = len(gains)
-    yield from zip(
-        np.split(jacobian, count),
-        np.split(residual, count),
-        np.split(current, count),
-        strict=True,
-    )
+    jacobians = np.split(jacobian, count)
+    residuals = np.split(residual, count)
+    currents_of_motors = np.split(current, count)
+    yield from zip(jacobians, residuals, currents_of_motors, strict=True)
 
 
 def motor_jacobian(
     rows: FloatArray, motor: int, gains: FloatArray, parameters: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (r, m + p)
-    and (r,).
+    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor, shapes (r, m + p) and (r,).
 
     Args:
         rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the
@@ -390,19 +380,21 @@ def motor_jacobian(
         noise: σ of each motor's current [A].
     """
     count = len(gains)
+    gain = gains[motor]
+    std_a = noise[motor]
     columns = rows[:, 1:-1]
-    torque = columns @ parameters + rows[:, -1]
-    scale = 1.0 / (gains[motor] * noise[motor])
+    known = rows[:, -1]
+    torque = columns @ parameters + known
+    scale = 1.0 / (gain * std_a)
     jacobian = np.zeros((len(rows), count + len(parameters)))
-    jacobian[:, motor] = -scale / gains[motor] * torque  # ∂(γ τ)/∂g = −γ² τ
+    jacobian[:, motor] = -scale / gain * torque  # ∂(γ τ)/∂g = −γ² τ
     jacobian[:, count:] = scale * columns
-    current = rows[:, 0] / noise[motor]
+    current = rows[:, 0] / std_a
     return jacobian, current - scale * torque
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c,
-    shape (C, f).
+    """Shift when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (C, f).
 
     Args:
         grams: G_c = J_cᵀJ_c of each cluster, shape (C, f, f).
@@ -419,11 +411,10 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
 
 
 def _even_unit(hessian: FloatArray) -> FloatArray:
-    """Unit of each unknown in which all are seen equally well, shape (f,):
-    some are in kg, others in kg m².
-    """
+    """Units in which all unknowns are seen equally well, (f,): some are in kg, some in kg m²."""
     diagonal = np.diag(hessian)
-    return 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    squares = np.where(diagonal > 0.0, diagonal, 1.0)
+    return 1.0 / np.sqrt(squares)
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -437,17 +428,19 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
-    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f), of C shifts d_c,
-    shape (C, f).
+    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f).
+
+    Args:
+        shifts: d_c of C clusters, shape (C, f).
     """
     count = len(shifts)
     centred = shifts - shifts.mean(axis=0)
-    return np.asarray((count - 1) / count * (centred.T @ centred))
+    factor = (count - 1) / count
+    return np.asarray(factor * (centred.T @ centred))
 
 
 def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) -> IntArray:
-    """Join neighbouring clusters of a run in pairs, again and again,
-    until they are independent of each other.
+    """Join neighbouring clusters of a run in pairs until they are independent of each other.
 
     Clusters are moves, and pieces of 2 s of longer moves: long compared with the noise of drives,
     but not with every misfit of a model. The correlation of neighbours, in units in which all
@@ -593,7 +586,8 @@ def _sums_of_motors(
         rows = np.concatenate(of_clusters)
         jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
         if recorded is not system:
-            recorded_rows = np.concatenate([cluster[motor] for cluster in recorded.clusters])
+            of_recorded = [cluster[motor] for cluster in recorded.clusters]
+            recorded_rows = np.concatenate(of_recorded)
             _, residual = motor_jacobian(recorded_rows, motor, gains, parameters, noise)
         seen = np.flatnonzero(jacobian.any(axis=0))
         own_jacobian = jacobian[:, seen]
@@ -602,8 +596,9 @@ def _sums_of_motors(
         first = 0
         for index, end in enumerate(ends.tolist()):
             of_cluster = own_jacobian[first:end]
+            own_residual = residual[first:end]
             np.matmul(of_cluster.T, of_cluster, out=products[index])
-            scores[index, seen] += of_cluster.T @ residual[first:end]
+            scores[index, seen] += of_cluster.T @ own_residual
             first = end
         grams[:, seen[:, None], seen] += products
     return grams, scores
@@ -611,9 +606,7 @@ def _sums_of_motors(
 
 @dataclass(frozen=True, slots=True)
 class MotorRows:
-    """Rows of one motor in a problem cut into folds:
-    they follow each other, sorted by fold and cluster.
-    """
+    """Rows of one motor in a problem cut into folds, sorted by fold and cluster."""
 
     motor: int  #: index
     rows: slice  #: among those of the problem
@@ -624,21 +617,21 @@ class MotorRows:
     equations: FloatArray  #: J of these, e and r, columns first, shape (s + 2, rows)
 
     def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Products A_b B_bᵀ of two sets of columns over the rows of each block, shape (blocks, …,
-        a, b).
+        """Products A_b B_bᵀ of two sets of columns over each block, shape (blocks, …, a, b).
 
         Args:
             first, second: columns first, shapes (…, a, rows) and (…, b, rows).
         """
-        out = np.empty((len(self.starts), *first.shape[:-1], second.shape[-2]))
+        *leading, _ = first.shape
+        columns = second.shape[-2]
+        out = np.empty((len(self.starts), *leading, columns))
         for product, block in zip(out, self._blocks(), strict=True):
             transposed = np.swapaxes(second[..., block], -1, -2)
             np.matmul(first[..., block], transposed, out=product)
         return out
 
     def grams(self, columns: FloatArray) -> FloatArray:
-        """Products A_b A_bᵀ over the rows of each block, shape (blocks, …, a, a);
-        see `sums`.
+        """Products A_b A_bᵀ over the rows of each block, shape (blocks, …, a, a); see `sums`.
 
         The products of a few columns are summed along memory, because a matrix product for each
         block and candidate would be a call for a few dozen numbers.
@@ -650,19 +643,19 @@ class MotorRows:
         for row in range(count):
             for column in range(row + 1):
                 product = columns[..., row, :] * columns[..., column, :]
-                of_blocks = np.moveaxis(np.add.reduceat(product, self.starts, axis=-1), -1, 0)
+                by_block = np.add.reduceat(product, self.starts, axis=-1)
+                of_blocks = np.moveaxis(by_block, -1, 0)
                 out[..., row, column] = of_blocks
                 out[..., column, row] = of_blocks
         return out
 
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
-        """J x of the motor's rows, shape (rows,) or (p, rows), with an x of each block, shape (f,)
-        or (p, f).
-        """
+        """J x of the motor's rows, (rows,) or (p, rows), with an x a block, (f,) or (p, f)."""
         jacobian = self.equations[:-2]
         parts: list[FloatArray] = []
         for step, block in zip(steps, self._blocks(), strict=True):
-            parts.append(step[..., self.seen] @ jacobian[:, block])
+            own_step = step[..., self.seen]
+            parts.append(own_step @ jacobian[:, block])
         return np.concatenate(parts, axis=-1)
 
     def _blocks(self) -> Iterator[slice]:
@@ -672,9 +665,7 @@ class MotorRows:
             yield slice(start, end)
 
     def by_fold(self, products: FloatArray, count: int) -> FloatArray:
-        """Products of each block, shape (blocks, …), summed over each of so many folds,
-        shape (count, …).
-        """
+        """Products of each block, (blocks, …), summed over each of so many folds, (count, …)."""
         folds, first = np.unique(self.fold, return_index=True)
         out = np.zeros((count, *products.shape[1:]))
         out[folds] = np.add.reduceat(products, first, axis=0)
@@ -683,8 +674,7 @@ class MotorRows:
 
 @dataclass(frozen=True, slots=True)
 class Folds:
-    """A linearised problem cut into folds of complete moves,
-    with everything that cross-validation reuses.
+    """A linearised problem cut into folds of complete moves, with all that cross-validation reuses.
 
     A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over
     blocks.
@@ -725,8 +715,7 @@ class Folds:
 
 
 def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> Folds:
-    """Deal the moves out to folds in turn, so that every fold sees every run;
-    a move is never parted.
+    """Deal the moves out to folds in turn, so that each fold sees every run; no move is parted.
 
     Args:
         problem: around an estimate.
@@ -773,10 +762,12 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     for own in by_motor:
         steps_of_blocks = [steps[fold] for fold in own.fold]
         own_residual = own.equations[-1]
-        own_residual[:] = problem.residual[own.rows] - own.predicted(steps_of_blocks)
+        predicted = own.predicted(steps_of_blocks)
+        own_residual[:] = problem.residual[own.rows] - predicted
         residual[own.rows] = own_residual
         products = own.sums(own.equations[:-2], own_residual[None])
-        part_score[:, own.motor][:, own.seen] = own.by_fold(products[..., 0], FOLDS)
+        scores_of_motor = part_score[:, own.motor]
+        scores_of_motor[:, own.seen] = own.by_fold(products[..., 0], FOLDS)
     problem = _with_sorted_jacobian(problem, by_motor)
     full_factor = _lower_factor(hessian)
     estimate_factor = full_factor
@@ -813,9 +804,7 @@ def _orders_of_motors(problem: Linearisation, order: IntArray) -> list[IntArray]
 def _with_sorted_rows(
     problem: Linearisation, order: IntArray, orders: Sequence[IntArray]
 ) -> Linearisation:
-    """Sort everything but the Jacobian:
-    all rows by one order, the scatter by those of each motor.
-    """
+    """Sort all but the Jacobian: rows by one order, the scatter by those of each motor."""
     sorted_rows = {name: getattr(problem, name)[order] for name in LINEARISATION_ROWS}
     scatter = problem.scatter
     if scatter is not None:
@@ -846,17 +835,17 @@ def _described_blocks(
 def _motor_rows(
     problem: Linearisation, fold_of: IntArray, starts: IntArray, orders: Sequence[IntArray]
 ) -> list[MotorRows]:
-    """Sorted rows of each motor that has any;
-    the place of r in their equations is not filled in yet.
-    """
+    """Sorted rows of each motor that has any; r in their equations is not filled in yet."""
     jacobian = problem.jacobian
     motor_of_block = problem.motor[starts]
     found: list[MotorRows] = []
     for motor in np.unique(motor_of_block).tolist():
         rows = problem.rows_of(motor)
         seen = jacobian.seen[motor]
-        equations = np.empty((len(seen) + 2, rows.stop - rows.start))
-        np.take(jacobian.parts[motor], orders[motor], axis=1, out=equations[:-2], mode="clip")
+        row_count = rows.stop - rows.start
+        equations = np.empty((len(seen) + 2, row_count))
+        own_jacobian = equations[:-2]
+        np.take(jacobian.parts[motor], orders[motor], axis=1, out=own_jacobian, mode="clip")
         equations[-2] = problem.residual[rows]
         own_starts = starts[motor_of_block == motor]
         cluster = problem.cluster[own_starts]
@@ -896,20 +885,21 @@ def _sums_of(by_motor: Sequence[MotorRows], problem: Linearisation) -> _Sums:
     )
     for own in by_motor:
         seen = own.seen
-        products = own.sums(own.equations[:-2], own.equations[:-1])  # J [J | e]ᵀ of each block
+        jacobian = own.equations[:-2]
+        with_residual = own.equations[:-1]
+        products = own.sums(jacobian, with_residual)  # J [J | e]ᵀ of each block
         grams = products[..., :-1]
         scores = products[..., -1]
         sums.cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
         sums.cluster_score[np.ix_(own.cluster, seen)] += scores
-        sums.part_hessian[:, own.motor][:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
+        hessian_of_motor = sums.part_hessian[:, own.motor]
+        hessian_of_motor[:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
         sums.motor_score[own.motor, seen] = scores.sum(axis=0)
     return sums
 
 
 def _with_sorted_jacobian(problem: Linearisation, by_motor: Sequence[MotorRows]) -> Linearisation:
-    """The same with the Jacobian's rows sorted as the others:
-    views of the equations of each motor.
-    """
+    """The same with sorted rows of the Jacobian: views of the equations of each motor."""
     parts = list(problem.jacobian.parts)
     for own in by_motor:
         parts[own.motor] = own.equations[:-2]
@@ -926,9 +916,7 @@ def _lower_factor(matrix: FloatArray) -> tuple[FloatArray, bool]:
 def _estimate_factor(
     problem: Linearisation, scatter: RunScatter, hessian: FloatArray
 ) -> tuple[FloatArray, bool]:
-    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ, J = V^(−1/2) J₀ being the decorrelated Jacobian,
-    from JᵀJ.
-    """
+    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ from JᵀJ; J = V^(−1/2) J₀ is the decorrelated Jacobian."""
     jacobian = problem.jacobian
     undone = hessian.copy()
     for motor, (part, seen) in enumerate(zip(jacobian.parts, jacobian.seen, strict=True)):

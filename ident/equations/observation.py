@@ -1,5 +1,4 @@
-"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq.
-17), for everything that looks into a residual.
+"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (eq. 17), for whatever looks into a residual.
 
 An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a
 usual length.
@@ -7,7 +6,7 @@ usual length.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,18 +59,19 @@ class Observation(Equations):
 
     def of_joint(self, joint: int, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows of a joint, shape (p, rows)."""
-        parts = [self.regressor[joint][:, rows], self.effects[joint][:, rows]]
+        base = self.regressor[joint][:, rows]
+        effects = self.effects[joint][:, rows]
+        flange = self.flange[joint]
+        parts = [base, effects]
         mounting = self.mounting[rows]
         for index, indices in enumerate(self.payload_columns):
-            columns = self.flange[joint][list(indices)][:, rows]
+            columns = flange[list(indices)][:, rows]
             is_mounted = mounting == index
             parts.append(columns * is_mounted)
         return np.concatenate(parts)
 
     def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (m,
-        rows).
-        """
+        """W_kL χ_kL of some rows: joint torque of what is known of the payloads [Nm], (m, rows)."""
         # An index of −1, no load, takes the last row, which stays zero.
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
@@ -82,8 +82,7 @@ class Observation(Equations):
         return np.asarray(torque)
 
     def motor_columns(self) -> Iterator[FloatArray]:
-        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor in turn, columns first,
-        shape (p + 2, r).
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor, columns first, (p + 2, r).
 
         Of a redundantly driven robot V_i in place of v_i, shape (m + p + 1, r).
         """
@@ -102,9 +101,7 @@ class Observation(Equations):
             yield np.concatenate((current, torque))
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """Y = V g: joint torque from the measured current references (eq.
-        4 through R) [Nm], shape (m, rows).
-        """
+        """Y = V g: joint torque from measured currents (eq. 4 through R) [Nm], shape (m, rows)."""
         if self.preload.size:
             # Σ_m V_amr g_m of each axis a and row r
             torque = np.einsum("amr,m->ar", self.drive[:, :, rows], gains)
@@ -118,9 +115,7 @@ class Observation(Equations):
         return replace(self, **chosen)
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """Add columns to W, torque of shape (m, extra, r) [Nm per unit];
-        what preload hides of them is left out.
-        """
+        """Add columns to W, (m, extra, r) [Nm per unit]; what preload hides of them is left out."""
         if self.preload.size:
             # (1 − N Nᵀ) of the torque, row by row
             hidden = np.einsum("alr,apr->lpr", self.preload, torque)
@@ -141,19 +136,15 @@ class Observation(Equations):
             support |= demanded._support()
         columns = len(self.columns)
         flange = np.arange(columns, support.shape[1])
+        given = payload_values(self.payloads, self.payload_columns, columns)
+        runs = self._read_runs(demanded)
+        has_instruments = demanded is not None
         return reduce_rows(
-            self,
-            self._read_runs(demanded),
-            support=support,
-            flange=flange,
-            given=payload_values(self.payloads, self.payload_columns, columns),
-            instruments=demanded is not None,
+            self, runs, support=support, flange=flange, given=given, instruments=has_instruments
         )
 
     def _parts(self) -> list[FloatArray]:
-        """[W | W_L]: torque per unit of base parameters, effects and the payload's ten, shapes (m,
-        …, r).
-        """
+        """[W | W_L]: torque per unit of base parameters, effects and payload, shapes (m, …, r)."""
         parts = [self.regressor, self.effects]
         if self.payloads:
             parts.append(self.flange)
@@ -237,7 +228,11 @@ def observe(
     mounting: list[IntArray] = []
     moves_before = 0
     for index, data in enumerate(runs):
-        pieces = rows_of(model, data, conditioning) if built is None else built[index]
+        pieces: Iterable[Rows]
+        if built is None:
+            pieces = rows_of(model, data, conditioning)
+        else:
+            pieces = built[index]
         mounted = -1
         if data.payload is not None:
             mounted = mountings.index(data.payload.mounting)
@@ -248,18 +243,26 @@ def observe(
             moves_so_far = int(own_move.max()) + 1
             parts.append(rows)
             regressor.append(rows.standard[:, base])
-            flange.append(np.ascontiguousarray(rows.standard[:, model.flange]))
+            of_flange = rows.standard[:, model.flange]
+            flange.append(np.ascontiguousarray(of_flange))
             move.append(own_move)
             run.append(np.full(count, index, dtype=np.int64))
             mounting.append(np.full(count, mounted, dtype=np.int64))
         moves_before = moves_so_far
     run_of_row = np.concatenate(run)
+    no_effects = np.zeros((model.robot.axis_count, 0, len(run_of_row)))
+    current = np.concatenate([rows.current for rows in parts], axis=-1)
+    use = np.concatenate([rows.use for rows in parts], axis=-1)
+    motor_use = np.concatenate([rows.motor_use for rows in parts], axis=-1)
+    time_s = np.concatenate([rows.time_s for rows in parts])
+    drive = np.concatenate([rows.drive for rows in parts], axis=-1)
+    preload = np.concatenate([rows.preload for rows in parts], axis=-1)
     return Observation(
         model=model,
         columns=like.columns[: len(base)],
         base=like.base,
         regressor=np.concatenate(regressor, axis=2),
-        effects=np.zeros((model.robot.axis_count, 0, len(run_of_row))),
+        effects=no_effects,
         flange=np.concatenate(flange, axis=2),
         run=run_of_row,
         move=np.concatenate(move),
@@ -268,18 +271,17 @@ def observe(
         payload_columns=like.payload_columns,
         runs=tuple(data.name for data in runs),
         conditioning=conditioning,
-        current=np.concatenate([rows.current for rows in parts], axis=-1),
-        use=np.concatenate([rows.use for rows in parts], axis=-1),
-        motor_use=np.concatenate([rows.motor_use for rows in parts], axis=-1),
-        time_s=np.concatenate([rows.time_s for rows in parts]),
-        drive=np.concatenate([rows.drive for rows in parts], axis=-1),
-        preload=np.concatenate([rows.preload for rows in parts], axis=-1),
+        current=current,
+        use=use,
+        motor_use=motor_use,
+        time_s=time_s,
+        drive=drive,
+        preload=preload,
     )
 
 
 def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observation) -> Observation:
-    """Replace the declared columns by those of the demanded motion, where a run's is known;
-    effects' columns stay.
+    """Replace declared columns by those of the demanded motion where it is known; effects stay.
 
     Args:
         model: the declared model.

@@ -1,5 +1,4 @@
-"""Runs, one after the other, reduced to triangles:
-the observation matrix is never in memory at once (TSQR).
+"""Runs reduced to triangles one by one: W_tot is never in memory at once (TSQR).
 
 `reduce_rows` makes every `System`. Its unknowns are at first those of the columns that the rows
 have, and all ten parameters of the payload of each mounting; `System.holding` then gives some of
@@ -51,9 +50,7 @@ def rows_of_runs(
     instruments: bool = False,
     chunk_rows: int = CHUNK_ROWS,
 ) -> Iterator[tuple[Dataset, Iterable[Rows]]]:
-    """Differentiate runs one after the other and build their rows;
-    arguments and errors are those of `reduce_runs`.
-    """
+    """Differentiate runs one by one and build their rows; errors as of `reduce_runs`."""
     for run in runs:
         data = differentiate(run, model.drive_train, conditioning)
         if instruments:
@@ -178,9 +175,7 @@ def reduce_rows(
 
 @dataclass(frozen=True, slots=True)
 class _Cluster:
-    """Motor rows of one move, or of several that follow each other in one run,
-    in the columns that each motor has.
-    """
+    """Motor rows of one move, or of several in a run, in the columns that each motor has."""
 
     mounting: int  #: index into the payloads, −1 without load
     run: int  #: index into the runs
@@ -259,20 +254,20 @@ class _Reducer:
         moves = np.unique(rows.move[any_motor])
         if not len(moves):
             return []
-        by_motor = [self._by_move(rows, motor, moves) for motor in range(len(self.of_motor))]
+        motors = range(len(self.of_motor))
+        by_motor = [self._by_move(rows, motor, moves) for motor in motors]
         run = len(self.names)
         clusters: list[tuple[int, _Cluster]] = []
         for index, move in enumerate(moves.tolist()):
             factors = tuple(of_moves[index] for of_moves in by_motor)
-            counted = rows.motor_use[0] & (rows.move == move)
+            is_of_move = rows.move == move
+            counted = rows.motor_use[0] & is_of_move
             preload = rows.preload[:, :, counted].transpose(2, 0, 1)
             clusters.append((move, _Cluster(mounting, run, factors, preload)))
         return clusters
 
     def _by_move(self, rows: Rows, motor: int, moves: IntArray) -> list[FloatArray]:
-        """[v_i | (T W)_i] of a motor, with instruments [v_i | (T W)_i | (T Z)_i],
-        in the rows of each move.
-        """
+        """[v_i | (T W)_i] of a motor in each move, with instruments [v_i | (T W)_i | (T Z)_i]."""
         to_motor = self.model.drive_train.to_motor[motor]
         chosen = self.of_motor[motor]
         if self.model.is_redundant:
@@ -290,9 +285,7 @@ class _Reducer:
         return [of_move.T for of_move in np.split(columns, ends, axis=1)]
 
     def system(self, given: Mapping[int, float]) -> System:
-        """The equations with all columns but those that are given;
-        what a joint or motor does not have is zero.
-        """
+        """The equations without given columns; what a joint or motor does not have is zero."""
         without_clusters = self._without_clusters()
         unknowns = GivenUnknowns.of(given, len(without_clusters.unknowns))
         if given:
@@ -333,6 +326,9 @@ class _Reducer:
         motors = [self._motor(motor) for motor in range(len(self.of_motor))]
         every_parameter = tuple(range(BODY))
         cluster_runs = [(one.run, one.mounting) for one in self.clusters]
+        payload_columns = (every_parameter,) * len(self.payloads)
+        of_joints = Triangles(tuple(joints), self.joint_rows)
+        of_motors = Triangles(tuple(motors), self.motor_rows)
         preload: list[FloatArray] = []
         if self.model.is_redundant:
             preload = [one.preload for one in self.clusters]
@@ -341,23 +337,22 @@ class _Reducer:
             base=self.unknowns.base,
             columns=self.unknowns.columns,
             payloads=tuple(self.payloads),
-            payload_columns=(every_parameter,) * len(self.payloads),
+            payload_columns=payload_columns,
             runs=tuple(self.names),
-            joints=Triangles(tuple(joints), self.joint_rows),
-            motors=Triangles(tuple(motors), self.motor_rows),
+            joints=of_joints,
+            motors=of_motors,
             clusters=(),
             cluster_runs=tuple(cluster_runs),
             preload=tuple(preload),
         )
 
     def _joint(self, joint: int) -> FloatArray:
-        """[V | −W | −W_L of each mounting | 0] of a joint:
-        the triangles of all mountings below each other.
-        """
+        """[V | −W | −W_L of each mounting | 0] of a joint: the triangles of all mountings."""
         count = len(self.of_joint)
         columns = self.of_joint[joint]
         motors = np.count_nonzero(columns < count)
-        parts: list[FloatArray] = [np.empty((0, count + self._width))]
+        no_rows = np.empty((0, count + self._width))
+        parts: list[FloatArray] = [no_rows]
         for mounting, factors in self.joints.items():
             rows = factors[joint]
             currents = np.zeros((len(rows), count))
@@ -369,11 +364,10 @@ class _Reducer:
         return np.concatenate(parts)
 
     def _motor(self, motor: int) -> FloatArray:
-        """[v_i | W | W_L of each mounting | 0] of a motor:
-        the triangles of all mountings below each other.
-        """
+        """[v_i | W | W_L of each mounting | 0] of a motor: the triangles of all mountings."""
         width = self.leading + len(self.of_motor[motor])
-        parts: list[FloatArray] = [np.empty((0, self.leading + self._width))]
+        no_rows = np.empty((0, self.leading + self._width))
+        parts: list[FloatArray] = [no_rows]
         for mounting in self.joints:
             clusters = [one for one in self.clusters if one.mounting == mounting]
             rows = [one.factors[motor][:, :width] for one in clusters]
@@ -384,7 +378,9 @@ class _Reducer:
     @property
     def _width(self) -> int:
         """Number of the columns of [W | W_L of each mounting | 0]."""
-        return len(self.unknowns.columns) + BODY * len(self.payloads) + 1
+        of_robot = len(self.unknowns.columns)
+        of_payloads = BODY * len(self.payloads)
+        return of_robot + of_payloads + 1
 
     def _currents(self, rows: FloatArray, motor: int, mounting: int) -> FloatArray:
         """[v_i | W | W_L of each mounting | 0] from the columns that a motor has."""
@@ -409,7 +405,8 @@ class _Reducer:
         out[:, :robot] = every[:, :robot]
         if mounting >= 0:
             first = robot + BODY * mounting
-            out[:, first : first + BODY] = every[:, self.flange]
+            last = first + BODY
+            out[:, first:last] = every[:, self.flange]
         return out
 
 
@@ -456,9 +453,7 @@ def _support_with_currents(model: Model, support: BoolArray) -> BoolArray:
 
 
 def motor_support(train: DriveTrain, support: BoolArray) -> BoolArray:
-    """Mask of the columns of W that the equation of each motor has, from those of each joint,
-    both of shape (m, c).
-    """
+    """Mask of the columns of W that each motor's equation has, from each joint's, (m, c) each."""
     is_mixed = np.abs(train.to_motor) > 0.0
     joints_with_column = is_mixed.astype(np.int64) @ support.astype(np.int64)
     return np.asarray(joints_with_column > 0)
@@ -473,7 +468,8 @@ def _rows_of_joint(model: Model, rows: Rows, joint: int, columns: IntArray) -> F
         currents = rows.drive[joint][:, used]
     else:
         direction = model.drive_train.direction[motors, joint]
-        currents = direction[:, None] * rows.current[motors][:, used]
+        own_currents = rows.current[motors][:, used]
+        currents = direction[:, None] * own_currents
     standard = columns[len(motors) :] - count
     own_columns = rows.standard[joint][np.ix_(standard, used)]
     return np.concatenate((currents, own_columns))
@@ -507,7 +503,8 @@ def _joined(clusters: list[_Cluster]) -> list[_Cluster]:
     index = 0
     while index < len(clusters):
         pair = clusters[index : index + 2]
-        if len(pair) == 2 and pair[0].run == pair[1].run:
+        runs = {cluster.run for cluster in pair}
+        if len(pair) == 2 and len(runs) == 1:
             joined.append(_merged(pair))
         else:
             joined.append(pair[0])
@@ -573,8 +570,7 @@ def regrouped(
 def payload_values(
     payloads: Sequence[Payload], payload_columns: Sequence[Sequence[int]], first: int
 ) -> dict[int, float]:
-    """Values of the payloads' parameters that are no unknowns, zero where not known,
-    for `System.holding`.
+    """Values of payload parameters that are no unknowns, zero where unknown (`System.holding`).
 
     Args:
         payloads: of the system.
@@ -609,9 +605,7 @@ def shown_base(standard: System) -> BaseParameters:
 
 
 def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -> FloatArray:
-    """The columns of W without what a payload adds to a friction that no bare row shows:
-    the two are one parameter.
-    """
+    """Columns of W without a payload's part of a friction that no bare row shows: both are one."""
     if not model.friction_by_payload:
         return columns
     columns = columns.copy()
@@ -626,9 +620,7 @@ def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -
 
 
 def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
-    """For each mounting, its unknown parameters that a system in standard parameters shows
-    (LINK_PARAMETERS).
-    """
+    """Unknown parameters of each mounting that a system in standard parameters shows."""
     columns = _linear_columns(standard)
     chosen: list[tuple[int, ...]] = []
     for mounting, payload in enumerate(standard.payloads):
@@ -647,9 +639,7 @@ def shown_payload_columns(standard: System) -> tuple[tuple[int, ...], ...]:
 
 
 def _independent_payload_columns(flange: FloatArray, unknown: list[int]) -> tuple[int, ...]:
-    """Those of some parameters of a payload (LINK_PARAMETERS)
-    whose columns do not depend on each other.
-    """
+    """Those of some parameters of a payload whose columns do not depend on each other."""
     if not unknown:
         return ()
     names = tuple(LINK_PARAMETERS[index] for index in unknown)
@@ -660,4 +650,5 @@ def _independent_payload_columns(flange: FloatArray, unknown: list[int]) -> tupl
 def _linear_columns(standard: System) -> FloatArray:
     """[W | W_L of each mounting] of all joints below each other."""
     first = standard.axis_count
-    return np.concatenate([-factor[:, first:-1] for factor in standard.joints.factors])
+    parts = [-factor[:, first:-1] for factor in standard.joints.factors]
+    return np.concatenate(parts)

@@ -1,5 +1,4 @@
-"""What differs from run to run as correlated errors of whitened rows:
-friction moves with temperature and mounting.
+"""What differs from run to run, such as friction, as correlated errors of whitened rows.
 
 The rows of one motor in one run share the deviation b of their friction from the common one, b ~
 N(0, s²). In units of the noise and of s, with N the torque per unit of b, their errors have the
@@ -32,9 +31,7 @@ MOST_DENSE = 32
 
 @dataclass(frozen=True, slots=True)
 class RunScatter:
-    """Covariance of the whitened rows of each motor,
-    given by orthonormal directions of single runs.
-    """
+    """Covariance of each motor's whitened rows, by orthonormal directions of single runs."""
 
     directions: tuple[Any, ...]  #: Uᵀ of each motor, an array or a sparse one, shapes (k_i, rows_i)
     variances: tuple[FloatArray, ...]  #: λ of each direction, shapes (k_i,)
@@ -57,7 +54,8 @@ class RunScatter:
 
     def decorrelate(self, motor: int, columns: FloatArray) -> FloatArray:
         """V^(−1/2) times columns on the rows of a motor, columns first, shape (p, rows)."""
-        factors = 1.0 / np.sqrt(1.0 + self.variances[motor]) - 1.0
+        std = np.sqrt(1.0 + self.variances[motor])
+        factors = 1.0 / std - 1.0
         return self._scaled(motor, columns, factors)
 
     def correlate(self, motor: int, columns: FloatArray) -> FloatArray:
@@ -65,9 +63,7 @@ class RunScatter:
         return self._scaled(motor, columns, self.variances[motor])
 
     def shared(self, motor: int, columns: FloatArray) -> FloatArray:
-        """X (V − 1) Xᵀ of columns on the rows of a motor, columns first, shape (p, rows) → (p,
-        p).
-        """
+        """X (V − 1) Xᵀ of columns on a motor's rows, columns first, (p, rows) → (p, p)."""
         components = self.directions[motor] @ columns.T  # Uᵀ Xᵀ
         variances = self.variances[motor][:, None]
         return np.asarray(components.T @ (variances * components))
@@ -100,7 +96,8 @@ def _directions_of_runs(columns: FloatArray, run: IntArray) -> tuple[Any, FloatA
     squares = [np.zeros(0)]
     for number in np.unique(run):
         rows = np.flatnonzero(run == number)
-        _, sizes, own = np.linalg.svd(seen[:, rows], full_matrices=False)
+        of_run = seen[:, rows]
+        _, sizes, own = np.linalg.svd(of_run, full_matrices=False)
         count = len(own)
         column_indices = np.broadcast_to(rows, own.shape).ravel()
         starts = len(rows) * np.arange(count + 1)

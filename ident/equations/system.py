@@ -43,16 +43,12 @@ class Equations:
 
     @property
     def leading(self) -> int:
-        """How many columns of the motors' rows belong to currents:
-        the own one, or with preload those of all motors.
-        """
+        """Number of columns of currents in motors' rows: the own one, with preload those of all."""
         return self.axis_count if self.model.is_redundant else 1
 
     @property
     def unknowns(self) -> tuple[Column, ...]:
-        """χ, then χ_uL of each mounting: everything linear that is estimated in addition to the
-        gains.
-        """
+        """χ, then χ_uL of each mounting: everything linear that is estimated beside the gains."""
         unknowns = list(self.columns)
         for payload, indices in zip(self.payloads, self.payload_columns, strict=True):
             for index in indices:
@@ -75,11 +71,9 @@ class GivenUnknowns:
         remaining = [index for index in range(count + 1) if index not in values]
         nonzero = [index for index, value in values.items() if value]
         nonzero_values = [values[index] for index in nonzero]
-        return cls(
-            kept=np.array(remaining, dtype=np.int64),
-            given=np.array(nonzero, dtype=np.int64),
-            values=np.array(nonzero_values),
-        )
+        kept = np.array(remaining, dtype=np.int64)
+        given = np.array(nonzero, dtype=np.int64)
+        return cls(kept=kept, given=given, values=np.array(nonzero_values))
 
     def joined_in(self, rows: FloatArray, first: int) -> FloatArray:
         """Rows without the columns of these unknowns, whose torque joins the last column.
@@ -139,8 +133,7 @@ class System(Equations):
     def weighted_singular_values(
         self, solution: FloatArray, free: int, *, gains: bool
     ) -> FloatArray:
-        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper
-        Table 5).
+        """Singular values of W_r, rows of a joint divided by its residual's deviation (Table 5).
 
         An effect's coefficient may have any unit, such as rad/Nm, where others have kg m². Its
         column is scaled to the median norm of the base parameters' columns: otherwise the condition
@@ -155,15 +148,16 @@ class System(Equations):
         residual_std = self.joints.residual_std(solution, free)
         matrix = self.joints.stacked(1.0 / residual_std)
         norms = np.linalg.norm(matrix, axis=0)
-        is_base = np.array(
-            [column.name in self.base.names for column in self.columns], dtype=np.bool_
-        )
+        base_names = self.base.names
+        has_base_name = [column.name in base_names for column in self.columns]
+        is_base = np.array(has_base_name, dtype=np.bool_)
         if is_base.any():
             base = count + np.flatnonzero(is_base)
             effects = count + np.flatnonzero(~is_base)
             typical_norm = np.median(norms[base])
             divisors = np.where(norms > 0.0, norms, 1.0)
-            matrix[:, effects] *= typical_norm / divisors[effects]
+            scale = typical_norm / divisors[effects]
+            matrix[:, effects] *= scale
         first = count
         if gains:
             first = 0
@@ -176,9 +170,7 @@ class System(Equations):
         return tuple(self.runs[index] for index in sorted(seen))
 
     def preload_of(self, cluster: int) -> FloatArray:
-        """N of a cluster's rows, shape (rows, m, m − d);
-        empty where no motor works against another.
-        """
+        """N of a cluster's rows, (rows, m, m − d); empty where no motor works against another."""
         if self.preload:
             return self.preload[cluster]
         return np.empty((0, self.axis_count, 0))
@@ -220,19 +212,22 @@ class System(Equations):
             ]
             payload_columns.append(tuple(unknown))
             first += len(indices)
+        joints = given.joined_in_triangles(self.joints, self.axis_count)
+        motors = given.joined_in_triangles(self.motors, self.leading)
+        clusters = given.joined_in_clusters(self.clusters, self.leading)
+        instruments = given.joined_in_clusters(self.instruments, 0)
         return replace(
             self,
             columns=tuple(columns),
             payload_columns=tuple(payload_columns),
-            joints=given.joined_in_triangles(self.joints, self.axis_count),
-            motors=given.joined_in_triangles(self.motors, self.leading),
-            clusters=given.joined_in_clusters(self.clusters, self.leading),
-            instruments=given.joined_in_clusters(self.instruments, 0),
+            joints=joints,
+            motors=motors,
+            clusters=clusters,
+            instruments=instruments,
         )
 
     def on_instruments(self) -> System:
-        """Replace each motor's columns by their projection on its instruments:
-        the first of two stages.
+        """Replace each motor's columns by their projection on its instruments: the first stage.
 
         What is left of a column depends on the demanded motion alone; a disturbance that moved the
         arm is gone from it.
@@ -333,7 +328,8 @@ def require_distinct(system: System, *, gains: bool) -> None:
 def _dependent_unknowns(system: System) -> tuple[str, ...]:
     """Names of the unknowns whose columns depend on those of the others."""
     names = [column.name for column in system.unknowns]
-    columns = np.concatenate([factor[:, system.axis_count :] for factor in system.joints.factors])
+    without_currents = [factor[:, system.axis_count :] for factor in system.joints.factors]
+    columns = np.concatenate(without_currents)
     if system.knows_payload:
         names.append(KNOWN_PAYLOAD)
     else:

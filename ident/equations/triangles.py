@@ -29,9 +29,7 @@ the rest.
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """R of the QR factorisation of each axis' equations;
-    ‖R x‖ is the norm of their residual for any x.
-    """
+    """R of the QR factorisation of each axis' equations; ‖R x‖ is their residual's norm at x."""
 
     factors: tuple[FloatArray, ...]  #: one for each axis, shape (≤c, c)
     rows: IntArray  #: number of equations of each axis, shape (m,)
@@ -42,9 +40,7 @@ class Triangles:
         return np.concatenate([factor * scale for factor, scale in pairs])
 
     def residual_std(self, vector: FloatArray, free: int) -> FloatArray:
-        """Standard deviation of each axis' residual R x;
-        ``free`` parameters are shared among the axes (eq. 9).
-        """
+        """σ of each axis' residual R x; ``free`` parameters are shared by the axes (eq. 9)."""
         square_sum = self.square_sum(vector)
         share = free / len(self.rows)
         freedom = np.maximum(self.rows - share, 1.0)
@@ -52,8 +48,11 @@ class Triangles:
 
     def square_sum(self, vector: FloatArray) -> FloatArray:
         """‖R x‖² of each axis, shape (m,)."""
-        residuals = [factor @ vector for factor in self.factors]
-        return np.array([float(np.sum(residual**2)) for residual in residuals])
+        square_sums: list[float] = []
+        for factor in self.factors:
+            residual = factor @ vector
+            square_sums.append(float(np.sum(residual**2)))
+        return np.array(square_sums)
 
 
 def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
@@ -74,9 +73,7 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
 
 
 def triangle_of(columns: FloatArray) -> FloatArray:
-    """R of rows that are given column by column, shape (c, k) → (≤c, c);
-    columns that are zero take no part.
-    """
+    """R of rows that are given column by column, (c, k) → (≤c, c), without columns of zeros."""
     nonzero = np.flatnonzero(columns.any(axis=1))
     out = np.zeros((len(nonzero), len(columns)))
     out[:, nonzero] = qr_update(None, columns[nonzero])
@@ -93,9 +90,11 @@ def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray
     norms[norms == 0.0] = 1.0
     u, s, vt = np.linalg.svd(matrix / norms, full_matrices=False)
     is_seen = s > s[0] * 1e-13
-    half = vt[is_seen].T / s[is_seen] / norms[:, None]
-    solution = half @ (u[:, is_seen].T @ right)
-    return solution, half @ half.T
+    # M⁺ = H Uᵀ with H = V S⁻¹, in the units of the columns; (MᵀM)⁻¹ = H Hᵀ
+    half = vt[is_seen].T / s[is_seen]
+    half = half / norms[:, None]
+    components = u[:, is_seen].T @ right
+    return half @ components, half @ half.T
 
 
 def least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -113,13 +112,15 @@ def least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
     if len(matrix) <= columns or not norms.all():
         solution, _ = solve(matrix, right)
         return solution
-    factor = triangle((np.column_stack((matrix / norms, right)),), columns + 1)
+    rows = np.column_stack((matrix / norms, right))
+    factor = triangle((rows,), columns + 1)
     upper = factor[:columns, :columns]
     reciprocal_condition, _ = lapack.dtrcon(upper)
     if reciprocal_condition < LEAST_RECIPROCAL_CONDITION:
         solution, _ = solve(matrix, right)
         return solution
-    in_units, _ = lapack.dtrtrs(upper, factor[:columns, columns])
+    turned_right = factor[:columns, columns]
+    in_units, _ = lapack.dtrtrs(upper, turned_right)
     return np.asarray(in_units / norms)
 
 
@@ -158,6 +159,7 @@ def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
     for first in range(0, rows, BLOCK_ROWS):
         # Time last in C order is (rows, columns) in Fortran order: LAPACK gets it without a
         # transposition.
-        block = np.array(columns[:, first : first + BLOCK_ROWS], order="C")
+        last = first + BLOCK_ROWS
+        block = np.array(columns[:, first:last], order="C")
         out, *_ = lapack.dtpqrt(0, reflectors, out, block.T, overwrite_a=1, overwrite_b=1)
     return np.triu(out)

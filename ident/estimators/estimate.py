@@ -33,9 +33,7 @@ class RelativeError:
     total: float  #: of all together [%]
 
     def at(self, place: int) -> float:
-        """Error of an axis [%]; for a joint without a motor (numbers above the axes'),
-        that of all axes together.
-        """
+        """Error of an axis [%]; of all together for a joint without a motor (above the axes)."""
         if place < len(self.axes):
             return self.axes[place]
         return self.total
@@ -44,8 +42,7 @@ class RelativeError:
 def relative_error(
     measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray
 ) -> RelativeError:
-    """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6);
-    NaN for a joint without a row that counts.
+    """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (Table 6); NaN for a joint without rows.
 
     Args:
         measured_nm, predicted_nm: joint torque, shape (m, r).
@@ -141,8 +138,7 @@ class Identification:
 
     @property
     def current_residual(self) -> tuple[float, ...] | None:
-        """Root mean square of what is left of each motor's current,
-        as `Calibration.current_residual`.
+        """Root mean square of what is left of each motor's current, as in a `Calibration`.
 
         None where a motor has no rows.
         """

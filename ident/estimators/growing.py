@@ -1,6 +1,4 @@
-"""A fit that grows with a recording: each new piece is folded into the triangles,
-and the gains are there at once.
-"""
+"""A fit that grows with a recording: new pieces are folded in, and the gains are there at once."""
 
 from __future__ import annotations
 
@@ -35,8 +33,7 @@ class GrowingFit:
     runs: tuple[RunProgress, ...] = ()  #: in the order in which they began
 
     def with_run(self, run: Run) -> GrowingFit:
-        """Fold in a run to its end: as a whole, or what is left of one that `with_run_so_far` has
-        folded in.
+        """Fold in a run to its end: all of it, or what `with_run_so_far` has left of it.
 
         Args:
             run: all its samples.
@@ -74,9 +71,7 @@ class GrowingFit:
         return replace(self, standard=standard, runs=(*others, found.progress))
 
     def _before(self, run: Run) -> RunProgress | None:
-        """Return how far a run is in the triangles, None for a new one;
-        refuse one that must not be folded in.
-        """
+        """Return how far a run is folded in, None for a new one; refuse one that may not be."""
         if run.payload is not None and run.payload not in self.payloads:
             mountings = ", ".join(repr(payload.mounting) for payload in self.payloads) or "none"
             raise DataUnfit(
@@ -96,9 +91,7 @@ class GrowingFit:
 
     @property
     def move_count(self) -> int:
-        """Number of moves that can be left out for σ;
-        one longer than two seconds counts as several.
-        """
+        """Number of moves that can be left out for σ; one above two seconds counts as several."""
         if self.standard is None:
             return 0
         return len(self.standard.clusters)
@@ -110,8 +103,7 @@ class GrowingFit:
         return quick_gains(self.standard)
 
     def system(self) -> System:
-        """Return the equations so far in base parameters,
-        for `ident.estimators.maximum_likelihood.ml`.
+        """Return the equations so far in base parameters, for `maximum_likelihood.ml`.
 
         Raises:
             DataUnfit: a joint has not moved yet.

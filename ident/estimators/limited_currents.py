@@ -1,5 +1,4 @@
-"""Drives that give their motor less current than its reference asks for,
-which neither drive nor log reports.
+"""Drives that give less current than their reference asks for, and do not report it.
 
 A limit behind the reference shows nothing in the current itself: the reference goes on to grow. But
 the torque does not: the current that the motion needs goes no further than the limit, whenever the

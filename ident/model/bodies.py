@@ -27,9 +27,7 @@ from ident.errors import ModelError
 LOADED = "_loaded"
 """Ends the name of what a payload adds to a friction parameter (`Model.friction_by_payload`)."""
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
-"""Inertia about the link frame's origin, first moments, mass, in the paper's order;
-a payload is a link too (§2.2).
-"""
+"""Inertia about the link frame's origin, first moments, mass; a payload is a link too (§2.2)."""
 
 LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
 ROUNDING = 1e-3  #: Share of its size by which rounding in a drawing may make an inertia impossible
@@ -76,10 +74,14 @@ class Payload:
             raise ModelError(
                 f"payload {self.name!r} has {found}; expected zero or more; give that of the scale"
             )
-        bad = [f"{name} = {value}" for name, value in self.known.items() if not isfinite(value)]
-        if bad:
+        not_finite: list[str] = []
+        for name, value in self.known.items():
+            if not isfinite(value):
+                not_finite.append(f"{name} = {value}")
+        if not_finite:
+            found = ", ".join(not_finite)
             raise ModelError(
-                f"payload {self.name!r} has {', '.join(bad)}; expected finite numbers; leave out "
+                f"payload {self.name!r} has {found}; expected finite numbers; leave out "
                 "what is not known"
             )
         mass_kg = self.known.get("m")
@@ -99,8 +101,7 @@ class Payload:
 
 
 def _require_possible_inertia(payload: Payload) -> None:
-    """Refuse an inertia that no distribution of mass has, as far as what is known says so;
-    a point mass may be.
+    """Refuse an inertia that no distribution of mass has, as far as it is known; a point may be.
 
     Raises:
         ModelError: the second moments Σ, or the pseudo-inertia where the centre is known too, have
@@ -114,7 +115,8 @@ def _require_possible_inertia(payload: Payload) -> None:
     pseudo = pseudo_inertia(payload.known_parameters)
     if set(known) != set(LINK_PARAMETERS):
         pseudo = pseudo[:3, :3]
-    size = max(float(np.trace(pseudo[:3, :3])), 0.0)
+    second_moments = pseudo[:3, :3]
+    size = max(float(np.trace(second_moments)), 0.0)
     # The rows of the second moments and of the mass have other units: compare them at a common
     # size.
     scale = np.ones(len(pseudo))
@@ -122,7 +124,8 @@ def _require_possible_inertia(payload: Payload) -> None:
         scale[:3] = np.sqrt(size)
     scale[3:] = np.sqrt(known.get("m", 1.0))
     scaled = pseudo / np.outer(scale, scale)
-    smallest = float(np.linalg.eigvalsh(scaled)[0])
+    eigenvalues = np.linalg.eigvalsh(scaled)
+    smallest = float(eigenvalues[0])
     if smallest >= -ROUNDING:
         return
     values = [f"{name} = {known[name]:g}" for name in LINK_PARAMETERS if name in known]
@@ -154,13 +157,13 @@ def _require_no_negative_moment(payload: Payload) -> None:
 
 
 def pseudo_inertia(link: FloatArray) -> FloatArray:
-    """P of a link's parameters in the order of LINK_PARAMETERS, shape (10,) → (4, 4) [kg m², kg m,
-    kg].
-    """
+    """P of a link's parameters (LINK_PARAMETERS), (10,) → (4, 4) [kg m², kg m, kg]."""
     inertia = _symmetric(link[:6])
     first_moment = link[6:9]
+    # Σ = ½ tr(I) 1 − I
+    half_trace = 0.5 * np.trace(inertia)
     out = np.empty((4, 4))
-    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, :3] = half_trace * np.eye(3) - inertia
     out[:3, 3] = first_moment
     out[3, :3] = first_moment
     out[3, 3] = link[9]
@@ -168,13 +171,14 @@ def pseudo_inertia(link: FloatArray) -> FloatArray:
 
 
 def link_parameters(pseudo: FloatArray) -> FloatArray:
-    """The inverse of `pseudo_inertia`, shape (4, 4) → (10,);
-    a matrix that is not symmetric counts as its mean.
-    """
+    """The inverse of `pseudo_inertia`, (4, 4) → (10,); of the mean with the transpose."""
     symmetric = 0.5 * (pseudo + pseudo.T)
     second_moments = symmetric[:3, :3]
+    first_moments = symmetric[:3, 3]
+    mass = symmetric[3:, 3]
     inertia = np.trace(second_moments) * np.eye(3) - second_moments
-    return np.concatenate((inertia[_ROWS, _COLUMNS], symmetric[:3, 3], symmetric[3:, 3]))
+    upper = inertia[_ROWS, _COLUMNS]
+    return np.concatenate((upper, first_moments, mass))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,13 +192,12 @@ class Body:
 
     @property
     def parameters(self) -> FloatArray:
-        """About the link frame's origin (Huygens-Steiner), in the order of LINK_PARAMETERS,
-        shape (10,).
-        """
+        """About the link frame's origin (Huygens-Steiner), as LINK_PARAMETERS, shape (10,)."""
         mass = self.mass_kg
         inertia = self.inertia_kg_m2 + mass * _steiner(self.centre_m)
         first_moment = mass * self.centre_m
-        return np.concatenate((inertia[_ROWS, _COLUMNS], first_moment, (mass,)))
+        upper = inertia[_ROWS, _COLUMNS]
+        return np.concatenate((upper, first_moment, (mass,)))
 
 
 def body_of(link: FloatArray) -> Body:
@@ -205,13 +208,15 @@ def body_of(link: FloatArray) -> Body:
     """
     mass = float(link[9])
     centre_m = link[6:9] / mass
-    inertia = _symmetric(link[:6]) - mass * _steiner(centre_m)
+    about_origin = _symmetric(link[:6])
+    inertia = about_origin - mass * _steiner(centre_m)
     return Body(mass, centre_m, inertia)
 
 
 def _steiner(centre_m: FloatArray) -> FloatArray:
     """c · c 1 − c cᵀ, shape (3, 3): inertia of a unit mass at a point."""
-    return np.asarray(centre_m @ centre_m * np.eye(3) - np.outer(centre_m, centre_m))
+    square = centre_m @ centre_m
+    return np.asarray(square * np.eye(3) - np.outer(centre_m, centre_m))
 
 
 def _symmetric(upper: FloatArray) -> FloatArray:

@@ -190,7 +190,8 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     jacobian = loops(robot, position, assembly.size_m).jacobian
     # J_d = Q R, so that G_d = −R⁻¹ Qᵀ J_x
     q, r = np.linalg.qr(jacobian[:, :, dependent])
-    right = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
+    transposed = np.swapaxes(q, 1, 2)
+    right = transposed @ jacobian[:, :, x]
     to_joints = np.zeros((samples, count, len(x)))
     to_joints[:, x] = np.eye(len(x))
     to_joints[:, dependent] = -np.linalg.solve(r, right)
@@ -200,11 +201,13 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     # h_d = −R⁻¹ Qᵀ J̇ q̇
     turning = loops(robot, position, assembly.size_m, velocity).bias
     turning_right = np.einsum("kcr,kc->kr", q, turning)
+    solution = np.linalg.solve(r, turning_right[..., None])
     bias = np.zeros((samples, count))
-    bias[:, dependent] = -np.linalg.solve(r, turning_right[..., None])[..., 0]
+    bias[:, dependent] = -solution[..., 0]
     axes_acceleration = np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
     acceleration_x = _least_squares(to_motors, axes_acceleration)
-    acceleration = np.einsum("knd,kd->kn", to_joints, acceleration_x) + bias  # G ẍ + h
+    without_bias = np.einsum("knd,kd->kn", to_joints, acceleration_x)
+    acceleration = without_bias + bias  # G ẍ + h
     condition = _condition(r)
     condition_of_motors = _condition_of_motors(robot, assembly, to_motors)
     _require_regular(robot, axes_rad, condition, "closures")
@@ -220,11 +223,12 @@ def _require_regular(robot: Robot, axes_rad: FloatArray, condition: FloatArray, 
         ModelError: one is above LARGEST_CONDITION.
     """
     worst = int(np.argmax(condition))
-    if condition[worst] > LARGEST_CONDITION:
+    largest = condition[worst]
+    if largest > LARGEST_CONDITION:
+        place = _at(robot, axes_rad[worst])
         raise ModelError(
-            f"the motion comes close to a singularity at {_at(robot, axes_rad[worst])}: condition "
-            f"{condition[worst]:.3g} of the {of}; expected below {LARGEST_CONDITION:g}: record "
-            "moves away from it"
+            f"the motion comes close to a singularity at {place}: condition {largest:.3g} of the "
+            f"{of}; expected below {LARGEST_CONDITION:g}: record moves away from it"
         )
 
 
@@ -247,8 +251,9 @@ class Reach:
 
 
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
-    """Positions of all joints [rad or m], shape (k, n), of those of the motors' joints, shape (k,
-    m); see `follow`.
+    """Positions of all joints, (k, n), of those of the motors' joints, (k, m); see `follow`.
+
+    In rad or m.
 
     Raises:
         ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not
@@ -259,20 +264,25 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     motors = list(robot.axis_joints)
     difference = np.abs(found.position_rad[:, motors] - axes_rad)
     misfit = difference / units  # zero where m = d
-    worst, axis = divmod(int(np.argmax(misfit)), misfit.shape[1])
+    largest = int(np.argmax(misfit))
+    worst, axis = divmod(largest, misfit.shape[1])
     if misfit[worst, axis] > LARGEST_MISFIT:
         name = robot.axes[axis].name
-        found_misfit = misfit[worst, axis] * units[axis]
-        largest_misfit = LARGEST_MISFIT * units[axis]
+        unit = units[axis]
+        found_misfit = misfit[worst, axis] * unit
+        largest_misfit = LARGEST_MISFIT * unit
+        place = _at(robot, axes_rad[worst])
         raise ModelError(
-            f"the motors do not fit each other at {_at(robot, axes_rad[worst])}: {name} is "
+            f"the motors do not fit each other at {place}: {name} is "
             f"{found_misfit:.2g} away from where the others hold it; expected at most "
             f"{largest_misfit:.2g} (rad or m): are signs, zeros and ratios of the axes right?"
         )
     if not found.closed.all():
         worst = int(np.argmax(found.gap))
+        gap = found.gap[worst]
+        place = _at(robot, axes_rad[worst])
         raise ModelError(
-            f"the loops cannot be closed at {_at(robot, axes_rad[worst])}: {found.gap[worst]:.2g} "
+            f"the loops cannot be closed at {place}: {gap:.2g} "
             "of the robot's size is left open; expected positions inside the workspace: are signs, "
             "zeros and units of the axes right?"
         )
@@ -318,23 +328,20 @@ def _condition_of_motors(robot: Robot, assembly: Assembly, to_motors: FloatArray
 
 def _at(robot: Robot, axes_rad: FloatArray) -> str:
     """Positions of the axes, for a message."""
-    pairs = zip(robot.axes, axes_rad, strict=True)
-    named = [f"{joint.name} {value:.4g}" for joint, value in pairs]
-    return ", ".join(named) + " (rad or m)"
+    named: list[str] = []
+    for joint, value in zip(robot.axes, axes_rad, strict=True):
+        named.append(f"{joint.name} {value:.4g}")
+    places = ", ".join(named)
+    return f"{places} (rad or m)"
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
-    """Close the loops at positions of the motors' joints [rad or m], shape (k, m),
-    as far as they close.
-    """
+    """Close the loops at positions of the motors' joints [rad or m], (k, m), as far as they do."""
     samples = len(axes_rad)
     if not robot.is_constrained:
-        return Reach(
-            position_rad=axes_rad,
-            gap=np.zeros(samples),
-            misfit=np.zeros(samples),
-            condition=np.ones(samples),
-        )
+        no_gap = np.zeros(samples)
+        no_misfit = np.zeros(samples)
+        return Reach(axes_rad, no_gap, no_misfit, condition=np.ones(samples))
     motors = list(robot.axis_joints)
     start = assembly.position_rad[motors]
     units = _units(robot, assembly)
@@ -353,7 +360,8 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
         way = start + (goal - start) * (step / steps)
-        found, gap, condition = _newton(robot, assembly, found, way, on_the_way=step < steps)
+        is_on_the_way = step < steps
+        found, gap, condition = _newton(robot, assembly, found, way, on_the_way=is_on_the_way)
     while len(coarse) < samples:
         stride = max(1, stride // 8)
         finer = _every(stride, samples)
@@ -363,7 +371,8 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
             near = np.repeat(found, len(finer), axis=0)
         coarse = finer
         found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
-    return Reach(found, gap, _largest_misfit(found[:, motors], axes_rad), condition)
+    misfit = _largest_misfit(found[:, motors], axes_rad)
+    return Reach(found, gap, misfit, condition)
 
 
 def _every(stride: int, samples: int) -> IntArray:
@@ -373,17 +382,15 @@ def _every(stride: int, samples: int) -> IntArray:
 
 
 def _largest_misfit(found_rad: FloatArray, axes_rad: FloatArray) -> FloatArray:
-    """Largest difference of a motor's joint from its measured position in each sample,
-    shape (k,).
-    """
-    return np.asarray(np.max(np.abs(found_rad - axes_rad), axis=1))
+    """Largest difference of a motor's joint from its measured position in each sample, (k,)."""
+    difference = np.abs(found_rad - axes_rad)
+    return np.asarray(np.max(difference, axis=1))
 
 
 def reach_near(
     robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray
 ) -> Reach:
-    """Close the loops from poses near by, as those of the same robot with slightly other lengths or
-    zeros.
+    """Close the loops from poses near by, as those with slightly other lengths or zeros.
 
     Args:
         robot: whose loops are closed.
@@ -393,7 +400,8 @@ def reach_near(
     """
     motors = list(robot.axis_joints)
     found, gap, condition = _newton(robot, assembly, near_rad, axes_rad)
-    return Reach(found, gap, _largest_misfit(found[:, motors], axes_rad), condition)
+    misfit = _largest_misfit(found[:, motors], axes_rad)
+    return Reach(found, gap, misfit, condition)
 
 
 def _newton(
@@ -404,10 +412,10 @@ def _newton(
     *,
     on_the_way: bool = False,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Close the loops at given positions of the motors' joints, from near by:
-    positions, gaps and conditions.
+    """Close the loops at given positions of the motors' joints, from near by.
 
-    ``on_the_way`` to other positions it is enough to stay near the pose.
+    It returns positions, gaps and conditions. ``on_the_way`` to other positions it is enough to
+    stay near the pose.
     """
     largest_gap = CLOSED
     longest_step_rad = 1e-9
@@ -428,15 +436,19 @@ def _newton(
         gap = np.max(np.abs(closing.residual), axis=1)
         # −J_d⁻¹ [φ | J_x]: the step that closes the loops, and G_d
         q, r = np.linalg.qr(closing.jacobian[:, :, dependent])
-        right = np.concatenate((closing.residual[:, :, None], closing.jacobian[:, :, x]), axis=2)
-        solution = -_solve_each(r, np.swapaxes(q, 1, 2) @ right)
+        residual = closing.residual[:, :, None]
+        of_independent = closing.jacobian[:, :, x]
+        right = np.concatenate((residual, of_independent), axis=2)
+        turned_right = np.swapaxes(q, 1, 2) @ right
+        solution = -_solve_each(r, turned_right)
         change = np.zeros_like(position)
         change[:, dependent] = solution[:, :, 0]
         if is_redundant:
             to_joints = np.zeros((samples, count, len(x)))
             to_joints[:, x] = np.eye(len(x))
             to_joints[:, dependent] = solution[:, :, 1:]
-            misfit = axes_rad - position[:, motors] - change[:, motors]
+            closed = position[:, motors]
+            misfit = axes_rad - closed - change[:, motors]
             change_x = _least_squares(to_joints[:, motors], misfit)
             change += np.einsum("knd,kd->kn", to_joints, change_x)  # G Δx
         step = np.max(np.abs(change), axis=1)
@@ -444,16 +456,16 @@ def _newton(
         is_lost = ~(step < LONGEST_STEP_RAD)
         change[is_lost] = 0.0
         position += change
-        is_closed = (gap < largest_gap) & (step < longest_step_rad)
+        has_no_gap = gap < largest_gap
+        has_settled = step < longest_step_rad
+        is_closed = has_no_gap & has_settled
         if np.all(is_lost | is_closed):
             break
     return position, gap, _condition(r)
 
 
 def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray:
-    """Positions between known samples, shape (len(finer), n):
-    cubic polynomials with the slopes of differences.
-    """
+    """Positions between known samples, (len(finer), n), by cubics with slopes of differences."""
     slope = np.gradient(found, coarse, axis=0)
     before = np.searchsorted(coarse, finer, side="right") - 1
     before = np.clip(before, 0, len(coarse) - 2)
@@ -466,7 +478,8 @@ def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray
     a = slope[before] * length + difference
     b = -slope[after] * length - difference
     straight = (1 - s) * first + s * second
-    return np.asarray(straight + s * (1 - s) * ((1 - s) * a + s * b))
+    bend = (1 - s) * a + s * b
+    return np.asarray(straight + s * (1 - s) * bend)
 
 
 def _solve_each(triangle: FloatArray, right: FloatArray) -> FloatArray:

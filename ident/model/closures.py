@@ -42,8 +42,11 @@ def loops(
     samples = len(position)
     placed = poses(robot, position)
     axes_of_joints = np.array([joint.axis for joint in robot.joints])
-    axes = (placed.rotation[1:] @ axes_of_joints[:, None, :, None])[..., 0]
-    width = sum(len(closure.directions) for closure in robot.closures) + len(robot.couplings)
+    columns = axes_of_joints[:, None, :, None]
+    axes = (placed.rotation[1:] @ columns)[..., 0]
+    width = len(robot.couplings)
+    for closure in robot.closures:
+        width += len(closure.directions)
     residual = np.empty((samples, width))
     jacobian = np.empty((samples, width, robot.joint_count))
     if velocity is None:
@@ -58,7 +61,8 @@ def loops(
         own = _closure(robot, closure, placed, axes, moved)
         residual[:, first:end] = own.residual
         jacobian[:, first:end] = own.jacobian
-        lengths = [first + row for row, name in enumerate(closure.directions) if name in _INDEX]
+        directions = enumerate(closure.directions, start=first)
+        lengths = [row for row, name in directions if name in _INDEX]
         residual[:, lengths] /= size_m
         jacobian[:, lengths] /= size_m
         if moved is not None:
@@ -72,7 +76,8 @@ def loops(
         if robot.joints[follower].kind is JointKind.REVOLUTE:
             unit = 1.0
         followed = coupling.multiplier * position[:, leader] + coupling.offset
-        residual[:, row] = (position[:, follower] - followed) / unit
+        gap = position[:, follower] - followed
+        residual[:, row] = gap / unit
         jacobian[:, row] = 0.0
         jacobian[:, row, follower] = 1.0 / unit
         jacobian[:, row, leader] = -coupling.multiplier / unit
@@ -82,21 +87,18 @@ def loops(
 
 
 def with_followers(robot: Robot, position: FloatArray) -> FloatArray:
-    """Positions of all joints [rad or m], shape (…, n),
-    with each follower where its leader puts it.
-    """
+    """Positions of all joints [rad or m], (…, n), each follower where its leader puts it."""
     out = position.copy()
     for coupling in robot.couplings:
         leader_position = position[..., coupling.leader]
-        out[..., coupling.follower] = coupling.multiplier * leader_position + coupling.offset
+        followed = coupling.multiplier * leader_position + coupling.offset
+        out[..., coupling.follower] = followed
     return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Spin:
-    """Motion of every link with all joint accelerations zero;
-    arrays of shape (n + 1, k, 3), in the base frame.
-    """
+    """Motion of every link without joint accelerations, in the base frame, (n + 1, k, 3) each."""
 
     angular: FloatArray  #: ω
     linear: FloatArray  #: velocity of the frame's origin
@@ -120,8 +122,10 @@ def _spin(
         arm = placed.origin_m[i] - placed.origin_m[p]
         w[i] = w[p]
         dw[i] = dw[p]
-        v[i] = v[p] + _cross(w[p], arm)
-        dv[i] = dv[p] + _cross(dw[p], arm) + _cross(w[p], _cross(w[p], arm))
+        of_arm = _cross(w[p], arm)
+        centripetal = _cross(w[p], of_arm)
+        v[i] = v[p] + of_arm
+        dv[i] = dv[p] + _cross(dw[p], arm) + centripetal
         if joint.kind is JointKind.REVOLUTE:
             w[i] = w[p] + along
             dw[i] = dw[p] + _cross(w[p], along)
@@ -136,8 +140,9 @@ _LAST = np.array([2, 0, 1])  #: Component before each one
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of vectors, shape (…, 3);
-    without the checks of numpy's, which take longer than the products.
+    """Cross products of vectors, shape (…, 3).
+
+    numpy's own has checks that take longer than the products.
     """
     positive = a[..., _NEXT] * b[..., _LAST]
     negative = a[..., _LAST] * b[..., _NEXT]
@@ -147,7 +152,8 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 def origin(placed: Poses, place: Place) -> FloatArray:
     """Origin of a frame in the base [m], shape (k, 3)."""
     at = place.joint + 1
-    return np.asarray(placed.origin_m[at] + placed.rotation[at] @ place.translation_m)
+    offset_m = placed.rotation[at] @ place.translation_m
+    return np.asarray(placed.origin_m[at] + offset_m)
 
 
 def _columns(
@@ -240,9 +246,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatArray) -> FloatArray:
-    """Acceleration of p₂ − p₁ as the first frame sees it, with all joint accelerations zero,
-    shape (k, 3).
-    """
+    """Acceleration of p₂ − p₁ in the first frame, without joint accelerations, shape (k, 3)."""
     v1, dv1 = _place_motion(moved, placed, closure.first)
     v2, dv2 = _place_motion(moved, placed, closure.second)
     at = closure.first.joint + 1
@@ -250,20 +254,21 @@ def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatA
     dw1 = moved.angular_bias[at]
     coriolis = 2.0 * _cross(w1, v2 - v1)
     centripetal = _cross(w1, _cross(w1, gap))
-    return dv2 - dv1 - _cross(dw1, gap) - coriolis + centripetal
+    euler = _cross(dw1, gap)
+    return dv2 - dv1 - euler - coriolis + centripetal
 
 
 def _relative_turn(
     moved: _Spin, closure: Closure, to_frame: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angular velocity of the second frame in the first one,
-    and its rate with all joint accelerations zero.
-    """
+    """Angular velocity of the second frame in the first, and its rate without accelerations."""
     first = closure.first.joint + 1
     second = closure.second.joint + 1
     w1 = moved.angular[first]
+    dw1 = moved.angular_bias[first]
     relative = moved.angular[second] - w1
-    rate = moved.angular_bias[second] - moved.angular_bias[first] - _cross(w1, relative)
+    coriolis = _cross(w1, relative)
+    rate = moved.angular_bias[second] - dw1 - coriolis
     return _in_frame(to_frame, relative), _in_frame(to_frame, rate)
 
 
@@ -287,6 +292,8 @@ def _place_motion(moved: _Spin, placed: Poses, place: Place) -> tuple[FloatArray
     arm = placed.rotation[at] @ place.translation_m
     w = moved.angular[at]
     dw = moved.angular_bias[at]
-    velocity = moved.linear[at] + _cross(w, arm)
-    acceleration = moved.linear_bias[at] + _cross(dw, arm) + _cross(w, _cross(w, arm))
+    of_arm = _cross(w, arm)
+    centripetal = _cross(w, of_arm)
+    velocity = moved.linear[at] + of_arm
+    acceleration = moved.linear_bias[at] + _cross(dw, arm) + centripetal
     return velocity, acceleration

@@ -98,7 +98,8 @@ def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
         loop = _loop(robot, robot.closures[pivot.closure])
         for joint, sign in loop.items():
             axis = _joint_axis(robot, placed, joint)
-            rates[:, number, joint] = sign * np.einsum("ki,ki->k", about, axis)  # ± a · a_j
+            along = np.einsum("ki,ki->k", about, axis)  # a · a_j
+            rates[:, number, joint] = sign * along
     return rates
 
 
@@ -129,25 +130,31 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
     for number, pivot in enumerate(robot.pivots):
         middle = _angle(robot, assembled, pivot)
         away = _angle(robot, placed, pivot) - middle
-        position[:, number] = middle + np.arctan2(np.sin(away), np.cos(away))
+        within_half_turn = np.arctan2(np.sin(away), np.cos(away))
+        position[:, number] = middle + within_half_turn
         about = _axis(robot, placed, pivot)
         loop = _loop(robot, robot.closures[pivot.closure])
         for joint, sign in loop.items():
             parent = robot.joints[joint].parent
             of_parent = turning[parent + 1]
-            own = _joint_axis(robot, placed, joint) * joints.velocity_rad_s[:, joint, None]
+            axis = _joint_axis(robot, placed, joint)
+            own = axis * joints.velocity_rad_s[:, joint, None]
             turned = np.cross(of_parent, own)
-            acceleration[:, number] += sign * np.einsum("ki,ki->k", about, turned)
+            along = np.einsum("ki,ki->k", about, turned)  # a · (ω × a_j q̇_j)
+            acceleration[:, number] += sign * along
     return Motion(position, velocity, acceleration)
 
 
 def _pivot_of(robot: Robot, index: int) -> Pivot | None:
-    """Return the pivot that a closure is of;
-    None of one that turns about no axis or about several.
-    """
-    closure = robot.closures[index]
-    lengths = [axis for axis, name in enumerate("xyz") if name in closure.directions]
-    free = [axis for axis, name in enumerate("xyz") if f"r{name}" not in closure.directions]
+    """Return the pivot of a closure; None of one that turns about no axis or about several."""
+    directions = robot.closures[index].directions
+    lengths: list[int] = []
+    free: list[int] = []
+    for axis, name in enumerate("xyz"):
+        if name in directions:
+            lengths.append(axis)
+        if f"r{name}" not in directions:
+            free.append(axis)
     if len(free) == 1:
         return Pivot(index, free[0])
     if len(free) < 3 or len(lengths) != 2:
@@ -189,7 +196,8 @@ def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
 
 def _joint_axis(robot: Robot, placed: Poses, joint: int) -> FloatArray:
     """Axis of a joint in the base, shape (k, 3)."""
-    return np.asarray(placed.rotation[joint + 1] @ robot.joints[joint].axis)
+    in_link = robot.joints[joint].axis
+    return np.asarray(placed.rotation[joint + 1] @ in_link)
 
 
 def _axis(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
@@ -202,8 +210,10 @@ def _axis(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
 def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
     """Angle of a pivot, between −π and π, shape (k,)."""
     closure = robot.closures[pivot.closure]
-    frame = placed.rotation[closure.first.joint + 1] @ closure.first.rotation
-    other = placed.rotation[closure.second.joint + 1] @ closure.second.rotation
+    first = closure.first
+    second = closure.second
+    frame = placed.rotation[first.joint + 1] @ first.rotation
+    other = placed.rotation[second.joint + 1] @ second.rotation
     turned = np.swapaxes(frame, 1, 2) @ other
     following = (pivot.axis + 1) % 3
     last = (pivot.axis + 2) % 3
@@ -218,14 +228,13 @@ def _angular_velocities(robot: Robot, placed: Poses, velocity_rad_s: FloatArray)
     for index, joint in enumerate(robot.joints):
         turning[index + 1] = turning[joint.parent + 1]
         if joint.kind is JointKind.REVOLUTE:
-            turning[index + 1] += _joint_axis(robot, placed, index) * velocity_rad_s[:, index, None]
+            axis = _joint_axis(robot, placed, index)
+            turning[index + 1] += axis * velocity_rad_s[:, index, None]
     return turning
 
 
 def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:
-    """Speeds of all joints and pivots in free motions at and near the assembly pose,
-    shape (motions, n + p).
-    """
+    """Speeds of joints and pivots in free motions near the assembly pose, (motions, n + p)."""
     draw = np.random.default_rng(0)
     assembled = loops(robot, assembly.position_rad[None], assembly.size_m)
     free = null_space(assembled.jacobian[0])
@@ -242,6 +251,8 @@ def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:
             position = position - step
         closing = loops(robot, position[None], assembly.size_m)
         of_joints = null_space(closing.jacobian[0])
-        of_pivots = pivot_rates(robot, position[None])[0] @ of_joints
-        speeds.append(np.concatenate((of_joints, of_pivots)).T)
+        (rates,) = pivot_rates(robot, position[None])
+        of_pivots = rates @ of_joints
+        of_all = np.concatenate((of_joints, of_pivots))
+        speeds.append(of_all.T)
     return np.concatenate(speeds)

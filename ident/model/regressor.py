@@ -66,14 +66,8 @@ def fill_rigid(
         if end - first != size:
             work = _work(robot, links, end - first)
         for index, link in enumerate(links):
-            _move(
-                link,
-                work,
-                index,
-                _placed(link, position[index, block]),
-                velocity[index, block],
-                acceleration[index, block],
-            )
+            place = _placed(link, position[index, block])
+            _move(link, work, index, place, velocity[index, block], acceleration[index, block])
             screws = work.screws[index]
             _fill_wrench(work.inertia, work.moments, screws[0], screws[1])
             for screw, mover in zip(screws[2:], link.movers, strict=True):
@@ -93,9 +87,7 @@ def _copy_row(
     inertias: Sequence[slice],
     moments: Sequence[slice],
 ) -> None:
-    """Write one row of Y, for the joint whose screw is a unit vector,
-    into the spans of the parameters.
-    """
+    """Write one row of Y, of a joint whose screw is a unit vector, into spans of parameters."""
     of_inertia = row[:6]
     of_moments = row[6:]
     is_angular = component < 3
@@ -115,16 +107,16 @@ def _project_row(
     inertias: Sequence[slice],
     moments: Sequence[slice],
 ) -> None:
-    """Write SᵀY of a joint, Σ_d S_dk Y_dck of parameter c and sample k,
-    into the spans of the parameters.
-    """
+    """Write SᵀY of a joint into spans of parameters: Σ_d S_dk Y_dck of parameter c, sample k."""
     of_inertia = row[:6]
     of_moments = row[6:]
     angular = screw[:3]
     for span in inertias:
-        np.einsum("dk,dck->ck", angular, work.inertia[:, span], out=of_inertia[span])
+        inertia = work.inertia[:, span]
+        np.einsum("dk,dck->ck", angular, inertia, out=of_inertia[span])
     for span in moments:
-        np.einsum("dk,dck->ck", screw, work.moments[:, span], out=of_moments[span])
+        moment = work.moments[:, span]
+        np.einsum("dk,dck->ck", screw, moment, out=of_moments[span])
 
 
 def _spans(wanted: BoolArray) -> list[slice]:
@@ -133,7 +125,7 @@ def _spans(wanted: BoolArray) -> list[slice]:
     edges = np.flatnonzero(np.diff(padded)).tolist()
     starts = edges[::2]
     ends = edges[1::2]
-    return [slice(start, end) for start, end in zip(starts, ends, strict=True)]
+    return [slice(*span) for span in zip(starts, ends, strict=True)]
 
 
 def rigid_torque(
@@ -143,9 +135,7 @@ def rigid_torque(
     acceleration: FloatArray,
     parameters: FloatArray,
 ) -> FloatArray:
-    """Torque of the rigid links [Nm or N], shape (n, k):
-    the columns of `fill_rigid` times ``parameters``, (n, 10).
-    """
+    """Torque of rigid links [Nm or N], (n, k): `fill_rigid` times ``parameters``, (n, 10)."""
     links = _links(robot)
     inertias = [_inertia(own) for own in parameters]
     out = np.empty_like(position)
@@ -193,8 +183,7 @@ def _fill_inertial_wrench(wrench: FloatArray, screws: FloatArray, inertia: Float
 
 
 def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Torque of the rigid links at joint i per unit of acceleration of joint j,
-    Σ S_iᵀ M S_j over the links, (n, n, k).
+    """Torque at joint i per unit of acceleration of joint j, Σ S_iᵀ M S_j, shape (n, n, k).
 
     Args:
         robot: n joints.
@@ -217,7 +206,8 @@ def mass_matrix(robot: Robot, position: FloatArray, parameters: FloatArray) -> F
             momenta = inertia @ screws
             # S_iᵀ M S_j of the joints i and j that move this link
             of_link = np.einsum("idk,jdk->ijk", screws, momenta)
-            of_block[np.ix_(link.movers, link.movers)] += of_link
+            movers = np.ix_(link.movers, link.movers)
+            of_block[movers] += of_link
     return out
 
 
@@ -228,7 +218,8 @@ def _add_cross(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 
 def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cosine and sine to the last digit of one, by the half-angle:
+    """Cosine and sine to the last digit of one, by the half-angle.
+
     numpy has a vector tangent, four times as fast.
     """
     tangent = np.tan(0.5 * angle)
@@ -239,11 +230,13 @@ def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
     return cosine, sine
 
 
+#: Which of LINK_PARAMETERS each entry of the inertia tensor is
+_OF_TENSOR = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
 def _inertia(parameters: FloatArray) -> FloatArray:
-    """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS),
-    shape (6, 6).
-    """
-    tensor = parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3)
+    """Momentum of a link per unit of its screw, from its LINK_PARAMETERS, shape (6, 6)."""
+    tensor = parameters[_OF_TENSOR]
     first_moment = skew(parameters[6:9])
     mass = parameters[9] * np.eye(3)
     return np.block([[tensor, first_moment], [-first_moment, mass]])
@@ -269,12 +262,11 @@ class _Link:
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Arrays that every block uses again: V, A and the movers' screws of each link,
-    shape (2 + movers, 6, k) (the base is the last), room for products, and Y.
-    """
+    """Arrays that every block uses again."""
 
+    #: V, A and the movers' screws of each link, shape (2 + movers, 6, k); the base is the last
     screws: tuple[FloatArray, ...]
-    products: FloatArray
+    products: FloatArray  #: room for products
     inertia: FloatArray
     moments: FloatArray
 
@@ -324,13 +316,13 @@ def _link(joint: Joint, movers: tuple[int, ...]) -> _Link:
     component = None
     if np.count_nonzero(own) == 1 and own.max() == 1.0:
         component = int(np.argmax(own))
+    rotation = turn @ joint.rotation.T
+    lower = -turn @ joint.rotation.T @ skew(joint.translation_m)
     return _Link(
         parent=joint.parent,
         movers=movers,
         revolute=revolute,
-        fixed=_blocks(
-            turn @ joint.rotation.T, -turn @ joint.rotation.T @ skew(joint.translation_m)
-        ),
+        fixed=_blocks(rotation, lower),
         back=back,
         own=own,
         component=component,
@@ -338,12 +330,12 @@ def _link(joint: Joint, movers: tuple[int, ...]) -> _Link:
 
 
 def _frame_about(axis: FloatArray) -> FloatArray:
-    """Rotation to a frame whose z is an axis, shape (3, 3);
-    its x is near the axis of the frame most across to it.
-    """
-    across = np.eye(3)[np.argmin(np.abs(axis))]
+    """Rotation to a frame whose z is an axis, x near the one most across to it, shape (3, 3)."""
+    most_across = np.argmin(np.abs(axis))
+    across = np.eye(3)[most_across]
     cosine = axis @ across
-    x = (across - axis * cosine) / np.sqrt(1.0 - cosine**2)
+    sine = np.sqrt(1.0 - cosine**2)
+    x = (across - axis * cosine) / sine
     y = skew(axis) @ x
     return np.array((x, y, axis))
 
@@ -360,12 +352,10 @@ def _work(robot: Robot, links: tuple[_Link, ...], samples: int, *, movers: bool 
         of_link = np.empty((count, 6, samples))
         of_link[2:] = link.own[:, None]  # the last one stays
         screws.append(of_link)
-    return _Work(
-        screws=(*screws, base),
-        products=np.empty((1 + robot.joint_count, 2, 2, samples)),
-        inertia=np.zeros((3, 6, samples)),
-        moments=np.zeros((6, 4, samples)),
-    )
+    products = np.empty((1 + robot.joint_count, 2, 2, samples))
+    inertia = np.zeros((3, 6, samples))
+    moments = np.zeros((6, 4, samples))
+    return _Work((*screws, base), products, inertia, moments)
 
 
 def _move(
@@ -412,7 +402,8 @@ def _borne(link: _Link, wrench: FloatArray, place: _JointPlace) -> FloatArray:
         wrench = link.back.T @ wrench
     at_joint = wrench.copy()
     if link.revolute:
-        x, y, _ = np.moveaxis(wrench.reshape(2, 3, -1), 1, 0)  # of moment and force
+        moment_and_force = wrench.reshape(2, 3, -1)
+        x, y, _ = np.moveaxis(moment_and_force, 1, 0)
         turned = at_joint.reshape(2, 3, -1)
         turned[:, 0] = place.cosine * x - place.sine * y
         turned[:, 1] = place.sine * x + place.cosine * y
@@ -436,14 +427,14 @@ def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray
 def _fill_wrench(
     inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray
 ) -> None:
-    """Y, in two parts: the moment of unit inertias, shape (3, 6, k);
-    moment and force of unit (h, m), shape (6, 4, k).
+    """Y: the moment of unit inertias, (3, 6, k); moment and force of unit (h, m), (6, 4, k).
 
     What is zero in every motion is left as it is.
     """
     w = velocity[:3]
+    x, y, z = w
     squares = w * w
-    mixed = (w[0] * w[1], w[0] * w[2], w[1] * w[2])
+    mixed = (x * y, x * z, y * z)
     _fill_inertia_columns(inertia, acceleration[:3], squares, mixed)
     _fill_moment_columns(moments, velocity, acceleration, squares, mixed)
 
@@ -504,16 +495,16 @@ def _fill_moment_columns(
         velocity, acceleration: V and A, shape (6, k).
         squares, mixed: of ω, as for `_fill_inertia_columns`.
     """
-    w = velocity[:3]
-    v = velocity[3:]
+    wx, wy, wz, vx, vy, vz = velocity
     dw = acceleration[:3]
     dv = acceleration[3:]
     xx, yy, zz = squares
     xy, xz, yz = mixed
+    # a = v̇ + ω × v
     a = moments[3:, 3]
-    np.add(dv[0], w[1] * v[2] - w[2] * v[1], out=a[0])
-    np.add(dv[1], w[2] * v[0] - w[0] * v[2], out=a[1])
-    np.add(dv[2], w[0] * v[1] - w[1] * v[0], out=a[2])
+    np.add(dv[0], wy * vz - wz * vy, out=a[0])
+    np.add(dv[1], wz * vx - wx * vz, out=a[1])
+    np.add(dv[2], wx * vy - wy * vx, out=a[2])
     moments[0, 1] = a[2]
     moments[1, 2] = a[0]
     moments[2, 0] = a[1]

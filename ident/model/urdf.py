@@ -127,9 +127,10 @@ def robot_from_urdf(
     if couplings and not driven:
         followers = {coupling.follower for coupling in couplings}
         driven = tuple(number for number in index.values() if number not in followers)
+    gravity = np.asarray(gravity_m_s2, dtype=np.float64)
     robot = Robot(
         joints=found.joints,
-        gravity_m_s2=np.asarray(gravity_m_s2, dtype=np.float64),
+        gravity_m_s2=gravity,
         closures=closed,
         motors=driven,
         platform=carrier,
@@ -183,23 +184,18 @@ def _closure(found: UrdfRobot, pair: LinkPair) -> Closure:
     are_distinct = len(set(pair.directions)) == len(pair.directions)
     if not (pair.directions and are_known and are_distinct):
         given = ", ".join(pair.directions) or "none"
+        known = ", ".join(DIRECTIONS)
         raise ModelError(
-            f"{source} has the directions {given}; expected some of "
-            f"{', '.join(DIRECTIONS)}, each once"
+            f"{source} has the directions {given}; expected some of {known}, each once"
         )
-    return Closure(
-        name=pair.name,
-        first=_place_of(found, pair.first, source),
-        second=_place_of(found, pair.second, source),
-        directions=tuple(pair.directions),
-    )
+    first = _place_of(found, pair.first, source)
+    second = _place_of(found, pair.second, source)
+    return Closure(name=pair.name, first=first, second=second, directions=tuple(pair.directions))
 
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """A joint that follows another one:
-    q = multiplier · q_leader + offset, the `<mimic>` of a URDF.
-    """
+    """A joint that follows another one, `<mimic>`: q = multiplier · q_leader + offset."""
 
     leader: str  #: name of the joint that it follows
     multiplier: float
@@ -254,8 +250,11 @@ def mimics_of(urdf: str) -> dict[str, Mimic]:
 
 def _movable(robot: Element) -> dict[str, Element]:
     """Joints that are not fixed, by name."""
-    joints = [joint for joint in robot.findall("joint") if joint.get("type") != "fixed"]
-    return {_name(joint): joint for joint in joints}
+    movable: dict[str, Element] = {}
+    for joint in robot.findall("joint"):
+        if joint.get("type") != "fixed":
+            movable[_name(joint)] = joint
+    return movable
 
 
 def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
@@ -279,11 +278,9 @@ def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
         seen.add(found.leader)
         before = mimics[found.leader]
         # q = a (b q_leader + c) + d
-        found = Mimic(
-            leader=before.leader,
-            multiplier=found.multiplier * before.multiplier,
-            offset=found.multiplier * before.offset + found.offset,
-        )
+        multiplier = found.multiplier * before.multiplier
+        offset = found.multiplier * before.offset + found.offset
+        found = Mimic(leader=before.leader, multiplier=multiplier, offset=offset)
     return found
 
 
@@ -293,7 +290,8 @@ def _couplings(mimics: Mapping[str, Mimic], index: Mapping[str, int]) -> tuple[J
     for name in mimics:
         mimic = first_leader(name, mimics)
         if mimic.leader not in index:
-            moving = ", ".join(joint for joint in index if joint not in mimics) or "none"
+            leaders = [joint for joint in index if joint not in mimics]
+            moving = ", ".join(leaders) or "none"
             raise ModelError(
                 f"joint {name!r} mimics {mimic.leader!r}, which is no joint of the URDF that "
                 f"moves; expected one of {moving}; hold {name!r} where it stays (`hold_joints`)"
@@ -394,8 +392,12 @@ def _roll_pitch_yaw(rotation: FloatArray) -> tuple[float, float, float]:
     s = sin(roll)
     c = cos(roll)
     # With this roll the other two are exact for every pitch, 90° included.
-    pitch = atan2(-rotation[2, 0], s * rotation[2, 1] + c * rotation[2, 2])
-    yaw = atan2(s * rotation[0, 2] - c * rotation[0, 1], c * rotation[1, 1] - s * rotation[1, 2])
+    pitch_sine = -rotation[2, 0]
+    pitch_cosine = s * rotation[2, 1] + c * rotation[2, 2]
+    yaw_sine = s * rotation[0, 2] - c * rotation[0, 1]
+    yaw_cosine = c * rotation[1, 1] - s * rotation[1, 2]
+    pitch = atan2(pitch_sine, pitch_cosine)
+    yaw = atan2(yaw_sine, yaw_cosine)
     return roll, pitch, yaw
 
 
@@ -411,23 +413,26 @@ def read_urdf(urdf: str) -> UrdfRobot:
             freedom.
     """
     links, joints_behind, root = _tree(urdf)
-    places = {root: Place(-1, np.eye(3), np.zeros(3))}
+    base = Place(-1, np.eye(3), np.zeros(3))
+    places = {root: base}
     joints: list[Joint] = []
     bodies: list[Body] = []
     effort_limit: list[float] = []
-    pending = [(places[root], element) for element in joints_behind[root]]
+    pending = [(base, element) for element in joints_behind[root]]
     while pending:
         before, element = pending.pop()
         link = _link_at(element, "child")
         here = _place_behind(before, element)
         body = _body(links[link])
         if element.get("type") != "fixed":
+            number = len(joints)
             joints.append(_joint(element, here))
             bodies.append(body)
             effort_limit.append(_effort_limit(element))
-            here = Place(len(joints) - 1, np.eye(3), np.zeros(3))
+            here = Place(number, np.eye(3), np.zeros(3))
         elif here.joint >= 0:
-            bodies[here.joint] = _joined(bodies[here.joint], _placed(body, here))
+            moved = bodies[here.joint]
+            bodies[here.joint] = _joined(moved, _placed(body, here))
         places[link] = here
         pending += [(here, behind) for behind in joints_behind[link]]
     if not joints:
@@ -439,12 +444,10 @@ def read_urdf(urdf: str) -> UrdfRobot:
 
 def _place_behind(before: Place, element: Element) -> Place:
     """Frame of a joint, in the frame of the moving joint before it."""
-    rotation, translation = _origin(element, _name(element))
-    return Place(
-        joint=before.joint,
-        rotation=before.rotation @ rotation,
-        translation_m=before.translation_m + before.rotation @ translation,
-    )
+    own_rotation, own_translation = _origin(element, _name(element))
+    rotation = before.rotation @ own_rotation
+    translation = before.translation_m + before.rotation @ own_translation
+    return Place(joint=before.joint, rotation=rotation, translation_m=translation)
 
 
 #: Characters of a path in the place of a text; a longer one is not repeated in a message
@@ -489,9 +492,11 @@ def _root(urdf: str) -> Element:
 
 def _looks_like_file_name(text: str) -> bool:
     """Whether a text is short, of one line and without any element."""
+    is_empty = not text.strip()
+    is_short = len(text) <= LONGEST_NAME
     is_one_line = "\n" not in text
     has_element = "<" in text
-    return bool(text.strip()) and len(text) <= LONGEST_NAME and is_one_line and not has_element
+    return is_short and is_one_line and not is_empty and not has_element
 
 
 def _require_expanded(robot: Element) -> None:
@@ -582,7 +587,8 @@ def _joint(element: Element, at: Place) -> Joint:
     length = float(np.linalg.norm(axis))
     if length > 0.0:
         axis = axis / length
-    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
+    unit_length = float(np.linalg.norm(axis))
+    if not np.isclose(unit_length, 1.0, atol=1e-6):
         raise ModelError(
             f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one"
         )
@@ -609,10 +615,14 @@ def _travel(element: Element) -> float | None:
     if limit is None or element.get("type") == "continuous":
         return None
     try:
-        travel = float(limit.get("upper", "")) - float(limit.get("lower", ""))
+        upper = float(limit.get("upper", ""))
+        lower = float(limit.get("lower", ""))
     except ValueError:
         return None
-    return travel if 0.0 < travel < inf else None
+    travel = upper - lower
+    if 0.0 < travel < inf:
+        return travel
+    return None
 
 
 def _effort_limit(element: Element) -> float:
@@ -676,18 +686,20 @@ def _joined(first: Body, second: Body) -> Body:
     inertia = first.inertia_kg_m2 + second.inertia_kg_m2
     if mass == 0.0:
         return Body(0.0, np.zeros(3), inertia)
-    first_moment = first.mass_kg * first.centre_m + second.mass_kg * second.centre_m
-    centre = first_moment / mass
+    of_first = first.mass_kg * first.centre_m
+    of_second = second.mass_kg * second.centre_m
+    centre = (of_first + of_second) / mass
+    # μ (‖d‖² 1 − d dᵀ), μ the reduced mass
     distance = first.centre_m - second.centre_m
     reduced_mass = first.mass_kg * second.mass_kg / mass
-    steiner = reduced_mass * (distance @ distance * np.eye(3) - np.outer(distance, distance))
+    square = distance @ distance
+    per_mass = square * np.eye(3) - np.outer(distance, distance)
+    steiner = reduced_mass * per_mass
     return Body(mass, centre, inertia + steiner)
 
 
 def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
-    """Rotation and translation of an <origin>;
-    the angles are about the fixed axes x, y, z, in this order.
-    """
+    """Rotation and translation of an <origin>; angles about fixed x, y, z, in this order."""
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
@@ -701,9 +713,7 @@ def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:
 
 
 def _rotation(angles_rad: FloatArray) -> FloatArray:
-    """Rotation by angles about the fixed axes x, y, z, in this order, shape (3, 3);
-    by its unit quaternion.
-    """
+    """Rotation by angles about fixed x, y, z, in this order, by its unit quaternion, (3, 3)."""
     half = 0.5 * angles_rad
     cx, cy, cz = map(cos, half)
     sx, sy, sz = map(sin, half)
@@ -716,16 +726,20 @@ def _rotation(angles_rad: FloatArray) -> FloatArray:
     y /= length
     z /= length
     w /= length
+    # Twice the products of the quaternion's components
+    xx = 2.0 * x * x
+    yy = 2.0 * y * y
+    zz = 2.0 * z * z
+    xy = 2.0 * y * x
+    xz = 2.0 * z * x
+    yz = 2.0 * z * y
+    xw = 2.0 * x * w
+    yw = 2.0 * y * w
+    zw = 2.0 * z * w
     rotation = np.empty((3, 3))
-    rotation[0, 0] = 1.0 - (2.0 * y * y + 2.0 * z * z)
-    rotation[0, 1] = 2.0 * y * x - 2.0 * z * w
-    rotation[0, 2] = 2.0 * z * x + 2.0 * y * w
-    rotation[1, 0] = 2.0 * y * x + 2.0 * z * w
-    rotation[1, 1] = 1.0 - (2.0 * x * x + 2.0 * z * z)
-    rotation[1, 2] = 2.0 * z * y - 2.0 * x * w
-    rotation[2, 0] = 2.0 * z * x - 2.0 * y * w
-    rotation[2, 1] = 2.0 * z * y + 2.0 * x * w
-    rotation[2, 2] = 1.0 - (2.0 * x * x + 2.0 * y * y)
+    rotation[0] = (1.0 - (yy + zz), xy - zw, xz + yw)
+    rotation[1] = (xy + zw, 1.0 - (xx + zz), yz - xw)
+    rotation[2] = (xz - yw, yz + xw, 1.0 - (xx + yy))
     return rotation
 
 

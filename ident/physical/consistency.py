@@ -70,7 +70,8 @@ class Consistency:
             margin: least eigenvalue of Q.
             room: least value of what may not be negative.
         """
-        constraints = [link >> margin * np.eye(4) for link in links]
+        least_link = margin * np.eye(4)
+        constraints = [link >> least_link for link in links]
         number_of = {int(column): number for number, column in enumerate(self.scalars)}
         if self.positive:
             positive = [number_of[column] for column in self.positive]
@@ -79,13 +80,16 @@ class Consistency:
             numbers = [number_of[column] for column in columns]
             sizes = self.scales[numbers]
             # In the scales of its diagonal, like everything else.
-            largest_on_diagonal = np.argmax(np.einsum("pkk->pk", parts), axis=0)
+            diagonals = np.einsum("pkk->pk", parts)
+            largest_on_diagonal = np.argmax(diagonals, axis=0)
             unit = np.sqrt(sizes[largest_on_diagonal])
             unit_square = np.outer(unit, unit)
             matrix: Any = 0
             for number, part, size in zip(numbers, parts, sizes, strict=True):
-                matrix = matrix + scalars[number] * (part * size / unit_square)
-            constraints.append(matrix >> room * np.eye(len(unit)))
+                scaled_part = part * size / unit_square
+                matrix = matrix + scalars[number] * scaled_part
+            least_matrix = room * np.eye(len(unit))
+            constraints.append(matrix >> least_matrix)
         return constraints
 
     def is_met(self, factors: FloatArray, standard: FloatArray, margin: float) -> bool:
@@ -97,13 +101,16 @@ class Consistency:
             margin: least eigenvalue of each link relative to its prior.
         """
         links = relative_to_prior(factors, standard[self.link_columns])
-        if float(np.linalg.eigvalsh(links).min()) < margin:
+        eigenvalues = np.linalg.eigvalsh(links)
+        if float(eigenvalues.min()) < margin:
             return False
         if any(standard[column] < 0.0 for column in self.positive):
             return False
         for columns, parts in self.dissipative:
+            # Σ_p χ_p (part of p), shape (k, k)
             matrix = np.einsum("p,pij->ij", standard[list(columns)], parts)
-            if float(np.linalg.eigvalsh(matrix)[0]) < 0.0:
+            eigenvalues = np.linalg.eigvalsh(matrix)
+            if float(eigenvalues.min()) < 0.0:
                 return False
         return True
 
@@ -134,18 +141,19 @@ def consistency_of(
             positive.append(index[f"fsm{motor + 1}"])
     dissipative: list[tuple[tuple[int, ...], FloatArray]] = []
     for axes in _turned_together(model):
-        motors = [
-            motor for motor in coupled if np.any(model.drive_train.direction[motor, list(axes)])
-        ]
-        for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
-            if single == "fv" and other_friction.intersection(axes):
+        directions = model.drive_train.direction[:, list(axes)]
+        motors = [motor for motor in coupled if np.any(directions[motor])]
+        for of_axis, of_motor in (("Ia", "Iam"), ("fv", "fvm")):
+            if of_axis == "fv" and other_friction.intersection(axes):
                 continue
-            columns = [index[f"{single}{numbers[axis]}"] for axis in axes]
-            columns += [index[f"{shared}{motor + 1}"] for motor in motors]
+            names = [f"{of_axis}{numbers[axis]}" for axis in axes]
+            names += [f"{of_motor}{motor + 1}" for motor in motors]
+            columns = tuple(index[name] for name in names)
             if len(axes) == 1:
                 positive.append(columns[0])
             else:
-                dissipative.append((tuple(columns), _contributions(model, axes, motors)))
+                contributions = _contributions(model, axes, motors)
+                dissipative.append((columns, contributions))
     return Consistency(
         link_columns=model.link_columns,
         scalars=driven_scalars(model),
@@ -156,32 +164,33 @@ def consistency_of(
 
 
 def _contributions(model: Model, axes: Sequence[int], motors: Sequence[int]) -> FloatArray:
-    """Contribution of each axis', then each motor's parameter to the matrix over these axes,
-    shape (p, k, k).
-    """
+    """Part of each axis', then each motor's parameter in the matrix over these axes, (p, k, k)."""
     parts = [np.diag(unit) for unit in np.eye(len(axes))]
     for motor in motors:
+        # r rᵀ without its diagonal, which the axes have
         r = model.drive_train.direction[motor, list(axes)]
-        parts.append(np.outer(r, r) - np.diag(r**2))
+        diagonal = np.diag(r**2)
+        parts.append(np.outer(r, r) - diagonal)
     return np.array(parts)
 
 
 def driven_scalars(model: Model) -> IntArray:
-    """Columns of rotors, friction and offsets, without those of joints that have no motor,
-    shape (s,).
-    """
+    """Columns of rotors, friction and offsets of joints that have a motor, shape (s,)."""
+    every = np.arange(len(model.columns))
     others = [model.link_columns.ravel()]
     drive = np.arange(ROTOR_INERTIA, JOINT_COLUMNS)
     for joint in model.robot.passive_joints:
         others.append(JOINT_COLUMNS * joint + drive)
-    return np.setdiff1d(np.arange(len(model.columns)), np.concatenate(others))
+    return np.setdiff1d(every, np.concatenate(others))
 
 
 def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
     """Q = L⁻¹ P L⁻ᵀ of links, shapes (n, 4, 4) and (n, 10) → (n, 4, 4)."""
     relative: list[FloatArray] = []
-    for inverse, link in zip(np.linalg.inv(factors), links, strict=True):
-        relative.append(inverse @ pseudo_inertia(link) @ inverse.T)
+    inverses = np.linalg.inv(factors)
+    for inverse, link in zip(inverses, links, strict=True):
+        pseudo = pseudo_inertia(link)
+        relative.append(inverse @ pseudo @ inverse.T)
     return np.array(relative)
 
 
@@ -207,14 +216,16 @@ def solve_programme(
         if is_solved and all(one.value is not None for one in unknowns):
             return
     status = problem.status or "failed"
-    raise NotPhysical("the semidefinite programme has no solution", f"{status} {message}".strip())
+    evidence = f"{status} {message}".strip()
+    raise NotPhysical("the semidefinite programme has no solution", evidence)
 
 
 def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
     """Group axes that share motors."""
     groups: list[set[int]] = [{axis} for axis in range(model.robot.axis_count)]
     for motor in model.drive_train.coupled:
-        turned = set(np.flatnonzero(model.drive_train.direction[motor]).tolist())
+        direction = model.drive_train.direction[motor]
+        turned = set(np.flatnonzero(direction).tolist())
         joined: set[int] = set()
         others: list[set[int]] = []
         for group in groups:

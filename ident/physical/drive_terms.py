@@ -67,7 +67,8 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     """
     coupled = list(model.drive_train.coupled)
     first = JOINT_COLUMNS * model.robot.joint_count
-    of_coupled = slice(first, first + COUPLED_COLUMNS * len(coupled))
+    last = first + COUPLED_COLUMNS * len(coupled)
+    of_coupled = slice(first, last)
     of_motors = np.zeros((model.robot.axis_count, COUPLED_COLUMNS))
     of_motors[coupled] = standard[of_coupled].reshape(-1, COUPLED_COLUMNS)
     rotors = standard[model.rotor_columns]
@@ -77,7 +78,9 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     squares = directions**2
     for kind, of_joints in enumerate((rotors, viscous)):
         own = of_motors[:, kind]
-        if np.any(own < 0.0) or np.any(own @ squares > of_joints):
+        is_negative = own < 0.0
+        exceeds_joints = own @ squares > of_joints
+        if np.any(is_negative) or np.any(exceeds_joints):
             of_motors[coupled, kind] = _least_of_motors(own[coupled], directions[coupled])
     inertia = _split(rotors, of_motors[:, 0], squares)
     damping = _split(viscous, of_motors[:, 1], squares)
@@ -99,18 +102,19 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
 
 
 def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArray:
-    """The least Iam or fvm that couple the joints alike,
-    none of them negative where that is possible, shape (c,).
+    """The least Iam or fvm that couple the joints alike, shape (c,).
 
-    Both motors of a differential couple its joints with opposite signs: the torque shows their
-    difference, and what both have in common would only need room at the joints.
+    None of them is negative where that is possible. Both motors of a differential couple its joints
+    with opposite signs: the torque shows their difference, and what both have in common would only
+    need room at the joints.
 
     Args:
         of_motors: Iam or fvm of the motors that turn with several joints, shape (c,).
         directions: r of each of them, shape (c, m).
     """
     first, second = np.triu_indices(directions.shape[1], 1)
-    couplings = (directions[:, first] * directions[:, second]).T
+    products = directions[:, first] * directions[:, second]
+    couplings = products.T
     wanted = couplings @ of_motors
     least, residual = nnls(couplings, wanted)
     if residual <= ROUNDING * np.linalg.norm(wanted):

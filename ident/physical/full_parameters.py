@@ -98,7 +98,8 @@ class LinkPrior:
                 "moments"
             )
         for number, link in enumerate(self.links, start=1):
-            if np.linalg.eigvalsh(pseudo_inertia(link))[0] <= 0.0:
+            eigenvalues = np.linalg.eigvalsh(pseudo_inertia(link))
+            if eigenvalues.min() <= 0.0:
                 raise ModelError(
                     f"link {number} of the prior is no possible body: its pseudo-inertia has a "
                     "negative eigenvalue; expected a mass and an inertia for each moving link; "
@@ -112,13 +113,16 @@ class LinkPrior:
         return np.linalg.cholesky(pseudo_inertias)
 
     def directions(self) -> FloatArray:
-        """Change of each link's ten parameters for one σ of ten independent numbers, columns,
-        shape (n, 10, 10).
+        """Change of each link's ten parameters for one σ of ten independent numbers.
+
+        Returns:
+            a column for each number, shape (n, 10, 10).
         """
         basis = _symmetric_basis()
         directions: list[FloatArray] = []
         for factor in self.factors:
-            columns = [link_parameters(factor @ unit @ factor.T) for unit in basis]
+            changes = [factor @ unit @ factor.T for unit in basis]
+            columns = [link_parameters(change) for change in changes]
             directions.append(self.tolerance * np.column_stack(columns))
         return np.array(directions)
 
@@ -268,6 +272,7 @@ def full_parameters(
     prior_std[links] = np.linalg.norm(prior.directions(), axis=2)
     prior_variance = np.diag(given.from_prior)[own]
     relative_links = relative_to_prior(prior.factors, standard[links])
+    eigenvalues = np.linalg.eigvalsh(relative_links)
     data_covariance = equations.weight @ equations.covariance @ equations.weight.T
     check = check_prior(
         matrix=equations.matrix,
@@ -287,7 +292,7 @@ def full_parameters(
         gains_std=gains_with_prior_std,
         base=grouping @ standard,
         base_std=np.sqrt(np.diag(base_covariance)),
-        eigenvalues=np.asarray(np.linalg.eigvalsh(relative_links)[:, 0]),
+        eigenvalues=np.asarray(eigenvalues[:, 0]),
         bounded=is_bounded,
         variance_ratio=ratio,
         check=check,
@@ -295,8 +300,7 @@ def full_parameters(
 
 
 def _solved(equations: _Equations, first: int) -> _Solution:
-    """Solve the equations for all unknowns from ``first`` on;
-    those before keep the values of the estimate.
+    """Solve for all unknowns from ``first`` on; those before keep the values of the estimate.
 
     Raises:
         NotPhysical: data and prior do not determine every unknown.
@@ -307,7 +311,8 @@ def _solved(equations: _Equations, first: int) -> _Solution:
     unseen = np.flatnonzero(scale == 0.0)
     if len(unseen):
         columns = equations.model.columns
-        names = ", ".join(columns[number + first - equations.gains].name for number in unseen)
+        places = unseen + first - equations.gains
+        names = ", ".join(columns[place].name for place in places)
         raise NotPhysical("neither data nor prior say anything of some parameters", names)
     q, upper = np.linalg.qr(free / scale)
     smallest = float(np.abs(np.diag(upper)).min())
@@ -322,8 +327,10 @@ def _solved(equations: _Equations, first: int) -> _Solution:
     # x = (ĝ, M⁺ (y − M_g ĝ)): A is the derivative to θ̂, B that to the prior's rows.
     from_theta = inverse[:, :rows] @ equations.weight
     from_theta[:, :first] -= inverse @ matrix[:, :first]
-    by_data = np.concatenate((np.eye(first, from_theta.shape[1]), from_theta))
-    by_prior = np.concatenate((np.zeros((first, prior_rows)), inverse[:, rows:]))
+    gains_themselves = np.eye(first, from_theta.shape[1])
+    gains_by_prior = np.zeros((first, prior_rows))
+    by_data = np.concatenate((gains_themselves, from_theta))
+    by_prior = np.concatenate((gains_by_prior, inverse[:, rows:]))
     values = by_data @ equations.theta + by_prior @ equations.prior_right
     return _Solution(
         values=values,

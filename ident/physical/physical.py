@@ -59,8 +59,7 @@ class Programme:
     triangle: FloatArray  #: a torque of relative size ‖triangle @ base‖, shape (b, b)
 
     def nearest(self, base: FloatArray) -> FloatArray:
-        """Find the consistent standard parameters whose torque is nearest to that of ``base``,
-        shape (b,) → (c,).
+        """Find consistent standard parameters with the torque nearest to ``base``, (b,) → (c,).
 
         Raises:
             NotPhysical: the solver found none.
@@ -74,12 +73,15 @@ class Programme:
         constraints = conditions.constraints(cp, links, scalars, _ROOM * MARGIN, _SCALAR_ROOM)
         per_scalar = np.zeros((self.grouping.shape[1], count))
         per_scalar[conditions.scalars, np.arange(count)] = conditions.scales
-        torque_of = self.triangle @ self.grouping
-        torque = (torque_of @ per_scalar) @ scalars
-        for link, factor, columns in zip(links, self.factors, conditions.link_columns, strict=True):
-            per_entry = torque_of[:, columns] @ _parameters_per_entry(factor)
-            torque = torque + per_entry @ cp.vec(link, order="C")
-        distance = cp.norm2(torque - self.triangle @ base)
+        per_parameter = self.triangle @ self.grouping
+        torque = (per_parameter @ per_scalar) @ scalars
+        of_links = zip(links, self.factors, conditions.link_columns, strict=True)
+        for link, factor, columns in of_links:
+            per_entry = per_parameter[:, columns] @ _parameters_per_entry(factor)
+            entries = cp.vec(link, order="C")
+            torque = torque + per_entry @ entries
+        wanted_torque = self.triangle @ base
+        distance = cp.norm2(torque - wanted_torque)
         size = sum(cp.trace(link) for link in links)
         objective = cp.Minimize(distance + _TRACE * size)
         solve_programme(cp, objective, constraints, (*links, scalars))
@@ -93,18 +95,20 @@ class Programme:
         All of it in the leading parameters would be more than a light link has, where the torque
         hardly shows a base parameter.
         """
-        sizes = np.array([np.linalg.norm(self._scaled(unit)) for unit in np.eye(len(standard))])
-        unit_change = np.zeros(len(sizes))
+        count = len(standard)
+        scaled_units = [self._scaled(unit) for unit in np.eye(count)]
+        sizes = np.array([np.linalg.norm(scaled) for scaled in scaled_units])
+        unit_change = np.zeros(count)
         np.divide(1.0, sizes, where=sizes > 0.0, out=unit_change)
         missing = base - self.grouping @ standard
-        change, *_ = np.linalg.lstsq(self.grouping * unit_change, missing, rcond=None)
+        scaled_grouping = self.grouping * unit_change
+        change, *_ = np.linalg.lstsq(scaled_grouping, missing, rcond=None)
         return np.asarray(standard + unit_change * change)
 
     def closest_to_prior(
         self, start: FloatArray, directions: FloatArray, base: FloatArray, farthest: float
     ) -> FloatArray:
-        """Find the standard parameters nearest to the prior with almost the same torque,
-        shape (c,).
+        """Find the standard parameters nearest to the prior with almost the same torque, (c,).
 
         The distance of a link is the divergence tr Q − log det Q − 4 (Lee, Wensing, Park: Geometric
         Robot Dynamic Identification, 2020): it does not depend on frames and units, and grows
@@ -123,29 +127,36 @@ class Programme:
 
         # Orthonormal steps: the solver gets neither kg with kg m² nor two directions that are
         # almost one.
-        scaled = np.column_stack([self._scaled(change) for change in directions.T])
-        steps, upper = np.linalg.qr(scaled)
+        scaled_directions = [self._scaled(change) for change in directions.T]
+        steps, upper = np.linalg.qr(np.column_stack(scaled_directions))
         rotation = np.linalg.inv(upper)
         step = cp.Variable(steps.shape[1])
         moved = self._scaled(start) + steps @ step
         links: list[Any] = []
-        for number in range(len(self.factors)):
-            first = _ENTRIES * number
-            link = cp.reshape(moved[first : first + _ENTRIES], (4, 4), order="C")
+        first = 0
+        for _ in self.factors:
+            last = first + _ENTRIES
+            link = cp.reshape(moved[first:last], (4, 4), order="C")
             links.append(0.5 * (link + link.T))
-        drive_first = _ENTRIES * len(self.factors)
-        drive = moved[drive_first:]
+            first = last
+        link_entries = first
+        drive = moved[link_entries:]
         divergence = sum(cp.trace(link) - cp.log_det(link) for link in links)
-        objective = cp.Minimize(divergence + _RIDGE * cp.sum_squares(drive))
-        constraints = self.consistency.constraints(cp, links, drive, MARGIN, 0.5 * _SCALAR_ROOM)
+        drive_size = cp.sum_squares(drive)
+        objective = cp.Minimize(divergence + _RIDGE * drive_size)
+        room = 0.5 * _SCALAR_ROOM
+        constraints = self.consistency.constraints(cp, links, drive, MARGIN, room)
         per_step = self.triangle @ self.grouping @ directions @ rotation
         if np.linalg.norm(per_step) > _INVISIBLE:
-            difference = self.triangle @ (self.grouping @ start - base)
-            constraints.append(cp.norm2(difference + per_step @ step) <= farthest)
+            base_difference = self.grouping @ start - base
+            torque_difference = self.triangle @ base_difference
+            distance = cp.norm2(torque_difference + per_step @ step)
+            constraints.append(distance <= farthest)
         solve_programme(cp, objective, constraints, (step,))
         change = steps @ step.value
-        of_links = change[:drive_first].reshape(-1, 4, 4)
-        return start + self._standard(of_links, change[drive_first:])
+        of_links = change[:link_entries].reshape(-1, 4, 4)
+        of_drives = change[link_entries:]
+        return start + self._standard(of_links, of_drives)
 
     def _scaled(self, standard: FloatArray) -> FloatArray:
         """Q of every link, row by row, and the scaled other parameters, shape (16 n + s,)."""
@@ -155,14 +166,14 @@ class Programme:
         return np.concatenate((links.ravel(), scalars))
 
     def _standard(self, links: FloatArray, scalars: FloatArray) -> FloatArray:
-        """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters,
-        shape (c,).
-        """
+        """Standard parameters of links Q, (n, 4, 4), and scaled other parameters, shape (c,)."""
         conditions = self.consistency
         standard = np.zeros(self.grouping.shape[1])
         standard[conditions.scalars] = conditions.scales * scalars
-        for link, factor, columns in zip(links, self.factors, conditions.link_columns, strict=True):
-            standard[columns] = link_parameters(factor @ link @ factor.T)
+        of_links = zip(links, self.factors, conditions.link_columns, strict=True)
+        for link, factor, columns in of_links:
+            pseudo = factor @ link @ factor.T
+            standard[columns] = link_parameters(pseudo)
         return standard
 
 
@@ -174,7 +185,8 @@ def _parameters_per_entry(factor: FloatArray) -> FloatArray:
     """
     columns: list[FloatArray] = []
     for unit in np.eye(_ENTRIES):
-        pseudo = factor @ unit.reshape(4, 4) @ factor.T
+        entry = unit.reshape(4, 4)
+        pseudo = factor @ entry @ factor.T
         columns.append(link_parameters(pseudo))
     return np.column_stack(columns)
 
@@ -203,18 +215,19 @@ class InertiaPrior:
 
 
 def urdf_links(urdf: str) -> FloatArray:
-    """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints,
-    shape (n, 10).
+    """Return inertial parameters of a URDF's moving links, shape (n, 10).
+
+    They contain the bodies behind fixed joints.
 
     Raises:
         ModelError: the text is no URDF.
     """
-    return np.array([body.parameters for body in read_urdf(urdf).bodies])
+    bodies = read_urdf(urdf).bodies
+    return np.array([body.parameters for body in bodies])
 
 
 def inertia_prior(urdf: str) -> InertiaPrior:
-    """Take the URDF's inertias where a body can have them,
-    else those of a solid ball about the centre of mass.
+    """Take the URDF's inertias where a body can have them, else those of a solid ball.
 
     The ball has DEFAULT_RADIUS_M, and the URDF's mass and centre of mass; without a mass,
     DEFAULT_MASS_KG at the origin of the link frame.
@@ -226,7 +239,8 @@ def inertia_prior(urdf: str) -> InertiaPrior:
     assumed: list[int] = []
     for index, link in enumerate(links):
         ball = _ball_of(link)
-        inverse = np.linalg.inv(np.linalg.cholesky(pseudo_inertia(ball)))
+        factor = np.linalg.cholesky(pseudo_inertia(ball))
+        inverse = np.linalg.inv(factor)
         relative = inverse @ pseudo_inertia(link) @ inverse.T
         smallest = np.linalg.eigvalsh(relative)[0]
         if smallest < _THINNEST:
@@ -243,7 +257,9 @@ def _ball_of(link: FloatArray) -> FloatArray:
     else:
         mass = DEFAULT_MASS_KG
         centre = np.zeros(3)
-    inertia = mass * (0.4 * DEFAULT_RADIUS_M**2 * np.eye(3))
+    # (2/5) m r² about every axis
+    inertia_per_kg = 0.4 * DEFAULT_RADIUS_M**2 * np.eye(3)
+    inertia = mass * inertia_per_kg
     return Body(mass, centre, inertia).parameters
 
 
@@ -263,12 +279,13 @@ def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
         seed: the same seed gives the same states.
     """
     random = np.random.default_rng(seed)
-    drawn = random.uniform(-1.0, 1.0, (3, limits.shape[1], samples)).transpose(0, 2, 1)
     middle, half_range, speed, acceleration = limits
+    drawn = random.uniform(-1.0, 1.0, (3, len(middle), samples))
+    position, velocity, change = drawn.transpose(0, 2, 1)
     return Motion(
-        position_rad=middle + half_range * drawn[0],
-        velocity_rad_s=speed * drawn[1],
-        acceleration_rad_s2=acceleration * drawn[2],
+        position_rad=middle + half_range * position,
+        velocity_rad_s=speed * velocity,
+        acceleration_rad_s2=acceleration * change,
     )
 
 
@@ -291,10 +308,10 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     leading = [name.split(" ", 1)[0] for name in names]
-    foreign = [name for name in leading if name not in index]
+    foreign = ", ".join(name for name in leading if name not in index)
     if foreign:
         raise ModelError(
-            f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; "
+            f"the calibration has parameters that this robot does not have: {foreign}; "
             "use the cell of the fit, with its drive train"
         )
     order = np.argsort([index[name] for name in leading])
@@ -306,20 +323,24 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     unit = columns / scale
     chosen = unit[:, independent]
     weights, _, rank, _ = linalg.lstsq(chosen, unit, cond=_ROUNDING)
-    if rank < len(independent):
+    count = len(independent)
+    if rank < count:
         raise ModelError(
-            f"the calibration has {len(independent)} base parameters, this robot only {rank}: "
+            f"the calibration has {count} base parameters, this robot only {rank}: "
             "another geometry, gravity or drive train"
         )
-    rest = np.linalg.norm(unit - chosen @ weights, axis=0)
-    missing = [model.columns[column].name for column in np.flatnonzero(rest > _LARGEST_REST)]
+    left = unit - chosen @ weights
+    left_size = np.linalg.norm(left, axis=0)
+    is_missing = left_size > _LARGEST_REST
+    missing = [model.columns[column].name for column in np.flatnonzero(is_missing)]
     if missing:
+        names_text = ", ".join(missing)
         raise ModelError(
-            f"the calibration lacks {', '.join(missing)}, which this robot's torque depends on: "
+            f"the calibration lacks {names_text}, which this robot's torque depends on: "
             "its data did not determine them, or it is of another robot"
         )
     grouping = weights * scale / scale[independent, None]
-    grouping[:, independent] = np.eye(len(independent))
+    grouping[:, independent] = np.eye(count)
     for row, name in zip(grouping, ordered, strict=True):
         _require_same_weights(name, row, index)
     return BaseParameters(tuple(independent), grouping, ordered)
@@ -390,18 +411,20 @@ class PhysicalParameters:
             standard: χ_st.
             model, base, values, columns, prior: as of `physical_parameters`.
         """
-        identified = np.einsum("jck,c->jk", columns[:, list(base.independent)], values)
-        realised = np.einsum("jck,c->jk", columns, standard)
+        identified = _torque(columns[:, list(base.independent)], values)
+        realised = _torque(columns, standard)
         every_sample = np.ones(identified.shape, dtype=np.bool_)
+        change_percent = relative_error(identified, realised, every_sample)
         links = relative_to_prior(prior.factors, standard[model.link_columns])
+        eigenvalues = np.linalg.eigvalsh(links)
         return cls(
             model=model,
             standard=standard,
             base=base,
             identified=values,
             realised=base.grouping @ standard,
-            torque_change_percent=relative_error(identified, realised, every_sample),
-            eigenvalues=np.asarray(np.linalg.eigvalsh(links)[:, 0], dtype=np.float64),
+            torque_change_percent=change_percent,
+            eigenvalues=np.asarray(eigenvalues[:, 0], dtype=np.float64),
         )
 
     @property
@@ -413,6 +436,11 @@ class PhysicalParameters:
     def links(self) -> FloatArray:
         """Inertial parameters of each link in the order of LINK_PARAMETERS, shape (n, 10)."""
         return self.standard[self.model.link_columns]
+
+
+def _torque(columns: FloatArray, values: FloatArray) -> FloatArray:
+    """τ_jk = Σ_c W_jck χ_c, shape (n, k)."""
+    return np.asarray(np.einsum("jck,c->jk", columns, values))
 
 
 def physical_parameters(
@@ -444,14 +472,16 @@ def physical_parameters(
         ModuleNotFoundError: cvxpy or Clarabel is not installed.
     """
     if not np.all(np.isfinite(values)):
-        raise NotPhysical("base parameters must be finite", np.array2string(values, precision=3))
-    count = model.robot.axis_count
+        found_values = np.array2string(values, precision=3)
+        raise NotPhysical("base parameters must be finite", found_values)
     leading = list(base.independent)
-    identified = np.einsum("jck,c->jk", columns[:, leading], values)
+    identified = _torque(columns[:, leading], values)
     size = np.linalg.norm(identified, axis=1)
-    weight = np.sqrt(count) * np.where(size > 0.0, size, 1.0)
+    size = np.where(size > 0.0, size, 1.0)
+    weight = np.sqrt(model.robot.axis_count) * size
     weighted = columns / weight[:, None, None]
-    rows = weighted.transpose(0, 2, 1).reshape(-1, columns.shape[1])
+    by_row = weighted.transpose(0, 2, 1)
+    rows = by_row.reshape(-1, columns.shape[1])
     triangle = np.asarray(np.linalg.qr(rows[:, leading], mode="r"))
     programme = _programme(model, base, triangle, rows, prior, other_friction)
     nearest = programme.nearest(values)
@@ -459,23 +489,25 @@ def physical_parameters(
     distance = float(np.linalg.norm(triangle @ difference))
     exact = distance <= EXACT
     free = np.union1d(model.link_columns.ravel(), programme.consistency.scalars)
-    directions = np.eye(len(nearest))[:, free]
+    every_change = np.eye(len(nearest))
+    directions = every_change[:, free]
     if exact:  # only the changes that leave all base parameters as they are
         others = np.setdiff1d(free, leading)
-        directions = np.eye(len(nearest))[:, others]
+        directions = every_change[:, others]
         directions[leading] = -base.grouping[:, others]
         nearest = programme.with_base(nearest, values)
     farthest = (1.0 + SLACK) * distance
     standard = programme.closest_to_prior(nearest, directions, values, farthest)
     if exact:
         # The leading parameters take what rounding has left.
-        standard[leading] += values - base.grouping @ standard
+        rounding = values - base.grouping @ standard
+        standard[leading] += rounding
     for column in programme.consistency.positive:
         standard[column] = max(standard[column], 0.0)
     found = PhysicalParameters.of(standard, model, base, values, columns, prior)
     if not np.all(found.eigenvalues >= 0.5 * MARGIN):
-        evidence = f"eigenvalues {np.array2string(found.eigenvalues, precision=3)}"
-        raise NotPhysical("the solution has an impossible link", evidence)
+        eigenvalues = np.array2string(found.eigenvalues, precision=3)
+        raise NotPhysical("the solution has an impossible link", f"eigenvalues {eigenvalues}")
     return found
 
 
@@ -490,10 +522,12 @@ def _programme(
     """Data of both programmes."""
     scalars = driven_scalars(model)
     norms = np.linalg.norm(rows[:, scalars], axis=0)
-    scales = 1.0 / np.where(norms > 0.0, norms, 1.0)  # value of each that makes the total torque
+    norms = np.where(norms > 0.0, norms, 1.0)
+    scales = 1.0 / norms  # value of each that makes the total torque
+    consistency = consistency_of(model, scales, other_friction)
     return Programme(
         factors=prior.factors,
-        consistency=consistency_of(model, scales, other_friction),
+        consistency=consistency,
         grouping=base.grouping,
         triangle=triangle,
     )

@@ -56,7 +56,11 @@ class PriorCheck:
         """Links (from 0) that the data find lighter or heavier than the tolerance allows."""
         sigmas = (self.link_ratios - 1.0) / self.link_ratio_stds
         level = LEVEL / (3.0 * len(sigmas))
-        return tuple(number for number, size in enumerate(sigmas) if _chance(float(size)) < level)
+        wrong: list[int] = []
+        for link, size in enumerate(sigmas.tolist()):
+            if _chance(size) < level:
+                wrong.append(link)
+        return tuple(wrong)
 
     @property
     def is_wrong(self) -> bool:
@@ -77,30 +81,37 @@ def check_prior(
         links: n.
         tolerance: of the prior, one relative standard deviation.
     """
-    basis, _ = np.linalg.qr(matrix / np.linalg.norm(matrix, axis=0))
-    misfit = right - basis @ (basis.T @ right)
     rows = len(right)
     data_rows = len(data_covariance)
+    norms = np.linalg.norm(matrix, axis=0)
+    basis, _ = np.linalg.qr(matrix / norms)
+    explained = basis @ (basis.T @ right)
+    misfit = right - explained
     covariance = np.eye(rows)
     covariance[:data_rows, :data_rows] = data_covariance
+    # The misfit's covariance P S P, P = I − Q Qᵀ. A sum of squares with it has the mean tr and
+    # the variance 2 tr of the square: that of a scaled χ² (Satterthwaite).
     projection = np.eye(rows) - basis @ basis.T
     misfit_covariance = projection @ covariance @ projection
     mean = float(np.trace(misfit_covariance))
     square_sum = float(np.sum(misfit_covariance**2))
-    columns = projection @ _columns_of_mass(rows, links, tolerance)
-    of_all_links = columns.sum(axis=1)
-    columns = np.column_stack((columns, of_all_links))
+    misfit_square = float(misfit @ misfit)
+    columns_of_links = projection @ _columns_of_mass(rows, links, tolerance)
+    column_of_all = columns_of_links.sum(axis=1)
+    columns = np.column_stack((columns_of_links, column_of_all))
     squares = np.sum(columns**2, axis=0)
-    is_visible = squares > _VISIBLE * 4.0 / tolerance**2
+    least_square = _VISIBLE * 4.0 / tolerance**2
+    is_visible = squares > least_square
     squares = np.where(is_visible, squares, np.inf)
     weights = columns / squares
     ratios = 1.0 - weights.T @ misfit
     variances = np.einsum("rl,rs,sl->l", weights, covariance, weights)  # wᵀ S w of each column
-    stds = np.full(links + 1, np.inf)
-    stds[is_visible] = np.sqrt(variances)[is_visible]
+    stds = np.where(is_visible, np.sqrt(variances), np.inf)
+    chi_square = misfit_square * mean / square_sum
+    degrees_of_freedom = mean**2 / square_sum
     return PriorCheck(
-        chi_square=float(misfit @ misfit) * mean / square_sum,
-        degrees_of_freedom=mean**2 / square_sum,
+        chi_square=chi_square,
+        degrees_of_freedom=degrees_of_freedom,
         mass_ratio=float(ratios[-1]),
         mass_ratio_std=float(stds[-1]),
         link_ratios=ratios[:-1],
@@ -114,13 +125,15 @@ def _columns_of_mass(rows: int, links: int, tolerance: float) -> FloatArray:
     With E = 1, P and with it all ten parameters are 1 + t times the prior's.
     """
     columns = np.zeros((rows, links))
-    first = rows - 10 * links
+    first_of_prior = rows - 10 * links
     on_diagonal = np.array([0, 4, 7, 9])
     for link in range(links):
-        columns[first + 10 * link + on_diagonal, link] = 1.0 / tolerance
+        first = first_of_prior + 10 * link
+        columns[first + on_diagonal, link] = 1.0 / tolerance
     return columns
 
 
 def _chance(sigmas: float) -> float:
     """Probability of a normal number at least as far from zero."""
-    return float(2.0 * special.ndtr(-abs(sigmas)))
+    one_tail = special.ndtr(-abs(sigmas))
+    return float(2.0 * one_tail)

@@ -56,7 +56,8 @@ def prior_shares(
     inner = null.T @ precision @ null
     inverse = np.linalg.pinv(inner, rcond=_LOOSE, hermitian=True)
     by_prior = null @ inverse @ null.T  # N (Nᵀ S⁻¹ N)⁻¹ Nᵀ
-    from_data = np.linalg.pinv(scaled, rcond=_LOOSE) / row_norms
+    inverse_grouping = np.linalg.pinv(scaled, rcond=_LOOSE)
+    from_data = inverse_grouping / row_norms
     from_data -= by_prior @ precision @ from_data  # A
     data_variance = np.einsum("xb,bc,xc->x", from_data, covariance, from_data)  # diagonal of A C Aᵀ
     prior_variance = np.diag(by_prior)
@@ -65,7 +66,8 @@ def prior_shares(
     np.divide(prior_variance, variance, where=variance > 0.0, out=own_shares)
     # A direction without a prior that the data do not determine has no finite variance.
     loose = null - null @ (inverse @ inner)
-    is_loose = np.linalg.norm(loose, axis=1) > np.sqrt(_LOOSE)
+    loose_size = np.linalg.norm(loose, axis=1)
+    is_loose = loose_size > np.sqrt(_LOOSE)
     own_shares[is_loose] = 1.0
     shares = np.zeros(len(model.columns))
     shares[present] = own_shares
@@ -74,8 +76,9 @@ def prior_shares(
 
 def _scales(model: Model, prior: LinkPrior) -> FloatArray:
     """σ of the prior of each link parameter, and one for all else, shape (c,)."""
+    link_std = np.linalg.norm(prior.directions(), axis=2)
     scale = np.ones(len(model.columns))
-    scale[model.link_columns] = np.linalg.norm(prior.directions(), axis=2)
+    scale[model.link_columns] = link_std
     return scale
 
 

@@ -185,15 +185,15 @@ class Design:
         if model.is_redundant:
             return self._without_preload(excitation, motors)
         unit = expected.gains * expected.noise_a
-        motors *= excitation.use[:, None, :] / unit[:, None, None]
+        weight = excitation.use[:, None, :] / unit[:, None, None]
+        motors *= weight
         return np.asarray(motors)
 
     def _without_preload(self, excitation: Excitation, torque: FloatArray) -> FloatArray:
-        """Whitened columns of a redundant drive, its torques, and its gains, shape (n, 2 (b + 10)
-        + n, k).
+        """Whitened columns of a redundant drive, its torques and gains, (n, 2 (b + 10) + n, k).
 
         The currents that are expected are those without preload: with it, gains become better
-            known, not worse.
+        known, not worse.
         """
         expected = self.expectation
         _, to_motors = expected.model.balance(excitation.motion)
@@ -207,12 +207,14 @@ class Design:
         return np.concatenate((columns, torque, of_gains), axis=1)
 
     def with_known_preload(self, whitened: FloatArray, use: BoolArray) -> FloatArray:
-        """``whitened`` of a redundant drive if its preload were known:
-        an equation for each motor, (n, b + 10, k).
+        """``whitened`` of a redundant drive with known preload, (n, b + 10, k).
+
+        It has an equation for each motor.
         """
         expected = self.expectation
         all_move = np.all(use, axis=0)
-        torque = whitened[:, self.width : 2 * self.width] * all_move
+        of_torque = slice(self.width, 2 * self.width)
+        torque = whitened[:, of_torque] * all_move
         unit = expected.gains * expected.noise_a
         return np.asarray(torque / unit[:, None, None])
 
@@ -240,12 +242,14 @@ class Design:
         gains = np.arange(others, self.size)
         for payload in payloads:
             unknowns, source = self.columns(payload)
-            out[np.ix_(unknowns, unknowns)] += summed[np.ix_(source, source)]
+            of_unknowns = np.ix_(unknowns, unknowns)
+            with_gains = np.ix_(unknowns, gains)
+            out[of_unknowns] += summed[np.ix_(source, source)]
             parameters = np.tile(self.expected(payload), (len(grams), 1))
             if blind is not None and payload is not None:
                 parameters[blind] -= self.known(payload)
             products = np.einsum("nab,nb->na", grams, parameters)  # Wᵀ τ of each motor
-            out[np.ix_(unknowns, gains)] -= products[:, source].T
+            out[with_gains] -= products[:, source].T
             out[gains, gains] += np.einsum("na,na->n", products, parameters)  # τᵀ τ
         out[others:, :others] = out[:others, others:].T
         return out
@@ -262,24 +266,23 @@ class Design:
         of_gains = slice(others, None)
         for payload in payloads:
             unknowns, source = self.columns(payload)
-            out[np.ix_(unknowns, unknowns)] += summed[np.ix_(source, source)]
+            of_unknowns = np.ix_(unknowns, unknowns)
+            out[of_unknowns] += summed[np.ix_(source, source)]
             torque = np.einsum("nck,c->nk", torques, self.expected(payload))
             if blind is not None and payload is not None:
                 torque[blind] -= self.known(payload) @ torques[blind]
             gain_columns = gains * torque
-            out[unknowns, of_gains] -= np.einsum(
-                "nak,njk->aj", columns[:, source], gain_columns, optimize=True
-            )
-            out[of_gains, of_gains] += np.einsum(
-                "nik,njk->ij", gain_columns, gain_columns, optimize=True
-            )
+            own_columns = columns[:, source]
+            # Sums over motors n and rows k, as above
+            mixed = np.einsum("nak,njk->aj", own_columns, gain_columns, optimize=True)
+            squares = np.einsum("nik,njk->ij", gain_columns, gain_columns, optimize=True)
+            out[unknowns, of_gains] -= mixed
+            out[of_gains, of_gains] += squares
         out[others:, :others] = out[:others, others:].T
         return out
 
     def expected(self, payload: int | None) -> FloatArray:
-        """Parameters for which the columns of ``whitened`` give the total torque,
-        shape (b + 10,).
-        """
+        """Parameters with which the columns of ``whitened`` give the total torque, (b + 10,)."""
         base = self.base.grouping @ self.expectation.parameters
         mounted = np.zeros(len(LINK_PARAMETERS))
         if payload is not None:
@@ -298,32 +301,33 @@ class Design:
         """Unknowns of a run, and the columns of ``whitened`` that they belong to."""
         base = self.base.independent
         if payload is None:
-            payload_friction = self.expectation.model.loaded_friction_columns.tolist()
-            chosen = [index for index, column in enumerate(base) if column not in payload_friction]
-            unknowns = np.array(chosen, dtype=np.intp)
-            return unknowns, unknowns
+            is_payload_friction = self._is_payload_friction()
+            bare = np.flatnonzero(~is_payload_friction)
+            return bare, bare
         payloads = self.expectation.payloads
         unknown = payloads[payload].unknown
-        before = sum(len(other.unknown) for other in payloads[:payload])
-        first = len(base) + before
-        base_columns = list(range(len(base)))
-        payload_unknowns = list(range(first, first + len(unknown)))
-        payload_columns = [len(base) + index for index in unknown]
-        return (
-            np.array(base_columns + payload_unknowns, dtype=np.intp),
-            np.array(base_columns + payload_columns, dtype=np.intp),
-        )
+        first = len(base)
+        for other in payloads[:payload]:
+            first += len(other.unknown)
+        of_base = np.arange(len(base))
+        payload_unknowns = np.arange(first, first + len(unknown))
+        payload_columns = len(base) + np.array(unknown, dtype=np.intp)
+        unknowns = np.concatenate((of_base, payload_unknowns))
+        columns = np.concatenate((of_base, payload_columns))
+        return unknowns, columns
+
+    def _is_payload_friction(self) -> BoolArray:
+        """Whether a base parameter is what a payload adds to friction, shape (b,)."""
+        payload_friction = self.expectation.model.loaded_friction_columns
+        return np.isin(self.base.independent, payload_friction)
 
     def condition(self, information: FloatArray) -> float:
-        """Condition number of the observation matrix W, rows weighted by their noise;
-        inf for a column without rows.
+        """Condition number of W, rows weighted by their noise; inf for a column without rows.
 
         What a payload adds to friction is left out: in bare or in loaded runs alone it is no
-            separate unknown.
+        separate unknown.
         """
-        payload_friction = self.expectation.model.loaded_friction_columns
-        is_payload_friction = np.isin(self.base.independent, payload_friction)
-        chosen = np.flatnonzero(~is_payload_friction)
+        chosen = np.flatnonzero(~self._is_payload_friction())
         values = np.linalg.eigvalsh(information[np.ix_(chosen, chosen)])
         smallest = values[0]
         largest = values[-1]
@@ -379,21 +383,18 @@ class Design:
         return np.asarray(factor[gains, gains])
 
     def _gains_alone(self, scaled: FloatArray) -> FloatArray:
-        """Information about the gains alone, shape (n, n);
-        other unknowns that are not identifiable drop out.
-        """
+        """Information about the gains alone, (n, n); other unknowns that are not seen drop out."""
         others = slice(None, self.others)
         gains = slice(self.others, None)
         values, vectors = np.linalg.eigh(scaled[others, others])
         is_seen = values > UNSEEN * values[-1]
-        projected = vectors[:, is_seen].T @ scaled[others, gains]
+        seen = vectors[:, is_seen]
+        projected = seen.T @ scaled[others, gains]
         explained = projected.T @ (projected / values[is_seen, None])
         return np.asarray(scaled[gains, gains] - explained)
 
     def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
-        """Predict with unknowns that are not identifiable:
-        they drop out, and gains that depend on them are inf.
-        """
+        """Predict without unknowns that are not seen; gains that depend on them are inf."""
         values, directions = np.linalg.eigh(self._gains_alone(scaled))
         squares = directions**2
         is_seen = values > UNSEEN
@@ -425,8 +426,7 @@ def nominal_expectation(
     limits: JointLimits,
     fast_motion: Motion,
 ) -> tuple[Expectation, bool]:
-    """Return the robot that is expected before a fit,
-    and whether the URDF contains the masses of its links.
+    """Return the robot expected before a fit, and whether the URDF has the masses of its links.
 
     Args:
         model: the declared model.
@@ -440,12 +440,14 @@ def nominal_expectation(
     loaded = links.copy()
     loaded[model.robot.carrier] += payload.parameters
     torque = nominal_torque_limits(model, urdf, loaded, fast_motion)
-    motor_torque = (np.abs(model.drive_train.to_motor) * torque).max(axis=1)
+    parameters = nominal_parameters(model, links, torque, limits.velocity, limits.acceleration)
+    at_motors = np.abs(model.drive_train.to_motor) * torque
+    motor_torque = at_motors.max(axis=1)
     noise = NOISE_SHARE * motor_torque / np.abs(gains)
     expectation = Expectation(
         model=model,
         gains=gains,
-        parameters=nominal_parameters(model, links, torque, limits.velocity, limits.acceleration),
+        parameters=parameters,
         payloads=(payload,),
         noise_a=effective_noise(noise, LAG_ONE),
     )
@@ -453,9 +455,7 @@ def nominal_expectation(
 
 
 def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
-    """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them;
-    else rods.
-    """
+    """Return inertial parameters of links, (n, 10), and whether the URDF has them; else rods."""
     if urdf is not None:
         bodies = read_urdf(urdf).bodies
         if any(body.mass_kg > 0.0 for body in bodies):
@@ -472,7 +472,9 @@ def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
 
 def _rod(rod_m: FloatArray) -> Body:
     """A rod of LINK_MASS_KG from the origin to a point."""
-    slender = LINK_MASS_KG / 12.0 * (rod_m @ rod_m * np.eye(3) - np.outer(rod_m, rod_m))
+    # m/12 (‖r‖² 1 − r rᵀ), and m R²/2 for its radius R
+    across = rod_m @ rod_m * np.eye(3) - np.outer(rod_m, rod_m)
+    slender = LINK_MASS_KG / 12.0 * across
     thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
     return Body(LINK_MASS_KG, 0.5 * rod_m, slender + thick)
 
@@ -483,11 +485,10 @@ def side_of_cube(mass_kg: float) -> float:
 
 
 def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
-    """Return a steel cube of the weighed mass, one side away from where it is mounted;
-    known parameters stay.
+    """Return a steel cube of the weighed mass, one side away from its mounting.
 
-    It is off the axis of the joint that carries it, as the technician is asked to mount it: on the
-    axis, gravity would have no lever.
+    Known parameters stay. It is off the axis of the joint that carries it, as the technician is
+    asked to mount it: on the axis, gravity would have no lever.
     """
     mass = payload.known.get("m", LINK_MASS_KG)
     side = side_of_cube(mass)
@@ -495,9 +496,11 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     most_across = np.eye(3)[np.argmin(np.abs(axis))]
     across = np.cross(axis, most_across)
     across /= np.linalg.norm(across)
-    direction = axis + 0.7 * across + 0.7 * np.cross(axis, across)
+    third = np.cross(axis, across)
+    direction = axis + 0.7 * across + 0.7 * third
     centre = robot.mounting_m + side * direction
-    cube = Body(mass, centre, mass * side**2 / 6.0 * np.eye(3))
+    inertia = mass * side**2 / 6.0 * np.eye(3)
+    cube = Body(mass, centre, inertia)
     parameters: list[float] = []
     for name, guess in zip(LINK_PARAMETERS, cube.parameters, strict=True):
         parameters.append(payload.known.get(name, guess))
@@ -505,9 +508,7 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
 
 
 def declared_efforts(model: Model, urdf: str | None) -> FloatArray:
-    """Return the effort limit of each axis in the URDF [Nm or N], shape (n,);
-    inf where it is not known.
-    """
+    """Return the effort limit of each axis in the URDF [Nm or N], (n,); inf where unknown."""
     if urdf is None:
         return np.full(model.robot.axis_count, np.inf)
     declared = read_urdf(urdf).effort_limit[list(model.robot.axis_joints)]
@@ -518,8 +519,9 @@ def declared_efforts(model: Model, urdf: str | None) -> FloatArray:
 def nominal_torque_limits(
     model: Model, urdf: str | None, links: FloatArray, fast_motion: Motion
 ) -> FloatArray:
-    """Return the URDF's effort limits [Nm or N], else TORQUE_RESERVE times the rigid-body torque,
-    shape (n,).
+    """Return the URDF's effort limits, else TORQUE_RESERVE times the rigid-body torque, (n,).
+
+    In Nm or N.
 
     Args:
         model, urdf: the declared model and the text of the URDF.
@@ -542,9 +544,7 @@ def nominal_parameters(
     velocity_limit: FloatArray,
     acceleration_limit: FloatArray,
 ) -> FloatArray:
-    """Return standard parameters of links, shape (n, 10),
-    and of drives with these limits of the joints, shape (c,).
-    """
+    """Return standard parameters of links, (n, 10), and of drives with these limits, (c,)."""
     parameters = np.zeros(len(model.columns))
     parameters[model.link_columns] = links
     parameters[model.rotor_columns] = ROTOR * torque_limit / acceleration_limit
@@ -554,5 +554,6 @@ def nominal_parameters(
         # Ia, fv and fs of the motor's joint stand for Iam, fvm and fsm.
         first = JOINT_COLUMNS * len(links) + COUPLED_COLUMNS * number
         rotor = model.rotor_columns[motor]
-        parameters[first : first + COUPLED_COLUMNS] = parameters[rotor : rotor + COUPLED_COLUMNS]
+        of_joint = parameters[rotor : rotor + COUPLED_COLUMNS]
+        parameters[first : first + COUPLED_COLUMNS] = of_joint
     return parameters
