@@ -224,7 +224,9 @@ class SimulatedCell:
             elif message is None and self._gate.open:
                 for wires in self._gate.close():
                     self._advance(wires)
+            looked_s = wall_s
             wall_s = self._clock()
+            self._excuse_silence(wall_s - looked_s - IDLE_S)
             now_us = self.time_us
             for node in self.nodes:
                 if node.keep_time(now_us, wall_s) and self._lone is None:
@@ -232,6 +234,12 @@ class SimulatedCell:
             self._run_alone(wall_s)
             if message is None and self._disturbance:
                 self._interfere()  # other masters do not wait for our SYNC
+
+    def _excuse_silence(self, held_up_s: float) -> None:
+        """Leave out the time for which a busy machine has held up the cell."""
+        if held_up_s > 0.0:
+            for node in self.nodes:
+                node.excuse_silence(held_up_s)
 
     def _nodes_of(self, ids: Collection[int]) -> tuple[Node, ...]:
         return tuple(node for node in self.nodes if node.node_id in ids)

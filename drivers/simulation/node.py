@@ -146,6 +146,13 @@ class Node:
         if self._number(0x1016, 1) >> 16 & 0x7F == producer:
             self._heard_wall_s = wall_s
 
+    def excuse_silence(self, seconds: float) -> None:
+        """Leave out a time in which the cell did not run, and so heard nobody:
+        the heartbeats of it may still wait to be read.
+        """
+        if self._heard_wall_s is not None:
+            self._heard_wall_s += seconds
+
     def keep_time(self, now_us: int, wall_s: float) -> bool:
         """React by 6007h when the monitored heartbeat is overdue,
         and send the own one when it is due.

@@ -373,11 +373,28 @@ def test_each_rate_comes_once_and_then_the_highest_without_a_loss_of_ours() -> N
         rows.append(row(rate_hz, **losses))
     assert next_rate(rows, rates) == 50
     assert (highest_rate(rows), highest_rate(rows, with_host=True)) == (50, 25)
+    rows.append(row(50))
+    assert next_rate(rows, rates) == 50
     rows.append(row(50, ended_by="ours"))
     assert next_rate(rows, rates) == 25
     rows.append(row(25, wrong=1))
     assert next_rate(rows, rates) == 25
     assert highest_rate(rows) is None
+
+
+def test_a_rate_that_only_the_host_has_spoilt_is_tried_again_in_turn_with_the_best() -> None:
+    rates = (25, 50, 100)
+    rows = [row(25), row(50, ended_by="host"), row(100, ended_by="host")]
+    assert highest_rate(rows) == 25
+    assert next_rate(rows, rates) == 25
+    rows.append(row(25))
+    assert next_rate(rows, rates) == 50
+    rows.append(row(50, lost_by_host=6))
+    assert (highest_rate(rows), next_rate(rows, rates)) == (50, 100)
+    rows.append(row(100, ended_by="host"))
+    assert next_rate(rows, rates) == 50
+    rows.append(row(50))
+    assert next_rate(rows, rates) == 100
 
 
 def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from tests.drivers.simulation.test_cell import SIX, begin_move
 
 GUARD_MS = 500
 RECORDER = 127
+ENABLING = 3  #: SYNCs of `set_up`
 CYCLES = 200  #: SYNCs of the master: in the middle of the move
 
 
@@ -127,6 +128,28 @@ def test_a_sync_ends_the_time_without_sync(request: pytest.FixtureRequest) -> No
         master.read(1, 0x6041, 0, "H")
         let_go_on(master, clock, 2.0)
         assert cell.cycles == stopping + 1
+
+
+def test_a_cell_that_a_busy_machine_held_up_does_not_blame_its_master(
+    request: pytest.FixtureRequest,
+) -> None:
+    """SYNCs and heartbeats that came meanwhile wait to be read; the first frame is a SYNC."""
+    spec = clean_cell()
+    clock = Clock()
+    with running(spec, request.node.name, clock) as (cell, master):
+        set_up(master)
+        begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
+        for _ in range(CYCLES):
+            master.sync()
+        clock.now_s += 4.0 * 0.001 * GUARD_MS
+        for _ in range(3):
+            master.sync()
+            master.send(0x700 + RECORDER, b"\x05")
+        assert {node.drive.state for node in cell.nodes} == {PowerState.OPERATION_ENABLED}
+        assert cell.cycles == CYCLES + 3 + ENABLING
+        # A master that is gone is still found, one guard time later.
+        let_go_on(master, clock, 0.001 * GUARD_MS + 0.06)
+        assert {node.drive.state for node in cell.nodes} == {PowerState.QUICK_STOP_ACTIVE}
 
 
 def test_a_master_that_is_late_within_the_guard_gets_the_same_bytes(
