@@ -92,7 +92,7 @@ def geometry_drift(
     payload_nm = np.empty((0, *left_nm.shape))
     if data.payload is not None:
         payload_nm = np.moveaxis(model.regressor(slow.motion())[:, model.flange], 1, 0)
-    # Of a closed chain the signals have the joints without a motor, too, behind those of the axes.
+    # Of a closed chain the signals have the joints without a motor, too, after those of the axes.
     velocity = signals.velocity_rad_s[: len(left_nm)]
     nuisance = _nuisance(signals.geared_torque_nm, velocity, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]

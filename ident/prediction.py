@@ -119,7 +119,7 @@ def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
 
 
 def left_of(placed: PlacedEffect, coefficients: FloatArray) -> tuple[PlacedEffect, FloatArray]:
-    """An effect and its coefficients beside a corrected model:
+    """An effect and its coefficients in a corrected model:
     of a correction nothing is left, but its σ.
     """
     if not isinstance(placed.effect, GeometryEffect):
@@ -428,7 +428,7 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
     masses_kg = {source.mass_kg for source in calibration.sources if source.payload == payload.name}
     mass_kg = payload.known.get("m")
     fitted_kg = next(iter(masses_kg - {None}), None)
-    # What was identified beside one mass, first moments and inertia, is not that of a body of
+    # What was identified with one mass, first moments and inertia, is not that of a body of
     # another mass.
     if (
         identified
