@@ -416,8 +416,8 @@ def torque_channels(
     none in a log without torques.
 
     The current is the mean over AVERAGED_S around the reading, because an SDO shows only within
-    some milliseconds when the drive read its torque; the current nearby is the mean over NEARBY_S before
-    and after it.
+    some milliseconds when the drive read its torque; the current nearby is the mean over NEARBY_S
+    before and after it.
 
     Args:
         log: with the readings.
