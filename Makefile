@@ -66,7 +66,7 @@ help:
 	@echo "make planner-study  error bars that the planner predicts beside those of the fit, slow noise too (docs/evidence/planning.md); minutes"
 	@echo "make contact-study  false alarms an hour and height of the thresholds of contact (docs/evidence/contact.md); minutes"
 	@echo "make mutation-study  small faults planted into the product, and whether a test notices (docs/evidence/tests.md); SEED=1 MUTANTS=300 MINUTES=55; resumable, hours"
-	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
+	@echo "make words   the words that code and prose use more often than well-known packages do; seconds"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
 	@echo "make clean   remove .venv and everything made"
@@ -285,9 +285,8 @@ console-study: setup vcan-tools
 soak: setup
 	$(BIN)/python -m tests.studies.soak --results docs/evidence/data/soak.csv $(if $(MINUTES),--minutes $(MINUTES)) $(if $(REALTIME),--realtime)
 
-# Counts phrases; fails above 2 % of the baseline. Not part of `make check` until the language pass is done.
 words: setup
-	$(BIN)/python -m tests.words
+	$(BIN)/python -m tests.tools.words
 
 wheel: setup
 	$(BIN)/python -m pip wheel -qq --no-deps --no-build-isolation --wheel-dir dist .

@@ -65,7 +65,7 @@ def shadowed_package() -> str:
     """Describe a file or folder that Python has imported in the place of one of the packages;
     empty without one.
 
-    The names of the packages are common: a folder `drivers` beside a script comes before an
+    The names of the packages are common: a folder `drivers` next to a script comes before an
     installed package.
     """
     home = Path(__file__).resolve().parent

@@ -27,7 +27,7 @@ errors                              `DaqError` and its subclasses (daq/errors.py
 ==================================  ==============================================================================
 
 Logs carry the description of their cell, so a fit needs no other file. Nothing is written unless
-every check of a proposal passes. The science behind is in `ident`, the bus in `drivers`; their
+every check of a proposal passes. The science is in `ident`, the bus in `drivers`; their
 errors (`ident.IdentificationError`, `drivers.DriverError`) pass through.
 """  # noqa: E501
 

@@ -33,7 +33,7 @@ JOBS = {
 STYLE = "font-family:DejaVu Sans,Helvetica,Arial,sans-serif"
 INK, FAINT = "#222222", "#666666"
 LONGEST = 52
-"""Letters of a line beside the name of a room."""
+"""Letters of a line next to the name of a room."""
 
 STATIONS = (
     ("bus", "drivers", "SYNC and PDOs"),

@@ -268,7 +268,7 @@ def schema_list() -> str:
 
 
 def _schema(model: Any) -> dict[str, Any]:
-    """The schema of a model, with the comments beside its fields (`#:`) as descriptions."""
+    """The schema of a model, with the comments at its fields (`#:`) as descriptions."""
     schema: dict[str, Any] = TypeAdapter(model).json_schema()
     classes: dict[str, type] = {}
     _collect_classes(model, classes)
@@ -295,7 +295,7 @@ def _collect_classes(kind: Any, found: dict[str, type]) -> None:
 
 
 def field_comments(kind: type) -> dict[str, str]:
-    """The comments `#:` behind or above the fields of a class and its bases, as sentences."""
+    """The comments `#:` after or above the fields of a class and its bases, as sentences."""
     comments: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if not base.__module__.startswith(FRONT_DOORS):
@@ -312,7 +312,7 @@ def field_comments(kind: type) -> dict[str, str]:
 
 
 def _comment_of(lines: Sequence[str], node: ast.AnnAssign) -> str:
-    """The comment of a field, behind its last line or above its first; empty without one."""
+    """The comment of a field, after its last line or above its first; empty without one."""
     last = lines[(node.end_lineno or node.lineno) - 1]
     behind = last[node.end_col_offset :].partition("#:")[2].strip()
     if behind:

@@ -84,7 +84,7 @@ class Quantity(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SlowReading:
-    """Value that is read a few times a second, beside the samples."""
+    """Value that is read a few times a second, alongside the samples."""
 
     time_ns: int  #: on the clock of the samples [ns since 1970]
     axis: int  #: index of the axis from 0

@@ -70,7 +70,7 @@ class Parameter:
 
         See `Model.friction_by_payload`.
         """
-        is_of_robot = ":" not in self.name  # behind a colon is the mounting of a payload
+        is_of_robot = ":" not in self.name  # after a colon is the mounting of a payload
         return is_of_robot and self.name.split(" ", 1)[0].endswith(LOADED)
 
     @property

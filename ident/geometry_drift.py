@@ -93,7 +93,7 @@ def geometry_drift(
     if data.payload is not None:
         regressor = model.regressor(slow.motion())
         payload_nm = np.moveaxis(regressor[:, model.flange], 1, 0)
-    # Of a closed chain the signals have the joints without a motor, too, behind those of the axes.
+    # Of a closed chain the signals have the joints without a motor, too, after those of the axes.
     velocity = signals.velocity_rad_s[: len(left_nm)]
     nuisance = _nuisance(signals.geared_torque_nm, velocity, payload_nm)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]

@@ -118,7 +118,7 @@ def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
 
 
 def left_of(placed: PlacedEffect, coefficients: FloatArray) -> tuple[PlacedEffect, FloatArray]:
-    """An effect and its coefficients beside a corrected model: of a correction only its σ."""
+    """An effect and its coefficients in a corrected model: of a correction only its σ."""
     if not isinstance(placed.effect, GeometryEffect):
         return placed, coefficients
     applied = placed.effect.with_applied(coefficients.tolist())
@@ -476,7 +476,7 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
 def _require_same_mass(calibration: Calibration, payload: Payload, run: str) -> None:
     """Refuse another mass than that of the fit.
 
-    What was identified beside one mass, first moments and inertia, is not that of a body of another
+    What was identified with one mass, first moments and inertia, is not that of a body of another
     mass.
 
     Raises:

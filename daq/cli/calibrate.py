@@ -87,7 +87,7 @@ class CalibrateOptions:
     ] = 30.0
     sessions: Annotated[
         Path | None,
-        output_option("--sessions", "Folder of the sessions, by default beside the cell file."),
+        output_option("--sessions", "Folder of the sessions, by default next to the cell file."),
     ] = None
     by: Annotated[
         str | None, typer.Option("--by", help="Operator, for logs and audit; you, by default.")
@@ -216,7 +216,7 @@ def ask_word(question: str, word: str) -> bool:
 def ask(question: str) -> str:
     """Ask the operator; return the answer without spaces.
 
-    Only what is typed at a terminal behind the question answers it: a key that was pressed too
+    Only what is typed at a terminal after the question answers it: a key that was pressed too
     often before must not start the robot.
 
     Raises:
@@ -312,10 +312,10 @@ class Looks:
     journal: Journal  #: for the terminal
     block: str = ""  #: that is being recorded; empty between two blocks
     last: QuickLook | None = None  #: that was printed
-    remark: str = MOVES  #: beside the progress bar of a block
+    remark: str = MOVES  #: next to the progress bar of a block
 
     def show(self, look: QuickLook) -> None:
-        """Publish a look, put its worst gain beside the bar, and print it if it is new;
+        """Publish a look, put its worst gain next to the bar, and print it if it is new;
         in the thread that receives it.
 
         One that comes after the end of its block is not printed: the operator types then.

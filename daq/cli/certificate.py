@@ -25,7 +25,7 @@ def certificate_verb(
     calibration: CalibrationArgument,
     out: Annotated[
         Path | None,
-        output_option("--out", "Page to write; by default beside the calibration, as .html."),
+        output_option("--out", "Page to write; by default next to the calibration, as .html."),
     ] = None,
     cell: Annotated[
         Path | None,

@@ -192,7 +192,7 @@ def history_verb(
 def _check_companions(
     option: str, given: str | None, companions: Mapping[str, object | None]
 ) -> None:
-    """Refuse options that mean something beside another one only."""
+    """Refuse options that mean something together with another one only."""
     lonely = [name for name, value in companions.items() if value is not None]
     if given is None and lonely:
         raise UsageError(
@@ -217,7 +217,7 @@ def _require_log(ledger: Ledger, checked: Verification) -> None:
         raise DataError(
             str(ledger.audit),
             found=f"no file, although {controller} has {counted(count, 'backup')} of earlier "
-            "writes beside it",
+            "writes next to it",
             expected="the audit log with these writes",
             remedy="restore it with its `.head`, and ask who removed it; if it is kept elsewhere "
             "on purpose, go on: the next write begins a new log, and says so in it",
@@ -388,7 +388,7 @@ def _rename(
     without `confirmed`, say what that would be.
 
     Sessions are looked for in the scheduled job's folder, in that of the cell file, in those that
-    cell files of other names have left beside it, and in the one that was named.
+    cell files of other names have left next to it, and in the one that was named.
     """
     from daq.jobs.position import former_session_folders, sessions_folder
     from daq.jobs.session import rename_sessions, sessions_to_rename

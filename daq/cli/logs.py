@@ -191,7 +191,7 @@ def export_log_verb(
     json: JsonOption = False,
 ) -> None:
     """Write the samples of a log into a table:
-    a row per SYNC, joint positions and currents in SI beside raw numbers.
+    a row per SYNC, joint positions and currents in SI, and the raw numbers.
 
     The log itself opens in Foxglove and PlotJuggler (configs/viewers).
     """

@@ -1,5 +1,5 @@
 """`drivegain monitor` and `console`: the axes live in the terminal,
-and on a page beside a recording.
+and on a page during a recording.
 """
 
 from __future__ import annotations

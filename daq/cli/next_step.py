@@ -118,14 +118,14 @@ def say_after_plan(cell: Path, declared: Cell, plan: Path, made: Plan) -> None:
     if runs.unloaded and runs.loaded:
         _say_record(cell, declared, plan, Path("held-out.mcap"), loaded=True)
         return
-    first = _good_plan_beside(plan, made) or plan
+    first = _other_good_plan(plan, made) or plan
     if runs.unloaded:
         _say_record(cell, declared, first, Path("loaded.mcap"), loaded=True)
     else:
         _say_record(cell, declared, first, Path("unloaded.mcap"), loaded=False)
 
 
-def _good_plan_beside(plan: Path, made: Plan) -> Path | None:
+def _other_good_plan(plan: Path, made: Plan) -> Path | None:
     """Return the oldest plan of this cell in the folder of a plan that is good and of another
     seed.
     """
@@ -279,7 +279,7 @@ def first_refusal(
 
     Args:
         calibration: that could be written.
-        file: it is in, beside which signatures are; None where it was not written.
+        file: it is in, next to which signatures are; None where it was not written.
         place: file of the cell, or CELL where it is not certain.
         described: the cell as the logs describe it, for a file that cannot be read.
     """
@@ -316,7 +316,7 @@ def _read_cell(place: Path) -> Cell | None:
 
 
 def cell_of(calibration: Calibration, logs: Sequence[Path]) -> Path:
-    """Find the cell file of a calibration, here or beside its logs;
+    """Find the cell file of a calibration, here or next to its logs;
     CELL, to be filled in, where it is not certain.
 
     Several files may describe a cell of that name, as the shipped one and a copy of it. The one

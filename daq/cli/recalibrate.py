@@ -192,7 +192,7 @@ def program() -> Path:
     if found is None:
         raise UsageError(
             "drivegain",
-            found=f"no such command beside {sys.executable} or on PATH",
+            found=f"no such command next to {sys.executable} or on PATH",
             expected="an installed command, for the timer to call",
             remedy="install it (`pip install .`), then repeat this",
         )

@@ -75,7 +75,7 @@ def sign_calibration_verb(
     name: Annotated[str, typer.Option("--name", help="Your name, as the cell file spells it.")],
     json: JsonOption = False,
 ) -> None:
-    """Show a calibration and write your signature beside it;
+    """Show a calibration and write your signature next to it;
     changing the file makes the signature invalid.
     """
 

@@ -328,7 +328,7 @@ def demo(
 
 def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     """Nodes on the bus, turns of the loop, errors before and after, the summary,
-    and the gains beside the truth.
+    and the gains compared with the truth.
     """
     from daq.report.bus_views import scan_table, scanned_nodes
     from daq.report.gains import gain_table
@@ -343,7 +343,7 @@ def demo_view(outcome: DemoOutcome) -> Iterator[RenderableType]:
     yield ""
     yield from map(Sentence, summary(fitted, outcome.changed, outcome.calibration.effects))
     yield ""
-    title = "Drive gains beside the truth of the simulated cell; change % is from the nameplate"
+    title = "Drive gains and the truth of the simulated cell; change % is from the nameplate"
     yield gain_table(outcome.calibration.gains, truth, title=title)
     if fitted.paper is not None:
         errors = (

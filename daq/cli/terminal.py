@@ -74,7 +74,7 @@ def write_new_folder(folder: Path) -> Iterator[Path]:
     """Write a new folder within the block, all of it or nothing.
 
     Yields:
-        a hidden folder beside it, to write into; it gets the name at the end of the block.
+        a hidden folder next to it, to write into; it gets the name at the end of the block.
 
     Raises:
         UsageError: there is something in the folder, or a file of this name.

@@ -245,7 +245,7 @@ class Cell:
     conditioning: Conditioning  #: the filters
     controller: Controller | None  #: destination of the gains, None without write-back
     clearance: Clearance | None  #: the room around the arm, None if it is not declared
-    effects: tuple[DeclaredEffect, ...]  #: part of every fit, whatever a search finds beside them
+    effects: tuple[DeclaredEffect, ...]  #: part of every fit, whatever a search finds besides them
     folder: Path | None  #: folder of the cell file; None for a cell from a log
     digest: str  #: sha256 of the cell file and all files it refers to, hex
     #: sha256 of the content that a recording or its fit depends on, hex: without comments, and

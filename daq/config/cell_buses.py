@@ -377,7 +377,7 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
 
 
 def polling_fits(cell: Cell) -> bool:
-    """Return whether every period has room for an SDO request and its answer beside all answers to
+    """Return whether every period has room for an SDO request and its answer besides all answers to
     the SYNC.
 
     Both frames may fall into one period, and an answer after the next SYNC makes a run invalid. In
@@ -390,7 +390,7 @@ def polling_fits(cell: Cell) -> bool:
 
 
 def polling_warnings(cell: Cell) -> tuple[str, ...]:
-    """Warn of a cell in which torque and temperature are not logged beside the samples:
+    """Warn of a cell in which torque and temperature are not logged alongside the samples:
     see `polling_fits`.
     """
     if cell.sync is None or polling_fits(cell):

@@ -43,7 +43,7 @@ STANDING = (0.0, 0.0, -9.81)
 
 
 class ChainModel(StrictModel):
-    """Keys of a robot with closures, beside its URDF."""
+    """Keys of a robot with closures, next to its URDF."""
 
     motors: Annotated[
         tuple[Name, ...],

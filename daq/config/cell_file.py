@@ -241,8 +241,8 @@ no recording and no fit depends on them.
 """
 _BOUNDS = ("rated_payload_kg",)
 """Keys of `robot` that only bound others; no recording and no fit depends on them."""
-_BESIDE = ("torque", "temperature")
-"""Keys of a drive profile for what is read beside the samples;
+_SLOW_READINGS = ("torque", "temperature")
+"""Keys of a drive profile for what is read alongside the samples;
 samples and gains do not depend on them.
 """
 
@@ -256,9 +256,9 @@ def _canonical(member: str, content: bytes, name: str) -> bytes:
         tree = _without(tree, _AFTERWARDS)
         tree["robot"] = _without(tree["robot"], _BOUNDS)
     elif member.startswith(DRIVES) and member.endswith(".yaml"):
-        tree = _without(tree, _BESIDE)
+        tree = _without(tree, _SLOW_READINGS)
         if tree.get("facts"):
-            tree["facts"] = _without(tree["facts"], _BESIDE)
+            tree["facts"] = _without(tree["facts"], _SLOW_READINGS)
     return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
 
 
@@ -312,7 +312,7 @@ def _read_sources(sources: Mapping[str, Path]) -> dict[str, bytes]:
 
 
 def drive_path(folder: Path, drive: str) -> Path:
-    """Find a profile beside the cell (drives/ or ../drives/), else the shipped one."""
+    """Find a profile next to the cell (drives/ or ../drives/), else the shipped one."""
     file = f"{drive}.yaml"
     candidates = (
         folder / "drives" / file,
@@ -328,7 +328,7 @@ def drive_path(folder: Path, drive: str) -> Path:
     raise ConfigurationMissing(
         f"drive profile {drive!r}",
         found=f"no file {tried}",
-        expected=f"a profile beside the cell, or a shipped one ({shipped})",
+        expected=f"a profile next to the cell, or a shipped one ({shipped})",
         remedy="correct the axis's `drive`, or write the profile",
     )
 

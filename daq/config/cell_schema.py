@@ -189,7 +189,7 @@ class AxisModel(StrictModel):
 
 
 class KnownModel(StrictModel):
-    """Single inertial parameters of a payload beside its mass,
+    """Single inertial parameters of a payload besides its mass,
     about the last joint's frame (paper eq. 5).
     """
 
@@ -232,9 +232,7 @@ class PayloadModel(StrictModel):
     @model_validator(mode="after")
     def _check_form(self) -> PayloadModel:
         if self.inertia_kg_m2 is not None and self.centre_m is None:
-            raise ValueError(
-                "centre_m beside inertia_kg_m2: the inertia is about the centre of mass"
-            )
+            raise ValueError("centre_m with inertia_kg_m2: the inertia is about the centre of mass")
         if self.centre_m is not None and self.known is not None:
             raise ValueError(
                 "centre_m and inertia_kg_m2, or single parameters under `known`, not both"
@@ -269,7 +267,7 @@ class ConditioningModel(StrictModel):
     position_cutoff_hz: _CutOff = 40.0  #: cut-off of the zero-phase low-pass of the positions [Hz]
     #: order of that filter
     position_order: Annotated[int, Field(ge=FILTER_ORDER[0], le=FILTER_ORDER[1])] = 4
-    #: cut-off of the filter of all columns, behind which rows are decimated [Hz]
+    #: cut-off of the filter of all columns, after which rows are decimated [Hz]
     decimation_cutoff_hz: _CutOff = 20.0
     #: speed of each revolute joint below which it stands still, and its rows are left out [rad/s];
     #: derived from each run where empty
@@ -329,7 +327,7 @@ class CellModel(StrictModel):
     #: one for each motor
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()  #: weighed bodies
-    #: what the robot is known to have beside rigid links and friction
+    #: what the robot is known to have besides rigid links and friction
     effects: tuple[EffectModel, ...] = ()
     friction_by_payload: Annotated[
         bool,

@@ -365,7 +365,7 @@ def _frame_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
 
 
 def _mass_faults(model: CellModel) -> Iterator[Fault]:
-    """Find payloads that this robot cannot carry, and g beside kg."""
+    """Find payloads that this robot cannot carry, and masses in g among those in kg."""
     rated_kg = model.robot.rated_payload_kg
     masses_kg = [payload.mass_kg for payload in model.payloads if payload.mass_kg > 0]
     lightest_kg = min(masses_kg, default=0.0)

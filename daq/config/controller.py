@@ -86,7 +86,7 @@ class Controller:
                 "file and gains of the controller, objects of the drives, or all three"
             )
         if self.file is None and self.format is not None:
-            raise ValueError("format only beside file")
+            raise ValueError("format without file")
         return self
 
     @property

@@ -245,7 +245,7 @@ class DriveModel(StrictModel):
     save_semantics: str
     source: Annotated[str, Field(min_length=1)]
     eds: Annotated[str, Field(pattern=r"^[^/\\\x00]+$", max_length=200)] | None = None
-    """File beside the profile, the maker's data sheet; a log carries it."""
+    """File next to the profile, the maker's data sheet; a log carries it."""
     facts: FactsModel | None = None
 
     @model_validator(mode="after")
@@ -288,7 +288,7 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         expected = "the peak current of this size of drive [A]; no object of the drive reports it"
         raise ConfigurationInconsistent(
             **fault_texts(document, [Fault(place, "nothing", expected)]),
-            remedy="copy the profile to drives/ beside your cell file and enter it from the "
+            remedy="copy the profile to drives/ next to your cell file and enter it from the "
             "drive's data sheet",
         )
     del parts["eds"]  # a log carries it for people; no reader of a profile needs it

@@ -16,7 +16,7 @@ from daq.config.cell_schema import CellModel
 from daq.config.yaml_file import parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent
 
-CELLS = "cells"  #: Folder of the cell file, where it names files beside its own folder
+CELLS = "cells"  #: Folder of the cell file, where it names files next to its own folder
 FILE_NAME = re.compile(r"\w[\w.-]*")
 
 
@@ -46,7 +46,7 @@ def extracted_cell(files: Mapping[str, bytes]) -> tuple[PurePosixPath, dict[Pure
     name = model.name if FILE_NAME.fullmatch(model.name) else "cell"
     place = folder / f"{name}.yaml"
     placed = {place: content, _inside(folder / urdf): files[URDF]}
-    # A profile is looked for in `drives` beside the cell file, and beside its folder.
+    # A profile is looked for in `drives` next to the cell file, and next to its folder.
     drives = folder.parent / "drives"
     for drive in model.drives:
         profile = files[f"{DRIVES}{drive}.yaml"]

@@ -184,7 +184,7 @@ class ScaledColumns(PublishedColumns):
 class CurrentColumns(ScaledColumns):
     """Columns of the current-loop reference; numbers × factor are in the gains' unit."""
 
-    #: One for all axes, a list in their order, or a mapping from their names, as N beside Nm.
+    #: One for all axes, a list in their order, or a mapping from their names.
     unit: UnitName | Annotated[tuple[UnitName, ...], Field(min_length=1)] | dict[Name, UnitName]
 
     def units(self, axes: Sequence[str]) -> tuple[str, ...] | None:

@@ -126,7 +126,7 @@ def policy_judged(cell_file: Path, key: str, path: Path) -> Path:
 class HistorySection:
     """`history`: file names relative to the cell file.
 
-    By default they are beside it, with its name.
+    By default they are next to it, with its name.
     """
 
     store: FileName | None = None  #: SQLite file of an earlier version, which is migrated

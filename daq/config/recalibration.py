@@ -65,7 +65,7 @@ class PlannedRun:
     name: RunName  #: name of its log
     #: mounted payload, None without load
     payload: Annotated[str, Field(min_length=1)] | None = None
-    #: Mass of the payload as weighed for this job, beside that in `payloads` [kg]; None without
+    #: Mass of the payload as weighed for this job, besides that in `payloads` [kg]; None without
     #: load.
     mass_kg: Annotated[float, Field(gt=0)] | None = None
     plan: SeededPlan | None = None  #: moves planned from a seed

@@ -56,7 +56,7 @@ class Fitted(StrictModel):
 
 
 class JudgedGain(StrictModel):
-    """An identified gain beside the current gain, with their σ,
+    """An identified gain compared with the current gain, with their σ,
     and whether they differ significantly.
 
     `old` and `new` are keys of `state.json` and of `--json`, which stay.
@@ -131,7 +131,7 @@ class SessionState(StrictModel):
         """Whether no command goes on with it.
 
         A command that was killed before it reported its end did not end it; nor did one that an
-        error ended behind the decision, before the certificate had it.
+        error ended after the decision, before the certificate had it.
         """
         if self.outcome is None or self.ended is None:
             return False
@@ -161,7 +161,7 @@ class Block(StrictModel):
 
 
 class GainSoFar(StrictModel):
-    """A gain after a block, beside its target."""
+    """A gain after a block, with its target."""
 
     axis: str
     unit: str
@@ -197,8 +197,8 @@ class ScaleOfAxis(StrictModel):
 
 
 class Acceptance(StrictModel):
-    """The short run after the write: torques of the currents beside those that the calibration
-    predicts.
+    """The short run after the write: torques of the currents compared with those that the
+    calibration predicts.
     """
 
     log_sha256: str

@@ -45,7 +45,7 @@ _COMMENTS: dict[ControllerFormat, re.Pattern[str]] = {
     ControllerFormat.YAML: re.compile(r"[^\r\n#]*[ \t]#[ \t]*([^\r\n]*[^\s])"),
     ControllerFormat.XML: re.compile(r"[^\r\n]*?<!--[ \t]*([^\r\n]*?)[ \t]*-->"),
 }
-"""Comment behind a number, by format; the other formats have none on the line of a number."""
+"""Comment after a number, by format; the other formats have none on the line of a number."""
 
 
 def format_of(name: str) -> ControllerFormat:
@@ -58,10 +58,10 @@ def format_of(name: str) -> ControllerFormat:
 
 
 def comment_behind(rest: str, name: str, file_format: ControllerFormat | None = None) -> str:
-    """Return the comment behind a number on its line, empty where there is none.
+    """Return the comment after a number on its line, empty where there is none.
 
     Args:
-        rest: text of the file behind the number.
+        rest: text of the file after the number.
         name: of the file.
         file_format: of the file; None where its name says it.
     """

@@ -125,7 +125,7 @@ class Scalar:
 
     @property
     def end(self) -> int:
-        """The character behind its last one."""
+        """The character after its last one."""
         return self.start + len(self.text)
 
     def read(self, text: str) -> float:

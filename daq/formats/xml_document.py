@@ -160,7 +160,7 @@ class XmlDocument(ControllerDocument):
                 key,
                 f"line {element.line}: {written!r:.60}",
                 "write a plain decimal number there, without entities, CDATA, comments or other "
-                "elements beside it",
+                "other elements next to it",
             )
         start += written.index(number)
         line = self.text.count("\n", 0, start) + 1

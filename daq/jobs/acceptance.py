@@ -104,7 +104,7 @@ def _require_written(context: SessionContext, session: Session) -> None:
 
 def _enter(context: SessionContext, session: Session) -> None:
     """Enter the result in the audit log, unless an earlier command of this session was killed
-    behind that.
+    after that.
     """
     acceptance = guided(session).acceptance
     if acceptance is None:

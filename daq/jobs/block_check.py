@@ -1,7 +1,7 @@
 """Look at a block right after its recording:
 a mistake that it shows costs one block then, and not the session.
 
-The body on the flange is weighed with the nameplate gains (`ident.weighing`), beside the blocks
+The body on the flange is weighed with the nameplate gains (`ident.weighing`), against the blocks
 before. These gains may be off by a quarter; a body that was forgotten is off by all of its mass. In
 a wrong geometry the weighing tells nothing, so gravity and the positions are judged before a body
 is blamed.
@@ -36,7 +36,7 @@ SAME_BODY = (0.5, 2.0)
 
 @dataclass(frozen=True, slots=True)
 class BlockFacts:
-    """What the log of a block shows by itself, and beside earlier blocks."""
+    """What the log of a block shows by itself, and against earlier blocks."""
 
     unreadable: str = ""  #: why no fit can use it; empty where one can
     #: share of samples with an active current limit, by axis
@@ -113,10 +113,10 @@ def look_at_geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
 
 
 def compared_with(blocks: Sequence[Block]) -> tuple[Block, ...]:
-    """Return the earlier blocks that the last one is weighed beside.
+    """Return the earlier blocks that the last one is weighed against.
 
-    They have the same body; without such blocks, a loaded block is weighed beside bare ones, and a
-    bare block that is recorded again beside loaded ones.
+    They have the same body; without such blocks, a loaded block is weighed against bare ones, and a
+    bare block that is recorded again against loaded ones.
     """
     *earlier, last = blocks
     same = tuple(block for block in earlier if block.payload == last.payload)
@@ -137,7 +137,7 @@ def mistake_in(
         payload: name of the body of the loaded blocks; its mass is that of the cell file until it
             was weighed.
         blocks: of the session, in the order of their recording.
-        facts: of the last block, beside `compared_with` of these blocks.
+        facts: of the last block, besides `compared_with` of these blocks.
         repeated: names of the blocks that were recorded again because of a mistake.
     """
     last = blocks[-1]
@@ -166,14 +166,14 @@ def _mistake_of_body(
     least_kg = max(LEAST_SHARE * body.mass_kg, noise_kg)
     has_same = compared_with(blocks)[-1].payload == last.payload
     if has_same and last.payload is None:
-        return _bare_beside_bare(blocks, body, added_kg, least_kg)
+        return _compare_bare_with_bare(blocks, body, added_kg, least_kg)
     if has_same:
-        return _loaded_beside_loaded(last, body, added_kg, least_kg) or _turned(
+        return _compare_loaded_with_loaded(last, body, added_kg, least_kg) or _turned(
             last, body.mass_kg, facts
         )
     if last.payload is None:
-        return _bare_beside_loaded(last, body, added_kg, least_kg)
-    return _loaded_beside_bare(blocks, body, added_kg, least_kg, is_again=is_again)
+        return _compare_bare_with_loaded(last, body, added_kg, least_kg)
+    return _compare_loaded_with_bare(blocks, body, added_kg, least_kg, is_again=is_again)
 
 
 def _limited(cell: Cell, facts: BlockFacts) -> str:
@@ -191,10 +191,10 @@ def _limited(cell: Cell, facts: BlockFacts) -> str:
     return ""
 
 
-def _bare_beside_bare(
+def _compare_bare_with_bare(
     blocks: Sequence[Block], body: WeighedPayload, added_kg: float, least_kg: float
 ) -> Mistake | None:
-    """Judge a bare block beside earlier bare ones."""
+    """Judge a bare block against earlier bare ones."""
     if abs(added_kg) <= least_kg:
         return None
     last = blocks[-1]
@@ -213,10 +213,10 @@ def _bare_beside_bare(
     return Mistake((*earlier, last.name), text)
 
 
-def _loaded_beside_loaded(
+def _compare_loaded_with_loaded(
     last: Block, body: WeighedPayload, added_kg: float, least_kg: float
 ) -> Mistake | None:
-    """Judge a loaded block beside earlier loaded ones."""
+    """Judge a loaded block against earlier loaded ones."""
     if abs(added_kg) <= least_kg:
         return None
     change = f"{abs(added_kg):.2g} kg {'more' if added_kg > 0.0 else 'less'}"
@@ -243,10 +243,10 @@ def _turned(last: Block, mass_kg: float, facts: BlockFacts) -> Mistake | None:
     return Mistake((last.name,), text)
 
 
-def _bare_beside_loaded(
+def _compare_bare_with_loaded(
     last: Block, body: WeighedPayload, added_kg: float, least_kg: float
 ) -> Mistake | None:
-    """Judge a bare block beside loaded ones, as the first bare block that is recorded again."""
+    """Judge a bare block against loaded ones, as the first bare block that is recorded again."""
     if abs(added_kg) > least_kg:
         return None
     text = (
@@ -255,7 +255,7 @@ def _bare_beside_loaded(
     return Mistake((last.name,), text)
 
 
-def _loaded_beside_bare(
+def _compare_loaded_with_bare(
     blocks: Sequence[Block],
     body: WeighedPayload,
     added_kg: float,
@@ -263,7 +263,7 @@ def _loaded_beside_bare(
     *,
     is_again: bool,
 ) -> Mistake | None:
-    """Judge the first loaded block beside the bare ones.
+    """Judge the first loaded block against the bare ones.
 
     Where it carries the same, the body was forgotten, as a rule: one block tells. Only where it
     carries the same once more, the body was there in the bare ones.

@@ -140,7 +140,7 @@ def next_role(so_far: BlocksSoFar, way: BlocksToCome) -> BlockRole:
 
 
 def _with_bare(so_far: BlocksSoFar, bare: int, wanted: float) -> BlocksToCome | None:
-    """The fewest loaded blocks that are enough beside so many bare ones;
+    """The fewest loaded blocks that are enough for so many bare ones;
     None where no number is.
     """
     left = wanted - 1.0 / (so_far.bare + bare)

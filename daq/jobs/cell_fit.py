@@ -166,7 +166,7 @@ _SUMMARY = TypeAdapter(Summary)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationCache:
-    """A calibration file a cell, and beside each a small JSON file that says what it was made
+    """A calibration file a cell, and next to each a small JSON file that says what it was made
     of.
     """
 

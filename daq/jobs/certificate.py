@@ -1,8 +1,8 @@
 """The certificate of a calibration that a session has made:
-first before its decision, and again behind it.
+first before its decision, and again after it.
 
 The page needs the fit for its details, and a command that goes on with a session does not have it
-any more. So they are kept in a file beside the page, and the page is made again from calibration,
+any more. So they are kept in a file next to the page, and the page is made again from calibration,
 audit log and this file.
 """
 
@@ -27,7 +27,7 @@ from daq.writeback.request import Request
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account
 
-DETAILS = "details.json"  #: Beside the page
+DETAILS = "details.json"  #: Next to the page
 LARGEST_BYTES = 64 << 20  #: Of the details; drawings of a long session take a few megabytes
 
 
@@ -48,7 +48,7 @@ def save_certificate(
     calibration: Calibration,
     folder: Path,
 ) -> Certificate:
-    """Write the page of a session, with the gains beside the current ones.
+    """Write the page of a session, with the gains compared with the current ones.
 
     Args:
         cell_file: for the command that the page shows.

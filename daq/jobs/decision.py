@@ -231,7 +231,7 @@ def _written_since(context: SessionContext, session: Session) -> bool:
 
 
 def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str) -> None:
-    """Write the change beside the calibration, as JSON and as a diff."""
+    """Write the change next to the calibration, as JSON and as a diff."""
     refusals = [
         FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals
     ]

@@ -723,7 +723,7 @@ def motion_left_s(
     Args:
         cell: with its model of friction, which the order of the blocks depends on.
         gains: so far.
-        blocks: behind them.
+        blocks: that they are from.
         block_s: duration of a block that was asked for [s].
     """
     if not gains:
@@ -771,7 +771,7 @@ def _variance_ratio(gains: Sequence[GainSoFar]) -> float:
 def gains_so_far(
     context: SessionContext, estimate: Estimate, target_percent: float
 ) -> tuple[GainSoFar, ...]:
-    """Return the gains of an estimate beside their target."""
+    """Return the gains of an estimate with their target."""
     std_percent = 100.0 * np.abs(estimate.gains_std / estimate.gains)
     gains = []
     for axis, value, std in zip(context.cell.axes, estimate.gains, std_percent, strict=True):

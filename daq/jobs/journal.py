@@ -1,6 +1,6 @@
 """Journal of a job: one line an event, as text, as JSON, or for the system's journal.
 
-Under systemd a line is JSON behind ``<N>``, its priority (sd-daemon(3)). That is chosen before the
+Under systemd a line is JSON after ``<N>``, its priority (sd-daemon(3)). That is chosen before the
 journal's own protocol because it is one write to the stream that we were given: no socket that may
 be full or absent, no limit of a datagram, and the order of everything else that goes to that stream
 is kept. ``journalctl -p err`` finds what is wrong, and ``journalctl -o cat | jq`` reads the fields.

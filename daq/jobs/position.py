@@ -40,7 +40,7 @@ SESSIONS_SUFFIX = ".sessions"
 
 
 def former_session_folders(cell_file: Path) -> tuple[Path, ...]:
-    """Return the folders beside a cell file that have sessions of a cell file of another name.
+    """Return the folders next to a cell file that have sessions of a cell file of another name.
 
     A cell file that was renamed leaves its sessions behind, under its earlier name. Where there is
     a cell file of that name, the sessions are its own.
@@ -96,7 +96,7 @@ def position_of(state: GuidedState) -> Position:
 
 
 def _recording_position(state: GuidedState) -> Position | None:
-    """Find the block that a session is at; None behind the recording."""
+    """Find the block that a session is at; None after the recording."""
     recorded = {run.name for run in state.runs}
     waiting = [block for block in state.blocks if block.name not in recorded]
     if waiting:

@@ -267,7 +267,7 @@ def remove_old(
 
 
 def _remove_remnants(newest: Path) -> None:
-    """Remove what killed jobs left beside this folder:
+    """Remove what killed jobs left next to this folder:
     sessions half removed, and those that never got a state.
 
     A later folder without a state may be that of another cell's job, which begins just now. One

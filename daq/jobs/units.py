@@ -166,7 +166,7 @@ def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
     if not wanted.user:
         capabilities = _CAPABILITIES.get(wanted.owner, "")
         hardening = (
-            f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
+            f"\n# It reads its cell, writes next to it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
             f"CapabilityBoundingSet={capabilities}\n"
         )
         owner = (
@@ -186,7 +186,7 @@ ExecStart={command}
 SuccessExitStatus={ExitCode.PROPOSED.value}
 # No automatic restart: an operator decides.
 Restart=no
-# The job bounds its own time (max_duration_min) and stops the axes; this is behind that bound.
+# The job bounds its own time (max_duration_min) and stops the axes; this limit is longer.
 TimeoutStartSec={seconds}
 # SIGTERM stops the axes and writes the session down.
 KillSignal=SIGTERM

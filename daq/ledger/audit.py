@@ -5,7 +5,7 @@ edited, removed, moved or added. An entry is on the disk before `append` returns
 piece under a lock. A killed writer leaves at most an unfinished line. That line stays; the next
 entry begins on a line of its own and records its digest.
 
-Beside the log is FILE.head with the digest of its last entry: a chain alone cannot show that its
+Next to the log is FILE.head with the digest of its last entry: a chain alone cannot show that its
 end, or all of it, is missing. docs/decisions/0036 says what this defends against.
 """
 
@@ -173,7 +173,7 @@ def _digest_of_line(line: bytes) -> str:
 def _is_fragment(line: bytes) -> bool:
     """Whether a line can be the begin of an unfinished entry, which is never JSON.
 
-    Zeros behind it, or alone, are left by a power cut. Any other text is from another file.
+    Zeros after it, or alone, are left by a power cut. Any other text is from another file.
     """
     begun = line.rstrip(b"\0")
     if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
@@ -271,7 +271,7 @@ def _write_part(descriptor: int, data: memoryview) -> int:
 
 
 def noted_heads(path: Path) -> tuple[str, ...]:
-    """Return the digests of entries that were noted beside an audit log, and that it must have;
+    """Return the digests of entries that were noted next to an audit log, and that it must have;
     none without a note.
 
     The last one is that of the last entry. Others are of entries that were missing when the next
@@ -288,7 +288,7 @@ def noted_heads(path: Path) -> tuple[str, ...]:
 
 
 def head_file(path: Path) -> Path:
-    """Return the note beside an audit log, FILE.head; symbolic links to the log are followed."""
+    """Return the note next to an audit log, FILE.head; symbolic links to the log are followed."""
     target = Path(os.path.realpath(path))
     return target.with_name(f"{target.name}.head")
 
@@ -296,7 +296,7 @@ def head_file(path: Path) -> Path:
 def _note_head(path: Path, content: bytes, head: str) -> None:
     """Note the last entry; the caller has the lock, and `content` is what was before it.
 
-    The note is behind the log after a kill, which is harmless: an older entry is in the chain, too.
+    The note is older than the log after a kill, which is harmless: the chain has older entries too.
     """
     missing = [one for one in noted_heads(path) if one.encode() not in content]
     noted = "".join(f"{one}\n" for one in (*missing, head)).encode()
@@ -587,7 +587,7 @@ class _Chain:
         """Lines that are no entries, since the last one that is."""
         self.number = 1
         self.previous: str | None = FIRST
-        """Digest that the next entry must follow; None behind a broken line."""
+        """Digest that the next entry must follow; None after a broken line."""
         self.place = 1
         """Line of the entry before."""
 

@@ -208,7 +208,7 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     Args:
         ledger: to check.
         heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the note
-            beside it.
+            next to it.
 
     Raises:
         AuditUnusable, HistoryUnreadable: see `read_history`.
@@ -289,7 +289,7 @@ def enter_calibration(
         _put_aside(ledger, at)
     except HistoryUnreadable:
         raise
-    except DataError as error:  # the next line goes behind the changed ones all the same
+    except DataError as error:  # the next line goes after the changed ones all the same
         _LOG.warning("the history of an earlier version stays where it is: %s", evidence(error))
     except _NotPutAside as error:  # the audit log has all of it, and takes the calibration too
         _LOG.warning("the history of an earlier version keeps its name: %s", evidence(error))

@@ -45,7 +45,7 @@ class Stretch:
 
     @property
     def ended(self) -> int:
-        """Index behind the last of them."""
+        """Index after the last of them."""
         return self.began + len(self.drift.deviations)
 
 

@@ -49,7 +49,7 @@ class SqliteBag:
         Raises:
             LogUnreadable: one of its kinds, with the row of the table where there is one.
         """
-        # Only read, and without locks: no file is made beside it.
+        # Only read, and without locks: no file is made next to it.
         uri = f"{self._source.absolute().as_uri()}?immutable=1"
         try:
             self._refuse_unfinished()
@@ -118,7 +118,7 @@ class SqliteBag:
             raise self.corrupt(row, "more bytes than the file has", "a recording")
 
     def _refuse_unfinished(self) -> None:
-        """Refuse a file beside which SQLite has left what belongs into it:
+        """Refuse a file next to which SQLite has left what belongs into it:
         it would be read without that.
         """
         name = self.path.name

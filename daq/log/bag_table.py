@@ -276,7 +276,7 @@ def _files(path: Path) -> list[Path]:
     files: list[Path] = []
     for pattern in PATTERNS:
         files += path.glob(pattern)
-    # A player leaves what it has unpacked beside the packed file.
+    # A player leaves what it has unpacked next to the packed file.
     unpacked = {file.with_name(file.name + PACKED) for file in files}
     once = [file for file in files if file not in unpacked]
     _require_parts(path, once)
@@ -778,7 +778,7 @@ class _Rows:
             self._path,
             f"nan for {empty} {at}",
             "numbers, but for the begin and the end of the bag",
-            "samples are never invented: import what is before it and what is behind it by `keep`, "
+            "samples are never invented: import what is before it and what is after it by `keep`, "
             "as recordings of their own",
         )
 

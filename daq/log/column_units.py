@@ -24,7 +24,7 @@ from daq.errors import TableUnfit
 
 NEAR_FACTOR = 10.0
 """Largest ratio of a factor to that of its two units:
-it may hold a gauge's scale, or rms beside amplitude.
+it may hold a gauge's scale, or that of rms to amplitude.
 """
 _IN_BRACKETS = re.compile(r"\[([^\[\]]+)\]\s*$")
 
@@ -283,7 +283,7 @@ def check_units(
 
 
 def _require_alike(place: str, in_line: str, in_name: str) -> None:
-    """Refuse a unit in the line of units beside another one of the same quantity in the column's
+    """Refuse a unit in the line of units that differs from one of the same quantity in the column's
     name.
 
     Letters in a name may mean something else than a quantity of another kind.

@@ -217,7 +217,7 @@ class RecordFile:
                 crc = zlib.crc32(body, zlib.crc32(head, crc))
             offset += HEAD_BYTES + length
         if offset != end:
-            raise self.corrupt(offset, f"{end - offset} bytes behind the footer", "none")
+            raise self.corrupt(offset, f"{end - offset} bytes after the footer", "none")
         digest.update(MAGIC)
         self.sha256 = digest.hexdigest()
 

@@ -34,7 +34,7 @@ _LOG = logging.getLogger("drivegain")
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
 #: Largest share of an axis's samples with an active limit; these samples are masked
 LARGEST_SATURATED = 0.1
-BESIDE_S = 0.005  #: Distance from a torque within which the current belongs to it
+AVERAGED_S = 0.005  #: Half of the time around a torque over which its current is averaged
 #: Distances from it at which the current has another noise, but hardly another value
 NEARBY_S = 0.01, 0.03
 
@@ -412,12 +412,12 @@ def temperatures(log: Log) -> FloatArray | None:
 def torque_channels(
     log: Log, cell: Cell, current: FloatArray, valid: BoolArray
 ) -> tuple[TorqueChannel, ...]:
-    """Return each axis's own torque beside its current, one channel an axis;
+    """Return each axis's own torque with its current, one channel an axis;
     none in a log without torques.
 
-    The current is the mean over BESIDE_S around the reading, because an SDO shows only within some
-    milliseconds when the drive read its torque; the current nearby is the mean over NEARBY_S before
-    and after it.
+    The current is the mean over AVERAGED_S around the reading, because an SDO shows only within
+    some milliseconds when the drive read its torque; the current nearby is the mean over NEARBY_S
+    before and after it.
 
     Args:
         log: with the readings.
@@ -430,7 +430,7 @@ def torque_channels(
         return ()
     time_ns = log.samples.time_ns
     rate_hz = log.head.run.rate_hz
-    half = round(BESIDE_S * rate_hz)
+    half = round(AVERAGED_S * rate_hz)
     near = max(half + 1, round(NEARBY_S[0] * rate_hz))
     far = max(half + 2, round(NEARBY_S[1] * rate_hz))
     sums = np.zeros((2, len(current) + 1, len(cell.axes)))

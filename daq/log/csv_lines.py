@@ -256,7 +256,7 @@ class _RawLines:
         return any(map(math.isfinite, numbers))
 
     def find_header(self, named: Iterable[str]) -> tuple[int, tuple[str, ...]]:
-        """Return the first line behind the header, and its names.
+        """Return the first line after the header, and its names.
 
         A header may begin with the sign of a comment: it is the line that has the names that are
         looked for, or the last one before the rows.
@@ -302,7 +302,7 @@ class _RawLines:
         return []
 
     def _skip_delimiter_line(self, number: int) -> int:
-        """Return the line behind `sep=;`, by which a spreadsheet names the delimiter."""
+        """Return the line after `sep=;`, by which a spreadsheet names the delimiter."""
         if number >= len(self.lines):
             return number
         text = self.lines[number].strip().strip('"')
@@ -347,7 +347,7 @@ class _RawLines:
         return None
 
     def end_of_rows(self, start: int) -> int:
-        """Return the line behind the last row: empty lines and comments after it are no rows."""
+        """Return the line after the last row: empty lines and comments there are no rows."""
         end = len(self.lines)
         while end > start and self.is_skipped(end - 1):
             end -= 1
@@ -358,7 +358,7 @@ class _RawLines:
         and remarks on those that are not.
 
         Args:
-            start, end: first line behind the head, and behind the last row.
+            start, end: first line after the head, and after the last row.
             has_time: stamps show where a recording goes on, so that an empty line says nothing.
         """
         while start < end and self.is_skipped(start):
@@ -405,7 +405,7 @@ class _RawLines:
                     "stamps",
                     expected="every sample, as `rate_hz` gives each row its time",
                     remedy="take the sign of the comment away, name a column of stamps by `time`, "
-                    "or import what is before it and what is behind it by `keep`",
+                    "or import what is before it and what is after it by `keep`",
                 )
 
     def check_quotes(self, numbers: Sequence[int]) -> None:
@@ -583,7 +583,7 @@ def _require_row(file: CsvLines, row: int) -> None:
         found=found,
         expected="rows of numbers alone, after the header",
         remedy=f"if no sample is missing there, delete the line{leave_out}; if it parts two "
-        f"recordings, import what is before it by {parts}, and what is behind it by `from_row`",
+        f"recordings, import what is before it by {parts}, and what is after it by `from_row`",
     )
 
 

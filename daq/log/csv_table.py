@@ -238,7 +238,7 @@ def _date_ns(text: str) -> int | None:
 
 
 def _fraction_ns(digits: str) -> int:
-    """Nanoseconds of the digits behind the point of a second."""
+    """Nanoseconds of the digits after the point of a second."""
     return int(digits.ljust(9, "0"))
 
 
@@ -312,7 +312,7 @@ def _check_points(file: CsvLines, indices: list[int]) -> None:
 
 def _check_thousands(file: CsvLines, index: int, values: FloatArray) -> None:
     """Refuse a column in which the decimal sign must group thousands:
-    987 beside 1.234, and never 1.2 or 0.987.
+    987 among 1.234, and never 1.2 or 0.987.
     """
     has_decimals = (values % 1.0).any()
     if np.abs(values).max() >= 1000.0 or not has_decimals:
@@ -339,7 +339,7 @@ def _check_thousands(file: CsvLines, index: int, values: FloatArray) -> None:
         return
     raise TableUnfit(
         file.field_place(first_grouped, index),
-        found=f"{texts[first_grouped]!r} beside {first_plain!r}: three digits behind every "
+        found=f"{texts[first_grouped]!r} and {first_plain!r}: three digits after every "
         f"{file.layout.decimal!r} of the column",
         expected="numbers whose thousands are not grouped",
         remedy="export them without grouping; if these are decimals, export all numbers with the "
@@ -381,7 +381,7 @@ def _remedy_for_a_line(file: CsvLines, row: int, text: str, values: FloatArray) 
         before = file.first_row + row
         return (
             "the header is there once more: import what is before it by `keep: {to_row: "
-            f"{before}}}`, and what is behind it by `keep: {{from_row: {before + 2}}}`"
+            f"{before}}}`, and what is after it by `keep: {{from_row: {before + 2}}}`"
         )
     if row == 0 and set(file.names).intersection(fields):
         return (

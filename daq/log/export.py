@@ -267,7 +267,7 @@ def _in_rows(
         reading_ns: increasing times of all readings of the log, shape (r,).
         readings: their values, shape (r,).
         begin_ns: time of the first row; before all readings if it is the first of the log.
-        end_ns: time of the row after the last; infinite behind the last of the log.
+        end_ns: time of the row after the last; infinite after the last of the log.
     """
     values = np.full(len(time_ns), np.nan)
     inside = (reading_ns >= begin_ns) & (reading_ns < end_ns)

@@ -116,7 +116,7 @@ class ProgramEnd:
 
 @dataclass(frozen=True, slots=True)
 class QuickGain:
-    """Quick estimate of a gain, beside its target."""
+    """Quick estimate of a gain, with its target."""
 
     axis: str
     unit: str

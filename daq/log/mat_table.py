@@ -184,7 +184,7 @@ class _Array:
     kind: int  #: class
     shape: tuple[int, ...]  #: dimensions
     imaginary: bool  #: complex numbers
-    body: memoryview  #: elements behind the name
+    body: memoryview  #: elements after the name
 
     def __str__(self) -> str:
         size = "×".join(map(str, self.shape))

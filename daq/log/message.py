@@ -1,7 +1,7 @@
 """The messages of a log: their ROS 2 definitions and their CDR bytes.
 
 CDR (OMG DDSI-RTPS, XCDR1): four bytes of encapsulation, then the fields in order, each aligned to
-its own size, counted from behind the encapsulation. A sequence is its length and its elements; a
+its own size, counted from the end of the encapsulation. A sequence is its length and its elements; a
 string ends with NUL, which counts. With a given number of axes an AxisSamples message has a
 constant size, so numpy reads a chunk of them at once.
 """
@@ -230,7 +230,7 @@ def _string(text: str) -> bytes:
 
 
 def _string_from(data: bytes, start: int) -> tuple[str, int]:
-    """Decode a string; return it with the position behind it."""
+    """Decode a string; return it with the position after it."""
     (length,) = struct.unpack_from("<I", data, start)
     end = start + 4 + length
     text = data[start + 4 : end]

@@ -72,7 +72,7 @@ class _Samples:
     missing: NDArray[np.uint32]  #: bit i for axis i without an answer, shape (k,)
 
     def after(self, before: _Samples) -> _Samples:
-        """Return these samples behind others."""
+        """Return these samples after others."""
         position_counts = np.concatenate((before.position_counts, self.position_counts))
         current_raw = np.concatenate((before.current_raw, self.current_raw))
         missing = np.concatenate((before.missing, self.missing))

@@ -95,7 +95,7 @@ class Log:
     head: LogHead  #: everything before the samples
     samples: SampleBlock  #: all samples
     events: tuple[CellEvent, ...]  #: in the order of the log
-    #: torques and temperatures read beside the samples, in the order of the log
+    #: torques and temperatures read alongside the samples, in the order of the log
     readings: tuple[SlowReading, ...]
     statistics: RunStatistics  #: the recorder's summary at the end
     #: the end of the recording is unknown: it was salvaged, or never got its final name

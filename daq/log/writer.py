@@ -353,7 +353,7 @@ class LogWriter:
         return self._channels[topic]
 
     def _hold(self, topic: str, time_ns: int, data: bytes) -> None:
-        """Keep a message for the chunk behind the samples."""
+        """Keep a message for the chunk after the samples."""
         self._held.append((self._channel(topic), time_ns, data))
 
     def _count(self, sample: Sample) -> None:

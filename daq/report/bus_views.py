@@ -567,7 +567,7 @@ def _current_text(axis: MonitoredAxis) -> str:
 
 
 def prediction_view(report: MonitorReport) -> Iterator[RenderableType]:
-    """Measured beside predicted current, or why there is none; nothing without a calibration."""
+    """Measured and predicted current, or why there is none; nothing without a calibration."""
     if report.prediction is None:
         return
     if report.prediction.remark:

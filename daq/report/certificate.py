@@ -1,4 +1,5 @@
-"""The certificate of a calibration: its gains beside the current ones, the limits, and one verdict.
+"""The certificate of a calibration: its gains compared with the current ones, the limits and a
+verdict.
 
 The judgement is that of `drivegain apply`: the same gates, and the same test for a change beyond
 noise.
@@ -36,7 +37,7 @@ from ident.data.run import Recording
 
 
 class CertifiedGain(Report):
-    """A gain beside the current one, or beside the nameplate."""
+    """A gain compared with the current one, or with the nameplate."""
 
     axis: str
     key: str | None
@@ -73,7 +74,7 @@ class CertifiedEffect(Report):
 
 
 class EarlierCalibration(Report):
-    """An earlier calibration, and the gains beside it."""
+    """An earlier calibration, and the gains compared with it."""
 
     created: str
     axes: list[CertifiedGain]

@@ -340,14 +340,14 @@ def _written_row(change: GainChange, gain_before: float, after: str) -> tuple[st
 
 
 def _old_comments(edit: FileEdit) -> Iterator[str]:
-    """Say that comments behind the gains are those of the previous gains:
+    """Say that comments after the gains are those of the previous gains:
     a write changes numbers alone.
     """
     comments = edit.comments
     if comments:
         axis, text = next(iter(comments.items()))
         yield paragraph(
-            "A write changes numbers only, so comments behind the gains may describe the previous "
+            "A write changes numbers only, so comments after the gains may describe the previous "
             f"gains. {axis}: “{text}”."
         )
 
@@ -411,7 +411,7 @@ def _since(certificate: Certificate) -> Iterator[str]:
         drawing = _error_drawing(calibration, earlier.holdout_error_percent, holdout)
         errors = figure(drawing, caption, "Error on held-out runs")
     yield section(
-        "Beside the earlier calibration",
+        "Compared with the earlier calibration",
         table("", headings, rows, "words"),
         pair((change, errors)),
         html_list(facts),

@@ -1,4 +1,4 @@
-"""A calibration beside the current gains, or beside the nameplate,
+"""A calibration compared with the current gains, or with the nameplate,
 and its state by the cell's ledger.
 
 The judgement is that of `drivegain apply`: the same gates, and the same figures of the history. If
@@ -44,7 +44,7 @@ NO_LEDGER = Standing(
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Gains beside the current ones, or beside the nameplate where the controller was not read."""
+    """Gains with the current ones, or with the nameplate where the controller was not read."""
 
     changes: tuple[GainChange, ...]  #: one an axis
     refusals: tuple[Refusal, ...]  #: failed checks

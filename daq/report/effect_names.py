@@ -180,7 +180,7 @@ def named_size(effect: Effect, found: Sequence[Parameter]) -> str:
         # below zero.
         inertia = max(0.0, effect.known_rotor_kg_m2 + rest.value / (loss.value or math.inf))
         std = rest.std / (abs(loss.value) or math.inf)
-        rotor = f"beside a rotor of {with_deviation(inertia, std)} kg m²"
+        rotor = f"with a rotor of {with_deviation(inertia, std)} kg m²"
         sizes = f"{_sized(names[0], loss, effect.reported)}, {rotor}"
     else:
         sizes = ", ".join(

@@ -105,13 +105,13 @@ class Trial(Report):
 
 
 class FoundGravity(Report):
-    """Direction of gravity by the torques, beside the declared one."""
+    """Direction of gravity by the torques, and the declared one."""
 
     declared_m_s2: list[Figure]
     found_m_s2: list[Figure]
     turn_deg: Figure
     turn_std_deg: Figure
-    #: Other mistakes of the description, with their axes, beside which it was estimated; its σ does
+    #: Other mistakes of the description, with their axes, estimated together with it; its σ does
     #: not cover them.
     not_corrected: list[str]
 
@@ -266,7 +266,7 @@ def paper_note(
 
     On clean simulated cells at 5 % of noise the two differ by up to 3.3 σ and 1.9 % (`make
     tls-study`): never by more than both limits, so that a larger difference says something about
-    the model. It does not beside another estimator than ml, which noise may bias, nor where the
+    the model. It does not hold with another estimator than ml, which noise may bias, nor where the
     weights of tls are wrong.
 
     Args:
@@ -467,7 +467,7 @@ def geometry_notes(
     nothing where nothing was tested.
 
     Args:
-        check: beside the fit.
+        check: of the fit.
         axes: their names.
         robot: as declared.
         diagnoses: of the fit. Gravity is estimated without correcting what they name.
@@ -493,7 +493,7 @@ def geometry_notes(
 
 
 def not_corrected(diagnoses: Sequence[Diagnosis]) -> list[str]:
-    """Name the mistakes of the description, other than gravity, beside which gravity was estimated:
+    """Name the mistakes of the description, other than gravity, that were estimated with it:
     `zero-off J2`.
     """
     of_others = (OF_DESCRIPTION | {CORRECTION_UNCLEAR}) - {"gravity-tilted", GRAVITY_TURNED}

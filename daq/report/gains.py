@@ -1,4 +1,4 @@
-"""The gains with their σ: a table, and a picture beside the nameplate."""
+"""The gains with their σ: a table, and a picture of gain over nameplate."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def plot_gains(
 def gain_table(
     gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None
 ) -> Table:
-    """Table of the gains, a row an axis, beside the true ones of a simulated cell;
+    """Table of the gains, a row an axis, with the true ones of a simulated cell;
     fits a terminal of 80 columns.
     """
     true: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ def gain_table(
 
 
 def torque_table(slopes: Sequence[TorqueSlope | None], gains: Sequence[Gain]) -> Table:
-    """Table of the slopes of the drives' own torque over the current, beside the identified gains;
+    """Table of the slopes of the drives' own torque over the current, with the identified gains;
     no fit uses them.
 
     A ratio shows how far the torque constant in a drive is from the gain: gear losses, or a wrong

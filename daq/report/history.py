@@ -294,7 +294,7 @@ def calibration_table(
 
 
 def history_gain_table(all_series: Sequence[Series]) -> Table:
-    """Each gain as it was identified last, beside its baseline."""
+    """Each gain as it was identified last, with its baseline."""
     headings = ("axis", "identified ± σ", "nameplate", "since baseline %", "in σ", "state", "unit")
     table = plain_table(headings, left=(0, 5, 6), wrap=(3,))
     for series in all_series:

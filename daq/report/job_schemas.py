@@ -156,7 +156,7 @@ class ProposalReport(Report):
 
 
 class DemoGain(Report):
-    """A gain beside the truth of the simulated cell."""
+    """A gain compared with the truth of the simulated cell."""
 
     axis: str
     nameplate: float

@@ -50,7 +50,7 @@ class MjcfActuator(Report):
     unit: str
     """of the gear"""
     armature: float
-    """of the tendon, beside those of the joints"""
+    """of the tendon, besides those of the joints"""
     damping: float
     friction: float
 

@@ -678,7 +678,7 @@ def _unconfirmed_skew(skew: CurrentDelay | None) -> Iterator[str]:
         yield (
             "A time skew between currents and positions is not known: it needs instruments, so "
             "point-to-point moves and one motor for each degree of freedom, and data that show it "
-            "beside the model."
+            "next to the model."
         )
     elif not skew.confirmed:
         yield (

@@ -61,7 +61,7 @@ class Skew(Report):
 
 
 class SkewByInstruments(Skew):
-    """The same whether or not they confirm it, beside the estimate of the fit [s]."""
+    """The same whether or not they confirm it, besides the estimate of the fit [s]."""
 
     fit_seconds: float
     fit_std: float

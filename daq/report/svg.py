@@ -1,4 +1,4 @@
-"""Drawings as SVG: intervals beside limits, values before and after, curves, a ranking;
+"""Drawings as SVG: intervals with limits, values before and after, curves, a ranking;
 and a file of several.
 
 In a page they take their colours from its style (`daq.report.html`), so that they follow dark mode

@@ -151,8 +151,8 @@ def _broken(words: Sequence[str], indent: int, width: int) -> list[str]:
 class WholeTable(Table):
     """Table without a frame that never cuts a value.
 
-    Columns that a terminal has no room for follow below, beside the first `keys` columns again.
-    Where not even one of them fits beside those, each value gets a line of its own.
+    Columns that a terminal has no room for follow below, after the first `keys` columns again.
+    Where not even one of them fits after those, each value gets a line of its own.
     """
 
     def __init__(self, title: Text | None = None, *, keys: int = 1) -> None:
@@ -203,7 +203,7 @@ class WholeTable(Table):
 
     def _blocks(self, widths: list[int], room: int) -> list[list[int]]:
         """Columns of the tables below each other;
-        none where a column does not fit beside the keys.
+        none where a column does not fit after the keys.
         """
         keys = list(range(self._keys))
         blocks = [keys]
@@ -276,12 +276,12 @@ _GAP = 3
 
 def entry_lines(name: str, text: str, indent: int, width: int) -> list[str]:
     """Lines of a name and its text, broken at spaces alone;
-    a word without room beside the name is below it.
+    a word without room after the name is below it.
 
     Args:
         name: of the entry.
         text: printable, without line ends.
-        indent: columns of the longest name and the gap behind it.
+        indent: columns of the longest name and the gap after it.
         width: columns of a line.
     """
     below = max(map(cell_len, text.split()), default=0) > width - indent

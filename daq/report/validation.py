@@ -242,7 +242,7 @@ def validate_report(
 
     Args:
         calibration: the one to validate.
-        found: by it, and by those beside it.
+        found: by it, and by those compared with it.
         drawn: pictures by log.
     """
     validations = found.validations

@@ -200,7 +200,7 @@ def _basis_text(found: Weighed) -> str:
         errors += " and with the tolerance of the calibration's payload mass"
     how = "on the robot of the calibration"
     if found.bare:
-        how = "robot and body together, beside runs without load"
+        how = "robot and body together, with runs without load"
     left = f"it leaves {body.error.total:.3g} %"
     return f"Found {how}; σ from {body.moves} moves, with the errors of {errors}; {left}."
 

@@ -20,12 +20,12 @@ The order of the judgements, causes before their traces:
    fixed.
 6. Zeros and lengths that the encoders contradict (`daq.workflow.geometry_diagnoses`), where there
    are more of them than degrees of freedom: found before any torque is looked at, and named first.
-7. Small mistakes of the description: zeros, mounting and late positions, by torque. Beside a fit
+7. Small mistakes of the description: zeros, mounting and late positions, by torque. With a fit
    they are those of `check_diagnoses`; after a search, those that it corrects
    (`correction_diagnoses`), those that held-out runs leave undecided or that it has set aside
-   (`open_correction_diagnoses`), and what the check says beside its model. Several that the moves
-   do not tell apart are one, `CORRECTION_UNCLEAR`. They are named before 4. to 6., and where they
-   are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
+   (`open_correction_diagnoses`), and what the check reports besides its model. Several that the
+   moves do not distinguish are one, `CORRECTION_UNCLEAR`. They are named before 4. to 6., and
+   where they are, no exchange of currents is looked for (`daq.workflow.fit.judged`).
 8. Each held-out log; first whether the geometry has changed since the fit (`ident.geometry_drift`).
 
 Currents that are late, one of them or all alike, are named with 7., but they hide no exchange of
@@ -304,7 +304,7 @@ def _require_own_channels(runs: Sequence[ChannelTriangles], currents: str, cell:
     )
 
 
-# The description beside the torques
+# The description against the torques
 
 CHECKED_BYTES = 150_000_000
 """Largest size of all logs of a fit whose rows are kept for the test:
@@ -318,11 +318,11 @@ def is_checked(logs: Sequence[Path]) -> bool:
 
 
 def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
-    """Test the geometry beside a fit by any estimator;
+    """Test the geometry of a fit by any estimator;
     None with too few moves, or where ``ml`` fits nothing.
 
     Args:
-        evidence: the rows behind the fit.
+        evidence: the rows of the fit.
         seed: of the bootstrap.
     """
     try:
@@ -350,7 +350,7 @@ def by_likelihood(estimate: Estimate, system: System) -> Estimate:
 
 
 def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Diagnosis, ...]:
-    """Diagnoses of a check beside a fit.
+    """Diagnoses of the check of a fit.
 
     Args:
         check: of the fit.
@@ -374,7 +374,7 @@ def correction_diagnoses(
     Args:
         evidence: with its effects.
         cell: whose description it is.
-        check: beside the fit before the search; None where nothing was tested.
+        check: of the fit before the search; None where nothing was tested.
     """
     given = evidence.uncorrected or evidence
     found: list[Diagnosis] = []
@@ -389,8 +389,8 @@ def correction_diagnoses(
 
 
 def _is_settled(placed: PlacedEffect, check: GeometryCheck, evidence: Evidence) -> bool:
-    """Whether a correction that the fit did not tell apart from others stands beside one of them in
-    a model.
+    """Whether a model has a correction together with one of those that the fit could not
+    distinguish from it.
     """
     for alike in check.alike:
         if alike.contain(placed):
@@ -410,7 +410,7 @@ def open_correction_diagnoses(
     Args:
         steps: of the search, with the verdicts of held-out runs.
         cell: whose description it is.
-        check: beside the fit; None where nothing was tested.
+        check: of the fit; None where nothing was tested.
     """
     if not steps:
         return ()
@@ -488,7 +488,7 @@ def _beside_alike(
     Args:
         diagnosis: of one correction.
         placed: this correction.
-        check: beside the fit.
+        check: of the fit.
         cell: whose description it is.
         model: as declared.
     """
@@ -633,8 +633,8 @@ def _correction_diagnosis(
             )
         case TimeSkew():
             found = (
-                f"all currents {_late_text(values, deviations)} beside the positions, the same on "
-                "every axis"
+                f"all currents {_late_text(values, deviations)} relative to the positions, the "
+                "same on every axis"
             )
             expected = ONE_MOMENT
             remedy = (
@@ -712,7 +712,7 @@ def hidden_zeros_text(check: GeometryCheck | None, axes: Sequence[str], robot: R
     empty where they show all, or were not asked.
 
     Args:
-        check: beside the fit.
+        check: of the fit.
         axes: their names.
         robot: as declared.
     """

@@ -40,7 +40,7 @@ class EventNotice:
     axis: str | None  #: its name; None for the whole cell
     kind: str  #: name of the event's kind
     code: int  #: as in `CellEvent`
-    text: str  #: what happened, without the axis, which is shown beside it
+    text: str  #: what happened, without the axis, which is shown next to it
     remedy: str  #: what to do; empty where nothing is to be done
     alarm: bool  #: whether a person has to look
 

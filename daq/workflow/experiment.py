@@ -300,7 +300,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
             f"payloads of cell {cell.name!r}",
             found="none" if payload is None else f"no payload {payload!r}",
             expected=known or "a weighed payload",
-            remedy="gains show only beside a known mass: give a declared name, or weigh a body and "
+            remedy="the gains need a known mass: give a declared name, or weigh a body and "
             "declare it under `payloads`",
         )
     mounted = found[0]

@@ -112,7 +112,7 @@ class Fit:
     #: of the fit, with effects of the last one, and of each held-out log
     diagnoses: tuple[Diagnosis, ...] = ()
     is_holdout_judged: bool = False  #: whether the diagnoses are those of held-out logs, too
-    #: Slope of each axis's own torque over its current, beside the gains; empty where no log has
+    #: Slope of each axis's own torque over its current, with the gains; empty where no log has
     #: such torques.
     torque_slopes: tuple[TorqueSlope | None, ...] = ()
     #: The operator takes all effects that were found, also what held-out runs would refute: these
@@ -168,7 +168,7 @@ class Fit:
         )
 
     def evidence(self) -> Evidence:
-        """The rows behind the identification, without effects;
+        """The rows of the identification, without effects;
         the logs are read again unless it has kept them.
         """
         if self.identification.gathered is not None:
@@ -330,7 +330,7 @@ def fit_logs(
         effects: detect effects that the declared model lacks, and refit with those that pass.
         created: time stamp of the calibration, with its time zone; now when None.
         progress: receives a line for each step.
-        own_effects: effects that no installed package has, tried beside the others
+        own_effects: effects that no installed package has, tried together with the others
             (`ident.Effect`).
 
     Raises:
@@ -521,7 +521,7 @@ def _turned_geometry_of(fitted: Fit) -> Diagnosis | None:
 
 
 def _with_holdout_judged(fitted: Fit) -> Fit:
-    """Return a fit with what is said of its held-out logs behind what is said of the others,
+    """Return a fit with what is said of its held-out logs after what is said of the others,
     unless it has that.
     """
     if fitted.is_holdout_judged:
@@ -535,7 +535,7 @@ def _with_holdout_judged(fitted: Fit) -> Fit:
 
 
 def with_description(fitted: Fit) -> Fit:
-    """Test the declared geometry beside a fit that has kept its rows, unless it was tested before.
+    """Test the declared geometry of a fit that has kept its rows, unless it was tested before.
 
     A search tests it again in each of its turns: gravity and the zeros that are hidden stay those
     of the fit before it.
@@ -553,7 +553,7 @@ def _with_description_after_search(closed: Fit) -> Fit:
     """Keep the mistakes that the fit before a search has named,
     unless the search has explained them.
 
-    They are explained by corrections, or by effects beside which the same test names them no more.
+    They are explained by corrections, or by effects with which the same test names them no more.
     """
     description = closed.description
     if description is None or not description.mistakes:
@@ -563,7 +563,7 @@ def _with_description_after_search(closed: Fit) -> Fit:
     corrected = {(placed.effect.name, placed.axis) for placed in after.effects}
     if all((mistake.effect.name, mistake.axis) in corrected for mistake in description.mistakes):
         return replace(closed, description=replace(description, mistakes=()))
-    if len(after.effects) == after.declared:  # the model is the one beside which they were named
+    if len(after.effects) == after.declared:  # the model is the one with which they were named
         return closed
     beside = geometry_beside(after, BOOTSTRAP_SEED)
     if beside is None:
@@ -584,7 +584,7 @@ def _with_description_after_search(closed: Fit) -> Fit:
 
 def description_diagnoses(fitted: Fit) -> tuple[Diagnosis, ...]:
     """Name what is wrong with the declared geometry,
-    by the search of a fit and by the test beside it.
+    by the search of a fit and by the test with it.
 
     The same mistake of the same axis is said once.
     """
@@ -654,7 +654,7 @@ def close_loop(
         progress: receives a line for each step.
         undecided: whether effects that held-out logs neither confirm nor refute join; all that were
             found join where `Undecided.ALL_JOIN` overrides the held-out logs.
-        own_effects: effects that no installed package has, tried beside the others.
+        own_effects: effects that no installed package has, tried together with the others.
 
     Raises:
         IdentificationError: a refit failed.

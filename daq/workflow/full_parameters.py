@@ -106,7 +106,7 @@ def _with_std_by_moves(fitted: Fit) -> Estimate:
     if not estimate.gains_fixed:
         raise UsageError(
             f"--method {estimate.method.value}",
-            found="--prior or --prior-tolerance beside it",
+            found="--prior or --prior-tolerance with it",
             expected=f"{Method.ML.value}, whose σ comes from leaving out moves",
             remedy="leave out --method",
         )

@@ -69,7 +69,7 @@ class MjcfSource:
     shapes: UrdfShapes  #: of the URDF's links
     folder: Path  #: that the model will be in; names of mesh files are relative to it
     effects: JointEffects  #: of the calibration
-    #: for the comment at the head, beside what the writer itself leaves out
+    #: for the comment at the head, besides what the writer itself leaves out
     remarks: tuple[str, ...]
 
 

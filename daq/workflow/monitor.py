@@ -2,7 +2,7 @@
 and predicts the currents.
 
 While a recorder of drivegain leads the bus, the recorder's feed names the run: its rate, payload
-and the scale of its currents. Beside another master the rate is counted, and the scale is known
+and the scale of its currents. With another master the rate is counted, and the scale is known
 only if the drives were queried before.
 """
 
@@ -39,7 +39,7 @@ from ident.errors import IdentificationError
 FACTS_S = 0.1  #: Time for a recorder to name its run; it sends to a new console within 20 ms
 KEPT_EVENTS = 5  #: Alarming events, and others
 SAME_RATE = 0.01  #: Largest relative difference at which two rates of SYNC are the same
-CHANGED_RATE = 0.1  #: Relative difference at which it is another one, beside lost SYNCs
+CHANGED_RATE = 0.1  #: Relative difference at which it is another one, besides lost SYNCs
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class CellPrediction:
 
 @dataclass(frozen=True, slots=True)
 class WatchedCell:
-    """One reading of the bus with all that is shown beside it."""
+    """One reading of the bus with all that is shown with it."""
 
     reading: CellReading
     #: of each joint [rad or m], None where a motor that moves it is unknown

@@ -32,7 +32,7 @@ ADVICE_OF_CAUSE = {
     "lies farther from its axis",
     SlowCause.TIME: "",
 }
-"""What makes σ of a gain fall faster, beside more time."""
+"""What makes σ of a gain fall faster, besides more time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,5 +103,5 @@ def outlook_of(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> 
 
 
 def help_with(cause: SlowCause, axis: str) -> str:
-    """Say what makes σ of a gain fall faster, beside more time; empty where nothing else does."""
+    """Say what makes σ of a gain fall faster, besides more time; empty where nothing else does."""
     return ADVICE_OF_CAUSE[cause].format(axis=axis)

@@ -212,11 +212,9 @@ class GainsSoFar:
         mounted = [payloads for _, payloads in self.motions]
         name = self.experiment.payload.name.upper()
         if (0,) not in mounted:
-            return (
-                f"the gains show only beside a known mass, and no block with {name} is recorded yet"
-            )
+            return f"the gains need a known mass, and no block with {name} is recorded yet"
         if (None,) not in mounted:
-            return f"the gains show only beside a block without {name}, and none is recorded yet"
+            return f"the gains need a block without {name}, and none is recorded yet"
         if self.motion_s < self.honest_s:
             return f"there are none before {self.honest_s:g} s of motion"
         return ""

@@ -21,7 +21,7 @@ RESERVE_BYTES = 64 * 2**20
 """Never used: others write to the same disk, and the stop of the axes and the end of the log need
 some too.
 """
-INDEX_BYTES = 16  #: Index entry of a message, behind its chunk
+INDEX_BYTES = 16  #: Index entry of a message, after its chunk
 MESSAGE_HEAD_BYTES = 31
 CHUNKS_BYTES_S = 4096.0  #: Heads and indexes of the chunks of one second
 ENDS_BYTES = 2**16  #: Definitions and metadata, at the start and again at the end

@@ -294,7 +294,7 @@ class Markup:
         return found[0] if found else None
 
     def tag_end(self, element: Element) -> int:
-        """Return the offset behind an element's start tag.
+        """Return the offset after an element's start tag.
 
         Raises:
             SchemaMismatch: the tag cannot be read.
@@ -306,7 +306,7 @@ class Markup:
         return tag.end()
 
     def end(self, element: Element) -> int:
-        """Return the offset behind a whole element."""
+        """Return the offset after a whole element."""
         tag_end = self.tag_end(element)
         if self.is_empty(element):
             return tag_end

@@ -1,9 +1,9 @@
 """The shapes of a URDF's links, `<visual>` and `<collision>`, and the limits of its joints,
 for other models.
 
-Meshes are files beside the URDF. `package://NAME/…` is looked for in each folder above the URDF: as
-NAME in it, or in it where it is NAME itself. What cannot be read is listed with its reason, because
-a shape moves no torque.
+Meshes are files next to the URDF. `package://NAME/…` is looked for in each folder above the URDF:
+as NAME in it, or in it where it is NAME itself. What cannot be read is listed with its reason,
+because a shape moves no torque.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def _mesh_file(name: str, folder: Path, scale: tuple[float, ...]) -> Path:
     """Return the file that a URDF names, where it exists and MuJoCo reads it."""
     path = next((place for place in _places(name, folder) if place.is_file()), None)
     if path is None:
-        raise ShapeUnreadable(f"no file {name!r} beside or above the URDF")
+        raise ShapeUnreadable(f"no file {name!r} next to or above the URDF")
     ending = path.suffix.lower()
     if ending not in MESH_FORMATS:
         raise ShapeUnreadable(

@@ -1,4 +1,4 @@
-"""A calibration put to the test: what it predicts of a run, beside what was measured,
+"""A calibration put to the test: what it predicts of a run, compared with what was measured,
 under the filter of the fit.
 
 Several calibrations are compared on runs that they may never have seen (paper §4.3, Tables 5 to 8).

@@ -1,5 +1,5 @@
 """Access to a controller's file: which links may be followed, one writer at a time,
-and backups beside it.
+and backups next to it.
 
 A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first digits of SHA-256: of
 the backup's content, and of the content that replaced it. So a backup shows by itself whether it
@@ -119,7 +119,7 @@ def exclusive_writer(target: Path) -> Iterator[None]:
             raise OutputFailed(
                 str(lock),
                 found=reason_of(error),
-                expected="a lock file beside the controller's file",
+                expected="a lock file next to the controller's file",
                 remedy="nothing was written to the controller; free space or rights",
             ) from error
         yield
@@ -127,7 +127,7 @@ def exclusive_writer(target: Path) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A backup beside a controller file; all but its content is in its name."""
+    """A backup next to a controller file; all but its content is in its name."""
 
     path: Path  #: file
     stamp: str  #: time in its name
@@ -154,7 +154,7 @@ class Backup:
 
 
 def backups(target: Path) -> tuple[Backup, ...]:
-    """Backups beside a controller file, oldest first."""
+    """Backups next to a controller file, oldest first."""
     name = re.compile(
         re.escape(target.name)
         + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak"
@@ -168,7 +168,7 @@ def backups(target: Path) -> tuple[Backup, ...]:
 
 
 def backups_without_log(audit: Path, target: Path) -> int:
-    """Return the number of backups beside a controller file whose audit log is absent;
+    """Return the number of backups next to a controller file whose audit log is absent;
     0 where there is a log.
 
     A write that is audited leaves both: backups alone show that the log was removed or moved, or

@@ -95,7 +95,7 @@ class FileEdit(Edit):
 
     @property
     def comments(self) -> dict[str, str]:
-        """Comment behind each gain on its line, by axis; a write leaves it as it is."""
+        """Comment after each gain on its line, by axis; a write leaves it as it is."""
         document = self.document(self.before or b"")
         scalars = document.locate(tuple(change.key for change in self.changes))
         found = {}
@@ -230,7 +230,7 @@ class FileTarget:
                 str(self.file),
                 found=f"{len(found)} backups with the same content"
                 if found
-                else "no backup beside it",
+                else "no backup next to it",
                 expected=f"{target.name}.<time>.<digests>.bak with another content",
                 remedy="nothing was changed",
             )

@@ -55,7 +55,7 @@ class Request:
     base: str | None = None
     #: names of the operator, the login last; their own signatures do not count
     appliers: Collection[str] = ()
-    #: calibration file, beside which signatures are searched; None without one
+    #: calibration file, next to which signatures are searched; None without one
     file: Path | None = None
     content: bytes | None = None  #: bytes of that file as they were read; None without one
 
@@ -120,7 +120,7 @@ class GainOrigin(Enum):
 
 @dataclass(frozen=True, slots=True)
 class GainChange:
-    """A new gain beside the one that it is compared with: in a planned write, the current gain."""
+    """A new gain with the one that it is compared with: in a planned write, the current gain."""
 
     axis: str  #: name of the axis
     key: str  #: place of the number: its key in the controller file, or the drive's object

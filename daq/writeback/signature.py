@@ -1,4 +1,4 @@
-"""Signatures of a calibration: one file beside it for each person,
+"""Signatures of a calibration: one file next to it for each person,
 which `minisign -V` checks too.
 """
 
@@ -69,7 +69,7 @@ def needs_password(secret_key: Path) -> bool:
 def sign(
     file: Path, secret_key: Path, name: str, *, password: str = "", at: datetime | None = None
 ) -> Path:
-    """Write a signature of the file's bytes beside it; it replaces an earlier one of the same name.
+    """Write a signature of the file's bytes next to it; it replaces one of the same name.
 
     Args:
         file: a calibration.
@@ -133,7 +133,7 @@ def signers_of(
             ones.
 
     Returns:
-        Names with a valid signature beside the file, in the order of `trusted`.
+        Names with a valid signature next to the file, in the order of `trusted`.
 
     Raises:
         SignatureInvalid: the signature of a trusted person does not fit the file: one of the two

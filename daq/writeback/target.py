@@ -315,9 +315,9 @@ def _absence_of_log(recorder: _Recorder) -> dict[str, object]:
     if count == 0:
         return {}
     _LOG.warning(
-        "%s is absent, although %s has %s of earlier writes beside it: a new audit log begins with "
-        "this write, and says so; if the old one was not moved on purpose, restore it and ask who "
-        "removed it",
+        "%s is absent, although %s has %s of earlier writes next to it: a new audit log begins "
+        "with this write, and says so; if the old one was not moved on purpose, restore it and "
+        "ask who removed it",
         recorder.audit,
         subject,
         counted(count, "backup"),
@@ -375,7 +375,7 @@ def _disturbed(edit: Edit, error: OSError, *, made: bool) -> OutputFailed:
     )
     asking = (
         f"whether {edit.subject} has the new content is not known: compare it with the newest "
-        "backup beside it"
+        "backup next to it"
     )
     return OutputFailed(
         edit.subject,

@@ -199,7 +199,7 @@ class SynchronousSdoClient(SdoClient):
     """canopen's SDO client without its thread: it reads the bus while it waits.
 
     canopen leaves reading to a Notifier thread, which dies silently of an exception and would be a
-    second reader beside the stream. Here the caller is the only reader.
+    second reader alongside the stream. Here the caller is the only reader.
     """
 
     def __init__(self, node_id: int, bus: _Bus, policy: SdoPolicy) -> None:

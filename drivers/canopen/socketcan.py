@@ -312,7 +312,7 @@ class SocketcanBus(BurstBus):
         # appending.
         receive = partial(map, self._pair.recv, (_PAIR_BYTES,))
         try:
-            # Beside a busy thread each system call may wait for the interpreter lock: try without
+            # Next to a busy thread each system call may wait for the interpreter lock: try without
             # select first.
             self._chunks.extend(receive((socket.MSG_DONTWAIT,)))
         except BlockingIOError:

@@ -36,7 +36,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """Compile with numba, cached beside the function's file or in NUMBA_CACHE_DIR.
+    """Compile with numba, cached next to the function's file or in NUMBA_CACHE_DIR.
 
     numba invalidates a cached function when its own file changes, not when a function it calls in
     another file does: so compiled functions call only compiled functions of their own file.

@@ -85,7 +85,7 @@ def efficiency(moment: Moment, axis: int, efficiency: float) -> None:
 def nonlinear_viscous(
     moment: Moment, axis: int, torque_at_1_rad_s_nm: float, exponent: float
 ) -> None:
-    """Friction c·|v|^η against the motion, v in rad/s, beside the linear one:
+    """Friction c·|v|^η against the motion, v in rad/s, besides the linear one:
     lubricants, seals, churning.
 
     It joins the bound of dry friction, which can only dissipate: as an explicit torque |v|^(1/3)
@@ -96,7 +96,7 @@ def nonlinear_viscous(
 
 def asymmetric_viscous(moment: Moment, axis: int, coefficient_nm_s_rad: float) -> None:
     """Viscous friction Fv + c forwards and Fv − c backwards, never below zero:
-    a torque −c·|v| beside −Fv·v.
+    a torque −c·|v| besides −Fv·v.
     """
     change = -coefficient_nm_s_rad
     if moment.velocity_rad_s[axis] >= 0.0:
@@ -427,7 +427,7 @@ UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[WithState | Lag]] = {
     "coupling": Coupling,
 }
 """Physics by its name in a simulation file;
-their arguments beside the moment and the axis are the parameters.
+their arguments besides the moment and the axis are the parameters.
 """
 
 

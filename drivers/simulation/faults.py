@@ -74,7 +74,7 @@ ERROR_FRAMES = {
 """Class and data of an error frame of this end's controller (linux/can/error.h): bus-off;
 both counters passive.
 """
-#: Bytes of a TPDO that hold position and current; the statusword behind them is not frozen
+#: Bytes of a TPDO that hold position and current; the statusword after them is not frozen
 _FROZEN_BYTES = 6
 
 

@@ -144,7 +144,7 @@ class CycleBus:
         return outgoing or self.spare(self.time_ns)
 
     def send_sync(self) -> None:
-        """Send the frames that wait, and the SYNC right behind them."""
+        """Send the frames that wait, and the SYNC right after them."""
         self.link.send((*self.take_outgoing(), self._sync))
 
 

@@ -1,4 +1,4 @@
-"""Torque and temperature of the drives, read a few times a second by SDO beside the stream.
+"""Torque and temperature of the drives, read a few times a second by SDO alongside the stream.
 
 Nothing waits for an answer. At most one request is on its way; it is sent in a cycle without
 set-points, and its answer is taken from the frames that the stream reads anyway. SDO has a lower
@@ -125,7 +125,7 @@ class Polling:
         return tuple(found)
 
     def begin(self, stream: SyncStream, keep: Callable[[SlowReading], None]) -> None:
-        """Pass readings on from now on, made beside a stream until it stops the axes,
+        """Pass readings on from now on, made alongside a stream until it stops the axes,
         if the bus has room.
         """
         if self._beside_stream:

@@ -225,7 +225,7 @@ class Decimator:
 
     @property
     def _taps_of_blocks(self) -> FloatArray:
-        """Taps cut into blocks of q, with zeros behind the last one, shape (blocks, q).
+        """Taps cut into blocks of q, with zeros after the last one, shape (blocks, q).
 
         Window r starts at sample r·q, so it is a sum over blocks of samples: one matrix product
         that reads every sample once. Taps come first in it: its sums then run along memory.

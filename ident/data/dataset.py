@@ -457,6 +457,6 @@ def _uneven_times(time_s: FloatArray) -> str:
         return ""
     farthest = int(np.argmax(np.abs(steps_s - usual_s)))
     return (
-        f"a step of {steps_s[farthest]:.4g} s behind sample {farthest} "
+        f"a step of {steps_s[farthest]:.4g} s after sample {farthest} "
         f"({time_s[farthest]:.6g} s), where the usual one is {usual_s:.4g} s"
     )

@@ -29,7 +29,7 @@ JUMP_COUNTS = 3.0  #: Smallest jump after a held reading, in counts of the chann
 ROUNDING = 1e-9  #: Of a channel's range: smaller changes are rounding, no counts
 #: Readings on either side by which a damaged one is filled in; as many as it has samples, if these
 #: are more
-BESIDE = 4
+READINGS_EACH_SIDE = 4
 LONGEST_HOLD_S = 0.05  #: A reading that stays longer may be a joint at rest
 
 
@@ -160,7 +160,7 @@ def without_held(
 
 def longest_smooth(rate_hz: float) -> int:
     """Most samples that a curve is laid through: beyond LONGEST_HOLD_S it would be made up."""
-    return max(BESIDE, round(LONGEST_HOLD_S * rate_hz))
+    return max(READINGS_EACH_SIDE, round(LONGEST_HOLD_S * rate_hz))
 
 
 def fill_damaged(
@@ -171,8 +171,8 @@ def fill_damaged(
     Args:
         values: of a channel, shape (k,).
         damaged: shape (k,).
-        longest: so many samples and fewer are filled in by the cubic that fits BESIDE readings on
-            either side best, others by a straight line.
+        longest: so many samples and fewer are filled in by the cubic that fits
+            READINGS_EACH_SIDE readings on either side best, others by a straight line.
         time: of each sample, in any unit, shape (k,); None for a constant rate.
     """
     if not np.any(damaged) or np.all(damaged):
@@ -187,14 +187,14 @@ def fill_damaged(
     for block in np.split(wrong, gaps):
         if len(block) > longest:
             continue
-        count = max(BESIDE, len(block))
+        count = max(READINGS_EACH_SIDE, len(block))
         after = int(np.searchsorted(right, block[0]))
         first = max(after - count, 0)
         near = right[first : after + count]
         is_between = near[0] < block[0] and near[-1] > block[-1]
         # Beyond the first and the last reading a cubic goes astray.
         degree = 1
-        if is_between and len(near) > BESIDE:
+        if is_between and len(near) > READINGS_EACH_SIDE:
             degree = 3
         middle = float(np.mean(time[near]))
         coefficients = np.polyfit(time[near] - middle, values[near], degree)

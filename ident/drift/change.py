@@ -409,7 +409,7 @@ class Drift:
     #: for a trend; None where the newest calibration raises no alarm.
     onset: int | None
     #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without
-    #: alarm those behind the baseline, if fewer); while there is a trend, along the line [% of the
+    #: alarm those after the baseline, if fewer); while there is a trend, along the line [% of the
     #: baseline's magnitude].
     change_percent: float
     change_sigmas: float  #: the same over its σ
@@ -541,7 +541,7 @@ def _change_since_baseline(
     values: FloatArray, stds: FloatArray, onset: int | None
 ) -> _ChangeSinceBaseline:
     """Change of the newest calibrations; the baseline ends at the onset,
-    and the newest begin behind both.
+    and the newest begin after both.
     """
     count = len(values)
     most = count - 1

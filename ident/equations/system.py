@@ -348,7 +348,7 @@ def _remedy_of_dependence(system: System, dependent: tuple[str, ...]) -> str:
     if has_few_joints and dependent == (KNOWN_PAYLOAD,):
         return (
             "what is known of the payload does not show behind so few joints: say more of it, as "
-            "its centre of mass (`centre_m`) beside its mass"
+            "its centre of mass (`centre_m`) besides its mass"
         )
     return "move every joint through more of its range"
 

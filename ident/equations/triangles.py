@@ -131,7 +131,7 @@ def singular_values(matrix: FloatArray) -> FloatArray:
 
 
 def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
-    """R of the rows behind ``triangle`` and the rows in ``columns``.
+    """R of the rows after ``triangle`` and the rows in ``columns``.
 
     Args:
         triangle: what an earlier call returned, None at the start; left as it is.

@@ -148,7 +148,7 @@ def _require_driven(robot: Robot, position: FloatArray, free: FloatArray, size_m
     if has_enough and _generic_rank(robot, position, free, size_m) == mobility:
         raise ModelError(
             f"the robot is singular at the assembly pose: there the motors {names} do not move all "
-            f"of its {mobility} degrees of freedom, beside it they do; give an assembly pose "
+            f"of its {mobility} degrees of freedom, near it they do; give an assembly pose "
             "inside the workspace"
         )
     raise ModelError(

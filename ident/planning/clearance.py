@@ -480,7 +480,7 @@ def segment_to_box(
     excess = at_bends - np.clip(at_bends, lower[:, None], upper[:, None])
     slope = _dot(along[:, None], excess)
     falling = (slope < 0.0).sum(axis=1)
-    after = np.clip(falling, 1, bends.shape[1] - 1)  # the first bend behind the zero
+    after = np.clip(falling, 1, bends.shape[1] - 1)  # the first bend after the zero
     before = after - 1
     sample = np.arange(samples)
     low = slope[sample, before]

@@ -1,4 +1,4 @@
-"""Gates of the target: each gain beside the current gain, the content to be replaced,
+"""Gates of the target: each gain compared with the current gain, the content to be replaced,
 and who approved it.
 """
 

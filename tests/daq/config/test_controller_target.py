@@ -60,7 +60,7 @@ def test_objects_alone_and_beside_a_file(tmp_path: Path) -> None:
         ("{file: a.yaml}", "file and gains of the controller, objects of the drives, or all three"),
         (f"{{gains: {KEYS}}}", "file and gains of the controller"),
         ("{}", "file and gains of the controller"),
-        (f"{{format: xml, objects: {OBJECTS}}}", "format only beside file"),
+        (f"{{format: xml, objects: {OBJECTS}}}", "format without file"),
         ("{file: a.yaml, gains: [a, b]}", "2 keys; expected 6, one for each axis"),
         (f"{{file: a.yaml, format: toml, gains: {KEYS}}}", "controller.format"),
         (

@@ -158,9 +158,7 @@ def test_a_bare_block_alone_gives_no_figures(
     looks = looks_at(while_recording(whole_session, tmp_path, "block-1-bare"))
     assert looks
     assert not any(look.gains for look in looks)
-    assert {look.missing.split(",")[0] for look in looks} == {
-        "the gains show only beside a known mass"
-    }
+    assert {look.missing.split(",")[0] for look in looks} == {"the gains need a known mass"}
 
 
 def test_the_gains_come_while_the_loaded_block_is_recorded(

@@ -131,8 +131,8 @@ def test_thousands_that_are_grouped_by_the_decimal_sign_are_refused(
     data = _text(*(f"0{decimal}5;{text}" for text in grouped), header="q;i").encode()
     with pytest.raises(
         TableUnfit,
-        match=r"column i: found '-1[.,]500' beside '-982': three digits "
-        r"behind every",
+        match=r"column i: found '-1[.,]500' and '-982': three digits "
+        r"after every",
     ):
         _read(tmp_path, data, ("q", "i"), delimiter=";", decimal=decimal)
 

@@ -217,7 +217,7 @@ def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
     rest = Parameter("d", 0.002, 0.004, "kg m²")
     text = named_size(LoadFriction(0, 0.58, 1), (loss, rest))
     assert (
-        text == f"{with_deviation(10.0, 0.1)} % of the load torque, beside a rotor of "
+        text == f"{with_deviation(10.0, 0.1)} % of the load torque, with a rotor of "
         f"{with_deviation(0.6, 0.04)} kg m²"
     )
     assert named_size(LoadFriction(0), (loss,)) == (

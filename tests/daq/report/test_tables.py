@@ -265,7 +265,7 @@ def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
         chosen_by="bodies nearest to the URDF",
         assumed_links=[],
         not_in_mjcf=[left],
-        shapes_left_out=["visual of link1: no file 'arm.stl' beside or above the URDF"],
+        shapes_left_out=["visual of link1: no file 'arm.stl' next to or above the URDF"],
         effects_left_out=[],
         mountings_left_out=[],
         closures_left_out=[],

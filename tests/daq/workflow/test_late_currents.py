@@ -35,7 +35,7 @@ def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(cell: Cell) -> None:
     (one,) = check_diagnoses(_checked(_finding(TimeSkew(), 0, 0.003)), cell, model_of(cell))
     assert (one.name, one.axes) == ("time-skew", ())
     assert one.found == (
-        "all currents late by 3.00 ± 0.07 ms beside the positions, the same on every axis"
+        "all currents late by 3.00 ± 0.07 ms relative to the positions, the same on every axis"
     )
     assert "how positions and currents are stamped" in one.remedy
     assert "no single encoder or drive is late" in one.remedy

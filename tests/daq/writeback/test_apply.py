@@ -370,7 +370,7 @@ def _make_backup(
 
 
 def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
-    with pytest.raises(CalibrationRefused, match="no backup beside it"):
+    with pytest.raises(CalibrationRefused, match="no backup next to it"):
         rollback(FileTarget(controller), NOW)
     # A backup of a writer that was killed before it replaced the file does not allow a rollback
     # either.
@@ -380,7 +380,7 @@ def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> Non
     controller.with_name("demo.yaml.bak").write_text("a human's own")
     controller.unlink()
     controller.parent.joinpath("other.yaml").write_text("x: 1\n")
-    with pytest.raises(CalibrationRefused, match="no backup beside it"):
+    with pytest.raises(CalibrationRefused, match="no backup next to it"):
         rollback(FileTarget(controller.with_name("other.yaml")), NOW)
 
 

@@ -284,7 +284,7 @@ def test_history_is_not_called_sound_where_backups_show_that_its_log_is_gone(
     _write_and_delete_log(controller, place.audit)
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
     output = capsys.readouterr()
-    assert "1 backup of earlier writes beside it" in " ".join(output.err.split())
+    assert "1 backup of earlier writes next to it" in " ".join(output.err.split())
     assert "sound" not in output.out
     assert main(["history", str(cell_file), "--verify", "--json"]) == ExitCode.DATA_UNFIT
     assert main(["rollback", str(cell_file), "--yes"]) == ExitCode.OK

@@ -58,7 +58,7 @@ def test_moves_part_where_all_joints_rest() -> None:
         ),
         (
             lambda run: replace(run, time_s=np.delete(np.arange(len(run.time_s) + 1) / 1000.0, 9)),
-            r"not uniform: a step of 0\.002 s behind sample 8 \(0\.008 s\), where the usual one is "
+            r"not uniform: a step of 0\.002 s after sample 8 \(0\.008 s\), where the usual one is "
             r"0\.001 s; expected steps of one length, .*; resample .* or cut the run at the gap",
         ),
         (
