@@ -98,12 +98,11 @@ def accept_on_holdout(
             refitted = start
             if left is not start:
                 refitted = replace(with_effects(found, left.effects), declared=found.declared)
-            opened = dict.fromkeys((*last.left_open, *_undecided(found, left, verdicts)))
+            undecided = _undecided(found, left, verdicts)
+            opened = tuple(dict.fromkeys((*last.left_open, *undecided)))
             dropped = last.set_aside[len(steps[-1].set_aside) :]
             model = linearised(refitted, ColumnCache())
-            last = end_search(
-                steps, model, gates or Gates(), rng=bootstrap, left_open=tuple(opened)
-            )
+            last = end_search(steps, model, gates or Gates(), rng=bootstrap, left_open=opened)
             last = replace(last, set_aside=(*last.set_aside, *dropped))
         # An effect that passes no longer in this fit has left: those beside it are judged again
         # without it.
@@ -111,12 +110,12 @@ def accept_on_holdout(
             break
         judged_model = last.after
     written = last.after.effects
-    ordered = tuple(
-        replace(verdicts[placed], written=placed in written)
-        for placed in found.effects
-        if placed in verdicts
-    )
-    return (*steps[:-1], replace(last, verdicts=ordered))
+    ordered: list[EffectVerdict] = []
+    for placed in found.effects:
+        if placed in verdicts:
+            verdict = replace(verdicts[placed], written=placed in written)
+            ordered.append(verdict)
+    return (*steps[:-1], replace(last, verdicts=tuple(ordered)))
 
 
 def _undecided(
@@ -125,12 +124,9 @@ def _undecided(
     """Effects that a search has found, and that left although held-out runs do not refute them."""
     undecided: list[PlacedEffect] = []
     for placed in found.effects:
-        verdict = verdicts.get(placed)
-        if (
-            verdict is not None
-            and verdict.judgement is Judgement.UNDECIDED
-            and placed not in left.effects
-        ):
+        if placed not in verdicts or placed in left.effects:
+            continue
+        if verdicts[placed].judgement is Judgement.UNDECIDED:
             undecided.append(placed)
     return tuple(undecided)
 
@@ -144,46 +140,47 @@ def _judged(
     progress: Callable[[str], None],
     names: Sequence[str],
 ) -> Evidence:
-    """The model with those effects that held-out runs confirm;
+    """The model with those effects that held-out runs confirm.
+
     `verdicts` is given what they say of each.
     """
     current = found
     while len(current.effects) > current.declared:
-        searched = len(current.effects) - current.declared
-        progress(f"judging {searched} {'effect' if searched == 1 else 'effects'} on held-out runs")
-        judged = [
-            _verdict(start, current, placed) for placed in current.effects[current.declared :]
-        ]
+        searched = current.effects[current.declared :]
+        if len(searched) == 1:
+            progress("judging 1 effect on held-out runs")
+        else:
+            progress(f"judging {len(searched)} effects on held-out runs")
+        judged = [_verdict(start, current, placed) for placed in searched]
         verdicts |= {one.placed: one for one in judged}
         leaving = _leaving(judged, write_undecided=write_undecided)
         if leaving is None:
             break
-        progress(f"{leaving.placed.name_among(names)} leaves: {leaving.reason}")
+        name = leaving.placed.name_among(names)
+        progress(f"{name} leaves: {leaving.reason}")
         if leaving.is_needed:
-            reason = (
-                f"nothing can be fitted without {leaving.placed.name_among(names)}, which "
-                f"leaves: {leaving.reason}"
-            )
+            reason = f"nothing can be fitted without {name}, which leaves: {leaving.reason}"
             for one in judged:
                 if one.placed != leaving.placed:
-                    verdicts[one.placed] = replace(
-                        one, judgement=Judgement.UNDECIDED, reason=reason
-                    )
+                    undecided = replace(one, judgement=Judgement.UNDECIDED, reason=reason)
+                    verdicts[one.placed] = undecided
             return start
         current = _without(current, leaving.placed)
-    kept = current.effects[current.declared :]
-    if kept and (why := _loses(start, current)):
-        progress(f"the effects together leave: {why}")
-        reason = f"together with the other effects: {why}"
-        for placed in kept:
-            verdicts[placed] = replace(verdicts[placed], judgement=Judgement.REFUTED, reason=reason)
-        return start
-    return current
+    left = current.effects[current.declared :]
+    if not left:
+        return current
+    why = _loses(start, current)
+    if not why:
+        return current
+    progress(f"the effects together leave: {why}")
+    reason = f"together with the other effects: {why}"
+    for placed in left:
+        verdicts[placed] = replace(verdicts[placed], judgement=Judgement.REFUTED, reason=reason)
+    return start
 
 
 def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> ErrorChange:
-    """Compare two models of the same data on held-out rows,
-    in units of the noise of a model without effects.
+    """Compare two models on held-out rows, in units of the noise of a model without effects.
 
     Raises:
         ValueError: nothing was held out.
@@ -195,9 +192,8 @@ def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> Er
     first = squares_left(before.holdout, before.estimate)
     second = squares_left(after.holdout, after.estimate)
     used = rows.motor_use
-    motor = np.nonzero(used)[0]
+    motor, source = np.nonzero(used)
     variance = np.square(noise_a)[motor]
-    source = np.nonzero(used)[1]
     return change_of_errors(
         before=first[used] / variance,
         after=second[used] / variance,
@@ -209,9 +205,7 @@ def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> Er
 
 
 def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> EffectVerdict:
-    """Judge an effect beside the others;
-    together with them where they cannot be fitted without it.
-    """
+    """Judge an effect beside the others; all together where they cannot be fitted without it."""
     is_needed = False
     try:
         without = _without(current, placed)
@@ -221,10 +215,11 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
     change = compare_on_holdout(start, without, current)
     # A correction of the description changes all motors: that its own falls is no more than
     # friction there does.
-    has_motor = (
-        placed.axis < len(change.motors) and placed.effect.has_axis and not is_correction(placed)
-    )
-    judgement, reason = judge_change(change, placed.axis if has_motor else None)
+    is_driven = placed.axis < len(change.motors)
+    motor: int | None = None
+    if is_driven and placed.effect.has_axis and not is_correction(placed):
+        motor = placed.axis
+    judgement, reason = judge_change(change, motor)
     return EffectVerdict(
         placed=placed,
         judgement=judgement,
@@ -237,9 +232,7 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
 
 
 def _leaving(judged: Sequence[EffectVerdict], *, write_undecided: bool) -> EffectVerdict | None:
-    """The worst of what is refuted; then the least certain of what is undecided,
-    unless that is to be written.
-    """
+    """The worst of what is refuted; else the least certain that is undecided and not written."""
     refuted = [one for one in judged if one.judgement is Judgement.REFUTED]
     if refuted:
         return max(refuted, key=lambda one: one.change.largest_sigmas)
@@ -251,7 +244,8 @@ def _leaving(judged: Sequence[EffectVerdict], *, write_undecided: bool) -> Effec
 
 def _loses(start: Evidence, end: Evidence) -> str:
     """Why effects together are no better on held-out runs than none; empty where they are."""
-    if harm := compare_on_holdout(start, start, end).harm("held-out runs"):
+    harm = compare_on_holdout(start, start, end).harm("held-out runs")
+    if harm:
         return harm
     if start.holdout is None or end.holdout is None:
         return ""
@@ -269,19 +263,18 @@ def _without(evidence: Evidence, left_out: PlacedEffect) -> Evidence:
     These hold the load and the current that the model with it predicts, so that the comparison
     shows the effect alone.
     """
-    kept = tuple(placed for placed in evidence.effects if placed != left_out)
+    others = tuple(placed for placed in evidence.effects if placed != left_out)
     if is_correction(left_out):
         # The description is what it was without it, and with it all columns
-        return with_effects(evidence, kept)
+        return with_effects(evidence, others)
     names = {column.name for column in left_out.columns}
     bare = len(evidence.rows_without_effects.columns)
     added = evidence.training.columns[bare:]
     stays = np.array([column.name not in names for column in added], dtype=np.bool_)
-    columns = tuple(column for column, stay in zip(added, stays, strict=True) if stay)
+    staying = [column for column in added if column.name not in names]
     first = evidence.training
-    training = replace(
-        first, columns=(*first.columns[:bare], *columns), effects=first.effects[:, stays]
-    )
+    columns = (*first.columns[:bare], *staying)
+    training = replace(first, columns=columns, effects=first.effects[:, stays])
     holdout = evidence.holdout
     if holdout is not None:
         holdout = replace(holdout, columns=training.columns, effects=holdout.effects[:, stays])
@@ -290,7 +283,7 @@ def _without(evidence: Evidence, left_out: PlacedEffect) -> Evidence:
     else:
         fixed = None
     estimate = estimate_with(evidence.estimate.method, training.system(), fixed)
-    return replace(evidence, training=training, holdout=holdout, effects=kept, estimate=estimate)
+    return replace(evidence, training=training, holdout=holdout, effects=others, estimate=estimate)
 
 
 def _torque_error(evidence: Evidence) -> RelativeError:

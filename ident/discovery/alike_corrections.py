@@ -1,5 +1,4 @@
-"""Corrections of the description that recordings do not tell apart,
-and which axes must move further for it.
+"""Corrections that recordings do not tell apart, and which axes must move further for it.
 
 A zero that is off turns gravity for the arm behind its joint. Where the joints before it hardly
 move, a base that leans makes the same torques. Then neither is known, although each alone has a
@@ -35,7 +34,8 @@ def explains_beside(
         held_out_fall: of ‖e‖² on held-out moves, by the mistake alone.
         rival_nm: columns of the other effect.
     """
-    alone, both = problem.trials([rival_nm, np.concatenate((rival_nm, torque_nm), axis=1)])
+    both_nm = np.concatenate((rival_nm, torque_nm), axis=1)
+    alone, both = problem.trials([rival_nm, both_nm])
     if alone is None or both is None:
         return False
     fall = float(alone.held_out.sum() - both.held_out.sum())
@@ -45,8 +45,9 @@ def explains_beside(
 def alike_corrections(
     problem: SearchProblem, correction: Finding, findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
-    """Corrections that folds do not distinguish from one that was found,
-    and beside which it explains little more.
+    """Corrections that folds do not distinguish from one that was found.
+
+    Beside them, it explains little more.
 
     Args:
         problem: with rows that serve as signals.
@@ -67,11 +68,10 @@ def alike_corrections(
 def axes_to_move(
     alike: Sequence[PlacedEffect], robot: Robot, datasets: Sequence[Dataset]
 ) -> tuple[int, ...]:
-    """Axes that must turn further for recordings to tell corrections apart;
-    empty where no motion of one axis does.
+    """Axes that must turn further for recordings to tell corrections apart.
 
-    A zero differs from a turn of gravity by the joints before it, and from another zero by their
-    own joints.
+    Empty where no motion of one axis does. A zero differs from a turn of gravity by the joints
+    before it, and from another zero by their own joints.
 
     Args:
         alike: corrections that the recordings do not tell apart.
@@ -83,7 +83,9 @@ def axes_to_move(
         return ()
     wanted = zeros
     if any(isinstance(placed.effect, GravityDirection) for placed in alike):
-        wanted = set().union(*(axes_before(axis, robot) for axis in zeros))
+        wanted = set()
+        for axis in zeros:
+            wanted.update(axes_before(axis, robot))
     turning = [axis for axis in sorted(wanted) if robot.axes[axis].kind is JointKind.REVOLUTE]
     ranges_rad = _ranges(datasets)
     narrow = [axis for axis in turning if ranges_rad[axis] < WIDE_RAD]
@@ -103,6 +105,6 @@ def axes_before(axis: int, robot: Robot) -> tuple[int, ...]:
 
 def _ranges(datasets: Sequence[Dataset]) -> FloatArray:
     """Range of each axis in all recordings together [rad or m], shape (m,)."""
-    highest = np.max([data.position_rad.max(axis=0) for data in datasets], axis=0)
-    lowest = np.min([data.position_rad.min(axis=0) for data in datasets], axis=0)
-    return np.asarray(highest - lowest)
+    highest = [data.position_rad.max(axis=0) for data in datasets]
+    lowest = [data.position_rad.min(axis=0) for data in datasets]
+    return np.asarray(np.max(highest, axis=0) - np.min(lowest, axis=0))

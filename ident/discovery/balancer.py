@@ -35,7 +35,9 @@ def propose_balancers(
     """
     grid = next((family for family in families if isinstance(family[0], Counterbalance)), ())
     proposed: dict[int, tuple[tuple[Effect, ...], ...]] = {}
-    for axis in range(search_problem.axes) if grid else ():
+    if not grid:
+        return proposed
+    for axis in range(search_problem.axes):
         if axis in taken:
             continue
         tried = search_problem.fits_at_rows(grid, axis)
@@ -43,16 +45,12 @@ def propose_balancers(
             bare = [effect.with_settings({"with_spring": 0}) for effect in grid]
             tried = search_problem.fits_at_rows(bare, axis)
         shares = shares_explained(search_problem, [fit for _, fit in tried])
-        found = [
-            (share, effect)
-            for share, (effect, fit) in zip(shares, tried, strict=True)
-            if is_strictly_possible(effect, fit)
-        ]
-        members = [
-            effect
-            for share, effect in sorted(found, key=lambda one: -one[0])
-            if share >= gates.smallest_share
-        ]
+        found: list[tuple[float, Effect]] = []
+        for share, (effect, fit) in zip(shares, tried, strict=True):
+            if share >= gates.smallest_share and is_strictly_possible(effect, fit):
+                found.append((share, effect))
+        found.sort(key=lambda one: -one[0])
+        members = [effect for _, effect in found]
         refined = [refine_together(search_problem, start, axis) for start in _apart(members)]
         if refined:
             grid_effects = [effect for effect, _ in tried]
@@ -61,8 +59,9 @@ def propose_balancers(
 
 
 def _apart(members: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The best members of so many directions of the lever:
-    the simplex does not find the way from one to another.
+    """The best member of each of STARTS directions of the lever.
+
+    The simplex does not find the way from one direction to another.
     """
     best: dict[float, Effect] = {}
     for member in members:

@@ -1,11 +1,10 @@
-"""Change by accepted effects: the error of every motor in four ways, and every gain,
-before and after.
+"""Change by accepted effects: errors of every motor in four ways, and every gain, before and after.
 
 One error serves every model and every data set: the part of each motor's current that a model does
 not explain. For motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i
 and T from the drive train,
 
-    e_i = v_i − γ_i (T τ)_i,        ε_i = ‖e_i‖/‖v_i‖,        ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
+    e_i = v_i − γ_i (T τ)_i,     ε_i = ‖e_i‖/‖v_i‖,     ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
 
 The current is measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper
 Table 6) scales with the gains that a model finds. No model explains the internal preload of a
@@ -36,7 +35,7 @@ both), and
 
 It takes the effects as given; σ after the whole search includes their choice
 (ident/discovery/choice.py).
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 
@@ -84,52 +83,51 @@ class CurrentError:
 
     def relative(self, weights_nm_a: FloatArray) -> RelativeError:
         """ε_i and ε [%] with weights w, shape (m,); NaN for a motor without a row."""
-        return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
+        squared = weights_nm_a**2
+        return of_squares(self.size * squared, self.left * squared)
 
 
 def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
     """Error of an estimate on rows, those of its fit or others with the same columns."""
     use = observation.motor_use
     seen = _currents(observation, estimate)
-    return CurrentError(
-        np.sum(seen.measured**2, axis=1, where=use), np.sum(seen.left**2, axis=1, where=use)
-    )
+    size = np.sum(seen.measured**2, axis=1, where=use)
+    left = np.sum(seen.left**2, axis=1, where=use)
+    return CurrentError(size, left)
 
 
 def left_on(observation: Observation, estimate: Estimate) -> FloatArray:
-    """Root mean square of each motor's e_i [A], shape (m,), of a redundant drive over √P_ii;
-    NaN without a row.
+    """Root mean square of each motor's e_i [A], shape (m,); NaN without a row.
 
-    It compares with the noise of the current.
+    That of a redundant drive is over √P_ii, so that it compares with the noise of the current.
     """
-    rows = np.sum(_currents(observation, estimate).shown, axis=1, where=observation.motor_use)
+    shown = _currents(observation, estimate).shown
+    rows = np.sum(shown, axis=1, where=observation.motor_use)
     left = error_on(observation, estimate).left
-    return np.asarray(
-        np.sqrt(np.divide(left, rows, out=np.full(len(rows), np.nan), where=rows > 0))
-    )
+    mean_square = np.full(len(rows), np.nan)
+    np.divide(left, rows, out=mean_square, where=rows > 0)
+    return np.asarray(np.sqrt(mean_square))
 
 
 def squares_left(observation: Observation, estimate: Estimate) -> FloatArray:
-    """Squared error e_i² of each motor and row [A²], shape (m, r),
-    whether the row counts or not.
-    """
+    """Squared error e_i² of each motor and row [A²], shape (m, r), of all rows."""
     return np.square(_currents(observation, estimate).left)
 
 
 def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:
-    """Compare the squared errors of two models on held-out rows by move,
-    currents weighted by the gains before [Nm²].
+    """Compare the squared errors of two models on held-out rows by move [Nm²].
 
-    None without held-out runs.
+    Currents are weighted by the gains before. None without held-out runs.
     """
     if before.holdout is None or after.holdout is None:
         return None
     rows = before.holdout
-    first, second = (
-        np.square(_currents(one.holdout or rows, one.estimate).left) for one in (before, after)
-    )
-    weights = np.square(before.estimate.gains)[:, None] * rows.motor_use
-    return compare_by_move(np.sum(weights * (second - first), axis=0), rows.move)
+    first = squares_left(before.holdout, before.estimate)
+    second = squares_left(after.holdout, after.estimate)
+    squared_gains = np.square(before.estimate.gains)
+    weights = squared_gains[:, None] * rows.motor_use
+    rise = np.sum(weights * (second - first), axis=0)
+    return compare_by_move(rise, rows.move)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,39 +144,40 @@ def _currents(observation: Observation, estimate: Estimate) -> _Currents:
     """Currents of rows under an estimate."""
     predicted = estimate.predicted_torque(observation)
     measured = observation.current
+    gains = estimate.gains[:, None]
     if not observation.preload.size:
-        left = measured - observation.drive_train.to_motor @ predicted / estimate.gains[:, None]
+        # e = v − T τ/g.
+        left = measured - observation.drive_train.to_motor @ predicted / gains
         return _Currents(measured, left, np.ones_like(measured))
     noise = estimate.axis_noise
     torque = observation.torque(estimate.gains)
-    seen = noise[:, None] * whitening_transform(
-        observation.preload.transpose(2, 0, 1), estimate.gains, noise
-    )
+    # diag(σ) T_D of each row, shape (r, m, m).
+    preload = observation.preload.transpose(2, 0, 1)
+    to_currents = noise[:, None] * whitening_transform(preload, estimate.gains, noise)
     return _Currents(
-        measured=np.einsum("rij,jr->ir", seen, torque),
-        left=np.einsum("rij,jr->ir", seen, torque - predicted),
-        shown=np.einsum("rii->ir", seen) * estimate.gains[:, None],
+        measured=np.einsum("rij,jr->ir", to_currents, torque),
+        left=np.einsum("rij,jr->ir", to_currents, torque - predicted),
+        shown=np.einsum("rii->ir", to_currents) * gains,
     )
 
 
 def error_left_out(folds: Folds) -> CurrentError:
     """Error on each fold's rows, predicted by a fit that has not seen their moves."""
     problem = folds.linearisation
+    noise_a = problem.noise[problem.motor]
     size = np.zeros(len(problem.noise))
     left = np.zeros(len(problem.noise))
-    np.add.at(size, problem.motor, (problem.current * problem.noise[problem.motor]) ** 2)
-    np.add.at(left, problem.motor, (folds.residual * problem.noise[problem.motor]) ** 2)
+    np.add.at(size, problem.motor, (problem.current * noise_a) ** 2)
+    np.add.at(left, problem.motor, (folds.residual * noise_a) ** 2)
     return CurrentError(size, left)
 
 
 @dataclass(frozen=True, slots=True)
 class RunError:
-    """One run of the fit, predicted by the others;
-    `error` is None where they cannot be fitted, with the reason.
-    """
+    """One run of the fit, predicted by the others."""
 
     run: str  #: its name
-    error: RelativeError | None  #: on its rows [%]
+    error: RelativeError | None  #: on its rows [%]; None where the others cannot be fitted
     reason: str = ""  #: why there is no error
 
 
@@ -206,20 +205,25 @@ def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> RunErrors:
             runs.append(RunError(data.name, None, str(error)))
         else:
             runs.append(RunError(data.name, errors[-1].relative(weights_nm_a)))
-    return RunErrors(tuple(runs), reduce(add, errors).relative(weights_nm_a) if errors else None)
+    if not errors:
+        return RunErrors(tuple(runs), None)
+    together = reduce(add, errors)
+    return RunErrors(tuple(runs), together.relative(weights_nm_a))
 
 
 def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
     """Error on one run of the fit, with the model refitted without it."""
-    order = [index for index in range(len(evidence.fit_runs)) if index != left_out] + [left_out]
+    others = [index for index in range(len(evidence.fit_runs)) if index != left_out]
+    order = [*others, left_out]
     observation = _in_order(evidence.rows_without_effects, order)
-    last = observation.run == len(order) - 1
-    training = observation.only(~last)
-    held = observation.only(last)
+    is_last = observation.run == len(others)
+    training = observation.only(~is_last)
+    held = observation.only(is_last)
     if evidence.estimate.gains_fixed:
         fixed = evidence.estimate.gains
     else:
         fixed = None
+    estimate = estimate_with(evidence.estimate.method, training.system(), fixed)
     bare = replace(
         evidence,
         datasets=tuple(evidence.datasets[index] for index in order),
@@ -229,10 +233,10 @@ def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
         holdout=held,
         effects=(),
         uncorrected=_datasets_in_order(evidence.uncorrected, order),
-        estimate=estimate_with(evidence.estimate.method, training.system(), fixed),
+        estimate=estimate,
     )
     if not evidence.effects:
-        return error_on(held, bare.estimate)
+        return error_on(held, estimate)
     refitted = with_effects(bare, evidence.effects)
     return error_on(refitted.holdout or held, refitted.estimate)
 
@@ -246,12 +250,12 @@ def _datasets_in_order(uncorrected: Uncorrected | None, order: Sequence[int]) ->
 
 def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
     """Sort rows by run, in this order."""
-    rows: IntArray = np.concatenate([np.flatnonzero(bare.run == run) for run in order])
+    of_runs = [np.flatnonzero(bare.run == run) for run in order]
+    rows: IntArray = np.concatenate(of_runs)
     number = np.zeros(len(bare.runs), dtype=np.int64)
     number[list(order)] = np.arange(len(order))
-    return replace(
-        bare.only(rows), run=number[bare.run[rows]], runs=tuple(bare.runs[run] for run in order)
-    )
+    names = tuple(bare.runs[run] for run in order)
+    return replace(bare.only(rows), run=number[bare.run[rows]], runs=names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -279,7 +283,8 @@ class Moves:
 
     def shifts(self, starts: IntArray) -> FloatArray:
         """Shift of the unknowns when each block is left out, shape (blocks, f)."""
-        grams, scores = (np.add.reduceat(parts, starts) for parts in (self.grams, self.scores))
+        grams = np.add.reduceat(self.grams, starts)
+        scores = np.add.reduceat(self.scores, starts)
         return left_out_shifts(grams, scores) * self.scale
 
 
@@ -377,12 +382,14 @@ def account(
 
     def assessed(evidence: Evidence) -> Assessment:
         count = len(evidence.effects)
-        progress(f"errors with {count} {'effect' if count == 1 else 'effects'} in the model")
-        return assess(
-            evidence,
-            weights_nm_a,
-            left_out_runs(evidence, weights_nm_a) if leave_out_runs else None,
-        )
+        if count == 1:
+            progress("errors with 1 effect in the model")
+        else:
+            progress(f"errors with {count} effects in the model")
+        left_out: RunErrors | None = None
+        if leave_out_runs:
+            left_out = left_out_runs(evidence, weights_nm_a)
+        return assess(evidence, weights_nm_a, left_out)
 
     first = last = assessed(start)
     turns: list[BeforeAfter | None] = []
@@ -406,30 +413,36 @@ def account(
         if floor is None or floor.is_refuted(left):
             known.append(None)
             least.append(None)
+            continue
+        known.append(floor)
+        if floor.is_bound:
+            least.append(replace(floor, noise_a=floor.least_a))
         else:
-            known.append(floor)
-            least.append(replace(floor, noise_a=floor.least_a) if floor.is_bound else None)
+            least.append(None)
 
     def error_of(
         noises: Sequence[MotorNoiseFloor | None], before: Observation, after: Observation
     ) -> RelativeError:
         """Error by noise alone on some rows; a model that leaves less by chance is at the floor."""
-        left = np.fmin(left_on(before, start.estimate), left_on(after, end.after.estimate))
-        return floor_on(before, start.estimate, capped(noises, left)).relative(weights_nm_a)
+        left_before = left_on(before, start.estimate)
+        left_after = left_on(after, end.after.estimate)
+        at_most = capped(noises, np.fmin(left_before, left_after))
+        return floor_on(before, start.estimate, at_most).relative(weights_nm_a)
 
-    training = start.training, end.after.training
+    training = start.training
+    training_after = end.after.training
     holdout_floor: RelativeError | None = None
     least_holdout_floor: RelativeError | None = None
     if start.holdout is not None:
-        holdout = start.holdout, end.after.holdout or start.holdout
-        holdout_floor = error_of(known, *holdout)
-        least_holdout_floor = error_of(least, *holdout)
+        holdout_after = end.after.holdout or start.holdout
+        holdout_floor = error_of(known, start.holdout, holdout_after)
+        least_holdout_floor = error_of(least, start.holdout, holdout_after)
     return Account(
         floors=floors,
         left_a=left_a,
-        floor=error_of(known, *training),
+        floor=error_of(known, training, training_after),
         holdout_floor=holdout_floor,
-        least_floor=error_of(least, *training),
+        least_floor=error_of(least, training, training_after),
         least_holdout_floor=least_holdout_floor,
         turns=tuple(turns),
         total=before_after(first, last),
@@ -447,17 +460,17 @@ def assess(
         TooFewMoves: there are too few moves to leave some out.
     """
     estimate = evidence.estimate
-    folds = cut_into_folds(
-        linearise(
-            evidence.training,
-            estimate.gains,
-            estimate.parameters,
-            estimate.axis_noise,
-            gains_fixed=estimate.gains_fixed,
-        )
+    problem = linearise(
+        evidence.training,
+        estimate.gains,
+        estimate.parameters,
+        estimate.axis_noise,
+        gains_fixed=estimate.gains_fixed,
     )
-    held = evidence.holdout
-    problem = folds.linearisation
+    folds = cut_into_folds(problem)
+    holdout: RelativeError | None = None
+    if evidence.holdout is not None:
+        holdout = error_on(evidence.holdout, estimate).relative(weights_nm_a)
     moves = None
     if not estimate.gains_fixed:
         runs = problem.of_clusters(evidence.training.run)
@@ -468,7 +481,7 @@ def assess(
             in_sample=error_on(evidence.training, estimate).relative(weights_nm_a),
             cross_validated=error_left_out(folds).relative(weights_nm_a),
             left_out_runs=left_out,
-            holdout=None if held is None else error_on(held, estimate).relative(weights_nm_a),
+            holdout=holdout,
         ),
         gains=estimate.gains,
         gains_std=estimate.gains_std,
@@ -483,51 +496,62 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     change_std = np.zeros(count)
     if before.moves is not None and after.moves is not None:
         starts = min(before.moves.blocks(), after.moves.blocks(), key=len)
-        shifts = after.moves.shifts(starts)[:, :count] - before.moves.shifts(starts)[:, :count]
-        change_std = np.sqrt(np.diag(scatter_of(shifts)))
+        shifts_after = after.moves.shifts(starts)[:, :count]
+        shifts_before = before.moves.shifts(starts)[:, :count]
+        covariance = scatter_of(shifts_after - shifts_before)
+        change_std = np.sqrt(np.diag(covariance))
     limit = float(-scipy.special.ndtri(FALSE_ALARM / (2 * count)))
+    gains: list[GainShift] = []
+    for motor in range(count):
+        change = after.gains[motor] - before.gains[motor]
+        shift = GainShift(
+            before=float(before.gains[motor]),
+            before_std=float(before.gains_std[motor]),
+            after=float(after.gains[motor]),
+            after_std=float(after.gains_std[motor]),
+            choice_std=float(after.choice_std[motor]),
+            change_std=float(change_std[motor]),
+            significant=bool(abs(change) > limit * change_std[motor]),
+        )
+        gains.append(shift)
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),
         removed=tuple(placed for placed in before.effects if placed not in after.effects),
         before=before.errors,
         after=after.errors,
-        gains=tuple(
-            GainShift(
-                before=float(before.gains[motor]),
-                before_std=float(before.gains_std[motor]),
-                after=float(after.gains[motor]),
-                after_std=float(after.gains_std[motor]),
-                choice_std=float(after.choice_std[motor]),
-                change_std=float(change_std[motor]),
-                significant=bool(
-                    abs(after.gains[motor] - before.gains[motor]) > limit * change_std[motor]
-                ),
-            )
-            for motor in range(count)
-        ),
+        gains=tuple(gains),
     )
 
 
 def capped(
     floors: Sequence[MotorNoiseFloor | None], left_a: FloatArray
 ) -> tuple[MotorNoiseFloor | None, ...]:
-    """Lower each floor to what a model leaves on the rows it is shown for [A, root mean square],
-    shape (m,).
+    """Lower each floor to what a model leaves on the rows that it is shown for.
+
+    Args:
+        floors: of each motor.
+        left_a: root mean square of the error of each motor [A], shape (m,).
     """
-    return tuple(
-        None if floor is None else replace(floor, noise_a=float(np.fmin(floor.noise_a, left)))
-        for floor, left in zip(floors, left_a, strict=True)
-    )
+    lowered: list[MotorNoiseFloor | None] = []
+    for floor, left in zip(floors, left_a, strict=True):
+        if floor is None:
+            lowered.append(None)
+        else:
+            noise_a = float(np.fmin(floor.noise_a, left))
+            lowered.append(replace(floor, noise_a=noise_a))
+    return tuple(lowered)
 
 
 def floor_on(
     observation: Observation, estimate: Estimate, floors: Sequence[MotorNoiseFloor | None]
 ) -> CurrentError:
-    """Error that noise alone would leave on some rows under an estimate;
-    NaN for a motor whose noise is not known.
-    """
+    """Error that noise alone would leave on some rows; NaN for a motor whose noise is not known."""
     use = observation.motor_use
     seen = _currents(observation, estimate)
-    noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
-    size, rows = (np.sum(part, axis=1, where=use) for part in (seen.measured**2, seen.shown))
+    noise_a = np.full(len(floors), np.nan)
+    for motor, floor in enumerate(floors):
+        if floor is not None:
+            noise_a[motor] = floor.noise_a
+    size = np.sum(seen.measured**2, axis=1, where=use)
+    rows = np.sum(seen.shown, axis=1, where=use)
     return CurrentError(size, rows * noise_a**2)

@@ -28,9 +28,7 @@ in parts of what the cell allows.
 
 
 def turns_with_motion(effect: Effect) -> bool:
-    """Whether an effect could be taken for friction of joints at rest:
-    its torque turns with the sense of motion.
-    """
+    """Whether an effect's torque turns with the motion, as friction of joints at rest seems to."""
     if is_unnamed(effect):
         return effect.abscissa in {Abscissa.VELOCITY, Abscissa.DISTANCE}
     return effect.declares is Property.ODD_IN_VELOCITY
@@ -53,6 +51,5 @@ def fitted_clear_of_stops(evidence: Evidence) -> Estimate:
     Raises:
         RankDeficient, NotConverged: these rows do not determine it.
     """
-    return estimate_with(
-        evidence.estimate.method, rows_clear_of_stops(evidence).system(), fixed_gains(evidence)
-    )
+    system = rows_clear_of_stops(evidence).system()
+    return estimate_with(evidence.estimate.method, system, fixed_gains(evidence))

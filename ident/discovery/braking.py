@@ -1,5 +1,4 @@
-"""Whether the friction of an axis brakes at every speed:
-friction takes work out of the arm, it never drives it.
+"""Whether the friction of an axis brakes at every speed: it never drives the arm.
 
 A joint fit is of the speeds that its runs have. Terms that depend on the speed alone can stand in
 for each other there: drag by a root of the speed, with a dry friction below zero, is right from a
@@ -7,13 +6,13 @@ tenth of full speed on, and wrong below it. An axis of a real robot moved slowly
 was left out: there such a fit was off by 18 % of the torque, and the fit without the term by 5 %.
 So dry and viscous friction are judged together with all effects of the speed on the axis,
 
-    f(v) = fs + fv |v| + sign(v) Σ c φ(v) ≥ 0,     0 < |v| ≤ the largest speed of the runs, in both directions,
+    f(v) = fs + fv |v| + sign(v) Σ c φ(v) ≥ 0,     0 < |v| ≤ the largest speed of the runs,
 
-and may be below zero by no more than SIGMAS of its own σ. At rest, f is what the friction of the
-axis begins with. Friction that grows with the load, or depends on position or distance, brakes too
-and is left out. An axis whose friction depends on the temperature is not judged: fs and fv are then
-those of a temperature that the runs need not have.
-"""  # noqa: E501
+in both directions, and may be below zero by no more than SIGMAS of its own σ. At rest, f is what
+the friction of the axis begins with. Friction that grows with the load, or depends on position or
+distance, brakes too and is left out. An axis whose friction depends on the temperature is not
+judged: fs and fv are then those of a temperature that the runs need not have.
+"""
 
 from __future__ import annotations
 
@@ -42,33 +41,39 @@ def pushing(evidence: Evidence, axis: int) -> str:
         axis: index of the axis.
     """
     of_axis = [placed for placed in evidence.effects if placed.axis == axis]
-    terms = [
-        (placed, placed.effect) for placed in of_axis if isinstance(placed.effect, SpeedFriction)
-    ]
-    by_temperature = any(placed.effect.abscissa is Abscissa.TEMPERATURE for placed in of_axis)
-    if not terms or by_temperature:
+    terms: list[tuple[PlacedEffect, SpeedFriction]] = []
+    for placed in of_axis:
+        if placed.effect.abscissa is Abscissa.TEMPERATURE:
+            return ""
+        if isinstance(placed.effect, SpeedFriction):
+            terms.append((placed, placed.effect))
+    if not terms:
         return ""
-    fastest = max(float(np.max(np.abs(data.velocity_rad_s[:, axis]))) for data in evidence.fit_runs)
+    speeds = [np.abs(data.velocity_rad_s[:, axis]) for data in evidence.fit_runs]
+    fastest = max(float(np.max(speed)) for speed in speeds)
     found: list[_Friction] = []
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
-            found += _friction_at(evidence, declared, terms, direction * fastest * SPEEDS)
+            velocity = direction * fastest * SPEEDS
+            found += _friction_at(evidence, declared, terms, velocity)
     worst = min(found, key=lambda one: one.at_most, default=None)
     if worst is None or worst.at_most >= 0.0:
         return ""
-    rate = "m/s" if worst.unit == "N" else "rad/s"
-    is_at_rest = abs(worst.speed) < 2.0 * fastest * SPEEDS[0]
-    where = "at rest" if is_at_rest else f"at {worst.speed:.2g} {rate}"
-    return (
-        f"the friction of this axis would push the arm {where} ({worst.torque:.3g} ± "
-        f"{worst.std:.2g} {worst.unit})"
-    )
+    if abs(worst.speed) < 2.0 * fastest * SPEEDS[0]:
+        where = "at rest"
+    elif worst.unit == "N":
+        where = f"at {worst.speed:.2g} m/s"
+    else:
+        where = f"at {worst.speed:.2g} rad/s"
+    torque = f"{worst.torque:.3g} ± {worst.std:.2g} {worst.unit}"
+    return f"the friction of this axis would push the arm {where} ({torque})"
 
 
 @dataclass(frozen=True, slots=True)
 class _Declared:
-    """Dry and viscous friction of an axis, as places among the parameters:
-    without load, or the sums with it.
+    """Dry and viscous friction of an axis, as places among the parameters.
+
+    With a load, several parameters make the sum.
     """
 
     dry: tuple[int, ...]
@@ -97,10 +102,10 @@ def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
     Empty where a part of it is regrouped into other parameters.
     """
     model = evidence.model
-    places = {
-        column.name.split(" ", 1)[0]: place
-        for place, column in enumerate(evidence.estimate.unknowns)
-    }
+    places: dict[str, int] = {}
+    for place, column in enumerate(evidence.estimate.unknowns):
+        standard, *_ = column.name.split(" ", 1)
+        places[standard] = place
     dry = model.columns[model.dry_friction_columns[axis]]
     viscous = model.columns[model.viscous_friction_columns[axis]].name
     if dry.name not in places or viscous not in places:
@@ -110,7 +115,8 @@ def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
     more_viscous = places.get(f"{viscous}{LOADED}")
     if more_dry is None or more_viscous is None:
         return [bare]
-    return [bare, _Declared((*bare.dry, more_dry), (*bare.viscous, more_viscous), dry.unit)]
+    loaded = _Declared((*bare.dry, more_dry), (*bare.viscous, more_viscous), dry.unit)
+    return [bare, loaded]
 
 
 def _friction_at(
@@ -123,13 +129,18 @@ def _friction_at(
     estimate = evidence.estimate
     values = np.concatenate((estimate.gains, estimate.parameters))
     first = len(estimate.gains)
+    dry = first + np.array(declared.dry)
+    viscous = first + np.array(declared.viscous)
+    # Row k of the weights w is ∂f(v_k)/∂(g, χ): f = w χ, and its variance is w C wᵀ.
     weights = np.zeros((len(velocity), len(values)))
-    weights[:, first + np.array(declared.dry)] = 1.0
-    weights[:, first + np.array(declared.viscous)] = np.abs(velocity)[:, None]
+    weights[:, dry] = 1.0
+    weights[:, viscous] = np.abs(velocity)[:, None]
     for placed, effect in terms:
         against_motion = np.sign(velocity) * effect.at_speed(velocity)
-        weights[:, first + own_unknowns(estimate, (placed,))] = against_motion.T
+        of_effect = first + own_unknowns(estimate, (placed,))
+        weights[:, of_effect] = against_motion.T
     torque = weights @ values
-    std = np.sqrt(np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights))
+    variance = np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights)
+    std = np.sqrt(variance)
     at_each = zip(velocity.tolist(), torque.tolist(), std.tolist(), strict=True)
-    return [_Friction(speed, friction, sigma, declared.unit) for speed, friction, sigma in at_each]
+    return [_Friction(*numbers, declared.unit) for numbers in at_each]

@@ -36,8 +36,9 @@ Tried = tuple[Effect, CandidateFit]
 def propose_cables(
     search_problem: SearchProblem, gates: Gates, families: tuple[tuple[Effect, ...], ...]
 ) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
-    """Return a family of slack cables for the pair of joints that a cable explains most of,
-    by its lower axis.
+    """Return a family of slack cables for the pair of joints that a cable explains most of.
+
+    It is listed by the lower axis of the pair.
 
     Args:
         search_problem: around the model.
@@ -52,7 +53,8 @@ def propose_cables(
     for axis in range(search_problem.axes):
         tried = search_problem.fits_at_rows(chain.from_iterable(cables), axis)
         shares = shares_explained(search_problem, [fit for _, fit in tried])
-        found += [(share, axis, effect) for share, (effect, _) in zip(shares, tried, strict=True)]
+        for share, (effect, _) in zip(shares, tried, strict=True):
+            found.append((share, axis, effect))
     if not found:
         return {}
     share, axis, best = max(found, key=lambda one: one[0])
@@ -65,10 +67,11 @@ def propose_cables(
         fitted = refine_together(search_problem, effect, axis)
         if isinstance(fitted, SlackCable) and _is_slack_cable(search_problem, fitted, axis):
             refined.append(fitted)
-    shared = tuple(
-        effect for effect in grid if is_placeable(effect, axis, search_problem.model.robot)
-    )
-    return {axis: ((*shared, *(effect for effect, _ in tried), *refined),)}
+    robot = search_problem.model.robot
+    shared = [effect for effect in grid if is_placeable(effect, axis, robot)]
+    tried_effects = [effect for effect, _ in tried]
+    family = (*shared, *tried_effects, *refined)
+    return {axis: (family,)}
 
 
 def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tried]:
@@ -76,13 +79,13 @@ def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tr
     effects: list[SlackCable] = []
     step_rad = 2.0 * np.pi / DIRECTIONS
     # None along one joint alone
-    for direction_rad in (step_rad * (np.arange(DIRECTIONS) + 0.5) - np.pi).tolist():
+    directions_rad = step_rad * (np.arange(DIRECTIONS) + 0.5) - np.pi
+    for direction_rad in directions_rad.tolist():
         cable = SlackCable(other_axis, direction_rad)
         starts_rad = np.quantile(_way(search_problem, cable, axis), SHARES_OF_WAY)
-        effects += [
-            SlackCable(other_axis, direction_rad, float(f"{start_rad:.4g}"))
-            for start_rad in starts_rad
-        ]
+        for start_rad in starts_rad:
+            rounded_rad = float(f"{start_rad:.4g}")
+            effects.append(SlackCable(other_axis, direction_rad, rounded_rad))
     return search_problem.fits_at_rows(effects, axis)
 
 
@@ -94,21 +97,24 @@ def _way(search_problem: SearchProblem, cable: SlackCable, axis: int) -> FloatAr
 def _is_slack_cable(search_problem: SearchProblem, cable: SlackCable, axis: int) -> bool:
     """Whether a cable hangs slack in a part of the rows, and both joints make a part of its way."""
     is_slack = _way(search_problem, cable, axis) < cable.start_rad
+    if np.mean(is_slack) < LEAST_SLACK:
+        return False
+    # A quarter turn leads from one joint's own direction to that of the other.
     quarter_turns = cable.direction_rad / (np.pi / 2.0)
     from_one_joint_rad = abs(quarter_turns - round(quarter_turns)) * np.pi / 2.0
-    return bool(np.mean(is_slack) >= LEAST_SLACK and from_one_joint_rad >= ONE_JOINT_RAD)
+    return from_one_joint_rad >= ONE_JOINT_RAD
 
 
 def _best_of(search_problem: SearchProblem, tried: Sequence[Tried]) -> tuple[Effect, ...]:
-    """The best possible cable of each of the best directions:
-    the simplex does not find the way between them.
+    """The best possible cable of each of the best directions.
+
+    The simplex does not find the way from one direction to another.
     """
     shares = shares_explained(search_problem, [fit for _, fit in tried])
-    possible = [
-        (share, effect)
-        for share, (effect, fit) in zip(shares, tried, strict=True)
-        if is_strictly_possible(effect, fit)
-    ]
+    possible: list[tuple[float, Effect]] = []
+    for share, (effect, fit) in zip(shares, tried, strict=True):
+        if is_strictly_possible(effect, fit):
+            possible.append((share, effect))
     best: dict[float, Effect] = {}
     for _, effect in sorted(possible, key=lambda one: -one[0]):
         best.setdefault(effect.settings["direction_rad"], effect)

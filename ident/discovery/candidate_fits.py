@@ -39,10 +39,10 @@ class CandidateFit:
 def fit_candidates(
     folds: Folds, candidates: Iterable[tuple[int, Felt]]
 ) -> tuple[CandidateFit | None, ...]:
-    """Fit candidates, each given by its number of columns and these;
-    None where the declared model contains it already.
+    """Fit candidates, each given by its number of columns and these.
 
-    The numbers are those of the trials of the same candidates.
+    The numbers are those of the trials of the same candidates; None where the declared model
+    contains one already.
     """
 
     def fit(width: int, batch: Sequence[Felt]) -> Sequence[CandidateFit | None]:
@@ -219,15 +219,20 @@ def fall_of_motors(
 
 
 def is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
-    """Mask of candidates that the declared model lacks, from Φ⊥ᵀΦ⊥, (c, p, p),
-    and ‖φ‖² of their columns, (c, p).
+    """Mask of candidates that the declared model lacks, shape (c,).
+
+    Args:
+        gram: Φ⊥ᵀΦ⊥ of each candidate, shape (c, p, p).
+        squares: ‖φ‖² of its columns, shape (c, p).
     """
     size = np.diagonal(gram, axis1=1, axis2=2)
-    new = np.asarray(np.all(size > REDUNDANT_SHARE * squares, axis=1))
+    is_left = size > REDUNDANT_SHARE * squares
+    new = np.asarray(np.all(is_left, axis=1))
     if gram.shape[-1] == 1:  # a single column has the condition one
         return new
     root = np.sqrt(size[new])
-    in_own_units = gram[new] / (root[:, :, None] * root[:, None, :])
+    units = root[:, :, None] * root[:, None, :]
+    in_own_units = gram[new] / units
     new[new] = np.linalg.cond(in_own_units) <= LARGEST_CONDITION
     return new
 
@@ -280,8 +285,13 @@ def crossed_gram(first: FloatArray, second: FloatArray) -> FloatArray:
 def projected_gram(
     gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed_along: FloatArray
 ) -> FloatArray:
-    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), from ΦᵀΦ, ΦᵀJ, wᵀ and wᵀJᵀJ,
-    the last three (…, p, f).
+    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p).
+
+    Args:
+        gram: ΦᵀΦ, shape (…, p, p).
+        jacobian: ΦᵀJ, shape (…, p, f).
+        along: wᵀ, same shape.
+        pushed_along: wᵀJᵀJ, same shape.
     """
     crossed = crossed_gram(jacobian, along)
     transposed = np.swapaxes(crossed, -1, -2)

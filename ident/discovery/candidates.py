@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.arrays import FloatArray, IntArray
+from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.discovery.candidate_fits import (
     CandidateFit,
@@ -69,8 +70,8 @@ DECORRELATED_TOGETHER = 16  #: Candidates that are decorrelated at once
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
 UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
-#: Fields of `Signals` that do not change in a run
-NO_SERIES = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm"})
+#: Fields of `Signals` that do not change in a run, or that no effect needs at the rows
+NOT_DECIMATED = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm", "inertia_kg_m2"})
 FRICTION_OF_A_RUN = 0.03
 """Standard deviation of fv and fs from run to run, as a share of each:
 a few degrees of the grease make as much.
@@ -110,14 +111,17 @@ class SearchProblem:
 
         Columns built `at_rows` are fast, and good for effects that change slowly.
         """
-        torque = self.torque_at_rows if at_rows else self.torque
-        placed = [
-            (number, effect)
-            for number, family in enumerate(families)
-            for effect in family
-            if is_placeable(effect, axis, self.model.robot)
-        ]
-        trials = self.trials(torque(effect, axis) for _, effect in placed)
+        if at_rows:
+            torque = self.torque_at_rows
+        else:
+            torque = self.torque
+        robot = self.model.robot
+        placed: list[tuple[int, Effect]] = []
+        for number, family in enumerate(families):
+            fitting = (effect for effect in family if is_placeable(effect, axis, robot))
+            placed += ((number, effect) for effect in fitting)
+        torques = (torque(effect, axis) for _, effect in placed)
+        trials = self.trials(torques)
         members: dict[int, list[tuple[Effect, CandidateTrial]]] = {}
         for (number, effect), trial in zip(placed, trials, strict=True):
             if trial is not None:
@@ -125,22 +129,19 @@ class SearchProblem:
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[CandidateTrial | None, ...]:
-        """Test candidates given by their joint torques (m, p, r);
-        None where the model contains them already.
-        """
+        """Test candidates given by joint torques (m, p, r); None where the model contains them."""
         return _scored(self.folds, self._felt(torques))
 
     def fits(self, torques: Iterable[FloatArray]) -> tuple[CandidateFit | None, ...]:
-        """Fit candidates to all rows, without folds and moves, which takes a tenth of the time;
-        see `trials`.
-        """
+        """Fit candidates as `trials` has them to all rows, without folds: a tenth of the time."""
         return fit_candidates(self.folds, self._felt(torques))
 
     def fits_at_rows(
         self, effects: Iterable[Effect], axis: int
     ) -> list[tuple[Effect, CandidateFit]]:
-        """Fit effects on an axis by columns built at the rows;
-        those that the model contains already, or that cannot be there, are left out.
+        """Fit effects on an axis by columns built at the rows.
+
+        Those that the model contains already, or that cannot be there, are left out.
         """
         robot = self.model.robot
         placed = [effect for effect in effects if is_placeable(effect, axis, robot)]
@@ -152,22 +153,29 @@ class SearchProblem:
         return found
 
     def _felt(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, Felt]]:
-        """Number of columns of each candidate, and its whitened columns;
-        some are decorrelated at once.
+        """Yield the number of columns of each candidate, and its whitened columns.
+
+        Some are decorrelated at once. One torque after the other is in memory: it is far larger
+        than what single motors feel of it.
         """
-        problem, to_motor = self.folds.linearisation, self.model.drive_train.to_motor
-        # One torque after the other is in memory: it is far larger than what single motors feel of
-        # it.
-        whitened = (
-            (torque.shape[1], problem.whitened_by_motor(torque, to_motor)) for torque in torques
-        )
-        while together := list(islice(whitened, DECORRELATED_TOGETHER)):
-            widths, felt = zip(*together, strict=True)
-            yield from zip(widths, problem.decorrelated_by_motor(felt), strict=True)
+        problem = self.folds.linearisation
+        to_motor = self.model.drive_train.to_motor
+        remaining = iter(torques)
+        while True:
+            widths: list[int] = []
+            whitened: list[dict[int, FloatArray]] = []
+            for torque in islice(remaining, DECORRELATED_TOGETHER):
+                widths.append(torque.shape[1])
+                whitened.append(problem.whitened_by_motor(torque, to_motor))
+            if not whitened:
+                return
+            decorrelated = problem.decorrelated_by_motor(whitened)
+            yield from zip(widths, decorrelated, strict=True)
 
     def torque(self, effect: Effect, axis: int) -> FloatArray:
-        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (m,
-        p, r).
+        """Return an effect's columns as joint torques on the rows [Nm per unit], shape (m, p, r).
+
+        The rows are those of the observation.
         """
         if isinstance(effect, GeometryEffect):
             # The torque of the whole arm, once more, and it is smooth
@@ -183,12 +191,11 @@ class SearchProblem:
         return at_joints(effect, axis, kept.astype(np.float64), self.model.drive_train)
 
     def torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
-        """Build the same from signals that are decimated already:
-        fast, and good for effects that change slowly.
-        """
+        """Build the same from signals at the rows: fast, good for effects that change slowly."""
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
-        columns = np.concatenate([columns_at(effect, run, axis) for run in self.rows], axis=-1)
+        of_runs = [columns_at(effect, run, axis) for run in self.rows]
+        columns = np.concatenate(of_runs, axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
 
 
@@ -200,11 +207,12 @@ class FamilyTrials:
     members: tuple[tuple[Effect, CandidateTrial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, m),
-        with the setting chosen by the other folds alone.
-        """
-        chosen = np.argmax(np.stack([trial.training_fall for _, trial in self.members]), axis=0)
-        return np.stack([self.members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
+        """‖e‖² by fold and motor, shape (folds, m): each fold's setting is chosen by the others."""
+        trials = [trial for _, trial in self.members]
+        training_falls = np.stack([trial.training_fall for trial in trials])
+        chosen = np.argmax(training_falls, axis=0)
+        squares = [trials[best].held_out[fold] for fold, best in enumerate(chosen)]
+        return np.stack(squares)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,31 +235,39 @@ class CandidateTrial:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of the coefficients by the scatter of moves, G⁻¹XᵀXG⁻¹ (Liang & Zeger, 1986),
-        shape (p, p).
+        """Covariance of the coefficients by the scatter of moves, shape (p, p).
+
+        It is G⁻¹XᵀXG⁻¹ (Liang & Zeger, 1986).
         """
-        spread = self._spread()
-        return np.asarray(spread.T @ spread)
+        shares = self._cluster_shares()
+        return np.asarray(shares.T @ shares)
 
     @property
     def deviations(self) -> FloatArray:
         """σ of the coefficients, by the same scatter, shape (p,)."""
-        return np.asarray(np.sqrt(np.sum(self._spread() ** 2, axis=0)))
+        variances = np.sum(self._cluster_shares() ** 2, axis=0)
+        return np.asarray(np.sqrt(variances))
 
-    def _spread(self) -> FloatArray:
-        """What each cluster adds to the coefficients, shape (clusters, p)."""
-        return np.asarray(self.scatter @ np.linalg.pinv(self.gram.sum(axis=0)))
+    def _cluster_shares(self) -> FloatArray:
+        """What each cluster adds to the coefficients, X G⁻¹, shape (clusters, p)."""
+        inverse = np.linalg.pinv(self.gram.sum(axis=0))
+        return np.asarray(self.scatter @ inverse)
 
 
 def shares_explained(
     search_problem: SearchProblem, trials: Sequence[CandidateTrial | CandidateFit | None]
 ) -> list[float]:
-    """Share of a motor's squared residual that each trial explains,
-    of the motor that it affects most.
-    """
+    """Return the share of the squared residual that each trial explains, of its strongest motor."""
     problem = search_problem.folds.linearisation
     left = np.bincount(problem.motor, problem.residual**2)
-    return [0.0 if trial is None else float(np.max(trial.fallen / left)) for trial in trials]
+    shares: list[float] = []
+    for trial in trials:
+        if trial is None:
+            shares.append(0.0)
+        else:
+            of_motors = trial.fallen / left
+            shares.append(float(np.max(of_motors)))
+    return shares
 
 
 def prepare_search(
@@ -274,40 +290,18 @@ def prepare_search(
     fitted = (fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
     runs = tuple(beside_rotors(run, effects) for run in fitted)
     folds, step = folds_around(model, observation, estimate)
-    floors = noise_floors(datasets, observation.conditioning)
+
+    floors_a: list[float | None] = []
+    for floor in noise_floors(datasets, observation.conditioning):
+        if floor is None:
+            floors_a.append(None)
+        else:
+            floors_a.append(floor.noise_a)
     rows: list[Signals] = []
     for run, data in zip(runs, datasets, strict=True):
-        at_rate = {
-            array.name: getattr(run, array.name)
-            for array in fields(run)
-            if array.name not in NO_SERIES
-        }
-        sampled = {
-            name: array for name, array in at_rate.items() if array is not None and array.shape[-1]
-        }
-        known = {name: array for name, array in sampled.items() if name != "inertia_kg_m2"}
-        arrays = {
-            name: decimate_rows(data, observation.conditioning, array)
-            for name, array in known.items()
-        }
-        time_s, none = arrays["time_s"], run.inertia_kg_m2[..., :0]
-        rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
-        # The arm of a closed chain moves joints that are not axes: it is followed from the axes
-        # again.
-        states = (
-            decimate_rows(data, observation.conditioning, state.T).T
-            for state in (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
-        )
-        arm = None if run.arm is None else replace(run.arm, motion=Motion(*states))
-        rows.append(
-            Signals(
-                rate_hz=rate_hz,
-                inertia_kg_m2=none,
-                arm=arm,
-                rotor_inertia_kg_m2=run.rotor_inertia_kg_m2,
-                **arrays,
-            )
-        )
+        rows.append(_signals_at_rows(run, data, observation.conditioning))
+    if cache is None:
+        cache = {}
     return SearchProblem(
         model=model,
         datasets=datasets,
@@ -315,17 +309,44 @@ def prepare_search(
         runs=runs,
         rows=tuple(rows),
         folds=folds,
-        floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
+        floors_a=tuple(floors_a),
         step=step,
-        cache={} if cache is None else cache,
+        cache=cache,
+    )
+
+
+def _signals_at_rows(run: Signals, data: Dataset, conditioning: Conditioning) -> Signals:
+    """Decimate the signals of a run to its rows; inertia is left out."""
+    series: dict[str, FloatArray] = {}
+    for one in fields(run):
+        if one.name in NOT_DECIMATED:
+            continue
+        array = getattr(run, one.name)
+        if array is not None and array.shape[-1]:
+            series[one.name] = decimate_rows(data, conditioning, array)
+    time_s = series["time_s"]
+    duration_s = time_s[-1] - time_s[0]
+    # The arm of a closed chain moves joints that are not axes: it is followed from the axes again.
+    arm = run.arm
+    if arm is not None:
+        states = (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
+        decimated = [decimate_rows(data, conditioning, state.T).T for state in states]
+        arm = replace(arm, motion=Motion(*decimated))
+    return Signals(
+        rate_hz=float((len(time_s) - 1) / duration_s),
+        inertia_kg_m2=run.inertia_kg_m2[..., :0],
+        arm=arm,
+        rotor_inertia_kg_m2=run.rotor_inertia_kg_m2,
+        **series,
     )
 
 
 def folds_around(
     model: Model, observation: Observation, estimate: Estimate
 ) -> tuple[Folds, FloatArray]:
-    """The problem around an estimate in folds, with friction that differs by run,
-    and the step to its best fit.
+    """Return the problem around an estimate in folds, and the step to its best fit.
+
+    Friction differs from run to run in it.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
@@ -345,13 +366,14 @@ def folds_around(
 def _with_friction_of_runs(
     problem: Linearisation, model: Model, observation: Observation, estimate: Estimate
 ) -> Linearisation:
-    """Let viscous and dry friction differ at random from run to run;
-    the same problem of a single run.
+    """Let viscous and dry friction differ at random from run to run.
 
+    The problem of a single run stays the same.
     The rows of a redundant drive hold all motors at once, and their derivative to a gain would no
     longer be exact.
     """
-    if len(np.unique(observation.run)) < 2 or model.is_redundant:
+    runs = np.unique(observation.run)
+    if len(runs) < 2 or model.is_redundant:
         return problem
     rubbing = np.flatnonzero(np.isin(observation.base.independent, model.friction_columns))
     deviation = FRICTION_OF_A_RUN * np.abs(estimate.parameters[rubbing])
@@ -360,23 +382,26 @@ def _with_friction_of_runs(
 
 
 def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
-    """Piece of a move that each row belongs to, shape (r,),
-    and the move that each piece with rows belongs to.
+    """Return the piece of a move of each row, shape (r,), and the move of each piece with rows.
 
     The scatter of moves is known well only from many: moves of a short recording are cut into
     pieces of many correlation times (0.05 s) each. Folds still take whole moves.
     """
-    time_s, move = observation.time_s, observation.move
-    first = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    time_s = observation.time_s
+    move = observation.move
+    next_move = np.diff(move, prepend=move[0] - 1) != 0
+    first = np.flatnonzero(next_move)
     length = np.diff(first, append=len(move))
-    total_s = float(np.sum(time_s[first + length - 1] - time_s[first]))
-    shortest_s = (
-        max(SHORTEST_PIECE_S, total_s / MOVES_WANTED) if len(first) < MOVES_WANTED else np.inf
-    )
+    last = first + length - 1
+    total_s = float(np.sum(time_s[last] - time_s[first]))
+    if len(first) < MOVES_WANTED:
+        shortest_s = max(SHORTEST_PIECE_S, total_s / MOVES_WANTED)
+    else:
+        shortest_s = np.inf
     since_s = time_s - np.repeat(time_s[first], length)
     piece = np.floor(since_s / shortest_s).astype(np.int64)
-    change = (np.diff(move, prepend=move[0] - 1) != 0) | (np.diff(piece, prepend=-1) != 0)
-    pieces = np.cumsum(change).astype(np.int64)
+    next_piece = np.diff(piece, prepend=-1) != 0
+    pieces = np.cumsum(next_move | next_piece).astype(np.int64)
     used = np.flatnonzero(observation.motor_use.any(axis=0))
     _, at = np.unique(pieces[used], return_index=True)
     return pieces, move[used[at]]
@@ -395,12 +420,16 @@ def score_candidates(
     Returns:
         one trial a candidate; None where the declared model contains it already.
     """
-    parts = [columns.T[chosen] for chosen in candidates]
-    felt = (
-        {own.motor: part[:, own.rows] for own in folds.motors if part[:, own.rows].any()}
-        for part in parts
-    )
-    return _scored(folds, zip(map(len, parts), felt, strict=True))
+    whitened: list[tuple[int, Felt]] = []
+    for chosen in candidates:
+        part = columns.T[chosen]
+        felt: dict[int, FloatArray] = {}
+        for own in folds.motors:
+            of_motor = part[:, own.rows]
+            if of_motor.any():
+                felt[own.motor] = of_motor
+        whitened.append((len(part), felt))
+    return _scored(folds, whitened)
 
 
 def _scored(
@@ -460,8 +489,9 @@ def _tried_on_folds(
     sums: MotorSums,
     projection: Projection,
 ) -> tuple[CandidateTrial, ...]:
-    """Test c candidates that the declared model lacks on moves and folds; see `_scored_together`
-    and `_HeldOut`.
+    """Test c candidates that the declared model lacks, on moves and on folds.
+
+    See `_scored_together` and `_HeldOut`.
     """
     along = projection.along
     # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster.
@@ -469,14 +499,17 @@ def _tried_on_folds(
     cluster_score = -scored_along(along, folds.cluster_score)
     for one in made:
         at = np.ix_(one.own.cluster, one.felt)
-        crossed = crossed_gram(one.jacobian, along[one.felt][..., one.own.seen])
+        seen_along = along[one.felt][..., one.own.seen]
+        crossed = crossed_gram(one.jacobian, seen_along)
         gram[at] += one.gram - crossed - np.swapaxes(crossed, -1, -2)
         cluster_score[at] += one.score
-    fitted = np.linalg.solve(gram.sum(axis=0), cluster_score.sum(axis=0)[..., None])[..., 0]
-    fallen = fall_of_motors(folds, sums, along, fitted)
-    scatter = cluster_score - (gram @ fitted[..., None])[..., 0]
-    held_out = _held_out(folds, before, made, sums)
+    # β = G⁻¹ Φ⊥ᵀe, with both summed over clusters; each cluster's scatter is Φ⊥ᵀe − G β.
     score = cluster_score.sum(axis=0)
+    fitted = np.linalg.solve(gram.sum(axis=0), score[..., None])[..., 0]
+    fallen = fall_of_motors(folds, sums, along, fitted)
+    of_fit = (gram @ fitted[..., None])[..., 0]
+    scatter = cluster_score - of_fit
+    held_out = _held_out(folds, before, made, sums)
     trials: list[CandidateTrial] = []
     for place in range(len(along)):
         own_gram = gram[:, place]
@@ -508,19 +541,23 @@ def _held_out(
     """Fit candidates with J and Φ of the other folds, for each fold k: Φ − J w_k."""
     _, count, width, unknowns = sums.jacobian.shape
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
-    parts = (folds.count, len(folds.linearisation.gamma), count, width)
+    motors = len(folds.linearisation.gamma)
+    parts = (folds.count, motors, count, width)
     part_jacobian = np.zeros((*parts, unknowns))
     part_gram = np.zeros((*parts, width))
     part_score = np.zeros(parts)
     part_held = np.zeros(parts)
     for one in made:
-        place = np.s_[:, one.own.motor, one.felt]
-        spread = np.zeros((folds.count, len(one.felt), width, unknowns))
-        spread[..., one.own.seen] = one.own.by_fold(one.jacobian, folds.count)
-        part_jacobian[place] = spread
-        part_gram[place] = one.own.by_fold(one.gram, folds.count)
-        part_score[place] = one.own.by_fold(one.score, folds.count)
-        part_held[place] = one.own.by_fold(one.held, folds.count)
+        own = one.own
+        place = np.s_[:, own.motor, one.felt]
+        # A motor sees some of the unknowns only.
+        jacobian = np.zeros((folds.count, len(one.felt), width, unknowns))
+        jacobian[..., own.seen] = own.by_fold(one.jacobian, folds.count)
+        part_jacobian[place] = jacobian
+        part_gram[place] = own.by_fold(one.gram, folds.count)
+        part_score[place] = own.by_fold(one.score, folds.count)
+        part_held[place] = own.by_fold(one.held, folds.count)
+    # Of the other folds: all, less the fold's own part.
     coupling = sums.jacobian.sum(axis=0) - part_jacobian.sum(axis=1)
     step_of_folds: list[FloatArray] = []
     pushed_of_folds: list[FloatArray] = []
@@ -531,36 +568,46 @@ def _held_out(
         step_of_folds.append(step)
         pushed_of_folds.append(pushed(step, hessian))
     steps = np.stack(step_of_folds)
+    # (Φ − J w_k)ᵀe on the other folds.
     drive = part_score.sum(axis=(0, 1)) - part_score.sum(axis=1)
     drive -= (steps @ folds.scores[:, None, :, None])[..., 0]
-    shown = part_held - (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
+    # (Φ − J w_k)ᵀr on the fold, motor by motor.
+    along_jacobian = (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
+    shown = part_held - along_jacobian
     # What the other folds do not show at all is left as it is: in its own unit, the shortest of all
     # solutions.
     unit = np.sqrt(sums.squares)
-    schur = sums.gram.sum(axis=0) - part_gram.sum(axis=1) - crossed_gram(coupling, steps)
-    inverse = _shortest_inverse(schur / (unit[:, :, None] * unit[:, None, :]))
-    without = (inverse @ (drive / unit)[..., None])[..., 0] / unit
+    other_gram = sums.gram.sum(axis=0) - part_gram.sum(axis=1)
+    schur = other_gram - crossed_gram(coupling, steps)
+    units = unit[:, :, None] * unit[:, None, :]
+    inverse = _shortest_inverse(schur / units)
+    in_own_unit = (drive / unit)[..., None]
+    without = (inverse @ in_own_unit)[..., 0] / unit
     # r − (Φ − J w_k) fitted, squared motor by motor.
-    inside = projected_gram(part_gram, part_jacobian, steps[:, None], np.stack(pushed_of_folds))
-    squares = before[:, :, None] - 2.0 * np.einsum("kncp,kcp->knc", shown, without)
+    pushed_steps = np.stack(pushed_of_folds)
+    inside = projected_gram(part_gram, part_jacobian, steps[:, None], pushed_steps)
+    linear = np.einsum("kncp,kcp->knc", shown, without)
+    squares = before[:, :, None] - 2.0 * linear
     squares += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
-    return _HeldOut(np.sum(drive * without, axis=-1), squares)
+    training_fall = np.sum(drive * without, axis=-1)
+    return _HeldOut(training_fall, squares)
 
 
 def _shortest_inverse(matrices: FloatArray) -> FloatArray:
-    """Pseudoinverse of matrices in their own units, shape (…, p, p);
-    of single numbers without a decomposition.
+    """Pseudoinverse of matrices in their own units, shape (…, p, p).
+
+    That of single numbers needs no decomposition.
     """
     if matrices.shape[-1] > 1:
         return np.asarray(np.linalg.pinv(matrices, rcond=UNSEEN))
-    return np.divide(1.0, matrices, out=np.zeros_like(matrices), where=matrices != 0.0)
+    inverse = np.zeros_like(matrices)
+    np.divide(1.0, matrices, out=inverse, where=matrices != 0.0)
+    return inverse
 
 
 @dataclass(frozen=True, slots=True)
 class _Products:
-    """Products of the candidates that one motor feels with its rows, block by block,
-    and of these with J, e and r.
-    """
+    """Products, block by block, of the candidates that one motor feels with J, Φ, e and r."""
 
     own: MotorRows  #: the motor's rows
     felt: IntArray  #: these candidates, among those of the batch
@@ -571,13 +618,10 @@ class _Products:
 
     def add_to(self, sums: MotorSums) -> None:
         """Put the sums over all blocks into their places."""
-        sums.put(
-            self.own,
-            self.felt,
-            jacobian=self.jacobian.sum(axis=0),
-            gram=self.gram.sum(axis=0),
-            score=self.score.sum(axis=0),
-        )
+        jacobian = self.jacobian.sum(axis=0)
+        gram = self.gram.sum(axis=0)
+        score = self.score.sum(axis=0)
+        sums.put(self.own, self.felt, jacobian=jacobian, gram=gram, score=score)
 
     def only(self, chosen: IntArray) -> _Products:
         """The same of some of the candidates of the batch, which are counted anew."""
@@ -593,16 +637,19 @@ class _Products:
 
 
 def _products(own: MotorRows, numbers: IntArray, candidates: Sequence[Felt]) -> _Products:
-    inside = np.stack([candidates[number][own.motor] for number in numbers])
-    flat = own.sums(inside.reshape(-1, inside.shape[-1]), own.equations)
-    beside = flat.reshape(len(flat), *inside.shape[:2], -1)
+    """Products of those candidates, by number, that a motor feels."""
+    columns = np.stack([candidates[number][own.motor] for number in numbers])
+    count, width, rows = columns.shape
+    flat = own.sums(columns.reshape(-1, rows), own.equations)
+    # The equations of a motor are (J, e, r).
+    with_equations = flat.reshape(len(flat), count, width, -1)
     return _Products(
         own=own,
         felt=numbers,
-        jacobian=beside[..., :-2],
-        gram=own.grams(inside),
-        score=beside[..., -2],
-        held=beside[..., -1],
+        jacobian=with_equations[..., :-2],
+        gram=own.grams(columns),
+        score=with_equations[..., -2],
+        held=with_equations[..., -1],
     )
 
 
@@ -612,13 +659,15 @@ def _rest(
     """One candidate without the moves of most leverage; None where it rests on many."""
     if moves_behind(projected) >= FEW_MOVES:
         return None
-    crossed = np.zeros((*projected.shape[:2], folds.linearisation.jacobian.width))
+    clusters_and_columns = projected.shape[:2]
+    crossed = np.zeros((*clusters_and_columns, folds.linearisation.jacobian.width))
     squares = np.zeros(projected.shape)
-    scores = np.zeros(projected.shape[:2])
+    scores = np.zeros(clusters_and_columns)
     for one in made:
         for index in np.flatnonzero(one.felt == place):
             clusters = one.own.cluster
-            crossed[clusters[:, None], :, one.own.seen] += np.swapaxes(one.jacobian[:, index], 1, 2)
+            jacobian = np.swapaxes(one.jacobian[:, index], 1, 2)
+            crossed[clusters[:, None], :, one.own.seen] += jacobian
             squares[clusters] += one.gram[:, index]
             scores[clusters] += one.score[:, index]
     return without_most_leverage(folds, crossed, squares, scores, projected)

@@ -34,7 +34,7 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray
-from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.candidates import CandidateTrial, SearchProblem, score_candidates
 from ident.discovery.gates import Gates, impossible, shifts_by, whitened_columns, without_effects_of
 from ident.discovery.search import Finding, paired_t
 from ident.effects.effect import PlacedEffect
@@ -49,8 +49,7 @@ def choice_covariance(
     left: Sequence[Finding],
     open_effects: Sequence[PlacedEffect] = (),
 ) -> FloatArray:
-    """Covariance of (gains, parameters) from the choice of the effects in a joint fit,
-    shape (m + p, m + p).
+    """Covariance of (gains, parameters) from the choice of the effects, shape (m + p, m + p).
 
     Args:
         search_problem: linearised around the joint fit.
@@ -59,30 +58,28 @@ def choice_covariance(
         left: findings that are no noise, but did not join; `fold_errors` are beside this fit.
         open_effects: effects that left the fit, and may be true.
     """
-    shifts = [np.zeros((0, len(estimate.covariance)))]
+    size = len(estimate.covariance)
+    shifts = [np.zeros((0, size))]
     for finding, others in accepted:
-        placed = finding.placed
-        found = {(one.effect, one.axis): one for one in others}
-        rivals = [
-            found[key] for one in finding.ambiguity if (key := (one.effect, one.axis)) in found
-        ]
-        if rivals:
-            reduced = without_effects_of(search_problem, estimate, (placed,))
-            torque = reduced.torque
-            errors = finding.fold_errors
-            shifts.append(
-                _by_rivals(reduced.search_problem, torque, errors, rivals, len(estimate.covariance))
-            )
+        found = {one.placed: one for one in others}
+        rivals = [found[placed] for placed in finding.ambiguity if placed in found]
+        if not rivals:
+            continue
+        reduced = without_effects_of(search_problem, estimate, (finding.placed,))
+        torque = reduced.torque
+        errors = finding.fold_errors
+        shifts.append(_by_rivals(reduced.search_problem, torque, errors, rivals, size))
     folds = search_problem.folds
     errors = folds.square_sum(folds.residual).sum(axis=1)
     nothing = np.zeros(len(folds.residual))
     for axis in sorted({one.axis for one in left}):
         rivals = [one for one in left if one.axis == axis]
-        shifts.append(_by_rivals(search_problem, nothing, errors, rivals, len(estimate.covariance)))
-    size = len(estimate.covariance)
-    shifts += [_by_open_effect(search_problem, errors, placed, size) for placed in open_effects]
-    whole = np.concatenate(shifts)
-    return whole.T @ whole
+        shifts.append(_by_rivals(search_problem, nothing, errors, rivals, size))
+    for placed in open_effects:
+        shifts.append(_by_open_effect(search_problem, errors, placed, size))
+    # Σ C_r over all models r.
+    all_shifts = np.concatenate(shifts)
+    return all_shifts.T @ all_shifts
 
 
 def is_small(finding: Finding, gates: Gates) -> bool:
@@ -106,26 +103,36 @@ def scored_beside(search_problem: SearchProblem, finding: Finding) -> Finding | 
         finding: of a problem around another fit.
     """
     columns = whitened_columns(search_problem, finding.effect, finding.axis)
-    (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
+    trial = _trial_of(search_problem, columns)
     if trial is None:
         return None
-    return replace(finding, coefficients=trial.coefficients, fold_errors=trial.held_out.sum(axis=1))
+    fold_errors = trial.held_out.sum(axis=1)
+    return replace(finding, coefficients=trial.coefficients, fold_errors=fold_errors)
+
+
+def _trial_of(search_problem: SearchProblem, columns: FloatArray) -> CandidateTrial | None:
+    """Test whitened columns, shape (rows, p), as one candidate."""
+    together = slice(0, columns.shape[1])
+    (trial,) = score_candidates(search_problem.folds, columns, (together,))
+    return trial
 
 
 def _by_open_effect(
     search_problem: SearchProblem, fold_errors: FloatArray, placed: PlacedEffect, size: int
 ) -> FloatArray:
-    """√w_r (θ_r − θ) of the model with an effect that left, shape (1, size);
-    no row where the fit contains it.
+    """√w_r (θ_r − θ) of the model with an effect that left, shape (1, size).
+
+    It has no row where the fit contains the effect.
     """
     effect = placed.effect
     if isinstance(effect, GeometryEffect):  # the description no longer has its applied part
         effect = effect.with_applied([0.0] * len(effect.coefficients))
     columns = whitened_columns(search_problem, effect, placed.axis)
-    (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
+    trial = _trial_of(search_problem, columns)
     if trial is None:
         return np.zeros((0, size))
-    weight = _weights(fold_errors, trial.held_out.sum(axis=1)[None])
+    with_effect = trial.held_out.sum(axis=1)
+    weight = _weights(fold_errors, with_effect[None])
     moved = shifts_by(search_problem.folds, columns @ trial.coefficients, size)
     return np.sqrt(weight)[:, None] * moved
 
@@ -138,8 +145,10 @@ def _weights(chosen: FloatArray, others: FloatArray) -> FloatArray:
         others: of the other models, shape (models, folds).
     """
     gain = chosen - others
-    better = scipy.special.stdtr(gain.shape[1] - 1, paired_t(gain))
-    odds = better / np.maximum(1.0 - better, np.finfo(np.float64).eps)
+    freedom = gain.shape[1] - 1
+    is_better = scipy.special.stdtr(freedom, paired_t(gain))  # p_r
+    is_worse = np.maximum(1.0 - is_better, np.finfo(np.float64).eps)
+    odds = is_better / is_worse
     return np.asarray(odds / (1.0 + odds.sum()))
 
 
@@ -150,8 +159,7 @@ def _by_rivals(
     rivals: Sequence[Finding],
     size: int,
 ) -> FloatArray:
-    """√w_r (θ_r − θ) of models with another effect in the place of the chosen one, shape (rivals,
-    size).
+    """√w_r (θ_r − θ) of models with another effect in place of the chosen one, (rivals, size).
 
     Args:
         search_problem: around the fit, without the chosen effect.
@@ -160,12 +168,14 @@ def _by_rivals(
         rivals: the other effects.
         size: m + p.
     """
-    weights = _weights(fold_errors, np.stack([one.fold_errors for one in rivals]))
+    errors_of_rivals = np.stack([one.fold_errors for one in rivals])
+    weights = _weights(fold_errors, errors_of_rivals)
     shifts = []
     for rival, weight in zip(rivals, weights, strict=True):
         columns = whitened_columns(search_problem, rival.effect, rival.axis)
-        (trial,) = score_candidates(search_problem.folds, columns, (slice(0, columns.shape[1]),))
+        trial = _trial_of(search_problem, columns)
         if trial is not None:
-            moved = shifts_by(search_problem.folds, columns @ trial.coefficients - torque, size)
+            more_torque = columns @ trial.coefficients - torque
+            moved = shifts_by(search_problem.folds, more_torque, size)
             shifts.append(np.sqrt(weight) * moved)
     return np.reshape(shifts, (-1, size))

@@ -49,9 +49,7 @@ DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although i
 
 @dataclass(frozen=True, slots=True)
 class PairedChange:
-    """Change of a squared error on the same rows, and its noise by the scatter of moves,
-    or of blocks of moves.
-    """
+    """Change of a squared error on the same rows, and its noise by moves, or by blocks of them."""
 
     rise: float  #: Σ ‖e‖² after − before; negative where the error falls
     std: float  #: its σ
@@ -67,19 +65,22 @@ class PairedChange:
     @property
     def sigmas(self) -> float:
         """The change in units of its σ; 0 where no σ is known."""
-        return self.rise / self.std if self.std > 0.0 else 0.0
+        if self.std > 0.0:
+            return self.rise / self.std
+        return 0.0
 
     def rises(self, confidence: float) -> bool:
         """Whether the error rises by more than its noise, at a one-sided confidence."""
         if self.moves < 2 or self.rise <= 0.0:
             return False
-        limit = float(scipy.special.stdtrit(self.moves - 1, confidence))
+        limit = _student_limit(self.moves - 1, confidence)
         return self.rise > limit * self.std or self._rises_in_most_blocks(confidence)
 
     def falls(self, confidence: float) -> bool:
         """Whether the error falls by more than its noise, at a one-sided confidence."""
-        opposite = tuple(-change for change in reversed(self.by_block))
-        return PairedChange(-self.rise, self.std, self.moves, opposite).rises(confidence)
+        opposite_blocks = tuple(-change for change in reversed(self.by_block))
+        opposite = PairedChange(-self.rise, self.std, self.moves, opposite_blocks)
+        return opposite.rises(confidence)
 
     def _rises_in_most_blocks(self, confidence: float) -> bool:
         """Whether the trimmed mean of the blocks is larger than zero by more than its noise."""
@@ -90,9 +91,12 @@ class PairedChange:
         changes = np.array(self.by_block)
         inner = changes[trimmed:-trimmed]
         left = len(inner)
+        # σ² of a trimmed mean is (n − 1) s_w²/(h (h − 1)), s_w² being the winsorised variance.
         winsorised = np.clip(changes, inner[0], inner[-1])
-        std = float(np.sqrt((count - 1) * np.var(winsorised, ddof=1) / (left * (left - 1))))
-        return float(inner.mean()) > float(scipy.special.stdtrit(left - 1, confidence)) * std
+        scatter = (count - 1) * np.var(winsorised, ddof=1)
+        std = float(np.sqrt(scatter / (left * (left - 1))))
+        limit = _student_limit(left - 1, confidence)
+        return float(inner.mean()) > limit * std
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,21 +122,22 @@ class ErrorChange:
         """Motors whose error rises by more than noise, and by more than the tolerance."""
         found: list[int] = []
         for motor, change in enumerate(self.motors):
-            enough = change.moves >= FEWEST_BLOCKS and _is_beyond(
-                change, self.before[motor], SAME_ERROR
-            )
-            if enough and change.rises(self.each_confidence):
+            if change.moves < FEWEST_BLOCKS:
+                continue
+            is_large = _is_beyond(change, self.before[motor], SAME_ERROR)
+            if is_large and change.rises(self.each_confidence):
                 found.append(motor)
         return tuple(found)
 
     @property
     def doubtful_motors(self) -> tuple[int, ...]:
         """Motors whose error rises by much, although it may be noise."""
-        return tuple(
-            motor
-            for motor, change in enumerate(self.motors)
-            if _is_beyond(change, self.before[motor], DOUBTFUL) and change.rise > change.std
-        )
+        found: list[int] = []
+        for motor, change in enumerate(self.motors):
+            is_large = _is_beyond(change, self.before[motor], DOUBTFUL)
+            if is_large and change.rise > change.std:
+                found.append(motor)
+        return tuple(found)
 
     @property
     def is_enough(self) -> bool:
@@ -146,11 +151,10 @@ class ErrorChange:
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
     def is_fall(self, motor: int | None = None, each: float = CONFIDENCE) -> bool:
-        """Whether the error falls by more than noise, in total,
-        or of the motor that a model claims to know better.
+        """Whether the error falls by more than noise, in total or of one motor.
 
         Args:
-            motor: that one; None where the total alone is judged.
+            motor: that a model claims to know better; None where the total alone is judged.
             each: one-sided confidence of either error. Two of them are asked, so noise falls more
                 often than one is.
         """
@@ -158,22 +162,26 @@ class ErrorChange:
             return False
         if motor is None:
             return self.total.falls(each)
+        if self.total.falls(each):
+            return True
         own = self.motors[motor]
-        return self.total.falls(each) or (own.moves >= FEWEST_BLOCKS and own.falls(each))
+        return own.moves >= FEWEST_BLOCKS and own.falls(each)
 
     def harm(self, data: str) -> str:
-        """Say where the error on some data rises by more than noise;
-        empty where it does nowhere.
-        """
+        """Say where the error on some data rises by more than noise; empty where nowhere."""
         if self.is_rise:
             return f"the squared error on {data} rises by {_size(self.total)}"
-        if worse := self.worse_motors:
-            worst = max(worse, key=lambda motor: self.motors[motor].sigmas)
-            return (
-                f"the squared error of motor {worst + 1} on {data} rises by "
-                f"{_size(self.motors[worst])}"
-            )
-        return ""
+        worse = self.worse_motors
+        if not worse:
+            return ""
+        worst = max(worse, key=lambda motor: self.motors[motor].sigmas)
+        size = _size(self.motors[worst])
+        return f"the squared error of motor {worst + 1} on {data} rises by {size}"
+
+
+def _student_limit(freedom: int, confidence: float) -> float:
+    """Student's t at a one-sided confidence."""
+    return float(scipy.special.stdtrit(freedom, confidence))
 
 
 def _is_beyond(change: PairedChange, before: float, share: float) -> bool:
@@ -186,17 +194,14 @@ def _size(change: PairedChange) -> str:
 
 
 def compare_by_move(change: FloatArray, move: IntArray) -> PairedChange:
-    """Sum the change of each row's squared error, shape (r,), with σ by clusters of moves,
-    shape (r,).
-    """
-    return _of_blocks(
-        np.asarray(np.bincount(np.unique(move, return_inverse=True)[1], change), dtype=np.float64)
-    )
+    """Sum the change of each row's squared error, with σ by clusters of moves, shape (r,) each."""
+    _, move_of_row = np.unique(move, return_inverse=True)
+    sums = np.bincount(move_of_row, change)
+    return _of_blocks(np.asarray(sums, dtype=np.float64))
 
 
 def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> PairedChange:
-    """Sum the change of each row's squared error, with σ by blocks of moves that are independent of
-    each other.
+    """Sum the change of each row's squared error, with σ by independent blocks of moves.
 
     Neighbouring moves of a run are joined in pairs, again and again, while the changes of
     neighbours correlate by more than CORRELATED standard errors (batch means, as in
@@ -212,12 +217,13 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
     runs = run[first]
     while len(sums) >= 2 * FEWEST_BLOCKS:  # fewer blocks than FEWEST_BLOCKS would judge nothing
         centred = sums - sums.mean()
-        products = (centred[1:] * centred[:-1])[runs[1:] == runs[:-1]]
-        if float(products.sum()) <= CORRELATED * float(np.linalg.norm(products)):
+        are_of_one_run = runs[1:] == runs[:-1]
+        products = (centred[1:] * centred[:-1])[are_of_one_run]
+        standard_error = float(np.linalg.norm(products))
+        if float(products.sum()) <= CORRELATED * standard_error:
             break
-        starts = np.sort(
-            np.concatenate([np.flatnonzero(runs == one)[::2] for one in np.unique(runs)])
-        )
+        every_other = [np.flatnonzero(runs == one)[::2] for one in np.unique(runs)]
+        starts = np.sort(np.concatenate(every_other))
         if len(starts) == len(sums):
             break
         sums = np.add.reduceat(sums, starts)
@@ -234,11 +240,10 @@ def change_of_errors(
     run: IntArray,
     motors: int,
 ) -> ErrorChange:
-    """Compare whitened squared errors of two models on the same rows,
-    of all motors below each other.
+    """Compare whitened squared errors of two models on the same rows.
 
     Args:
-        before, after: squared errors, shape (rows,).
+        before, after: squared errors, those of all motors below each other, shape (rows,).
         motor: of each row, shape (rows,).
         move, run: of each row, shape (rows,).
         motors: their number; one without rows does not change.
@@ -252,16 +257,22 @@ def change_of_errors(
         else:
             part = PairedChange(0.0, 0.0, 0)
         parts.append(part)
+    squares_before = np.bincount(motor, before, minlength=motors)
     return ErrorChange(
         total=compare_by_block(change, move, run),
         motors=tuple(parts),
-        before=np.asarray(np.bincount(motor, before, minlength=motors), dtype=np.float64),
+        before=np.asarray(squares_before, dtype=np.float64),
     )
 
 
 def _of_blocks(sums: FloatArray) -> PairedChange:
+    """Change of the whole, with σ by the scatter of the blocks' sums, shape (blocks,)."""
     count = len(sums)
-    spread = np.sum((sums - sums.mean()) ** 2) * count / max(count - 1, 1)
+    deviation = sums - sums.mean()
+    variance = np.sum(deviation**2) * count / max(count - 1, 1)
     return PairedChange(
-        float(sums.sum()), float(np.sqrt(spread)), count, tuple(np.sort(sums).tolist())
+        rise=float(sums.sum()),
+        std=float(np.sqrt(variance)),
+        moves=count,
+        by_block=tuple(np.sort(sums).tolist()),
     )

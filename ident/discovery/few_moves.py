@@ -1,5 +1,4 @@
-"""Candidates that rest on few moves: tested without the moves of most leverage,
-or left untested with what to record.
+"""Candidates that rest on few moves: tested without those of most leverage, or not at all.
 
 The moves' random signs tell noise from an effect by the scatter of moves. A candidate whose columns
 are large in one or two moves, as a saturation that only the largest currents reach, has no scatter
@@ -22,11 +21,9 @@ from ident.effects.signals import Abscissa
 from ident.equations.linearisation import RIDGE, Folds
 
 FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs test nothing
-FEW_MOVES = (
-    #: The same below which a candidate sets no limit for others, and is tested without those of
-    #: most leverage
-    8.0
-)
+#: The same below which a candidate sets no limit for others, and is tested without those of most
+#: leverage
+FEW_MOVES = 8.0
 SHARE = 0.01
 """Share of Φ⊥ᵀΦ⊥ that the other moves must hold: with less they know the coefficients ten times
 worse, and a test by them says nothing.
@@ -65,9 +62,7 @@ class ByMove(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MoveScores:
-    """Projected products of a candidate, cluster by cluster;
-    zero for clusters that were left out.
-    """
+    """Projected products of a candidate by cluster; zero for clusters that were left out."""
 
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
     #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
@@ -76,15 +71,18 @@ class MoveScores:
 
 
 def moves_behind(gram: FloatArray) -> float:
-    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m²,
-    the least of its coefficients.
+    """Effective number of moves that a candidate's columns rest on, (Σ G_m)²/Σ G_m².
+
+    It is the least of its coefficients.
 
     Args:
         gram: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
     """
     own = np.diagonal(gram, axis1=1, axis2=2)
-    squares = np.maximum(np.sum(own**2, axis=0), np.finfo(np.float64).tiny)
-    return float(np.min(own.sum(axis=0) ** 2 / squares))
+    squares = np.sum(own**2, axis=0)
+    squares = np.maximum(squares, np.finfo(np.float64).tiny)
+    squared_sums = own.sum(axis=0) ** 2
+    return float(np.min(squared_sums / squares))
 
 
 def without_most_leverage(
@@ -94,8 +92,9 @@ def without_most_leverage(
     scores: FloatArray,
     projected: FloatArray,
 ) -> MoveScores | None:
-    """Fit everything again without the clusters of most leverage;
-    None where the others do not show the candidate.
+    """Fit everything again without the clusters of most leverage.
+
+    None where the other clusters do not show the candidate.
 
     Args:
         folds: the problem.
@@ -104,29 +103,38 @@ def without_most_leverage(
         scores: Φᵀe of each cluster, shape (clusters, p).
         projected: Φ⊥ᵀΦ⊥ of each cluster on all rows, shape (clusters, p, p).
     """
-    share = np.einsum("mpq,qp->m", projected, np.linalg.pinv(projected.sum(axis=0)))
-    order = np.argsort(share)
+    projected_sum = projected.sum(axis=0)
+    # Leverage of each cluster, tr(G_m G⁻¹).
+    leverage = np.einsum("mpq,qp->m", projected, np.linalg.pinv(projected_sum))
+    order = np.argsort(leverage)
+    left_out = order[-LEVERAGE:]
     left = np.sort(order[:-LEVERAGE])
     clusters, unknowns, _ = folds.cluster_hessian.shape
-    whole_hessian = folds.motor_hessian.sum(axis=0)
-    hessian = whole_hessian - folds.cluster_hessian[order[-LEVERAGE:]].sum(axis=0)
-    factor = linalg.cho_factor(hessian + RIDGE * np.diag(np.diag(whole_hessian)), lower=True)
-    along = linalg.cho_solve(factor, crossed[left].sum(axis=0).T)
+    full_hessian = folds.motor_hessian.sum(axis=0)
+    hessian = full_hessian - folds.cluster_hessian[left_out].sum(axis=0)
+    ridge = RIDGE * np.diag(np.diag(full_hessian))
+    factor = linalg.cho_factor(hessian + ridge, lower=True)
+    # w = H⁻¹ JᵀΦ and x = H⁻¹ Jᵀe of the clusters that are left.
+    crossed_left = crossed[left]
+    along = linalg.cho_solve(factor, crossed_left.sum(axis=0).T)
     step = linalg.cho_solve(factor, folds.cluster_score[left].sum(axis=0))
     # H_m w and H_m x of every cluster by one product, which is far faster than a product for each.
-    all_pushed = folds.cluster_hessian.reshape(-1, unknowns) @ np.column_stack((along, step))
+    flat_hessians = folds.cluster_hessian.reshape(-1, unknowns)
+    all_pushed = flat_hessians @ np.column_stack((along, step))
     of_cluster = all_pushed.reshape(clusters, unknowns, -1)[left]
     pushed = of_cluster[:, :, :-1]
     pushed_step = of_cluster[:, :, -1]
-    beside = crossed[left] @ along
+    # (Φ − J w)ᵀ(Φ − J w) and (Φ − J w)ᵀ(e − J x) of each cluster.
+    beside = crossed_left @ along
     gram = squares[left] - beside - np.swapaxes(beside, 1, 2) + along.T @ pushed
-    own_score = scores[left] - crossed[left] @ step
+    own_score = scores[left] - crossed_left @ step
     declared_score = folds.cluster_score[left] - pushed_step
     score = own_score - declared_score @ along
-    whole = gram.sum(axis=0)
-    if np.any(np.diag(whole) < SHARE * np.diag(projected.sum(axis=0))):
+    gram_sum = gram.sum(axis=0)
+    least_seen = SHARE * np.diag(projected_sum)
+    if np.any(np.diag(gram_sum) < least_seen):
         return None
-    coefficients = np.linalg.pinv(whole) @ score.sum(axis=0)
+    coefficients = np.linalg.pinv(gram_sum) @ score.sum(axis=0)
     scatter_of_all = np.zeros_like(scores)
     scatter_of_all[left] = score - gram @ coefficients
     gram_of_all = np.zeros_like(squares)
@@ -135,9 +143,7 @@ def without_most_leverage(
 
 
 def is_tested_on_others(rest: MoveScores | None) -> bool:
-    """Whether a candidate that rests on few moves rests on enough others, too,
-    to be tested by these.
-    """
+    """Whether a candidate that rests on few moves rests on enough others to be tested by these."""
     return rest is not None and moves_behind(rest.gram) >= FEW_MOVES
 
 
@@ -150,9 +156,13 @@ def what_to_record(effect: Effect, gram: FloatArray, rest: MoveScores | None) ->
         rest: the candidate without the moves of most leverage.
     """
     count = max(round(moves_behind(gram)), 1)
-    noun = "move" if count == 1 else "moves"
+    if count == 1:
+        moves = "one move"
+    else:
+        moves = f"{NUMBERS[count]} moves"
     if is_tested_on_others(rest):
         why = "and the others do not show it"
     else:
         why = "too few to test it"
-    return f"it rests on {NUMBERS[count]} {noun}, {why}: record more {RECORD[effect.abscissa]}"
+    wanted = RECORD[effect.abscissa]
+    return f"it rests on {moves}, {why}: record more {wanted}"

@@ -1,5 +1,4 @@
-"""Limits of the search, and gates that are no matter of one score:
-physics, parts left out, gains, effects together.
+"""Limits of the search, and gates beside the scores: physics, parts left out, gains, other effects.
 
 A column declares which values physics allows its coefficient (`ident.model.model.Column`);
 `impossible` compares an estimate with them. `PartsLeftOut` predicts parts of the data without and
@@ -62,33 +61,35 @@ class Gates:
 
     @property
     def smallest_share(self) -> float:
-        """Share of a motor's squared residual below which an effect fails a gate,
-        if held-out moves fall as all do.
+        """Share of a motor's squared residual below which an effect fails a gate.
+
+        Held-out moves are taken to fall as all do.
         """
-        return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
+        smallest_fall = 1.0 - (1.0 - self.error_fall) ** 2
+        return max(self.explained, smallest_fall)
 
 
 def impossible(
     columns: Sequence[Column], values: FloatArray, deviations: FloatArray, tolerance: float = SIGMAS
 ) -> str:
-    """Name the coefficients that are outside their possible values by more than a number of σ;
-    empty without any.
-    """
-    found = []
+    """Name the coefficients outside their possible values by a number of σ; empty without any."""
+    found: list[str] = []
     for column, value, std in zip(columns, values, deviations, strict=True):
-        size = f"{column.name} is {value:.3g} ± {std:.2g} {column.unit}; physics allows"
         if value < column.least - tolerance * std:
-            found.append(f"{size} no less than {column.least:g}")
+            limit = f"no less than {column.least:g}"
         elif value > column.largest + tolerance * std:
-            found.append(f"{size} no more than {column.largest:g}")
+            limit = f"no more than {column.largest:g}"
+        else:
+            continue
+        size = f"{value:.3g} ± {std:.2g} {column.unit}"
+        found.append(f"{column.name} is {size}; physics allows {limit}")
     return ", ".join(found)
 
 
 def possible_values(
     columns: Sequence[Column], values: FloatArray, covariance: FloatArray
 ) -> FloatArray:
-    """Move the first values into what physics allows, and the others with them,
-    by their covariance, shape (n,).
+    """Move the first values into what physics allows, and the others by their covariance, (n,).
 
     It is what the same fit finds, to first order, if the values that are outside are held at their
     bounds.
@@ -111,8 +112,11 @@ def possible_values(
         held |= {int(place): float(inside[place]) for place in outside}
         places = list(held)
         wanted = np.array(list(held.values()))
-        precision = np.linalg.pinv(covariance[np.ix_(places, places)], hermitian=True)
-        moved = values + covariance[:, places] @ precision @ (wanted - values[places])
+        # χ + C_h C_hh⁻¹ (bound − χ_h), of those that are held, h.
+        own_covariance = covariance[np.ix_(places, places)]
+        precision = np.linalg.pinv(own_covariance, hermitian=True)
+        missing = wanted - values[places]
+        moved = values + covariance[:, places] @ precision @ missing
         moved[places] = wanted
     return moved
 
@@ -131,29 +135,31 @@ def certain_delays(seconds: FloatArray, deviations: FloatArray) -> BoolArray:
 
 
 def probability_of_zero(values: FloatArray, covariance: FloatArray) -> float:
-    """Probability that coefficients which are all zero are estimated this far from it,
-    by Wald's test, shape (p,).
-    """
-    wald = float(values @ np.linalg.pinv(covariance, hermitian=True) @ values)
+    """Probability by Wald's test that coefficients of zero are estimated as far from it, (p,)."""
+    precision = np.linalg.pinv(covariance, hermitian=True)
+    wald = float(values @ precision @ values)
     return float(scipy.special.chdtrc(len(values), wald))
 
 
 def runs_to_leave_out(observation: Observation) -> tuple[int, ...]:
-    """Runs that can be left out: of at least MIN_RUNS, those whose payload, or lack of one,
-    is in another run too.
+    """Runs, of at least MIN_RUNS, that can be left out.
+
+    The payload of each, or the lack of one, is in another run too.
     """
     runs = np.unique(observation.run)
     mounted = np.array([observation.mounting[observation.run == run][0] for run in runs])
     if len(runs) < MIN_RUNS:
         return ()
-    return tuple(
-        int(run) for run, own in zip(runs, mounted, strict=True) if np.sum(mounted == own) > 1
-    )
+    found: list[int] = []
+    for run, own in zip(runs.tolist(), mounted, strict=True):
+        with_payload = np.sum(mounted == own)
+        if with_payload > 1:
+            found.append(run)
+    return tuple(found)
 
 
 def regions_to_leave_out(observation: Observation, position: FloatArray) -> IntArray:
-    """Region of the workspace that each row is in, shape (r,);
-    empty where there are too few moves to leave some out.
+    """Region of the workspace of each row, shape (r,); empty where moves are too few to leave out.
 
     Moves are parted by their mean posture, each joint in units of its scatter: the region with the
     most moves is cut at the median along the direction in which its moves differ most, until there
@@ -169,14 +175,17 @@ def regions_to_leave_out(observation: Observation, position: FloatArray) -> IntA
     rows = np.bincount(move_of_row)
     means = np.stack([np.bincount(move_of_row, joint) / rows for joint in position], axis=1)
     scatter = means.std(axis=0)
-    posture = (means - means.mean(axis=0)) / np.where(scatter > 0.0, scatter, 1.0)
+    unit = np.where(scatter > 0.0, scatter, 1.0)
+    posture = (means - means.mean(axis=0)) / unit
     region = np.zeros(len(moves), dtype=np.int64)
     for new in range(1, REGIONS):
-        largest = np.flatnonzero(region == np.argmax(np.bincount(region)))
-        centred = posture[largest] - posture[largest].mean(axis=0)
-        axis = np.linalg.svd(centred, full_matrices=False)[2][0]
-        order = np.argsort(centred @ axis, kind="stable")
-        region[largest[order[len(order) // 2 :]]] = new
+        largest = np.argmax(np.bincount(region))
+        members = np.flatnonzero(region == largest)
+        centred = posture[members] - posture[members].mean(axis=0)
+        _, _, directions = np.linalg.svd(centred, full_matrices=False)
+        order = np.argsort(centred @ directions[0], kind="stable")
+        upper_half = order[len(order) // 2 :]
+        region[members[upper_half]] = new
     return np.asarray(region[move_of_row])
 
 
@@ -185,7 +194,9 @@ def _can_be_left_out(observation: Observation, region: IntArray) -> tuple[int, .
     found: list[int] = []
     for own in range(REGIONS):
         rest = region != own
-        if set(observation.mounting[~rest]) <= set(observation.mounting[rest]):
+        mounted = set(observation.mounting[~rest])
+        mounted_elsewhere = set(observation.mounting[rest])
+        if mounted <= mounted_elsewhere:
             found.append(own)
     return tuple(found)
 
@@ -200,8 +211,9 @@ class _Others:
 
 @dataclass(frozen=True, slots=True)
 class PartsLeftOut:
-    """A linearised problem cut into parts, runs or regions of the workspace:
-    the others predict each.
+    """A linearised problem cut into parts, of which the others predict each.
+
+    Parts are runs or regions of the workspace.
     """
 
     search_problem: SearchProblem  #: the problem
@@ -212,9 +224,7 @@ class PartsLeftOut:
 
     @classmethod
     def of(cls, search_problem: SearchProblem) -> PartsLeftOut:
-        """Cut a search problem into its runs;
-        into regions of the workspace where no run can be left out.
-        """
+        """Cut a search problem into its runs, or into regions where no run can be left out."""
         folds = search_problem.folds
         observation = search_problem.observation
         left_out = runs_to_leave_out(observation)
@@ -239,12 +249,12 @@ class PartsLeftOut:
             rest = part_of != part
             factor = _factor(hessian[rest].sum(axis=0), seen_by_all)
             others.append(_Others(factor, score[rest].sum(axis=0)))
-        return cls(search_problem, name, part_of, tuple(others) if left_out else ())
+        if not left_out:
+            others = []
+        return cls(search_problem, name, part_of, tuple(others))
 
     def change(self, columns: FloatArray) -> ErrorChange:
-        """Change of the errors on parts left out when whitened columns, shape (rows, p),
-        join the model.
-        """
+        """Change of the errors on parts left out with whitened columns, (rows, p), in the model."""
         folds = self.search_problem.folds
         problem = folds.linearisation
         observation = self.search_problem.observation
@@ -263,8 +273,12 @@ class PartsLeftOut:
             beside = motor.sums(own, motor.equations)
             np.add.at(scores, part_of, beside[..., -2])
             for part in np.unique(part_of):
-                crossed[part][:, motor.seen] += beside[part_of == part][..., :-2].sum(axis=0)
-        unit = np.sqrt(np.maximum(np.diag(grams.sum(axis=0)), np.finfo(np.float64).tiny))
+                own_jacobian = beside[part_of == part][..., :-2]
+                crossed[part][:, motor.seen] += own_jacobian.sum(axis=0)
+        gram_of_all = grams.sum(axis=0)
+        squares = np.maximum(np.diag(gram_of_all), np.finfo(np.float64).tiny)
+        unit = np.sqrt(squares)
+        units = np.outer(unit, unit)
         # What the fit of the others predicts of each part, without the columns, and what these
         # change of it.
         steps = np.zeros((count, 2, unknowns))
@@ -274,20 +288,24 @@ class PartsLeftOut:
                 continue
             rest = crossed.sum(axis=0) - crossed[part]
             along = linalg.cho_solve(fit.factor, rest.T).T
-            left = grams.sum(axis=0) - grams[part] - rest @ along.T
+            left = gram_of_all - grams[part] - rest @ along.T
             drive = scores.sum(axis=0) - scores[part] - along @ fit.score
-            coefficients[part] = (
-                np.linalg.pinv(left / np.outer(unit, unit), rcond=UNSEEN) @ (drive / unit) / unit
-            )
-            steps[part] = linalg.cho_solve(fit.factor, fit.score), coefficients[part] @ along
-        without, turned = np.concatenate(
-            [motor.predicted(list(steps[self.part_of[motor.cluster]])) for motor in folds.motors],
-            axis=1,
-        )
+            inverse = np.linalg.pinv(left / units, rcond=UNSEEN)
+            coefficients[part] = inverse @ (drive / unit) / unit
+            steps[part, 0] = linalg.cho_solve(fit.factor, fit.score)
+            steps[part, 1] = coefficients[part] @ along
+        predicted: list[FloatArray] = []
+        for motor in folds.motors:
+            part_of = self.part_of[motor.cluster]
+            predicted.append(motor.predicted(list(steps[part_of])))
+        without, turned = np.concatenate(predicted, axis=1)
         part_of_row = self.part_of[problem.cluster]
+        # e − J x without the columns; with them e − J x + J w c − Φ c.
         before = problem.residual - without
-        after = before + turned - np.einsum("rp,rp->r", columns, coefficients[part_of_row])
-        shown = np.array([fit is not None for fit in self.others])[part_of_row]
+        added = np.einsum("rp,rp->r", columns, coefficients[part_of_row])
+        after = before + turned - added
+        is_shown = np.array([fit is not None for fit in self.others])
+        shown = is_shown[part_of_row]
         source = problem.source[shown]
         return change_of_errors(
             before=before[shown] ** 2,
@@ -299,20 +317,19 @@ class PartsLeftOut:
         )
 
     def refusal(self, columns: FloatArray) -> str:
-        """Why whitened columns may not join;
-        empty where they may, or where nothing can be left out.
-        """
+        """Why whitened columns may not join; empty where they may, or nothing can be left out."""
         if not self.others:
             return ""
         change = self.change(columns)
         data = f"{self.name} left out"
-        if harm := change.harm(data):
+        harm = change.harm(data)
+        if harm:
             return harm
         # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
-        of_motor = np.bincount(
-            self.search_problem.folds.linearisation.motor, np.sum(columns**2, axis=1)
-        )
-        if not change.is_enough or change.is_fall(int(np.argmax(of_motor))):
+        problem = self.search_problem.folds.linearisation
+        of_motor = np.bincount(problem.motor, np.sum(columns**2, axis=1))
+        most_affected = int(np.argmax(of_motor))
+        if not change.is_enough or change.is_fall(most_affected):
             return ""
         size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
         return f"the squared error on {data} changes by {size}, which may be noise"
@@ -321,9 +338,8 @@ class PartsLeftOut:
 def whitened_columns(search_problem: SearchProblem, effect: Effect, axis: int) -> FloatArray:
     """Columns of an effect beside the Jacobian of a search problem, shape (rows, p)."""
     torque = search_problem.torque(effect, axis)
-    return search_problem.folds.linearisation.whitened(
-        torque, search_problem.model.drive_train.to_motor
-    )
+    to_motor = search_problem.model.drive_train.to_motor
+    return search_problem.folds.linearisation.whitened(torque, to_motor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,15 +358,15 @@ class Reduced:
 
 def own_unknowns(estimate: Estimate, effects: Sequence[PlacedEffect]) -> IntArray:
     """Places of the coefficients of effects among the parameters of an estimate, shape (p,)."""
-    names = {column.name for placed in effects for column in placed.columns}
+    names: set[str] = set()
+    for placed in effects:
+        names.update(column.name for column in placed.columns)
     places = [index for index, column in enumerate(estimate.unknowns) if column.name in names]
     return np.array(places, dtype=np.int64)
 
 
 def values_of(estimate: Estimate, own: IntArray) -> FloatArray:
-    """Values of some parameters, what was applied to the description of the robot included,
-    shape (p,).
-    """
+    """Values of some parameters with what was applied to the robot's description, shape (p,)."""
     applied = np.array([estimate.unknowns[index].about for index in own])
     return np.asarray(estimate.parameters[own] + applied)
 
@@ -366,26 +382,31 @@ def without_effects_of(
         effects: in the fit.
     """
     own = own_unknowns(estimate, effects)
+    gains = len(estimate.gains)
     problem = search_problem.folds.linearisation
-    taken = np.isin(problem.free, len(estimate.gains) + own)
+    taken = np.isin(problem.free, gains + own)
     columns = problem.jacobian.columns(np.flatnonzero(taken)) / problem.scale[taken]
     torque = columns @ values_of(estimate, own)
     rest = problem.jacobian.only(np.flatnonzero(~taken))
-    for place, motor in enumerate(problem.free[problem.free < len(estimate.gains)]):
+    free_gains = problem.free[problem.free < gains]
+    for place, motor in enumerate(free_gains):
         # ∂(γ τ)/∂g = −γ² τ, and τ loses these effects; with preload ∂e/∂g_i = (T_D)_i (v_i − σ_i
         # e_i), in all rows.
         lost = torque[problem.rows_of(motor)]
         scale = problem.scale[place]
         if problem.transform is None:
-            rest.parts[motor][rest.seen[motor] == place] += lost * problem.gamma[motor] * scale
+            own_gain = rest.seen[motor] == place
+            rest.parts[motor][own_gain] += lost * problem.gamma[motor] * scale
             continue
         for other, (part, seen) in enumerate(zip(rest.parts, rest.seen, strict=True)):
-            passed = problem.transform[problem.source[problem.rows_of(other)], other, motor]
+            rows = problem.source[problem.rows_of(other)]
+            passed = problem.transform[rows, other, motor]
             part[seen == place] += lost * passed * problem.noise[motor] * scale
     # Around the estimate, from which the torque was taken.
     residual = problem.residual + problem.jacobian @ search_problem.step + torque
     hessian = sum_of_squares(rest)
-    step = linalg.cho_solve(_factor(hessian, np.diag(hessian)), rest.on_columns(residual))
+    factor = _factor(hessian, np.diag(hessian))
+    step = linalg.cho_solve(factor, rest.on_columns(residual))
     reduced = replace(
         problem,
         jacobian=rest,
@@ -394,23 +415,33 @@ def without_effects_of(
         scale=problem.scale[~taken],
     )
     # The rows keep their order: they are dealt to the same folds again.
-    folds = cut_into_folds(reduced, move_of=problem.of_clusters(search_problem.observation.move))
+    move_of = problem.of_clusters(search_problem.observation.move)
+    folds = cut_into_folds(reduced, move_of=move_of)
     return Reduced(replace(search_problem, folds=folds, step=step), columns, torque)
 
 
 def gain_shifts(folds: Folds, torque: FloatArray) -> FloatArray:
-    """Shift of each gain when a whitened torque, shape (rows,),
-    joins the model [Nm at the joint per A], shape (m,).
+    """Shift of each gain by a whitened torque in the model [Nm at the joint per A], shape (m,).
+
+    Args:
+        folds: the problem.
+        torque: that joins the model, shape (rows,).
     """
-    count = len(folds.linearisation.gamma)
-    return shifts_by(folds, torque, max(count, int(folds.linearisation.free[-1]) + 1))[:count]
+    problem = folds.linearisation
+    count = len(problem.gamma)
+    last = int(problem.free[-1])
+    return shifts_by(folds, torque, max(count, last + 1))[:count]
 
 
 def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
-    """Shift of (gains, parameters), size of them, when a whitened torque, shape (rows,),
-    joins the model.
+    """Shift of (gains, parameters) by a whitened torque in the model, shape (size,).
 
     It is zero for what is fixed and for what the problem does not hold.
+
+    Args:
+        folds: the problem.
+        torque: that joins the model, shape (rows,).
+        size: number of gains and parameters.
     """
     problem = folds.linearisation
     shifts = np.zeros(size)
@@ -420,11 +451,10 @@ def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
 
 
 def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, float], ...]:
-    """Index of each gain that moves by more than its σ, and by how many;
-    fixed gains do not move.
-    """
-    times = np.divide(np.abs(shifts), gains_std, where=gains_std > 0.0, out=np.zeros_like(shifts))
-    return tuple((motor, float(size)) for motor, size in enumerate(times) if size > 1.0)
+    """Index of each gain that moves by more than its σ, and by how many; fixed gains never move."""
+    sigmas = np.zeros_like(shifts)
+    np.divide(np.abs(shifts), gains_std, where=gains_std > 0.0, out=sigmas)
+    return tuple((motor, size) for motor, size in enumerate(sigmas.tolist()) if size > 1.0)
 
 
 def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> tuple[FloatArray, bool]:

@@ -1,5 +1,4 @@
-"""An identification with the geometry that the encoders of a redundant drive show,
-and what its σ does to the gains.
+"""The geometry that the encoders of a redundant drive show, and what its σ does to the gains.
 
 The corrections come from positions alone (`ident.estimators.geometry_estimate`), before any torque
 is looked at, so that they cannot take up what belongs to gains or effects. The gains depend on them
@@ -52,64 +51,64 @@ def geometry_covariance(
         raise IdentificationError(
             "the identification has not kept its rows; expected identify(..., keep_rows=True)"
         )
-    center = _vector(found.estimate)
+    center = _gains_and_parameters(found.estimate)
     parameters = [one.parameter for one in finding.corrections]
     values = np.array([one.change for one in finding.corrections])
-    variance, ways = np.linalg.eigh(finding.covariance)
+    variance, directions = np.linalg.eigh(finding.covariance)
+    deviations = np.sqrt(np.maximum(variance, 0.0))
     shifts: list[FloatArray] = []
-    for size, way in zip(np.sqrt(np.maximum(variance, 0.0)), ways.T, strict=True):
-        step = max(LEAST_STEP, float(size))
-        beside = values + step * way
+    for std, direction in zip(deviations, directions.T, strict=True):
+        step = max(LEAST_STEP, float(std))
+        beside = values + step * direction
         changes = [GeometryChange(*pair) for pair in zip(parameters, beside.tolist(), strict=True)]
-        moved = _vector(_estimated(found, model_with_geometry(described, changes))) - center
-        shifts.append(moved * (size / step))
-    others = [
-        _alternative(found, described, finding, number) - center
-        for number in range(len(finding.alternatives))
-    ]
+        moved = _estimated(found, described, changes) - center
+        shifts.append(moved * (std / step))
+    others: list[FloatArray] = []
+    for alternative in finding.alternatives:
+        changes = [GeometryChange(one.parameter, one.change) for one in alternative]
+        others.append(_estimated(found, described, changes) - center)
     if others:
-        shifts.append(max(others, key=lambda shift: shift_in_sigmas(shift, found.estimate)))
+        largest = max(others, key=lambda shift: shift_in_sigmas(shift, found.estimate))
+        shifts.append(largest)
     columns = np.stack(shifts, axis=1)
     return np.asarray(columns @ columns.T)
 
 
 def shift_in_sigmas(shift: FloatArray, estimate: Estimate) -> float:
-    """Size of a shift of (gains, parameters), shape (m + p,), in σ of the gains,
-    or of parameters beside fixed gains.
+    """Size of a shift of (gains, parameters), shape (m + p,), in σ of the gains.
 
-    A gain of 100 Nm/A that moves by 1 moves less than one of 1 Nm/A that moves by 0.1.
+    Beside fixed gains it is in σ of the parameters. A gain of 100 Nm/A that moves by 1 moves less
+    than one of 1 Nm/A that moves by 0.1.
     """
     gains = len(estimate.gains)
-    part = slice(gains, None) if estimate.gains_fixed else slice(gains)
+    if estimate.gains_fixed:
+        part = slice(gains, None)
+    else:
+        part = slice(gains)
     std = np.sqrt(np.diag(estimate.covariance))[part]
-    return float(
-        np.linalg.norm(np.divide(shift[part], std, out=np.zeros_like(std), where=std > 0.0))
-    )
+    in_sigmas = np.zeros_like(std)
+    np.divide(shift[part], std, out=in_sigmas, where=std > 0.0)
+    return float(np.linalg.norm(in_sigmas))
 
 
-def _alternative(
-    found: Identification, described: Model, finding: GeometryFinding, number: int
-) -> FloatArray:
-    """Gains and parameters with another explanation of the misfit."""
-    changes = [GeometryChange(one.parameter, one.change) for one in finding.alternatives[number]]
-    return _vector(_estimated(found, model_with_geometry(described, changes)))
-
-
-def _vector(estimate: Estimate) -> FloatArray:
+def _gains_and_parameters(estimate: Estimate) -> FloatArray:
     return np.concatenate((estimate.gains, estimate.parameters))
 
 
-def _estimated(found: Identification, model: Model) -> Estimate:
-    """Estimate the runs of an identification with another geometry."""
+def _estimated(
+    found: Identification, described: Model, changes: Sequence[GeometryChange]
+) -> FloatArray:
+    """Gains and parameters by the runs of an identification with another geometry."""
     assert found.gathered is not None
     datasets, _ = found.gathered
+    model = model_with_geometry(described, changes)
     of_fit = datasets[: len(found.system.runs)]
     system = observe(model, of_fit, found.conditioning, found.system).system()
     if found.estimate.gains_fixed:
         fixed = found.estimate.gains
     else:
         fixed = None
-    return estimate_with(found.estimate.method, system, fixed)
+    return _gains_and_parameters(estimate_with(found.estimate.method, system, fixed))
 
 
 def with_geometry_covariance(found: Identification, covariance: FloatArray) -> Identification:
@@ -121,11 +120,11 @@ def with_geometry_covariance(found: Identification, covariance: FloatArray) -> I
 def evidence_with_geometry(
     evidence: Evidence, covariance: FloatArray, unknowns: Sequence[Column]
 ) -> Evidence:
-    """Add the uncertainty of the geometry to an estimate with effects,
-    whose own parameters it leaves alone.
+    """Add the uncertainty of the geometry to an estimate with effects.
 
-    Rows are found by the names of the parameters: where gravity was turned, there are other base
-    parameters. Those that are new have no part in it.
+    The parameters of the effects stay as they are. Rows are found by the names of the parameters:
+    where gravity was turned, there are other base parameters. Those that are new have no part in
+    it.
 
     Args:
         evidence: with effects.
@@ -141,6 +140,6 @@ def evidence_with_geometry(
         if column.name in place_of:
             targets.append(place_of[column.name])
             sources.append(source)
-    whole = estimate.covariance.copy()
-    whole[np.ix_(targets, targets)] += covariance[np.ix_(sources, sources)]
-    return with_estimate(evidence, replace(estimate, covariance=whole))
+    total = estimate.covariance.copy()
+    total[np.ix_(targets, targets)] += covariance[np.ix_(sources, sources)]
+    return with_estimate(evidence, replace(estimate, covariance=total))

@@ -42,14 +42,14 @@ class LateCurrents:
 
 
 def rough_torque_rates(evidence: Evidence) -> FloatArray:
-    """Rate of each motor's predicted torque by differences of the rows of a fit [Nm/s], shape (m,
-    r).
+    """Rate of each motor's predicted torque by differences of rows [Nm/s], shape (m, r).
 
     It takes no time, and misses a third of what `torque_rates` has: enough to see whether a current
     may be late.
     """
     rows = evidence.training
-    torque_nm = evidence.model.drive_train.to_motor @ evidence.estimate.predicted_torque(rows)
+    predicted_nm = evidence.estimate.predicted_torque(rows)
+    torque_nm = evidence.model.drive_train.to_motor @ predicted_nm
     rates = np.zeros_like(torque_nm)
     for run in np.unique(rows.run):
         own = rows.run == run
@@ -118,7 +118,8 @@ def find_late_currents(
     skews = [family for family in tested if isinstance(family.members[0][0], TimeSkew)]
     if not lags:
         return None
-    columns = np.concatenate([delay_columns(problem, one, rates_nm_s) for one in lags], axis=1)
+    of_each = [delay_columns(problem, one, rates_nm_s) for one in lags]
+    columns = np.concatenate(of_each, axis=1)
     (trial,) = problem.trials([columns])
     if trial is None:
         return None
@@ -150,8 +151,7 @@ def find_late_currents(
 
 
 def _are_alike(seconds: FloatArray, covariance: FloatArray) -> bool:
-    """Whether delays are one common delay:
-    none differs from it by more than its σ explains and filters may.
+    """Whether delays are one common delay, by the σ of each and what filters may differ by.
 
     Args:
         seconds: of each motor, shape (m,).
@@ -163,7 +163,8 @@ def _are_alike(seconds: FloatArray, covariance: FloatArray) -> bool:
     # Each delay less the common one, and the σ of that.
     less_common = np.eye(len(seconds)) - weights
     differences = np.abs(less_common @ seconds)
-    std = np.sqrt(np.diag(less_common @ covariance @ less_common.T))
+    of_differences = less_common @ covariance @ less_common.T
+    std = np.sqrt(np.diag(of_differences))
     allowed = np.maximum(ALIKE_SIGMAS * std, ALIKE_SHARE * abs(common))
     return bool(np.all(differences <= allowed))
 
@@ -171,8 +172,7 @@ def _are_alike(seconds: FloatArray, covariance: FloatArray) -> bool:
 def with_delays(
     evidence: Evidence, effects: Sequence[PlacedEffect], seconds: FloatArray
 ) -> Evidence:
-    """Refit with delays in the model, each with the filter that makes it a delay to second order
-    (see `Lag`).
+    """Refit with delays in the model, each with the filter of second order (see `Lag`).
 
     Args:
         evidence: the fit without them.
@@ -185,21 +185,21 @@ def with_delays(
     found = evidence
     values = seconds
     for _ in range(REFITS):
-        placed = [
-            _with_filter(one, float(value)) for one, value in zip(effects, values, strict=True)
-        ]
+        delays = zip(effects, values.tolist(), strict=True)
+        placed = [_with_filter(one, value) for one, value in delays]
         found = with_effects(evidence, (*evidence.effects, *placed))
         before = values
         fitted = [coefficients_of(found.estimate, one) for one in placed]
         values = np.concatenate([value for value, _ in fitted])
         std = np.concatenate([deviation for _, deviation in fitted])
-        if np.all(np.abs(values - before) < SETTLED * std):
+        change = np.abs(values - before)
+        if np.all(change < SETTLED * std):
             break
     return found
 
 
 def _with_filter(placed: PlacedEffect, seconds: float) -> PlacedEffect:
     """A delay with its filter, T = c/2."""
-    filter_s = float(f"{0.5 * abs(seconds):.4g}")
-    setting = placed.effect.with_settings({"filter_s": filter_s, "backwards": int(seconds < 0.0)})
-    return replace(placed, effect=setting)
+    half_s = 0.5 * abs(seconds)
+    settings = {"filter_s": float(f"{half_s:.4g}"), "backwards": int(seconds < 0.0)}
+    return replace(placed, effect=placed.effect.with_settings(settings))

@@ -1,5 +1,4 @@
-"""Find missing effects: add what the residual calls for, refit everything,
-and examine the new residual.
+"""Find missing effects: add what the residual calls for, refit all, and examine the new residual.
 
 `find_effects` is the entry; `ident.discovery.evidence.gather` prepares the rows behind an
 identification for it.
@@ -7,15 +6,15 @@ identification for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ident.arrays import FloatArray, takes
 from ident.discovery.balancer import propose_balancers
 from ident.discovery.cables import propose_cables
-from ident.discovery.candidates import ColumnCache, SearchProblem
+from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem
 from ident.discovery.choice import choice_covariance, is_small, scored_beside
 from ident.discovery.effect_verdict import EffectVerdict
 from ident.discovery.evidence import Evidence, place_names, with_effects, with_estimate
@@ -106,10 +105,12 @@ class Step:
 
     def ranked(self, count: int) -> tuple[Finding, ...]:
         """The best findings on named effects, and the accepted one wherever it ranks."""
-        best, added = self.findings[:count], self.accepted
-        if added is None or effect_key(added.effect, added.axis) in {
-            effect_key(one.effect, one.axis) for one in best
-        }:
+        best = self.findings[:count]
+        added = self.accepted
+        if added is None:
+            return best
+        listed = {effect_key(one.effect, one.axis) for one in best}
+        if effect_key(added.effect, added.axis) in listed:
             return best
         return (*best, added)
 
@@ -202,8 +203,10 @@ def find_effects(
         families = (*families, *families_of(own_effects, "`own_effects`"))
     names = place_names(start.model, axes)
     steps: list[Step] = []
+    if mistakes is None and geometry:
+        mistakes = _named_mistakes(start, rng, gates, own_effects)
     if mistakes is None:
-        mistakes = _named_mistakes(start, rng, gates, own_effects) if geometry else ()
+        mistakes = ()
     corrections = [found for found in mistakes if not isinstance(found.effect, CLOCK)]
     delays = [found for found in mistakes if isinstance(found.effect, CLOCK)]
     corrected = start
@@ -220,9 +223,8 @@ def find_effects(
     found, model = search(corrected, MAX_EFFECTS)
     if delays and found[-1].accepted is None:
         progress("testing the clock beside what was found")
-        late = join_mistakes(
-            model, _named_mistakes(model.evidence, rng, gates, own_effects), rng, gates
-        )
+        named = _named_mistakes(model.evidence, rng, gates, own_effects)
+        late = join_mistakes(model, named, rng, gates)
         aside += late.set_aside
         if late.joined:
             *found, last = found  # a turn that has found nothing is the last one of all
@@ -243,14 +245,17 @@ def _corrected(
     rng: np.random.Generator,
     gates: Gates,
 ) -> tuple[list[Step], Evidence, tuple[SetAside, ...]]:
-    """Join corrections of the description: a turn for each that joins, the model with them,
-    and what does not join.
+    """Join corrections of the description.
 
     The linearised problem ends here: it is large, and the search makes its own.
+
+    Returns:
+        a turn for each that joins, the model with them, and what does not join.
     """
     model = linearised(start, ColumnCache())
     joined = join_mistakes(model, corrections, rng, gates)
-    steps = _steps_of(joined, mistakes, detection_limits_nm(model.search_problem, gates))
+    limits_nm = detection_limits_nm(model.search_problem, gates)
+    steps = _steps_of(joined, mistakes, limits_nm)
     return steps, joined.model.evidence, joined.set_aside
 
 
@@ -264,17 +269,18 @@ def _searched(
     progress: Callable[[str], None],
     names: Sequence[str],
 ) -> tuple[list[Step], JointFit]:
-    """Take turns until one finds nothing, at most so many and at least one:
-    the turns, and the model behind them.
+    """Take turns until one finds nothing, at most so many and at least one.
+
+    Returns:
+        the turns, and the model behind them.
     """
     model = linearised(start, ColumnCache())
     steps: list[Step] = []
     for _ in range(max(most, 1)):
         step, joined = _turn(model, rng, gates, families, seen, progress, names)
         if steps:
-            steps[-1] = _settled(
-                steps[-1], model.search_problem, (*step.findings, *step.structures), rng, gates
-            )
+            tested = (*step.findings, *step.structures)
+            steps[-1] = _settled(steps[-1], model.search_problem, tested, rng, gates)
         steps.append(step)
         if joined is None:
             break
@@ -292,9 +298,7 @@ def _ignore(_line: str) -> None:
 def _named_mistakes(
     start: Evidence, rng: np.random.Generator, gates: Gates, own_effects: Sequence[Effect]
 ) -> tuple[Finding, ...]:
-    """What the check of the description and of the clock names for certain;
-    nothing with too few moves.
-    """
+    """Mistakes of description and clock that their check is certain of; none with too few moves."""
     (own,) = rng.spawn(1)  # the draws of the search stay what they are
     try:
         return check_geometry(start, own, gates, own_effects).certain_mistakes
@@ -311,7 +315,8 @@ def _steps_of(
     """
     steps: list[Step] = []
     for found, after in zip(corrected.joined, corrected.models, strict=True):
-        steps.append(Step(tuple(mistakes), (), limits_nm, replace(found, ambiguity=()), after))
+        accepted = replace(found, ambiguity=())
+        steps.append(Step(tuple(mistakes), (), limits_nm, accepted, after))
     return steps
 
 
@@ -323,8 +328,7 @@ def end_search(
     rng: np.random.Generator,
     left_open: Sequence[PlacedEffect] = (),
 ) -> Step:
-    """Return the last step with the σ that is reported,
-    and with those effects alone that pass in this model.
+    """Return the last step with the σ that is reported, and the effects that pass in this model.
 
     σ from the choice of the effects comes last, so that an effect can have passed every gate by a
     smaller one: it leaves where its coefficients may all be zero by the covariance that is
@@ -364,9 +368,9 @@ def end_search(
             )
         worst, why, _ = max(failing, key=lambda one: one[2])
         evidence = model.evidence
-        kept = tuple(placed for placed in evidence.effects if placed != worst)
+        others = tuple(placed for placed in evidence.effects if placed != worst)
         try:
-            rest = with_effects(evidence, kept, model.search_problem.runs)
+            rest = with_effects(evidence, others, model.search_problem.runs)
             model = linearised_after(replace(rest, declared=evidence.declared), model)
         except UNFITTED:
             needed.add(worst)  # the data cannot be fitted without it
@@ -378,8 +382,7 @@ def end_search(
 
 
 def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
-    """Effects that the covariance of an estimate does not show, why,
-    and the probability of their being zero.
+    """Effects that the covariance of an estimate does not show, why, and their chance to be zero.
 
     What the cell declares stays. An impossible coefficient counts like one that is certainly zero.
     """
@@ -395,23 +398,23 @@ def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
         # What is not possible shows nothing: a part below zero must not carry the other one.
         shown = possible_values(placed.effect.coefficients, values, covariance)
         noise = in_noise(shown, covariance)
-        if not noise and not is_unnamed(placed.effect) and np.all(np.abs(shown) < std):
+        is_any_known = np.any(np.abs(shown) >= std)
+        if not noise and not is_unnamed(placed.effect) and not is_any_known:
             noise = (
                 "each of its coefficients is less than its σ: what they are together is not known"
             )
         if wrong:
             failing.append((placed, wrong, 1.0))
         elif noise:
-            failing.append((placed, noise, probability_of_zero(shown, covariance)))
+            chance = probability_of_zero(shown, covariance)
+            failing.append((placed, noise, chance))
     return failing
 
 
 def _failing_again(
     model: JointFit, rng: np.random.Generator, gates: Gates
 ) -> list[tuple[PlacedEffect, str, float]]:
-    """Effects that do not pass the gates of a joint fit, why,
-    and how much worse left-out moves are with each.
-    """
+    """Effects that do not pass a joint fit's gates, why, and how much worse left-out moves are."""
     evidence = model.evidence
     failing: list[tuple[PlacedEffect, str, float]] = []
     for placed in evidence.effects[evidence.declared :]:
@@ -432,14 +435,15 @@ def with_possible_values(evidence: Evidence) -> Evidence:
     if not len(own):
         return evidence
     count = len(estimate.gains)
-    order = np.concatenate(
-        (count + own, np.setdiff1d(np.arange(len(estimate.covariance)), count + own))
-    )
+    of_effects = count + own
+    others = np.setdiff1d(np.arange(len(estimate.covariance)), of_effects)
+    order = np.concatenate((of_effects, others))
     values = np.concatenate((estimate.gains, estimate.parameters))
     about = np.array([column.about for column in estimate.unknowns])
     values[count:] += about
     columns = [estimate.unknowns[index] for index in own]
-    moved = possible_values(columns, values[order], estimate.covariance[np.ix_(order, order)])
+    covariance = estimate.covariance[np.ix_(order, order)]
+    moved = possible_values(columns, values[order], covariance)
     if np.array_equal(moved, values[order]):
         return evidence
     values[order] = moved
@@ -459,28 +463,25 @@ def _finding_of(steps: Sequence[Step], placed: PlacedEffect) -> Finding | None:
 def _with_choice(
     steps: Sequence[Step], model: JointFit, gates: Gates, left_open: Sequence[PlacedEffect]
 ) -> Step:
-    """Return the last step, what the choice of its effects adds to the covariance of its estimate
-    included.
-    """
-    estimate, accepted = (
-        model.evidence.estimate,
-        dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]](),
-    )
+    """Return the last step, with the covariance from the choice of its effects in its estimate."""
+    estimate = model.evidence.estimate
+    in_model = model.evidence.effects
+    of_effects: dict[PlacedEffect, tuple[Finding, tuple[Finding, ...]]] = {}
     for step in steps:  # an effect that left and joined again counts by its last turn
         found = step.accepted
-        if found is not None and (placed := found.placed) in model.evidence.effects:
-            accepted[placed] = found, (*step.findings, *step.structures)
+        if found is not None and found.placed in in_model:
+            of_effects[found.placed] = found, (*step.findings, *step.structures)
     last = steps[-1]
     left = _small_findings(last, model, gates)
-    choice = choice_covariance(
-        model.search_problem, estimate, tuple(accepted.values()), left, left_open
-    )
+    accepted = tuple(of_effects.values())
+    choice = choice_covariance(model.search_problem, estimate, accepted, left, left_open)
     # The coefficient of an effect is that of a model with the effect: another model has none, not
     # another one.
-    own = len(estimate.gains) + own_unknowns(estimate, model.evidence.effects)
+    gains = len(estimate.gains)
+    own = gains + own_unknowns(estimate, in_model)
     choice[own, :] = 0.0
     choice[:, own] = 0.0
-    choice_std = np.sqrt(np.diag(choice)[: len(estimate.gains)])
+    choice_std = np.sqrt(np.diag(choice)[:gains])
     last = replace(last, after=model.evidence, choice_std=choice_std)
     if not choice.any():
         return last
@@ -496,9 +497,13 @@ def _small_findings(last: Step, model: JointFit, gates: Gates) -> tuple[Finding,
     """
     if last.accepted is not None:  # its findings are of the model before it
         return ()
-    # A name that structure refutes is no model that could be true.
-    found = [one.finding for one in last.set_aside if one.moved and is_unnamed(one.finding.effect)]
-    found += [finding for finding in (*last.findings, *last.structures) if is_small(finding, gates)]
+    found: list[Finding] = []
+    for one in last.set_aside:
+        # A name that structure refutes is no model that could be true.
+        if one.moved and is_unnamed(one.finding.effect):
+            found.append(one.finding)
+    tested = (*last.findings, *last.structures)
+    found += (finding for finding in tested if is_small(finding, gates))
     if model.evidence.effects == last.after.effects:
         return tuple(found)
     scored = [scored_beside(model.search_problem, finding) for finding in found]
@@ -515,87 +520,131 @@ def _turn(
     names: Sequence[str],
 ) -> tuple[Step, JointFit | None]:
     """Take one turn: the step, and the model with what was accepted; None where nothing was."""
-    evidence, problem = model.evidence, model.search_problem
-    known, moves = len(evidence.effects), problem.folds.moves
-    most = problem.folds.linearisation.cluster_count // PIECES_PER_EFFECT
-    progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
+    evidence = model.evidence
+    problem = model.search_problem
+    known = len(evidence.effects)
+    moves = problem.folds.moves
+    pieces = problem.folds.linearisation.cluster_count
+    most = pieces // PIECES_PER_EFFECT
+    if known:
+        progress(f"searching for a missing effect beside the {known} found")
+    else:
+        progress("searching for a missing effect")
     proposed = _proposals(problem, evidence.effects, rng, gates, families)
     present = {placed.effect.name for placed in evidence.effects if not is_unnamed(placed.effect)}
-    findings, structures = (
-        rank_effects(problem, rng, gates, families, proposed, present),
-        tuple[Finding, ...](),
-    )
-    limits_nm, runs = detection_limits_nm(problem, gates), PartsLeftOut.of(problem)
-    taken, searched, aside, ended = set(keys_of(evidence)), range(0), list[SetAside](), ""
+    findings = rank_effects(problem, rng, gates, families, proposed, present)
+    limits_nm = detection_limits_nm(problem, gates)
+    turn = _Tested(problem, PartsLeftOut.of(problem), set(keys_of(evidence)), findings)
     while True:
-        named = choose_effect(findings, taken)
-        if named is not None and (
-            why := runs.refusal(whitened_columns(problem, named.effect, named.axis))
-        ):
-            findings = _refused(findings, named, why)
-            aside += _first_of_axis(aside, SetAside(named, why))
-            continue
-        axes = range(problem.axes) if named is None else range(named.axis, named.axis + 1)
-        # Terms without a name are of driven joints
-        axes = axes if axes.stop <= problem.axes else range(0)
-        if axes != searched:
-            if named is None:
-                progress("searching for structure that no named effect explains")
-            structures, searched = find_structure(problem, axes, rng, gates), axes
-        accepted = term = choose_effect(structures, taken)
-        if term is not None and (
-            why := runs.refusal(whitened_columns(problem, term.effect, term.axis))
-        ):
-            structures = _refused(structures, term, why)
-            aside += _first_of_axis(aside, SetAside(term, why))
-            continue
-        if named is not None and (term is None or not is_inadequate(named, term)):
-            accepted = named
-        if accepted is None or known >= most:
+        named, chosen = turn.choose(rng, gates, progress)
+        if chosen is None or known >= most:
             break
-        near = (*proposed.get(accepted.axis, ()), *families)
-        effect = _refined(problem, accepted, near)
-        chosen, accepted = accepted, replace(accepted, effect=effect)
-        refuted = refuted_by_structure(model, accepted, aside)
-        progress(f"adding {effect.name} on {names[accepted.axis]}")
+        near = (*proposed.get(chosen.axis, ()), *families)
+        effect = _refined(problem, chosen, near)
+        accepted = replace(chosen, effect=effect)
+        refuted = refuted_by_structure(model, accepted, turn.aside)
+        name_and_axis = f"{effect.name} on {names[accepted.axis]}"
+        progress(f"adding {name_and_axis}")
         joined = refuted or join(model, accepted, rng, gates, seen)
         if isinstance(joined, JointFit):
             accepted = as_joined(accepted, joined.evidence)
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
-                aside.append(
-                    SetAside(named, "{rival} explains clearly more of the same residual", rival)
-                )
-            return Step(
-                findings, structures, limits_nm, accepted, joined.evidence, tuple(aside)
-            ), joined
-        progress(
-            f"{effect.name} on {names[accepted.axis]} does not join the model: "
-            f"{joined.reason(names)}"
-        )
-        aside.append(joined)
-        # The variables of an axis go together: if its best term may not join, no other term
-        # replaces it.
-        others = structures if is_unnamed(effect) else ()
-        taken |= {
-            effect_key(one.effect, one.axis) for one in (chosen, *others) if one.axis == chosen.axis
-        }
-    if accepted is not None:
-        ended = (
-            f"{problem.folds.linearisation.cluster_count} pieces of {moves} moves allow no "
-            f"more than {most} effects"
-        )
+                explains_more = "{rival} explains clearly more of the same residual"
+                turn.aside.append(SetAside(named, explains_more, rival))
+            return turn.step(limits_nm, accepted, joined.evidence), joined
+        progress(f"{name_and_axis} does not join the model: {joined.reason(names)}")
+        turn.aside.append(joined)
+        turn.leave_out(chosen, effect)
+    ended = ""
+    if chosen is not None:
+        ended = f"{pieces} pieces of {moves} moves allow no more than {most} effects"
     elif moves < MIN_MOVES_FOR_STRUCTURE:
         ended = f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}"
-    return Step(findings, structures, limits_nm, None, evidence, tuple(aside), ended), None
+    return replace(turn.step(limits_nm, None, evidence), ended=ended), None
+
+
+@dataclass(slots=True)
+class _Tested:
+    """What a turn has tested and set aside so far."""
+
+    problem: SearchProblem
+    parts: PartsLeftOut  #: the same problem, in parts
+    taken: set[EffectKey]  #: places in the model, or of what did not join
+    findings: tuple[Finding, ...]  #: named effects, the best first
+    structures: tuple[Finding, ...] = ()  #: terms without a name, the best first
+    searched: range = range(0)  #: axes that they were searched on
+    aside: list[SetAside] = field(default_factory=list)
+
+    def choose(
+        self, rng: np.random.Generator, gates: Gates, progress: Callable[[str], None]
+    ) -> tuple[Finding | None, Finding | None]:
+        """Choose the best named effect, and what joins: this, or a term that explains much more.
+
+        Neither is refused by parts left out.
+        """
+        while True:
+            named = choose_effect(self.findings, self.taken)
+            if self._is_refused(named):
+                continue
+            axes = self._axes_of_structure(named)
+            if axes != self.searched:
+                if named is None:
+                    progress("searching for structure that no named effect explains")
+                self.structures = find_structure(self.problem, axes, rng, gates)
+                self.searched = axes
+            term = choose_effect(self.structures, self.taken)
+            if self._is_refused(term):
+                continue
+            if named is not None and (term is None or not is_inadequate(named, term)):
+                return named, named
+            return named, term
+
+    def _is_refused(self, found: Finding | None) -> bool:
+        """Whether parts left out refuse a finding; it is then set aside."""
+        if found is None:
+            return False
+        why = self.parts.refusal(whitened_columns(self.problem, found.effect, found.axis))
+        if not why:
+            return False
+        self.findings = _refused(self.findings, found, why)
+        self.structures = _refused(self.structures, found, why)
+        self.aside += _first_of_axis(self.aside, SetAside(found, why))
+        return True
+
+    def _axes_of_structure(self, named: Finding | None) -> range:
+        """Axes to search for structure: that of a named effect, or all of them without one.
+
+        Terms without a name are of driven joints.
+        """
+        axes = self.problem.axes
+        if named is None:
+            return range(axes)
+        if named.axis >= axes:
+            return range(0)
+        return range(named.axis, named.axis + 1)
+
+    def leave_out(self, chosen: Finding, effect: Effect) -> None:
+        """Choose a finding no more, which did not join as this effect.
+
+        The variables of an axis go together: if its best term may not join, no other term replaces
+        it.
+        """
+        self.taken.add(effect_key(chosen.effect, chosen.axis))
+        if is_unnamed(effect):
+            of_axis = (one for one in self.structures if one.axis == chosen.axis)
+            self.taken.update(effect_key(one.effect, one.axis) for one in of_axis)
+
+    def step(self, limits_nm: FloatArray, accepted: Finding | None, after: Evidence) -> Step:
+        """The turn with what was accepted."""
+        aside = tuple(self.aside)
+        return Step(self.findings, self.structures, limits_nm, accepted, after, aside)
 
 
 def _refined(
     search_problem: SearchProblem, accepted: Finding, near: Sequence[Sequence[Effect]]
 ) -> Effect:
-    """Return the effect that was chosen with its setting refined;
-    a gear that is not rigid also gets its form.
-    """
+    """Return the effect that was chosen with its setting refined, and the form of a gear."""
     effect = refine_setting(search_problem, accepted.effect, accepted.axis, near)
     gear = refined_gear(search_problem, effect, accepted.axis)
     if gear == effect:
@@ -610,34 +659,34 @@ def _proposals(
     gates: Gates,
     families: tuple[tuple[Effect, ...], ...],
 ) -> dict[int, tuple[tuple[Effect, ...], ...]]:
-    """Families with settings that only the data suggest, by axis,
-    of those that the dictionary holds.
-    """
+    """Families of the dictionary with settings that only the data suggest, by axis."""
     kinds = {type(family[0]) for family in families}
-    ripples = propose_orders(search_problem, effects, rng, gates) if Ripple in kinds else {}
+    ripples: Mapping[int, tuple[tuple[Effect, ...], ...]] = {}
+    if Ripple in kinds:
+        ripples = propose_orders(search_problem, effects, rng, gates)
     resonances = propose_resonances(search_problem, gates, kinds)
     balanced = [placed.axis for placed in effects if isinstance(placed.effect, Counterbalance)]
     balancers = propose_balancers(search_problem, gates, families, balanced)
     cables = propose_cables(search_problem, gates, families)
     own_settings = propose_own_settings(search_problem, gates, families)
-    found = (ripples, resonances, balancers, cables, own_settings)
-    own = {
-        axis: tuple(f for one in found for f in one.get(axis, ()))
-        for axis in {a for one in found for a in one}
-    }
+    own: dict[int, tuple[tuple[Effect, ...], ...]] = {}
+    for proposed in (ripples, resonances, balancers, cables, own_settings):
+        for axis, of_axis in proposed.items():
+            own[axis] = (*own.get(axis, ()), *of_axis)
     return propose_rotors(search_problem, gates, families, own)
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:
-    """Finding that parts left out refuse, unless a better finding of its kind on this axis was set
-    aside before.
+    """A finding that parts left out refuse.
+
+    Nothing where a better one of its kind on this axis was set aside before.
     """
-    kind = new.finding.axis, is_unnamed(new.finding.effect)
-    return (
-        ()
-        if kind in {(one.finding.axis, is_unnamed(one.finding.effect)) for one in aside}
-        else (new,)
-    )
+    axis = new.finding.axis
+    has_no_name = is_unnamed(new.finding.effect)
+    for one in aside:
+        if one.finding.axis == axis and is_unnamed(one.finding.effect) == has_no_name:
+            return ()
+    return (new,)
 
 
 def _refused(findings: Sequence[Finding], refused: Finding, why: str) -> tuple[Finding, ...]:
@@ -652,8 +701,7 @@ def _settled(
     rng: np.random.Generator,
     gates: Gates,
 ) -> Step:
-    """Limit the ambiguity of an accepted effect to rivals that passed before it joined and no
-    longer do.
+    """Limit the ambiguity of an accepted effect to rivals that passed before it joined, not now.
 
     Args:
         step: with what was accepted.
@@ -665,18 +713,22 @@ def _settled(
     if step.accepted is None:
         return step
     own = effect_key(step.accepted.effect, step.accepted.axis)
-    passed = {(one.effect, one.axis) for one in (*step.findings, *step.structures) if one.passed}
-    rivals = {
-        effect_key(one.effect, one.axis): one
-        for one in step.accepted.ambiguity
-        if (one.effect, one.axis) in passed
-    }
-    now = {effect_key(one.effect, one.axis): one.passed for one in tested}
-    missing = [one for key, one in rivals.items() if key not in now]
-    again = [trial for one in missing for trial in problem.test(((one.effect,),), one.axis)]
-    now |= {
-        effect_key(one.effect, one.axis): one.passed
-        for one in rank_families(problem, again, rng, gates)
-    }
-    left = tuple(one for key, one in rivals.items() if key != own and not now.get(key, False))
-    return replace(step, accepted=replace(step.accepted, ambiguity=left))
+    tested_before = (*step.findings, *step.structures)
+    passed_before = {one.placed for one in tested_before if one.passed}
+    rivals: dict[EffectKey, PlacedEffect] = {}
+    for rival in step.accepted.ambiguity:
+        if rival in passed_before:
+            rivals[effect_key(rival.effect, rival.axis)] = rival
+    passes_now = {effect_key(one.effect, one.axis): one.passed for one in tested}
+    again: list[FamilyTrials] = []
+    for key, rival in rivals.items():
+        if key not in passes_now:
+            again += problem.test(((rival.effect,),), rival.axis)
+    for found in rank_families(problem, again, rng, gates):
+        passes_now[effect_key(found.effect, found.axis)] = found.passed
+    left: list[PlacedEffect] = []
+    for key, rival in rivals.items():
+        if key != own and not passes_now.get(key, False):
+            left.append(rival)
+    accepted = replace(step.accepted, ambiguity=tuple(left))
+    return replace(step, accepted=accepted)

@@ -118,15 +118,17 @@ class MotorNoiseFloor:
     def least_a(self) -> float:
         """Lower limit of this noise at CONFIDENCE [A]."""
         freedom = _MEDIAN_EFFICIENCY * self.freedom
-        return float(
-            self.noise_a * np.sqrt(freedom / scipy.special.chdtri(freedom, 1.0 - CONFIDENCE))
-        )
+        largest_chi2 = scipy.special.chdtri(freedom, 1.0 - CONFIDENCE)
+        return float(self.noise_a * np.sqrt(freedom / largest_chi2))
 
     def is_refuted(self, left_a: float) -> bool:
-        """Whether a model leaves so little on rows in motion [A,
-        root mean square] that the floor is too high.
+        """Whether a model leaves so little on rows in motion that the floor is too high.
+
+        Args:
+            left_a: root mean square of the model's error there [A].
         """
-        return bool(self.noise_a > (1.0 + REFUTED_SIGMAS * self.std_percent / 100.0) * left_a)
+        tolerance = REFUTED_SIGMAS * self.std_percent / 100.0
+        return bool(self.noise_a > (1.0 + tolerance) * left_a)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,39 +185,44 @@ def _floor(parts: Sequence[_Part], source: FloorSource) -> MotorNoiseFloor | Non
     total = sum(part.weight for part in parts)
     if len(parts) < fewest or total < MIN_FREEDOM:
         return None
-    variance, freedom, weight = np.array(
-        [(part.variance_a2, part.freedom, part.weight) for part in parts]
-    ).T
-    likely = variance * freedom / scipy.special.chdtri(freedom, 0.5)
+    variance = np.array([part.variance_a2 for part in parts])
+    freedom = np.array([part.freedom for part in parts])
+    weight = np.array([part.weight for part in parts])
+    # s²ν over the median of χ²_ν: as likely above σ² as below.
+    median_chi2 = scipy.special.chdtri(freedom, 0.5)
+    likely = variance * freedom / median_chi2
     order = np.argsort(likely)
     share = np.cumsum(weight[order]) / total
-    middle = likely[order][int(np.searchsorted(share, 0.5))]
-    return MotorNoiseFloor(float(np.sqrt(middle)), source, len(parts), float(total))
+    middle = int(np.searchsorted(share, 0.5))
+    noise_a = float(np.sqrt(likely[order][middle]))
+    return MotorNoiseFloor(noise_a, source, len(parts), float(total))
 
 
 def _dwells(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
+    """Parts of the standstills of a motor."""
     for data in datasets:
-        for dwell in _stretches(~data.motor_moving[:, motor] & data.valid[:, motor]):
-            yield from _parts(data.current_a[dwell, motor][None], data.rate_hz, conditioning)
+        is_still = ~data.motor_moving[:, motor] & data.valid[:, motor]
+        for dwell in _stretches(is_still):
+            current_a = data.current_a[dwell, motor]
+            yield from _parts(current_a[None], data.rate_hz, conditioning)
 
 
 def _pairs(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> Iterator[_Part]:
+    """Parts of the differences between repeated moves of a motor."""
     for differences, rate_hz in _repetitions(datasets, motor):
+        # Neighbouring pairs share a move.
         pairs = len(differences)
+        share = 2.0 * pairs / (3.0 * pairs - 1.0)
         for difference in differences:
-            yield from _parts(
-                difference / np.sqrt(2.0),
-                rate_hz,
-                conditioning,
-                share=2.0 * pairs / (3.0 * pairs - 1.0),
-            )
+            # A difference has twice the variance of a move.
+            signals = difference / np.sqrt(2.0)
+            yield from _parts(signals, rate_hz, conditioning, share=share)
 
 
 def _parts(
     signals: FloatArray, rate_hz: float, conditioning: Conditioning, share: float = 1.0
 ) -> Iterator[_Part]:
-    """Variance and freedom by the rows of each piece of a part;
-    nothing where it is too short or constant.
+    """Variance and freedom by the rows of each piece of a part, unless it is short or constant.
 
     Args:
         signals: the current [A], and after it what is subtracted from it by least squares, shape
@@ -224,7 +231,8 @@ def _parts(
         conditioning: the filter of the rows.
         share: of its freedom that a part adds to that of the others.
     """
-    filter_ = decimator(rate_hz, conditioning.decimation_cutoff_hz)
+    cutoff_hz = conditioning.decimation_cutoff_hz
+    filter_ = decimator(rate_hz, cutoff_hz)
     longest = round(LONGEST_MOVE_S * rate_hz)
     for first in range(0, signals.shape[1], longest):
         piece = signals[:, first : first + longest]
@@ -232,25 +240,26 @@ def _parts(
         if rows < _TREND + len(piece) or np.ptp(piece[0]) == 0.0:
             continue
         current, *others = filter_(piece)
-        powers, correlation = _of_length(rate_hz, conditioning.decimation_cutoff_hz, rows)
+        powers, correlation = _of_length(rate_hz, cutoff_hz, rows)
         if others:
-            taken, expected, freedom = _projection(np.column_stack((powers, *others)), correlation)
+            columns = np.column_stack((powers, *others))
+            basis, expected, freedom = _projection(columns, correlation)
         else:
-            taken, expected, freedom = _detrending(rate_hz, conditioning.decimation_cutoff_hz, rows)
-        yield _Part(
-            float(np.sum((current - taken @ (taken.T @ current)) ** 2)) / expected,
-            freedom,
-            share * freedom,
-        )
+            basis, expected, freedom = _detrending(rate_hz, cutoff_hz, rows)
+        left = current - basis @ (basis.T @ current)
+        variance_a2 = float(np.sum(left**2)) / expected
+        yield _Part(variance_a2, freedom, share * freedom)
 
 
 def _projection(columns: FloatArray, correlation: FloatArray) -> tuple[FloatArray, float, float]:
     """Orthonormal basis of the columns, tr(MP) and ν."""
     basis, _ = np.linalg.qr(columns)
-    spread = correlation - basis @ (basis.T @ correlation)
-    spread -= (spread @ basis) @ basis.T
-    expected = float(np.trace(spread))
-    return basis, expected, expected**2 / float(np.sum(spread**2))
+    # M P M, the correlation of what is left.
+    left = correlation - basis @ (basis.T @ correlation)
+    left -= (left @ basis) @ basis.T
+    expected = float(np.trace(left))
+    freedom = expected**2 / float(np.sum(left**2))
+    return basis, expected, freedom
 
 
 @lru_cache(maxsize=1024)
@@ -261,10 +270,11 @@ def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray
 
 def _stretches(flags: BoolArray) -> list[slice]:
     """Samples that follow each other and are all set, shape (k,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False])).astype(np.int8)))
-    return [
-        slice(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)
-    ]
+    between_unset = np.concatenate(([False], flags, [False]))
+    edges = np.flatnonzero(np.diff(between_unset.astype(np.int8))).tolist()
+    starts = edges[::2]
+    stops = edges[1::2]
+    return [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,18 +297,21 @@ def _repetitions(
     moved = np.any([data.moving.any(axis=0) for data in datasets], axis=0)
     travel = np.max([np.ptp(data.position_rad, axis=0) for data in datasets], axis=0)
     # An axis that rests throughout has no path
-    scale = np.where(moved, 1.0 / np.where(moved, travel, 1.0), 0.0)
+    unit = np.where(moved, travel, 1.0)
+    scale = np.where(moved, 1.0 / unit, 0.0)
     chains: list[_MoveChain] = []
     ends = np.empty((0, 2, len(scale)))  # of the last move of each chain
     for data in sorted(datasets, key=lambda data: data.started_s or 0.0):
-        for part in _stretches(data.motor_moving[:, motor] & data.valid[:, motor]):
+        is_moving = data.motor_moving[:, motor] & data.valid[:, motor]
+        for part in _stretches(is_moving):
             end = data.position_rad[[part.start, part.stop - 1]] * scale
             # Where a move begins is known to some samples only, in which other axes move on.
-            near = np.flatnonzero(np.all(np.abs(ends - end) < 10.0 * PATH_TOLERANCE, axis=(1, 2)))
-            for index in near:
-                difference = _difference(chains[index], data, part, motor, scale)
+            is_near = np.abs(ends - end) < 10.0 * PATH_TOLERANCE
+            for index in np.flatnonzero(np.all(is_near, axis=(1, 2))):
+                chain = chains[index]
+                difference = _difference(chain, data, part, motor, scale)
                 if difference is not None:
-                    chains[index] = _MoveChain(data, part, (*chains[index].differences, difference))
+                    chains[index] = _MoveChain(data, part, (*chain.differences, difference))
                     ends[index] = end
                     break
             else:
@@ -312,10 +325,9 @@ def _repetitions(
 def _difference(
     chain: _MoveChain, data: Dataset, part: slice, motor: int, scale: FloatArray
 ) -> FloatArray | None:
-    """A move minus the last one of a chain:
-    current [A] and accelerations of all axes, shape (1 + m, k).
+    """A move minus the last one of a chain, None if it is no repetition.
 
-    None if it is no repetition.
+    Rows are the current [A] and the accelerations of all axes, shape (1 + m, k).
 
     The two are aligned by their paths, because neither log nor controller starts a move at a
     sample. With q' = q + λ q̇ where the later one is ahead by λ, λ is found by least squares over
@@ -325,13 +337,12 @@ def _difference(
     rate = data.rate_hz
     lengths = (chain.part.stop - chain.part.start, part.stop - part.start)
     length = min(lengths)
-    if (
-        max(lengths) > (1.0 + DURATION_TOLERANCE) * length
-        or before.payload != data.payload
-        or not np.isclose(before.rate_hz, rate, rtol=1e-4)
-    ):
+    if max(lengths) > (1.0 + DURATION_TOLERANCE) * length or before.payload != data.payload:
+        return None
+    if not np.isclose(before.rate_hz, rate, rtol=1e-4):
         return None
     first = slice(chain.part.start, chain.part.start + length)
+    path = before.position_rad[first]
     speed = before.velocity_rad_s[first] * scale
     start = part.start
     ahead = 0.0
@@ -339,27 +350,40 @@ def _difference(
         start -= round(ahead)
         if start < 1 or start + length >= len(data.time_s):
             return None
-        apart = (data.position_rad[start : start + length] - before.position_rad[first]) * scale
+        apart = (data.position_rad[start : start + length] - path) * scale
         ahead = float(np.sum(speed * apart) / np.sum(speed**2)) * rate  # in samples
-    if np.max(np.abs(apart - ahead / rate * speed)) > PATH_TOLERANCE or abs(ahead) > 1.0:
+    beside_path = np.abs(apart - ahead / rate * speed)
+    if np.max(beside_path) > PATH_TOLERANCE or abs(ahead) > 1.0:
         return None
-    step = -1 if ahead > 0.0 else 1
-    nearest, next_ = (_signals(data, slice(at, at + length), motor) for at in (start, start + step))
-    return nearest + abs(ahead) * (next_ - nearest) - _signals(before, first, motor)
+    if ahead > 0.0:
+        next_start = start - 1
+    else:
+        next_start = start + 1
+    nearest = _signals(data, slice(start, start + length), motor)
+    next_ = _signals(data, slice(next_start, next_start + length), motor)
+    interpolated = nearest + abs(ahead) * (next_ - nearest)
+    return interpolated - _signals(before, first, motor)
 
 
 def _signals(data: Dataset, part: slice, motor: int) -> FloatArray:
-    return np.stack((data.current_a[part, motor], *data.acceleration_rad_s2[part].T))
+    """Current of a motor [A] and accelerations of all axes, shape (1 + m, k)."""
+    current_a = data.current_a[part, motor]
+    accelerations = data.acceleration_rad_s2[part].T
+    return np.stack((current_a, *accelerations))
 
 
 @lru_cache(maxsize=1024)
 def _of_length(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray, FloatArray]:
     """Powers of time of so many rows, shape (rows, 3), and P, shape (rows, rows)."""
     filter_ = decimator(rate_hz, cutoff_hz)
-    lags = filter_.factor * np.arange(rows)
     taps = filter_.taps
-    of_lag = np.array(
-        [float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags]
-    )
-    correlation = of_lag[np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))] / of_lag[0]
-    return np.vander(np.linspace(-1.0, 1.0, rows), _TREND), correlation
+    of_lag = np.zeros(rows)
+    for row in range(rows):
+        lag = filter_.factor * row
+        if lag < len(taps):
+            of_lag[row] = taps[lag:] @ taps[: len(taps) - lag]
+    numbers = np.arange(rows)
+    rows_apart = np.abs(np.subtract.outer(numbers, numbers))
+    correlation = of_lag[rows_apart] / of_lag[0]
+    time = np.linspace(-1.0, 1.0, rows)
+    return np.vander(time, _TREND), correlation

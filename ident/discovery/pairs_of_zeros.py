@@ -40,8 +40,10 @@ class PairOfZeros:
 
     def fall(self, problem: SearchProblem) -> FloatArray:
         """Fall of ‖e‖² on each fold of held-out moves, shape (folds,)."""
-        before = problem.folds.square_sum(problem.folds.residual).sum(axis=1)
-        return np.asarray(before - self.trial.held_out.sum(axis=1))
+        folds = problem.folds
+        before = folds.square_sum(folds.residual).sum(axis=1)
+        after = self.trial.held_out.sum(axis=1)
+        return np.asarray(before - after)
 
 
 def try_pairs(problem: SearchProblem, tested: Sequence[FamilyTrials]) -> tuple[PairOfZeros, ...]:
@@ -59,15 +61,16 @@ def try_pairs(problem: SearchProblem, tested: Sequence[FamilyTrials]) -> tuple[P
             zeros[family.axis] = PlacedEffect(effect, family.axis)
             columns[family.axis] = problem.torque_at_rows(effect, family.axis)
     paired = list(combinations(zeros, 2))
-    torques = [
-        np.concatenate((columns[first], columns[second]), axis=1) for first, second in paired
-    ]
+    torques: list[FloatArray] = []
+    for first, second in paired:
+        of_both = (columns[first], columns[second])
+        torques.append(np.concatenate(of_both, axis=1))
+    trials = problem.trials(torques)
     pairs: list[PairOfZeros] = []
-    for (first, second), torque_nm, trial in zip(
-        paired, torques, problem.trials(torques), strict=True
-    ):
+    for (first, second), torque_nm, trial in zip(paired, torques, trials, strict=True):
         if trial is not None:
-            pairs.append(PairOfZeros((zeros[first], zeros[second]), torque_nm, trial))
+            effects = (zeros[first], zeros[second])
+            pairs.append(PairOfZeros(effects, torque_nm, trial))
     return tuple(pairs)
 
 
@@ -83,19 +86,17 @@ def pairs_that_pass(
         gates: limits; the probability is that of the strongest of all pairs under noise.
     """
     trials = tuple(pair.trial for pair in pairs)
-    if all(
-        probability_of_zero(trial.coefficients, trial.covariance) > SCREENED_CHANCE
-        for trial in trials
-    ):
+    by_wald = (probability_of_zero(trial.coefficients, trial.covariance) for trial in trials)
+    if all(probability > SCREENED_CHANCE for probability in by_wald):
         return ()
-    passed: list[PairOfZeros] = []
+    passed: list[tuple[float, PairOfZeros]] = []
     for pair, chance in zip(pairs, chances(trials, rng, gates.draws), strict=True):
         fall = pair.fall(problem)
         share_of_folds = float(np.mean(fall > 0.0))
-        is_certain = np.all(
-            np.abs(pair.trial.coefficients) > CERTAIN_SIGMAS * pair.trial.deviations
-        )
+        limits = CERTAIN_SIGMAS * pair.trial.deviations
+        is_certain = np.all(np.abs(pair.trial.coefficients) > limits)
         is_better = fall.sum() > 0.0 and share_of_folds >= gates.folds_better
         if is_certain and is_better and chance <= gates.false_alarm:
-            passed.append(pair)
-    return tuple(sorted(passed, key=lambda pair: -float(pair.fall(problem).sum())))
+            passed.append((float(fall.sum()), pair))
+    passed.sort(key=lambda one: -one[0])
+    return tuple(pair for _, pair in passed)

@@ -25,15 +25,12 @@ DIGITS = 4  #: Of a setting, as a calibration shows it
 
 def is_strictly_possible(effect: Effect, fit: CandidateTrial | CandidateFit) -> bool:
     """Whether every coefficient is inside its possible values, without tolerance."""
-    return all(
-        column.least <= value <= column.largest
-        for column, value in zip(effect.coefficients, fit.coefficients, strict=True)
-    )
+    fitted = zip(effect.coefficients, fit.coefficients, strict=True)
+    return all(column.least <= value <= column.largest for column, value in fitted)
 
 
 def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
-    """Refine the settings in `Effect.refined_once_chosen`,
-    or return the effect unchanged where none is better.
+    """Refine the settings in `Effect.refined_once_chosen`; the same effect where none is better.
 
     Args:
         search_problem: around the model without the effect.
@@ -43,17 +40,18 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
     names = effect.refined_once_chosen
     ranges = [setting_range(effect, name) for name in names]
 
-    def changed(values: Sequence[float] | FloatArray) -> Effect:
-        return effect.with_settings(
-            {n: float(f"{v:.{DIGITS}g}") for n, v in zip(names, values, strict=True)}
-        )
+    def changed(values: FloatArray) -> Effect:
+        settings: dict[str, float] = {}
+        for name, value in zip(names, values.tolist(), strict=True):
+            settings[name] = float(f"{value:.{DIGITS}g}")
+        return effect.with_settings(settings)
 
     def cost(values: FloatArray) -> float:
-        if not all(
-            one.least <= value <= one.largest for one, value in zip(ranges, values, strict=True)
-        ):
+        in_ranges = zip(ranges, values.tolist(), strict=True)
+        if not all(one.least <= value <= one.largest for one, value in in_ranges):
             return 0.0  # it explains nothing
-        (fit,) = search_problem.fits([search_problem.torque_at_rows(changed(values), axis)])
+        torque_nm = search_problem.torque_at_rows(changed(values), axis)
+        (fit,) = search_problem.fits([torque_nm])
         if fit is not None and is_strictly_possible(effect, fit):
             return -float(fit.fallen.sum())
         return 0.0
@@ -89,7 +87,8 @@ def _first_simplex(start: FloatArray, unit: FloatArray, ranges: Sequence[Range])
     """
     corners = [start]
     for place, allowed in enumerate(ranges):
-        step = min(FIRST_STEP * unit[place], 0.5 * (allowed.largest - allowed.least))
+        half_range = 0.5 * (allowed.largest - allowed.least)
+        step = min(FIRST_STEP * unit[place], half_range)
         if start[place] + step > allowed.largest:
             step = -step
         corner = start.copy()
@@ -99,9 +98,11 @@ def _first_simplex(start: FloatArray, unit: FloatArray, ranges: Sequence[Range])
 
 
 def _units(effect: Effect, start: FloatArray) -> FloatArray:
-    """Unit in which each setting is changed:
-    1 rad or a ratio of 1 in the dictionary, else the size of its value.
+    """Unit in which each setting is changed.
+
+    In the dictionary it is 1 rad or a ratio of 1, else the size of the value.
     """
     if is_shipped(effect):
         return np.ones(len(start))
-    return np.where(start == 0.0, 1.0, np.abs(start))
+    size = np.abs(start)
+    return np.where(size == 0.0, 1.0, size)

@@ -1,5 +1,4 @@
-"""Propose compliances and gaps of a flexible gear:
-where its resonance would lie in the band that the rows can see.
+"""Propose compliances and gaps of a flexible gear, with resonances that the rows can show.
 
 A compliance means nothing by itself: 1e-4 rad/Nm puts the resonance of a heavy link at 10 Hz and
 that of a wrist at 100 Hz. The dictionary therefore holds elasticity and backlash to first order,
@@ -57,8 +56,7 @@ def propose_resonances(
     gates: Gates,
     kinds: Collection[type[Effect]] = (Elasticity, Backlash),
 ) -> Mapping[int, Families]:
-    """Return a family of elasticity for each axis whose residual could hold one,
-    and one of backlash.
+    """Return families of elasticity and of backlash for each axis whose residual could hold one.
 
     Only effects of these kinds are proposed.
     """
@@ -66,65 +64,75 @@ def propose_resonances(
     proposed: dict[int, Families] = {}
     least = SCREENED * gates.smallest_share
     for axis in range(search_problem.axes):
-        inertia = float(np.mean([np.mean(run.inertia(axis, axis)) for run in search_problem.runs]))
-        if inertia > 0.0:
-            found = (
-                make(search_problem, axis, inertia, least)
-                for kind, make in makers.items()
-                if kind in kinds
-            )
-            proposed[axis] = tuple(family for family in found if family)
-    return {axis: families for axis, families in proposed.items() if families}
+        of_runs = [np.mean(run.inertia(axis, axis)) for run in search_problem.runs]
+        inertia = float(np.mean(of_runs))
+        if not inertia > 0.0:
+            continue
+        families: list[tuple[Effect, ...]] = []
+        for kind, make in makers.items():
+            if kind in kinds:
+                families.append(make(search_problem, axis, inertia, least))
+        found = tuple(family for family in families if family)
+        if found:
+            proposed[axis] = found
+    return proposed
 
 
 def _elastic(
     search_problem: SearchProblem, axis: int, inertia: float, least: float
 ) -> tuple[Effect, ...]:
+    """A family of elasticity; empty where no compliance explains the least share."""
     compliances = _compliances(inertia, FREQUENCIES_HZ)
 
     def bent(run: Signals) -> FloatArray:
+        """Torque for the acceleration of the link by its bending, of every other compliance."""
         own = run.inertia(axis, axis)
         torque = run.link_torque(axis)
-        passed = [
-            spring_torque(torque, own, run.rate_hz, one, DAMPING_RATIOS[-1])
-            for one in compliances[::2]
-        ]
-        return -own * np.stack([curvature(one, run.rate_hz) for one in passed])
+        bending: list[FloatArray] = []
+        for compliance in compliances[::2]:
+            passed = spring_torque(torque, own, run.rate_hz, compliance, DAMPING_RATIOS[-1])
+            bending.append(curvature(passed, run.rate_hz))
+        return -own * np.stack(bending)
 
-    if max(shares_explained(search_problem, _tried(search_problem, axis, bent))) < least:
+    shares = shares_explained(search_problem, _tried(search_problem, axis, bent))
+    if max(shares) < least:
         return ()
-    plain = [Elasticity(one, ratio) for ratio in DAMPING_RATIOS for one in compliances]
-    return (Elasticity(), *plain)
+    family: list[Effect] = [Elasticity()]
+    for ratio in DAMPING_RATIOS:
+        family += (Elasticity(compliance, ratio) for compliance in compliances)
+    return tuple(family)
 
 
 def _with_gap(
     search_problem: SearchProblem, axis: int, inertia: float, least: float
 ) -> tuple[Effect, ...]:
+    """The best pair of gap and compliance with its neighbours; empty where none explains enough."""
     if _gathered_at_turns(search_problem, axis) < least:
         return ()
-    pairs = [(gap, one) for one in _compliances(inertia, FLANKS_HZ) for gap in HALF_GAPS_RAD]
-    gears = [Backlash(0.0, gap, one, FLANK_DAMPING) for gap, one in pairs]
+    gears: list[Effect] = []
+    for compliance in _compliances(inertia, FLANKS_HZ):
+        gears += (Backlash(0.0, gap, compliance, FLANK_DAMPING) for gap in HALF_GAPS_RAD)
     shares = _explained(search_problem, axis, gears)
     best = int(np.argmax(shares))
     if shares[best] < least:
         return ()
-    flank, place = divmod(best, len(HALF_GAPS_RAD))
-    near = [(flank, place + step) for step in (-1, 0, 1)] + [
-        (flank + step, place) for step in (-1, 1)
-    ]
-    return tuple(
-        gears[len(HALF_GAPS_RAD) * row + column]
-        for row, column in near
-        if 0 <= row < len(FLANKS_HZ) and 0 <= column < len(HALF_GAPS_RAD)
-    )
+    # A row a compliance, a column a gap.
+    gaps = len(HALF_GAPS_RAD)
+    row, column = divmod(best, gaps)
+    family: list[Effect] = []
+    for more_rows, more_columns in ((0, -1), (0, 0), (0, 1), (-1, 0), (1, 0)):
+        near_row = row + more_rows
+        near_column = column + more_columns
+        if 0 <= near_row < len(FLANKS_HZ) and 0 <= near_column < gaps:
+            family.append(gears[gaps * near_row + near_column])
+    return tuple(family)
 
 
 def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:
-    """Return a gear that is not rigid in the form, and with the settings, that explain most;
-    any other effect as it is.
+    """Return a gear that is not rigid in the form, and with the settings, that explain most.
 
-    Both forms are tried: a link whose friction acts as its motor moves, and one that its own
-    friction holds.
+    Any other effect is returned as it is. Both forms are tried: a link whose friction acts as its
+    motor moves, and one that its own friction holds.
 
     Args:
         search_problem: around the model without the effect.
@@ -133,18 +141,21 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
     """
     if not isinstance(effect, Elasticity | Backlash) or not effect.resonant_rad_nm > 0.0:
         return effect
+    as_motor_moves = replace(effect, held=0, sags=1, rotor_inertia_kg_m2=0.0)
+    held_by_friction: list[Effect] = []
+    for rotor in _rotors(search_problem, axis):
+        for ratio in HELD_DAMPING:
+            held_by_friction.append(
+                replace(effect, held=1, sags=1, rotor_inertia_kg_m2=rotor, damping_ratio=ratio)
+            )
     forms: list[Effect] = [effect]
-    for held in (0, 1):
+    for starts in ([as_motor_moves], held_by_friction):
         tried: list[Effect] = []
         shares: list[float] = []
-        for rotor in _rotors(search_problem, axis) if held else (0.0,):
-            for ratio in HELD_DAMPING if held else (effect.damping_ratio,):
-                form = replace(
-                    effect, held=held, sags=1, rotor_inertia_kg_m2=rotor, damping_ratio=ratio
-                )
-                gears = gears_around(form)
-                tried += gears
-                shares += _explained(search_problem, axis, gears)
+        for start in starts:
+            gears = gears_around(start)
+            tried += gears
+            shares += _explained(search_problem, axis, gears)
         forms.append(tried[int(np.argmax(shares))])
     fits = search_problem.fits(search_problem.torque(form, axis) for form in forms)
     falls: list[float] = []
@@ -157,9 +168,7 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
 
 
 def gears_around(gear: Effect) -> list[Effect]:
-    """Return gears that are stiffer and softer than one,
-    and have larger and smaller gaps where it has one.
-    """
+    """Return gears that are stiffer and softer than one, and of other gaps where it has one."""
     around: list[Effect] = []
     if not isinstance(gear, Elasticity | Backlash):
         return around
@@ -175,8 +184,9 @@ def gears_around(gear: Effect) -> list[Effect]:
 
 
 def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
-    """Inertias to be tried for the rotor of an axis [kg m²]:
-    none where it is no part of the mass matrix.
+    """Inertias to be tried for the rotor of an axis [kg m²].
+
+    None but zero where the rotor is no part of the mass matrix.
     """
     is_known = search_problem.runs[0].rotor_inertia(axis) > 0.0
     if is_known or axis not in axes_with_rotor_in_load(search_problem.observation):
@@ -186,8 +196,9 @@ def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
 
 
 def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Effect]) -> list[float]:
-    """Share of the squared residual that gears explain on the joint itself;
-    all have one damping, form and rotor.
+    """Share of the squared residual that gears explain on the joint itself.
+
+    All of them have one damping, form and rotor.
     """
     common = gears[0].settings
     gaps = np.array([gear.settings.get("half_gap_rad", 0.0) for gear in gears])
@@ -195,29 +206,27 @@ def _explained(search_problem: SearchProblem, axis: int, gears: Sequence[Effect]
     several = Gears(gaps, compliances, common["damping_ratio"])
 
     def behind(run: Signals) -> FloatArray:
+        """Torque that each gear passes on, beside that of a rigid one."""
         signals = beside_rotor(run, axis, common["rotor_inertia_kg_m2"])
-        found = twists(link_of(signals, axis, held=bool(common["held"])), several)
-        return found.passed_nm - signals.gear_torque(axis)
+        link = link_of(signals, axis, held=bool(common["held"]))
+        return twists(link, several).passed_nm - signals.gear_torque(axis)
 
-    return [
-        float(share)
-        for share in shares_explained(search_problem, _tried(search_problem, axis, behind))
-    ]
+    return shares_explained(search_problem, _tried(search_problem, axis, behind))
 
 
 def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
-    """Share of a motor's squared residual by which rows after a turn of the joint's torque exceed
-    the others.
+    """Excess of a motor's squared residual in rows after a turn of the joint's torque, as a share.
 
     Whatever a gap does, it does there; its first order follows the torque so badly that it cannot
     screen.
     """
     near: list[BoolArray] = []
     for run in search_problem.rows:
-        turned = np.diff(np.sign(run.gear_torque(axis)), prepend=0.0) != 0.0
-        near.append(
-            np.convolve(turned, np.ones(round(SETTLED_S * run.rate_hz)))[: len(turned)] > 0.0
-        )
+        direction = np.sign(run.gear_torque(axis))
+        turned = np.diff(direction, prepend=0.0) != 0.0
+        settling = np.ones(round(SETTLED_S * run.rate_hz))
+        turns_before = np.convolve(turned, settling)[: len(turned)]
+        near.append(turns_before > 0.0)
     is_near = np.concatenate(near)
     problem = search_problem.folds.linearisation
     shares = [0.0]
@@ -225,15 +234,20 @@ def _gathered_at_turns(search_problem: SearchProblem, axis: int) -> float:
         rows = problem.motor == motor
         square = problem.residual[rows] ** 2
         here = is_near[problem.source[rows]]
-        if here.any() and not here.all():
-            shares.append(
-                float(here.sum() * (square[here].mean() - square[~here].mean()) / square.sum())
-            )
+        if here.all() or not here.any():
+            continue
+        excess = square[here].mean() - square[~here].mean()
+        shares.append(float(here.sum() * excess / square.sum()))
     return max(shares)
 
 
 def _compliances(inertia_kg_m2: float, frequencies_hz: Sequence[float]) -> tuple[float, ...]:
-    return tuple(_rounded(1.0 / (inertia_kg_m2 * (2.0 * np.pi * hz) ** 2)) for hz in frequencies_hz)
+    """Compliances that put the resonance of an inertia at frequencies, 1/(J ω²) [rad/Nm]."""
+    compliances: list[float] = []
+    for frequency_hz in frequencies_hz:
+        omega_rad_s = 2.0 * np.pi * frequency_hz
+        compliances.append(_rounded(1.0 / (inertia_kg_m2 * omega_rad_s**2)))
+    return tuple(compliances)
 
 
 def _rounded(setting: float) -> float:
@@ -243,16 +257,13 @@ def _rounded(setting: float) -> float:
 def _tried(
     search_problem: SearchProblem, axis: int, added: Callable[[Signals], FloatArray]
 ) -> tuple[CandidateFit | None, ...]:
-    """Fit gears by their torque on the joint itself:
-    a sixth of the work of all joints on a six-axis arm.
-    """
+    """Fit gears by their torque on the joint itself: a sixth of the work of six joints."""
     conditioning = search_problem.observation.conditioning
-    runs = search_problem.runs
-    rows = [
-        decimate_rows(data, conditioning, added(run))
-        for run, data in zip(runs, search_problem.datasets, strict=True)
-    ]
+    rows: list[FloatArray] = []
+    for run, data in zip(search_problem.runs, search_problem.datasets, strict=True):
+        rows.append(decimate_rows(data, conditioning, added(run)))
     columns = np.concatenate(rows, axis=-1)
     torque = np.zeros((search_problem.axes, *columns.shape))
     torque[axis] = columns
-    return search_problem.fits([torque[:, index : index + 1] for index in range(len(columns))])
+    of_each = [torque[:, index : index + 1] for index in range(len(columns))]
+    return search_problem.fits(of_each)

@@ -68,12 +68,15 @@ class Periodogram:
         a = np.sum(cosine**2, axis=0)
         b = np.sum(cosine * sine, axis=0)
         c = np.sum(sine**2, axis=0)
+        # V = (a b; b c) of each order, and S = (x, y): SᵀV⁻¹S = (c x² − 2 b x y + a y²)/(a c − b²).
         determinant = a * c - b**2
         usable = determinant > 1e-9 * (a * c + np.finfo(np.float32).tiny)
+        divisor = np.where(usable, determinant, 1.0)
         signs = signs.astype(cosine.dtype)  # halves the work of the two products
         x = signs @ cosine
         y = signs @ sine
-        square = (c * x**2 - 2.0 * b * x * y + a * y**2) / np.where(usable, determinant, 1.0)
+        square = c * x**2 - 2.0 * b * x * y + a * y**2
+        square = square / divisor
         return np.asarray(np.where(usable, square, 0.0))
 
 
@@ -83,8 +86,7 @@ def propose_orders(
     rng: np.random.Generator,
     gates: Gates,
 ) -> Mapping[int, tuple[tuple[Effect, ...], ...]]:
-    """Find lines in the residual that noise does not make, as families of ripple for the search,
-    by axis.
+    """Find lines in the residual that noise does not make: families of ripple by axis.
 
     Args:
         search_problem: the residual.
@@ -94,45 +96,58 @@ def propose_orders(
     """
     if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
         return {}
-    tried = (
-        periodogram(search_problem, axis, of_joint)
-        for axis in range(search_problem.axes)
-        for of_joint in _angles(search_problem, axis)
-    )
-    made = [one for one in tried if one is not None]
+    made: list[Periodogram] = []
+    for axis in range(search_problem.axes):
+        tried = [periodogram(search_problem, axis, one) for one in _angles(search_problem, axis)]
+        made += (one for one in tried if one is not None)
     clusters = search_problem.folds.linearisation.cluster_count
-    observed = [one.statistic(np.ones((1, clusters)))[0] for one in made]
+    unchanged = np.ones((1, clusters))
+    observed = [one.statistic(unchanged)[0] for one in made]
     if not made or _independent_probability(observed, clusters) > HOPELESS:
         return {}
     signs = rng.choice((-1.0, 1.0), size=(DRAWS, clusters))
     largest = np.max([one.statistic(signs).max(axis=1) for one in made], axis=0)
     limit = float(np.quantile(largest, 1.0 - gates.false_alarm, method="higher"))
-    known = {
-        (placed.axis, *_line(placed.effect))
-        for placed in effects
-        if isinstance(placed.effect, Ripple | Cogging)
-    }
     proposed: dict[int, tuple[tuple[Effect, ...], ...]] = {}
     for one, statistic in zip(made, observed, strict=True):
-        taken = [
-            order for axis, of_joint, order in known if (axis, of_joint) == (one.axis, one.of_joint)
-        ]
-        families = tuple(_family(one, order) for order in _peaks(one, statistic, limit, taken))
+        taken = _orders_in_model(one, effects)
+        peaks = _peaks(one, statistic, limit, taken)
+        families = tuple(_family(one, order) for order in peaks)
         if families:
             proposed[one.axis] = (*proposed.get(one.axis, ()), *families)
     return proposed
 
 
+def _orders_in_model(one: Periodogram, effects: Iterable[PlacedEffect]) -> list[float]:
+    """Orders of a periodogram's angle that the model has already."""
+    orders: list[float] = []
+    for placed in effects:
+        if placed.axis != one.axis or not isinstance(placed.effect, Ripple | Cogging):
+            continue
+        settings = placed.effect.settings
+        if int(settings.get("of_joint", 0)) == one.of_joint:
+            orders.append(float(settings["order"]))
+    return orders
+
+
 def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Periodogram | None:
-    """Score all orders of ripple on one angle of an axis;
-    None where it turns too little for a line.
+    """Score all orders of ripple on an angle of an axis; None where it turns too little for a line.
+
+    Args:
+        search_problem: the residual.
+        axis: index of the axis.
+        of_joint: 1 for the joint's angle, 0 for the motor's.
     """
-    angles = [
-        (run.position_rad if of_joint else run.motor_position_rad)[axis]
-        for run in search_problem.runs
-    ]
+    angles: list[FloatArray] = []
+    for run in search_problem.runs:
+        if of_joint:
+            positions = run.position_rad
+        else:
+            positions = run.motor_position_rad
+        angles.append(positions[axis])
     lowest = min(float(angle.min()) for angle in angles)
-    range_rev = (max(float(angle.max()) for angle in angles) - lowest) / (2.0 * np.pi)
+    highest = max(float(angle.max()) for angle in angles)
+    range_rev = (highest - lowest) / (2.0 * np.pi)
     largest = LARGEST_ORDER[of_joint]
     if range_rev * largest <= FEWEST_PERIODS:
         return None
@@ -140,7 +155,8 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
     bins = _fast_length(STEPS_A_LINE * range_rev / width_rev)
     first = int(np.ceil(STEPS_A_LINE * FEWEST_PERIODS))
     last = bins // BINS_A_PERIOD
-    places = [((angle - lowest) / (2.0 * np.pi * width_rev)).astype(np.int64) for angle in angles]
+    width_rad = 2.0 * np.pi * width_rev
+    places = [((angle - lowest) / width_rad).astype(np.int64) for angle in angles]
     problem = search_problem.folds.linearisation
     observation = search_problem.observation
     if of_joint:
@@ -159,46 +175,54 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
         if weights[motor] == 0.0:
             continue
         source = problem.source[rows]
-        run = int(observation.run[source[0]])
+        run_number = int(observation.run[source[0]])
         begin = int(source.min())
         end = int(source.max())
-        filter_ = filters[run]
-        stuffed = np.zeros((end - begin) * filter_.factor + 1)
-        stuffed[(source - begin) * filter_.factor] = weights[motor] * residual[rows]
-        spread = np.convolve(stuffed, filter_.taps)
-        sample = (begin - int(starts[run])) * filter_.factor
-        place = places[run][sample : sample + len(spread)]
-        binned = np.bincount(place, spread, minlength=bins)
+        # Dᵀ w e: the rows stand apart by the factor of the decimation, and the taps spread each.
+        filter_ = filters[run_number]
+        samples_apart = np.zeros((end - begin) * filter_.factor + 1)
+        samples_apart[(source - begin) * filter_.factor] = weights[motor] * residual[rows]
+        at_samples = np.convolve(samples_apart, filter_.taps)
+        sample = (begin - int(starts[run_number])) * filter_.factor
+        place = places[run_number][sample : sample + len(at_samples)]
+        binned = np.bincount(place, at_samples, minlength=bins)
         scores[cluster] += np.fft.rfft(binned)[first:last]
     orders = np.arange(first, last) / (bins * width_rev)
-    return Periodogram(axis, of_joint, range_rev, orders, np.stack((scores.real, scores.imag)))
+    real_and_imaginary = (scores.real, scores.imag)
+    return Periodogram(axis, of_joint, range_rev, orders, np.stack(real_and_imaginary))
 
 
 def _fast_length(least: float) -> int:
-    """Smallest length from there on whose Fourier transform is fast;
-    one of a prime length takes twenty times as long.
+    """Smallest length from there on whose Fourier transform is fast.
 
-    The bins beyond the range stay empty.
+    One of a prime length takes twenty times as long. The bins beyond the range stay empty.
     """
-    smooth = (2**twos * odd for odd in (1, 3, 5, 9, 15, 25, 27, 45, 75) for twos in range(1, 31))
-    return int(min(length for length in smooth if length >= least))
+    fast: list[int] = []
+    for odd in (1, 3, 5, 9, 15, 25, 27, 45, 75):
+        fast += (2**twos * odd for twos in range(1, 31))
+    return min(length for length in fast if length >= least)
 
 
 def _angles(search_problem: SearchProblem, axis: int) -> tuple[int, ...]:
-    """Angles that show different lines: where the motor turns with its joint alone,
-    the joint's adds nothing.
+    """Angles that show different lines, as `Periodogram.of_joint`.
+
+    Where the motor turns with its joint alone, the joint's angle adds nothing.
     """
-    alone = np.count_nonzero(search_problem.model.drive_train.ratio[axis]) == 1
-    return (0,) if alone else (0, 1)
+    moved_joints = np.count_nonzero(search_problem.model.drive_train.ratio[axis])
+    if moved_joints == 1:
+        return (0,)
+    return (0, 1)
 
 
 def _independent_probability(observed: Sequence[FloatArray], clusters: int) -> float:
-    """Probability that one of so many independent orders reaches the largest T:
+    """Probability that one of so many independent orders reaches the largest T.
+
     T/m has a beta distribution.
     """
     count = sum(len(statistic) for statistic in observed) / STEPS_A_LINE
-    largest = min(max(float(statistic.max(initial=0.0)) for statistic in observed) / clusters, 1.0)
-    return float(count * (1.0 - largest) ** (0.5 * (clusters - 2)))
+    largest = max(float(statistic.max(initial=0.0)) for statistic in observed)
+    share = min(largest / clusters, 1.0)
+    return float(count * (1.0 - share) ** (0.5 * (clusters - 2)))
 
 
 def _peaks(
@@ -210,17 +234,17 @@ def _peaks(
         if statistic[index] <= limit or len(chosen) == LINES_AN_AXIS:
             break
         order = float(one.orders[index])
-        if all(abs(order - other) * one.range_rev > 1.0 for other in (*chosen, *taken)):
+        others = (*chosen, *taken)
+        if all(abs(order - other) * one.range_rev > 1.0 for other in others):
             chosen.append(order)
     return chosen
 
 
 def _family(one: Periodogram, order: float) -> tuple[Effect, ...]:
+    """Ripples of orders around a line."""
     width = 1.0 / one.range_rev
-    return tuple(
-        Ripple(float(f"{order + step * width / 6.0:.6g}"), one.of_joint) for step in FAMILY
-    )
-
-
-def _line(effect: Effect) -> tuple[int, float]:
-    return int(effect.settings.get("of_joint", 0)), float(effect.settings["order"])
+    members: list[Effect] = []
+    for step in FAMILY:
+        near = order + step * width / 6.0
+        members.append(Ripple(float(f"{near:.6g}"), one.of_joint))
+    return tuple(members)

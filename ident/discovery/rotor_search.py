@@ -1,5 +1,4 @@
-"""Propose what the rotor takes of the load, for losses at the gear of an axis whose load contains
-the rotor.
+"""Propose what the rotor takes of the load, for losses at a gear whose load contains the rotor.
 
 Which axes these are follows from the base parameters: the column of the rotor's inertia depends on
 columns of links. There `load-friction` and `efficiency` are proposed in a second form, with the
@@ -33,9 +32,7 @@ CLOSE_ENOUGH = 0.1  #: Standard deviations of the inertia below which a step no 
 
 
 def axes_with_rotor_in_load(observation: Observation) -> tuple[int, ...]:
-    """Indices of the axes whose predicted load contains the rotor's torque,
-    because links move the same way.
-    """
+    """Indices of the axes whose predicted load contains the rotor: links move as it does."""
     model = observation.model
     base = observation.base
     links = set(model.link_columns.ravel().tolist())
@@ -54,8 +51,7 @@ def propose_rotors(
     families: Families,
     proposed: Mapping[int, Families],
 ) -> dict[int, Families]:
-    """Return each family of losses with the form that leaves the rotor out,
-    for each axis that needs it.
+    """Return each family of losses with the form that leaves the rotor out, by axis.
 
     Args:
         search_problem: around the model.
@@ -65,22 +61,33 @@ def propose_rotors(
     """
     losses = [family for family in families if family[0].has_rotor_form]
     found = dict(proposed)
-    for axis in axes_with_rotor_in_load(search_problem.observation) if losses else ():
+    if not losses:
+        return found
+    for axis in axes_with_rotor_in_load(search_problem.observation):
         for family in losses:
-            (tested,) = search_problem.test((family,), axis, at_rows=True) or (None,)
-            if tested is None:
-                continue
-            shares = shares_explained(search_problem, [trial for _, trial in tested.members])
-            if max(shares) < gates.smallest_share:
-                continue
-            forms = [
-                without_rotor(search_problem, effect, trial, axis)
-                for effect, trial in tested.members
-            ]
-            better = tuple(effect for effect in forms if effect is not None)
+            better = _better_forms(search_problem, gates, family, axis)
             if better:
                 found[axis] = (*found.get(axis, ()), (*family, *better))
     return found
+
+
+def _better_forms(
+    search_problem: SearchProblem, gates: Gates, family: tuple[Effect, ...], axis: int
+) -> list[Effect]:
+    """Forms of a family of losses that leave the rotor out, and are better than the plain ones."""
+    tested = search_problem.test((family,), axis, at_rows=True)
+    if not tested:
+        return []
+    members = tested[0].members
+    shares = shares_explained(search_problem, [trial for _, trial in members])
+    if max(shares) < gates.smallest_share:
+        return []
+    better: list[Effect] = []
+    for effect, trial in members:
+        form = without_rotor(search_problem, effect, trial, axis)
+        if form is not None:
+            better.append(form)
+    return better
 
 
 def declared_forms(
@@ -119,11 +126,10 @@ def declared_forms(
 def without_rotor(
     search_problem: SearchProblem, effect: Effect, plain: CandidateTrial, axis: int
 ) -> Effect | None:
-    """Return the form of a loss that leaves the rotor out, with the inertia that fits best;
-    None where none is better.
+    """Return the form of a loss that leaves the rotor out, with the inertia that fits best.
 
-    Its second coefficient costs certainty: where the moves do not show the rotor, they are
-    predicted worse with it.
+    None where no inertia is better than the plain form. Its second coefficient costs certainty:
+    where the moves do not show the rotor, they are predicted worse with it.
 
     Args:
         search_problem: around the model.
@@ -156,11 +162,11 @@ def refined_rotor(
     coefficients: FloatArray,
     deviations: FloatArray,
 ) -> Effect:
-    """Return a loss with the rotor's inertia that its fit calls for,
-    or the same effect where that is close enough.
+    """Return a loss with the rotor's inertia that its fit calls for.
 
-    Where the fit calls for a rotor whose inertia is certainly negative, the data show none: the
-    loss then multiplies the load with the rotor in it.
+    The same effect is returned where its inertia is close enough. Where the fit calls for a rotor
+    whose inertia is certainly negative, the data show none: the loss then multiplies the load with
+    the rotor in it.
 
     Args:
         search_problem: around the fit.
@@ -174,27 +180,26 @@ def refined_rotor(
         return effect.with_settings({"with_rotor": 0})
     largest_kg_m2 = largest_inertia(search_problem, axis)
     inertia_kg_m2 = next_inertia(before_kg_m2, coefficients, largest_kg_m2)
-    if abs(inertia_kg_m2 - before_kg_m2) * abs(coefficients[0]) <= CLOSE_ENOUGH * deviations[1]:
+    change_kg_m2 = abs(inertia_kg_m2 - before_kg_m2)
+    if change_kg_m2 * abs(coefficients[0]) <= CLOSE_ENOUGH * deviations[1]:
         return effect
     return effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
 
 
 def largest_inertia(search_problem: SearchProblem, axis: int) -> float:
-    """Return the largest inertia that the rotor of an axis can have [kg m²]:
-    links have no negative one.
+    """Return the largest inertia that the rotor of an axis can have [kg m²].
 
-    With M the mass matrix that contains it, M − J e eᵀ has no negative eigenvalue for J ≤ 1/(eᵀ M⁺
-    e). M_jj, which is larger, is used where M is invertible: it needs no other estimate than its
-    own. The least of all postures counts; zero where the model has none.
+    Links have no negative inertia. With M the mass matrix that contains it, M − J e eᵀ has no
+    negative eigenvalue for J ≤ 1/(eᵀ M⁺ e). M_jj, which is larger, is used where M is invertible:
+    it needs no other estimate than its own. The least of all postures counts; zero where the model
+    has none.
     """
     least = np.inf
     for run in search_problem.runs:
         inertia_kg_m2 = run.inertia_kg_m2[axis, axis]
         if search_problem.model.is_redundant:
             by_posture = np.moveaxis(run.inertia_kg_m2, -1, 0)
-            mobility = np.linalg.pinv(by_posture, rcond=SMALLEST_EIGENVALUE, hermitian=True)[
-                :, axis, axis
-            ]
-            inertia_kg_m2 = 1.0 / mobility
+            mobility = np.linalg.pinv(by_posture, rcond=SMALLEST_EIGENVALUE, hermitian=True)
+            inertia_kg_m2 = 1.0 / mobility[:, axis, axis]
         least = min(least, float(np.min(inertia_kg_m2)))
     return max(0.0, least)

@@ -64,6 +64,9 @@ folds share training data, so it is a rough one).
 #: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
 GOLDEN_STEPS = 6
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+OF_ONE_JOINT = (Spring, Hinge, Compensator, Counterbalance)
+"""Effects of the position of one joint, which a cable over two joints resembles."""
+TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +124,13 @@ def rank_effects(
     """
     if families is None:
         families = search_families()
+    if proposed is None:
+        proposed = {}
     tested: list[FamilyTrials] = []
     for axis in range(len(search_problem.model.robot.places)):
-        own = (proposed or {}).get(axis, ())
+        own = proposed.get(axis, ())
         names = {family[0].name for family in own}
-        shared = (family for family in families if family[0].name not in names)
+        shared = [family for family in families if family[0].name not in names]
         fitting: list[tuple[Effect, ...]] = []
         for family in (*shared, *own):
             members = tuple(one for one in family if is_tried(search_problem, one, axis))
@@ -151,8 +156,7 @@ def rank_families(
     gates: Gates,
     known: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Judge each family by the gates, beside all that are tested with it,
-    and rank them by held-out moves.
+    """Judge each family by the gates, and rank them by held-out moves.
 
     Args:
         search_problem: around the model.
@@ -172,36 +176,45 @@ def rank_families(
     """
     if not tested:
         return ()
-    trials = tuple(trial for family in tested for _, trial in family.members)
-    probability = chances(trials, rng, gates.draws)
-    effects = [effect for family in tested for effect, _ in family.members]
+    effects: list[Effect] = []
+    trials: list[CandidateTrial] = []
+    for family in tested:
+        for effect, trial in family.members:
+            effects.append(effect)
+            trials.append(trial)
+    probability = chances(tuple(trials), rng, gates.draws)
     is_known = np.array([effect.name in known for effect in effects])
     is_geometry = np.array([isinstance(effect, GeometryEffect) for effect in effects])
     for alike in (is_known, is_geometry):
-        if alike.any():
-            among_them = chances(
-                tuple(trials[index] for index in np.flatnonzero(alike)), rng, gates.draws
-            )
-            probability[alike] = np.fmin(probability[alike], among_them)
+        if not alike.any():
+            continue
+        alike_trials = tuple(trials[index] for index in np.flatnonzero(alike))
+        among_them = chances(alike_trials, rng, gates.draws)
+        probability[alike] = np.fmin(probability[alike], among_them)
     probabilities = iter(probability)
     sizes = MotorSizes.of(search_problem)
     findings = [_judge(search_problem, sizes, family, probabilities, gates) for family in tested]
     ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
+    return _with_rivals(ranked)
+
+
+def _with_rivals(ranked: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Give each finding those that a paired comparison cannot distinguish from it."""
     errors = np.stack([finding.fold_errors for finding in ranked])
     better = is_better(errors[:, None], errors[None])
-    # Those that a paired comparison cannot distinguish from it.
-    rivals = ~(better | better.T | np.eye(len(ranked), dtype=np.bool_))
+    oneself = np.eye(len(ranked), dtype=np.bool_)
+    rivals = ~(better | better.T | oneself)
     rivals &= np.array([finding.held_out_fall > 0 for finding in ranked])
     places = [finding.placed for finding in ranked]
-    return tuple(
-        replace(finding, ambiguity=tuple(places[index] for index in np.flatnonzero(row)))
-        for finding, row in zip(ranked, rivals, strict=True)
-    )
+    compared: list[Finding] = []
+    for finding, is_rival in zip(ranked, rivals, strict=True):
+        ambiguity = tuple(places[index] for index in np.flatnonzero(is_rival))
+        compared.append(replace(finding, ambiguity=ambiguity))
+    return tuple(compared)
 
 
 def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()) -> Finding | None:
-    """Choose the best that passed; of those as good on the same axis,
-    the one with the fewest parameters.
+    """Choose the best that passed; of those as good on its axis, the one with fewest parameters.
 
     So a hinge that starts outside the joint's range is reported as a spring. Beside an effect whose
     settings are fitted to the residual, nearly as good is not enough: folds must not distinguish
@@ -209,77 +222,80 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
     so it must explain clearly more than what one joint does. Places that are taken, in the model or
     refused, are not chosen again.
     """
-    passed = [
-        found
-        for found in findings
-        if found.passed and effect_key(found.effect, found.axis) not in taken
-    ]
+    passed: list[Finding] = []
+    for found in findings:
+        if found.passed and effect_key(found.effect, found.axis) not in taken:
+            passed.append(found)
     if not passed:
         return None
     best = passed[0]
     if isinstance(best.effect, AlongTwoJoints):
-        best = next((found for found in passed if _is_simpler_than_cable(found, best)), best)
-    alike = [
-        finding
-        for finding in passed
-        if finding.axis == best.axis
-        and finding.held_out_fall >= AS_GOOD * best.held_out_fall
-        and not (best.effect.refined and is_better(best.fold_errors, finding.fold_errors))
-    ]
-    return min(
-        alike,
-        key=lambda finding: len(finding.effect.coefficients) + len(_own_settings(finding.effect)),
-    )
+        simpler = (found for found in passed if _is_simpler_than_cable(found, best))
+        best = next(simpler, best)
+    alike = [found for found in passed if _is_as_good(found, best)]
+    return min(alike, key=lambda finding: _parameter_count(finding.effect))
+
+
+def _is_as_good(finding: Finding, best: Finding) -> bool:
+    """Whether an effect on the same axis explains as much as the best one."""
+    if finding.axis != best.axis:
+        return False
+    if finding.held_out_fall < AS_GOOD * best.held_out_fall:
+        return False
+    if not best.effect.refined:
+        return True
+    return not is_better(best.fold_errors, finding.fold_errors)
 
 
 def _is_simpler_than_cable(found: Finding, cable: Finding) -> bool:
-    """Whether an effect of the position of one joint of a cable's pair explains nearly as much as
-    the cable.
-    """
-    if not isinstance(found.effect, Spring | Hinge | Compensator | Counterbalance):
+    """Whether one joint of a cable's pair alone, by its position, explains nearly as much."""
+    if not isinstance(found.effect, OF_ONE_JOINT):
         return False
-    pair = (cable.axis, (cable.effect.second_axis or 0) - 1)
-    return found.axis in pair and cable.held_out_fall < (1.0 + CABLE_MORE) * found.held_out_fall
+    second_axis = (cable.effect.second_axis or 0) - 1
+    if found.axis not in (cable.axis, second_axis):
+        return False
+    return cable.held_out_fall < (1.0 + CABLE_MORE) * found.held_out_fall
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:
-    """Identify an effect on an axis by its family and `Effect.key_settings`:
-    two orders of a ripple are two.
+    """Identify an effect on an axis by its family and `Effect.key_settings`.
+
+    Two orders of a ripple are two.
     """
     settings = effect.settings
-    return effect.name, axis, tuple(settings[name] for name in effect.key_settings)
+    key_settings = tuple(settings[name] for name in effect.key_settings)
+    return effect.name, axis, key_settings
 
 
-def _own_settings(effect: Effect) -> dict[str, float]:
-    """Settings without those that choose a form of the same effect."""
-    return {
-        name: value for name, value in effect.settings.items() if name not in effect.form_settings
-    }
+def _parameter_count(effect: Effect) -> int:
+    """Number of coefficients and settings, without those that choose a form of the same effect."""
+    own_settings = [name for name in effect.settings if name not in effect.form_settings]
+    return len(effect.coefficients) + len(own_settings)
 
 
 def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
     """Whether one ‖e‖² is less than the other by a paired comparison over folds, folds last."""
     gain = other - one
-    return np.asarray(
-        paired_t(gain) > scipy.special.stdtrit(gain.shape[-1] - 1, 0.5 + CLEARLY / 2.0)
-    )
+    freedom = gain.shape[-1] - 1
+    limit = scipy.special.stdtrit(freedom, 0.5 + CLEARLY / 2.0)
+    return np.asarray(paired_t(gain) > limit)
 
 
 def paired_t(gain: FloatArray) -> FloatArray:
     """Student's t of the fall of ‖e‖² on each fold, folds last."""
-    error = np.std(gain, axis=-1, ddof=1) * np.sqrt(gain.shape[-1])
-    return np.asarray(gain.sum(axis=-1) / np.maximum(error, np.finfo(np.float64).tiny))
+    scatter = np.std(gain, axis=-1, ddof=1)
+    error = scatter * np.sqrt(gain.shape[-1])
+    return np.asarray(gain.sum(axis=-1) / np.maximum(error, TINY))
 
 
 def refine_setting(
     search_problem: SearchProblem, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]
 ) -> Effect:
-    """Refine the first real setting by golden section on the squared residual,
-    between its neighbours in the family.
+    """Refine the first real setting by golden section on the squared residual.
 
-    The search is over the logarithm. An effect without a positive real setting, or at the end of
-    its family, is returned unchanged. Settings that an effect refines together are left to
-    `refine_together`.
+    The search is over the logarithm, between the setting's neighbours in the family. An effect
+    without a positive real setting, or at the end of its family, is returned unchanged. Settings
+    that an effect refines together are left to `refine_together`.
     """
     if effect.refined_once_chosen:
         return refine_together(search_problem, effect, axis)
@@ -287,21 +303,23 @@ def refine_setting(
     for name, value in effect.settings.items():
         if not isinstance(value, float):
             continue
-        grid = sorted(
-            member.settings[name]
-            for member in family
-            if member.with_settings({name: value}) == effect
-        )
-        place = grid.index(value) if value in grid else 0
-        if 0 < place < len(grid) - 1 and grid[0] > 0:
-            lower = grid[place - 1]
-            upper = grid[place + 1]
-            declared = effect.nearly_declared.get(name)
-            if declared is not None and value < declared.least:
-                upper = min(upper, declared.least)
-            elif declared is not None:
-                lower = max(lower, declared.largest)
-            return _golden_section(search_problem, effect, axis, name, lower, upper)
+        # Members that differ from the effect in this setting alone.
+        alike = [member for member in family if member.with_settings({name: value}) == effect]
+        grid = sorted(member.settings[name] for member in alike)
+        if value not in grid or grid[0] <= 0:
+            continue
+        place = grid.index(value)
+        is_inside = 0 < place < len(grid) - 1
+        if not is_inside:
+            continue
+        lower = grid[place - 1]
+        upper = grid[place + 1]
+        declared = effect.nearly_declared.get(name)
+        if declared is not None and value < declared.least:
+            upper = min(upper, declared.least)
+        elif declared is not None:
+            lower = max(lower, declared.largest)
+        return _golden_section(search_problem, effect, axis, name, lower, upper)
     return effect
 
 
@@ -326,6 +344,11 @@ class MotorSizes:
         before = folds.square_sum(folds.residual)
         return cls(before, residual, current)
 
+    def relative_error(self, squares: FloatArray, motor: int) -> float:
+        """Error of a motor of which ‖e‖² is given by fold and motor, ‖e‖/‖v‖ of the current."""
+        left = squares[:, motor].sum()
+        return float(np.sqrt(left / float(self.current[motor])))
+
 
 def _judge(
     search_problem: SearchProblem,
@@ -334,127 +357,155 @@ def _judge(
     probabilities: Iterator[float],
     gates: Gates,
 ) -> Finding:
-    problem = search_problem.folds.linearisation
-    before = sizes.before
+    """Judge the setting of a family that explains most."""
     probability = [next(probabilities) for _ in family.members]
+    members = family.members
+    widths = [len(effect.coefficients) for effect, _ in members]
+    ruled_out = [_ruled_out(effect, trial, min(widths)) for effect, trial in members]
     # A setting that needs impossible coefficients is chosen only where every setting of the family
     # does.
-    fewest = min(len(effect.coefficients) for effect, _ in family.members)
-    ruled_out = [_ruled_out(effect, trial, fewest) for effect, trial in family.members]
-    possible = [index for index, why in enumerate(ruled_out) if not why] or range(
-        len(family.members)
-    )
-    best = max(possible, key=lambda index: float(family.members[index][1].fallen.sum()))
-    effect, trial = family.members[best]
-    if len(effect.coefficients) > fewest:
-        # High powers rest on few moves, whose random signs test nothing: the simplest form is
-        # surprising for both.
-        plain = (
-            index for index in possible if len(family.members[index][0].coefficients) == fewest
-        )
-        probability[best] = float(
-            np.fmin.reduce([probability[best], *(probability[index] for index in plain)])
-        )
-    after = replace(family, members=tuple(family.members[index] for index in possible)).nested()
+    possible = [index for index, why in enumerate(ruled_out) if not why]
+    if not possible:
+        possible = list(range(len(members)))
+    explained = [float(trial.fallen.sum()) for _, trial in members]
+    best = max(possible, key=lambda index: explained[index])
+    effect, trial = members[best]
+    before = sizes.before
+    possible_members = tuple(members[index] for index in possible)
+    after = replace(family, members=possible_members).nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual
     # falls most.
     motor = int(np.argmax(trial.fallen))
-    own = float(sizes.residual[motor])
-    size = float(sizes.current[motor])
-    explained = float(trial.fallen[motor] / own)
-    error_before, error_after = (
-        float(np.sqrt(part[:, motor].sum() / size)) for part in (before, after)
-    )
-    error_fall = 1.0 - error_after / error_before
-    folds_better = float(np.mean(fall > 0))
-    # A small mistake of the geometry is spread over all motors, and bends their gains.
-    may_be_small = isinstance(effect, GeometryEffect)
-    if isinstance(effect, LatePosition):
-        may_be_small = bool(certain_delays(trial.coefficients, trial.deviations).all())
-    strong = folds_better >= gates.strong_folds and error_fall >= gates.strong_fall
-    if strong:
-        false_alarm = gates.strong_false_alarm
-    else:
-        false_alarm = gates.false_alarm
-    if np.isnan(probability[best]):
-        chance = None
-    else:
-        chance = float(probability[best])
-    may_be_noise = chance is None or chance > false_alarm
-    too_few_moves = ""
-    if chance is None:
-        by_chance = ""
-    else:
-        by_chance = f"noise makes one as strong with p = {chance:.3f}"
-    if may_be_noise and (chance is None or is_tested_on_others(trial.rest)):
-        too_few_moves = what_to_record(effect, trial.gram, trial.rest)
-        by_chance = too_few_moves
-    verdicts = (
-        (may_be_noise, by_chance),
-        (
-            folds_better < gates.folds_better,
-            f"it is better on {100 * folds_better:.0f} % of the folds only",
-        ),
-        (
-            explained < gates.explained and not may_be_small,
-            f"it explains {100 * explained:.1f} % of the squared residual only",
-        ),
-        (
-            error_fall < gates.error_fall and not may_be_small,
-            f"the error on left-out moves changes by {-100 * error_fall:+.1f} % only",
-        ),
-        (fall.sum() <= 0.0, "the error on left-out moves does not fall"),
-        (bool(ruled_out[best]), ruled_out[best]),
-    )
-    refusals = tuple(words for refused, words in verdicts if refused)
-    floor_a = search_problem.floors_a[motor]
-    if floor_a is None:
-        excess = 0.0
-    else:
-        excess = own - problem.shown(motor) * (floor_a / problem.noise[motor]) ** 2
-    return Finding(
+    error_before = sizes.relative_error(before, motor)
+    error_after = sizes.relative_error(after, motor)
+    finding = Finding(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
         deviations=trial.deviations,
-        probability=chance,
-        folds_better=folds_better,
-        explained=explained,
+        probability=_probability_of(best, possible, widths, probability),
+        folds_better=float(np.mean(fall > 0)),
+        explained=float(trial.fallen[motor] / sizes.residual[motor]),
         error_before_percent=100.0 * error_before,
         error_after_percent=100.0 * error_after,
-        error_fall=error_fall,
+        error_fall=1.0 - error_after / error_before,
         held_out_fall=float(fall.sum()),
-        passed=not refusals,
-        share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
+        passed=True,
+        share_of_excess=_share_of_excess(search_problem, sizes, trial, motor),
         fold_errors=after.sum(axis=1),
-        refusals=refusals,
-        too_few_moves=too_few_moves,
         impossible=ruled_out[best],
     )
+    return _with_refusals(finding, trial, gates)
+
+
+def _probability_of(
+    best: int, possible: Sequence[int], widths: Sequence[int], probability: Sequence[float]
+) -> float | None:
+    """Probability of the best setting of a family; None where none has a test.
+
+    High powers rest on few moves, whose random signs test nothing: the simplest form is surprising
+    for both.
+    """
+    competing = [probability[best]]
+    fewest = min(widths)
+    if widths[best] > fewest:
+        competing += [probability[index] for index in possible if widths[index] == fewest]
+    smallest = float(np.fmin.reduce(competing))
+    if np.isnan(smallest):
+        return None
+    return smallest
+
+
+def _with_refusals(finding: Finding, trial: CandidateTrial, gates: Gates) -> Finding:
+    """The finding with the gates that it does not pass."""
+    refusals: list[str] = []
+    too_few_moves = ""
+    if _may_be_noise(finding, gates):
+        if finding.probability is None or is_tested_on_others(trial.rest):
+            too_few_moves = what_to_record(finding.effect, trial.gram, trial.rest)
+            refusals.append(too_few_moves)
+        else:
+            refusals.append(f"noise makes one as strong with p = {finding.probability:.3f}")
+    if finding.folds_better < gates.folds_better:
+        percent = 100 * finding.folds_better
+        refusals.append(f"it is better on {percent:.0f} % of the folds only")
+    may_be_small = _may_be_small(finding)
+    if finding.explained < gates.explained and not may_be_small:
+        percent = 100 * finding.explained
+        refusals.append(f"it explains {percent:.1f} % of the squared residual only")
+    if finding.error_fall < gates.error_fall and not may_be_small:
+        percent = -100 * finding.error_fall
+        refusals.append(f"the error on left-out moves changes by {percent:+.1f} % only")
+    if finding.held_out_fall <= 0.0:
+        refusals.append("the error on left-out moves does not fall")
+    if finding.impossible:
+        refusals.append(finding.impossible)
+    if not refusals:
+        return finding
+    return replace(finding, passed=False, refusals=tuple(refusals), too_few_moves=too_few_moves)
+
+
+def _may_be_noise(finding: Finding, gates: Gates) -> bool:
+    """Whether noise alone makes such a candidate too often, or there is no test of it."""
+    if finding.probability is None:
+        return True
+    is_strong = finding.folds_better >= gates.strong_folds
+    if is_strong and finding.error_fall >= gates.strong_fall:
+        return finding.probability > gates.strong_false_alarm
+    return finding.probability > gates.false_alarm
+
+
+def _may_be_small(finding: Finding) -> bool:
+    """Whether it is a mistake of the geometry: that is spread over all motors, and bends gains."""
+    if isinstance(finding.effect, LatePosition):
+        is_certain = certain_delays(finding.coefficients, finding.deviations)
+        return bool(is_certain.all())
+    return isinstance(finding.effect, GeometryEffect)
+
+
+def _share_of_excess(
+    search_problem: SearchProblem, sizes: MotorSizes, trial: CandidateTrial, motor: int
+) -> float | None:
+    """Share of a motor's squared residual beyond its noise; see `Finding.share_of_excess`."""
+    floor_a = search_problem.floors_a[motor]
+    if floor_a is None:
+        return None
+    problem = search_problem.folds.linearisation
+    # The residual is whitened: a row of noise alone has (floor/σ)² on average.
+    of_noise = float(problem.shown(motor) * (floor_a / problem.noise[motor]) ** 2)
+    excess = float(sizes.residual[motor]) - of_noise
+    if excess <= 0.0:
+        return None
+    return min(float(trial.fallen[motor]) / excess, 1.0)
 
 
 def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
-    """Which coefficients are impossible; of a form with more of them than the fewest of its family,
-    without tolerance.
+    """Name the coefficients that are impossible.
 
-    Two that are nearly collinear each hide in their σ, however certain both together are. What is
-    left of a rotor may be zero within its σ: it is fitted to say how well the rotor is known.
+    A form with more of them than the fewest of its family has no tolerance. Two that are nearly
+    collinear each hide in their σ, however certain both together are. What is left of a rotor may
+    be zero within its σ: it is fitted to say how well the rotor is known.
     """
-    is_richer = len(effect.coefficients) > fewest and not effect.fits_rotor
-    tolerance = 0.0 if is_richer else SIGMAS
+    is_richer = len(effect.coefficients) > fewest
+    if is_richer and not effect.fits_rotor:
+        tolerance = 0.0
+    else:
+        tolerance = SIGMAS
     return impossible(effect.coefficients, trial.coefficients, trial.deviations, tolerance)
 
 
 def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
-    """Probability of each candidate's Wald statistic under random signs of the moves,
-    for the largest of all.
+    """Probability of each candidate's Wald statistic under random signs of the moves.
+
+    It is that the largest statistic of all candidates is as large.
 
     A candidate that rests on few moves has a heavy tail, and would hide every other one: it
     competes with all, but the others do not compete with it. It is tested without the moves of most
     leverage where the others are enough, and has no probability (NaN) where no test is left.
     """
-    signs = rng.choice((-1.0, 1.0), size=(draws, len(trials[0].scatter)))
+    moves = len(trials[0].scatter)
+    signs = rng.choice((-1.0, 1.0), size=(draws, moves))
     of_many: dict[int, ByMove] = {}
     of_few: dict[int, ByMove] = {}
     for number, trial in enumerate(trials):
@@ -469,34 +520,30 @@ def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws:
     for part in (of_many, of_few):
         observed, drawn = _surprises(list(part.values()), signs)
         surprise = np.maximum(surprise, drawn)
-        probability[list(part)] = (1.0 + np.sum(surprise[None] >= observed[:, None], axis=1)) / (
-            draws + 1.0
-        )
+        as_surprising = np.sum(surprise[None] >= observed[:, None], axis=1)
+        probability[list(part)] = (1.0 + as_surprising) / (draws + 1.0)
     return probability
 
 
 def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Surprise of each candidate, shape (c,), and of the most surprising one of each draw,
-    shape (draws,).
-    """
+    """Surprise of candidates, shape (c,), and of the most surprising one of each draw, (draws,)."""
     widths = np.array([len(one.score) for one in candidates], dtype=np.int64)
     observed = np.empty(len(candidates))
     surprise = np.zeros(len(signs))
     for freedom in np.unique(widths).tolist():
         numbers = np.flatnonzero(widths == freedom).tolist()
         alike = [candidates[number] for number in numbers]
-        score, scatter = (
-            np.stack(parts)
-            for parts in zip(*((one.score, one.scatter) for one in alike), strict=True)
-        )
+        score = np.stack([one.score for one in alike])
+        scatter = np.stack([one.scatter for one in alike])
         # The candidate is in the fit here: else its own torque would count as noise, and the
         # strongest would hide best.
-        inverse = np.linalg.pinv(np.swapaxes(scatter, 1, 2) @ scatter)
+        covariance = np.swapaxes(scatter, 1, 2) @ scatter
+        inverse = np.linalg.pinv(covariance)
+        # sᵀ(XᵀX)⁻¹s of each candidate.
         wald = (score[:, None] @ inverse @ score[:, :, None])[:, 0, 0]
         if freedom == 1:
-            drawn = _drawn_numbers(
-                scatter[:, :, 0].T, np.stack([one.gram[:, 0, 0] for one in alike], axis=1), signs
-            )
+            gram = np.stack([one.gram[:, 0, 0] for one in alike], axis=1)
+            drawn = _drawn_numbers(scatter[:, :, 0].T, gram, signs)
         else:
             drawn = reduce(np.maximum, (_drawn_wald(one, signs) for one in alike))
         # On the scale of −log p, so that candidates with one and with two coefficients compete
@@ -508,53 +555,66 @@ def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatAr
 
 def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
     """−log p of χ² statistics, finite however large they are."""
-    return np.asarray(
-        -np.log(np.maximum(scipy.special.chdtrc(freedom, wald), np.finfo(np.float64).tiny))
-    )
+    p = scipy.special.chdtrc(freedom, wald)
+    return np.asarray(-np.log(np.maximum(p, TINY)))
 
 
 def _drawn_wald(trial: ByMove, signs: FloatArray) -> FloatArray:
-    """Wald statistic of each draw, with a scatter of its own;
-    with one for all, few moves would look too certain.
+    """Wald statistic of each draw, with a scatter of its own, shape (draws,).
 
-    In a draw, x_m becomes s_m x_m; its sum S is taken for an effect β = G⁻¹S, and the rest in move
-    m is s_m x_m − G_m β (the studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
+    With one scatter for all draws, few moves would look too certain. In a draw, x_m becomes s_m
+    x_m; its sum S is taken for an effect β = G⁻¹S, and the rest in move m is s_m x_m − G_m β (the
+    studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
     """
     x = trial.scatter
     gram = trial.gram
-    (moves, p), (row, column) = x.shape, np.tril_indices(x.shape[1])
+    moves, p = x.shape
     sums = signs @ x
     fitted = sums @ np.linalg.pinv(gram.sum(axis=0))
-    # Symmetric matrices by their lower triangle. First Σ_m s_m (x_m (G_m β)ᵀ + (G_m β) x_mᵀ),
-    # linear in β.
-    mixed = gram[:, column] * x[:, row, None] + gram[:, row] * x[:, column, None]
-    crossed = (signs @ mixed.reshape(moves, -1)).reshape(-1, len(row), p) @ fitted[:, :, None]
+    # Symmetric matrices by their lower triangle.
+    row, column = np.tril_indices(p)
+    # Σ_m x_m x_mᵀ, the same in all draws.
+    fixed = (x.T @ x)[row, column]
+    # Σ_m s_m (x_m (G_m β)ᵀ + (G_m β) x_mᵀ), linear in β.
+    mixed = gram[:, column] * x[:, row, None]
+    mixed = mixed + gram[:, row] * x[:, column, None]
+    drawn = signs @ mixed.reshape(moves, -1)
+    crossed = drawn.reshape(-1, len(row), p) @ fitted[:, :, None]
     # Σ_m (G_m β)(G_m β)ᵀ, linear in ββᵀ: one matrix for all draws.
-    products = (gram.reshape(moves, -1).T @ gram.reshape(moves, -1)).reshape(p, p, p, p)
+    flat = gram.reshape(moves, -1)
+    products = (flat.T @ flat).reshape(p, p, p, p)
     squares = products[row[:, None], row, column[:, None], column]
-    squares += np.where(row == column, 0.0, products[row[:, None], column, column[:, None], row])
+    mirrored = products[row[:, None], column, column[:, None], row]
+    squares += np.where(row == column, 0.0, mirrored)
+    fitted_squares = fitted[:, row] * fitted[:, column]
     left = np.empty((len(signs), p, p))
-    left[:, row, column] = (
-        (x.T @ x)[row, column] - crossed[:, :, 0] + (fitted[:, row] * fitted[:, column]) @ squares.T
-    )
+    left[:, row, column] = fixed - crossed[:, :, 0] + fitted_squares @ squares.T
     left[:, column, row] = left[:, row, column]
     # A coefficient that no draw scatters
-    left += 1e-12 * np.trace(left, axis1=1, axis2=2)[:, None, None] * np.eye(p)
-    return np.asarray(np.sum(sums * np.linalg.solve(left, sums[:, :, None])[:, :, 0], axis=1))
+    trace = np.trace(left, axis1=1, axis2=2)
+    left += 1e-12 * trace[:, None, None] * np.eye(p)
+    # SᵀL⁻¹S of each draw.
+    solution = np.linalg.solve(left, sums[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(sums * solution, axis=1))
 
 
 def _drawn_numbers(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatArray:
-    """The same for candidates with one coefficient each, the largest of all;
-    x_m and G_m of shape (moves, c).
+    """The largest of `_drawn_wald` of candidates with one coefficient each, shape (draws,).
+
+    Args:
+        x: x_m of each candidate, shape (moves, c).
+        gram: G_m, shape (moves, c).
+        signs: s_m, shape (draws, moves).
     """
     sums = signs @ x
     fitted = sums / gram.sum(axis=0)
-    left = (
-        np.sum(x**2, axis=0)
-        - 2.0 * fitted * (signs @ (x * gram))
-        + fitted**2 * np.sum(gram**2, axis=0)
-    )
-    return np.asarray(np.max(sums**2 / left, axis=1))
+    # Σ_m (s_m x_m − G_m β)² = Σ_m x_m² − 2 β Σ_m s_m x_m G_m + β² Σ_m G_m².
+    fixed = np.sum(x**2, axis=0)
+    crossed = signs @ (x * gram)
+    squares = np.sum(gram**2, axis=0)
+    left = fixed - 2.0 * fitted * crossed + fitted**2 * squares
+    wald = sums**2 / left
+    return np.asarray(np.max(wald, axis=1))
 
 
 def _golden_section(
@@ -587,6 +647,9 @@ def _golden_section(
             at_inner = at_outer
             outer = a + GOLDEN * (b - a)
             at_outer = fall(outer)
-    best = float(f"{np.exp((a + b) / 2.0):.4g}")
-    better = fall(np.log(best)) > fall(np.log(effect.settings[name]))
-    return effect.with_settings({name: best}) if better else effect
+    middle = np.exp((a + b) / 2.0)
+    best = float(f"{middle:.4g}")
+    given = effect.settings[name]
+    if fall(np.log(best)) > fall(np.log(given)):
+        return effect.with_settings({name: best})
+    return effect
