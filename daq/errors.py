@@ -328,6 +328,14 @@ class OutputFailed(DaqError):
                 "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
                 "`chgrp`) if the controller can read it then",
             )
+        if error.errno == errno.ENAMETOOLONG:
+            return cls(
+                str(path),
+                found=reason_of(error),
+                expected="a name that the file system takes, with the endings of its temporary "
+                "files",
+                remedy="it is as it was; choose a shorter name",
+            )
         return cls(
             str(path),
             found=reason_of(error),

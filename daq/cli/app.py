@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import gc
 import io
 import json
@@ -30,7 +31,7 @@ from daq.cli.terminal import (
 )
 from daq.cli.verb import HELP_NAMES, Job, Verb
 from daq.environment import software
-from daq.errors import DaqError, ExitCode, OutputFailed
+from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, reason_of
 from daq.report.text import printable
 from drivers.errors import DriverError, all_notes
 from ident.errors import IdentificationError
@@ -460,6 +461,17 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
 
 
 def _output_failed(error: OSError, json_wanted: bool) -> int:
+    if error.errno == errno.ENAMETOOLONG and error.filename:
+        # Names to write were judged with the command line: this one is of a file to read.
+        unusable = UsageError(
+            str(error.filename),
+            found=reason_of(error),
+            expected="a name that the file system takes",
+            remedy="check the name",
+        )
+        failure = ErrorParts.of(unusable)
+        show_failure(failure, json_wanted=json_wanted)
+        return failure.exit_code
     # A reader that closed the pipe needs no message where nothing was written; a full disk does.
     has_changed = bool(WRITTEN or CHANGED)
     if has_changed or not isinstance(error, BrokenPipeError):

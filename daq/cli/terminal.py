@@ -171,7 +171,7 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
     """Refuse to overwrite an input, or a file that does not begin with its format."""
     if out is None or not out.exists():
         return
-    if any(given is not None and given.exists() and out.samefile(given) for given in inputs):
+    if any(given is not None and _is_same(out, given) for given in inputs):
         raise UsageError(
             str(out),
             found="one of the input files",
@@ -179,6 +179,14 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
             remedy="choose another name",
         )
     check_replaceable(out, f"format: {format_}", format_)
+
+
+def _is_same(out: Path, given: Path) -> bool:
+    """Whether a file to write is an input; what reads an input says why that cannot be read."""
+    try:
+        return given.exists() and out.samefile(given)
+    except OSError:
+        return False
 
 
 def require_different(out: Path | None, **folders: Path | None) -> None:

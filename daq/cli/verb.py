@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from daq.errors import UsageError
+from daq.errors import UsageError, reason_of
 from daq.files import judge_target
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def judged_output(path: Path | None) -> Path | None:
     except OSError as error:
         raise UsageError(
             str(path),
-            found=error.strerror or type(error).__name__,
+            found=reason_of(error),
             expected="a file or folder, or a new name, without links of other users",
             remedy="choose another name, or name the place itself",
         ) from error

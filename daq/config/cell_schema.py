@@ -28,6 +28,7 @@ from daq.config.recalibration import RecalibrationSection
 from daq.config.workspace import ClearanceSection, WorkspaceSection
 from daq.config.yaml_file import DocumentKind, FileName, Name, Positive, StrictModel, not_in_file
 from ident.arrays import FloatArray
+from ident.data.conditioning import FILTER_ORDER
 from ident.plausible import LEAD_MM, SPEED, within
 
 ONE_BUS = not_in_file("one bus")
@@ -257,7 +258,6 @@ class EffectModel(StrictModel):
 
 #: Least and largest cut-off of a filter; below, its window is minutes long
 CUTOFF_HZ = (0.01, 100_000.0)
-FILTER_ORDER = (1, 10)  #: Least and largest order
 _CutOff = Annotated[float, Field(ge=CUTOFF_HZ[0], le=CUTOFF_HZ[1])]
 
 

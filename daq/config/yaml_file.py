@@ -47,6 +47,17 @@ MAX_EXPLAINED = 100
 MAX_SHOWN = 8  #: Faults listed in one message
 _NOT_IN_FILE = "\0"
 
+PATTERNS = {
+    r"^[\w][\w .()/+-]*$": "letters, digits, spaces and _ . ( ) / + -, beginning with a letter, a "
+    "digit or _",
+    r"^[^\x00]+$": "text without the character NUL",
+    r"^[^/\\\x00]+$": "the name of a file, without a folder",
+    r"^[a-z0-9][a-z0-9_-]*$": "lower-case letters, digits, _ and -, beginning with a letter or a "
+    "digit",
+    r"^J[1-9][0-9]?$": "the name of a joint, J1 to J99",
+    r"^[.,]$": "a point or a comma",
+}
+"""What each pattern of a text in the schemas allows, in words for a message."""
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
 FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 Positive = Annotated[float, Field(gt=0)]
@@ -245,7 +256,7 @@ def parse_yaml(text: bytes, name: str) -> Document:
         line = _line(error.problem_mark or error.context_mark)
         raise YamlInvalid(
             f"{name}:{line}",
-            found=error.problem or error.context or "broken YAML",
+            found=(error.problem or error.context or "broken YAML").removeprefix("found "),
             expected="one YAML document",
             remedy="mind indentation (spaces, no tabs), colons and quotes; is this the right file?",
         ) from error
@@ -474,13 +485,15 @@ def _convert(
         for key_node, value_node in node.value:
             if isinstance(key_node, yaml.ScalarNode):
                 key = loader.construct_object(key_node)
+                shown = f"key {key_node.value!r}"
             else:
                 key = None
+                shown = f"a {key_node.id} as a key"
             key_line = key_node.start_mark.line + 1
             if not isinstance(key, str):
                 raise YamlInvalid(
                     f"{name}:{key_line}: {yaml_text(path)}",
-                    found=f"key {key_node.value!r}",
+                    found=shown,
                     expected="a key that is text",
                     remedy="quote it if this is intended",
                 )
@@ -524,6 +537,9 @@ def _fault(item: Any, model: type[BaseModel]) -> Fault:
         return Fault(path, f"unknown key {path[-1]!r}", hint)
     if item["type"] == "missing":
         return Fault(path, "nothing", "this key, it is required")
+    if item["type"] == "string_pattern_mismatch":
+        pattern = item["ctx"]["pattern"]
+        return Fault(path, _show(item["input"]), PATTERNS.get(pattern, f"text like {pattern}"))
     expected = re.sub(
         r"^\w+ should (be|have) |^Value error, | after "
         r"validation, not .*$",

@@ -20,7 +20,7 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from daq.arguments import A_FILE_TO_WRITE, A_LIST, A_PATH, checks_arguments, of_kind
-from daq.config.cell_schema import CUTOFF_HZ, FILTER_ORDER
+from daq.config.cell_schema import CUTOFF_HZ
 from daq.config.yaml_file import (
     IN_ORDER,
     DocumentKind,
@@ -51,6 +51,7 @@ from ident.calibration import (
     PayloadMass,
     Source,
 )
+from ident.data.conditioning import FILTER_ORDER
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 from ident.physical.full_set import FullParameter, FullSet, GainWithPrior

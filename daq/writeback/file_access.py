@@ -40,12 +40,19 @@ def resolve_links(file: Path) -> Path:
         file: as it was declared. A name that was resolved before has no links left to judge.
 
     Raises:
-        ControllerUnfit: the links form a circle, one of them belongs to another user, or they lead
-            into a folder in which every user may exchange the file.
+        ControllerUnfit: the name is too long, the links form a circle, one of them belongs to
+            another user, or they lead into a folder in which every user may exchange the file.
     """
     try:
         target = follow_links(file)
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise ControllerUnfit(
+                str(file),
+                found=reason_of(error),
+                expected="a name that the file system takes",
+                remedy="correct `controller.file` of the cell configuration, or give --to FILE",
+            ) from error
         if error.errno not in (errno.ELOOP, errno.EPERM):
             raise
         raise ControllerUnfit(

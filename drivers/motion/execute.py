@@ -124,8 +124,7 @@ def execute(
         # without yielding.
         with network.block_signals():
             try:
-                ended_by = f"{type(error).__name__}: {text_of(error)}".removesuffix(": ")
-                execution.report(None, EventKind.ENDED, 0, ended_by)
+                execution.report(None, EventKind.ENDED, 0, _cause(error))
                 for _ in execution.stop():
                     pass
             except BaseException as cut:
@@ -469,3 +468,12 @@ class _Execution:
             if not powered or silent > tolerated:
                 break
         return tuple(powered)
+
+
+def _cause(error: BaseException) -> str:
+    """Say for the log what ended a motion: an error by its class and text, others in words."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    if isinstance(error, GeneratorExit):
+        return "its caller took no more samples"
+    return f"{type(error).__name__}: {text_of(error)}".removesuffix(": ")

@@ -13,12 +13,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from math import ceil
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
 
-from ident.arrays import FloatArray, IntArray
+from ident.arrays import FloatArray, IntArray, require_count, require_kind
 from ident.errors import ModelError
+
+FILTER_ORDER = (1, 10)  #: Least and largest order of the filter of the positions
 
 FULL_FILTER_HZ = 125.0
 """Sampling rate from which the usual cut-offs hold, that of a real arm in the tests;
@@ -81,6 +84,28 @@ class Conditioning:
         document = asdict(self)
         document["standstill_rad_s"] = list(self.standstill_rad_s)
         return document
+
+
+def require_settings(conditioning: Conditioning) -> None:
+    """Refuse settings that are no numbers, and an order that no filter of positions has.
+
+    Cut-offs are compared with the sampling rate of each run.
+
+    Raises:
+        ModelError: for the setting.
+    """
+    numbers = {
+        "position_cutoff_hz": conditioning.position_cutoff_hz,
+        "decimation_cutoff_hz": conditioning.decimation_cutoff_hz,
+        "standstill_share": conditioning.standstill_share,
+    }
+    for name, value in numbers.items():
+        require_kind(f"{name} of the conditioning", value, Real, "give a number")
+    label = "position_order of the conditioning"
+    least, largest = FILTER_ORDER
+    order = require_count(label, conditioning.position_order, remedy="give a number such as 4")
+    if not least <= order <= largest:
+        raise ModelError(f"{label} is {order}; expected {least} to {largest}; 4 is usual")
 
 
 def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:

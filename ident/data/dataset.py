@@ -28,9 +28,14 @@ from ident.data.channel_faults import (
     replaced_samples,
 )
 from ident.data.clipping import clipped_samples
-from ident.data.conditioning import Conditioning, central_differences, low_pass
+from ident.data.conditioning import (
+    Conditioning,
+    central_differences,
+    low_pass,
+    require_settings,
+)
 from ident.data.held import HeldChannels, fill_held
-from ident.data.run import Run, usual_conditioning
+from ident.data.run import Run, require_named, usual_conditioning
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain
@@ -56,6 +61,8 @@ SETTLED_PERIODS = 4.0
 
 LARGEST_JITTER = 0.01  #: Range of the steps of time, as a share of their median
 MEDIAN_OF_NORMAL = 0.6745  #: Median of |Z| of a standard normal Z
+#: Sizes of a current, in whatever unit, whose squares and their sums are exact enough
+SMALLEST_CURRENT, LARGEST_CURRENT = 1e-30, 1e30
 
 LONGEST_MOVE_S = 2.0
 """Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a
@@ -126,6 +133,7 @@ def differentiate(
         DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short
             a recording.
     """
+    require_named(run)
     refuse = partial(DataUnfit, run.name)
     if conditioning is None:
         conditioning = usual_conditioning([run])
@@ -233,6 +241,7 @@ def _checked(
     each = "one row per entry of time_s, one column per axis"
     position = as_array("position_rad", run.position_rad, shape, each, refuse)
     current = as_array("current_a", run.current_a, shape, each, refuse)
+    _require_squares(current, refuse)
     usable = None
     if run.valid is not None:
         usable = as_array("valid", run.valid, shape, each, refuse)
@@ -242,6 +251,22 @@ def _checked(
     temperature_c = _temperature(run.temperature_c, shape, each, refuse)
     _check(replace(run, time_s=time_s), axes, conditioning, refuse)
     return _CheckedArrays(position, current, usable, move, temperature_c)
+
+
+def _require_squares(current: FloatArray, refuse: Refusal) -> None:
+    """Refuse currents whose squares are zero or infinite in floating point.
+
+    Raises:
+        DataUnfit: as of `differentiate`.
+    """
+    largest = np.max(np.abs(current), axis=0, initial=0.0)
+    is_wrong = (largest > 0.0) & ((largest < SMALLEST_CURRENT) | (largest > LARGEST_CURRENT))
+    if np.any(is_wrong):
+        axis = int(np.argmax(is_wrong))
+        raise refuse(
+            f"current_a has {largest[axis]:g} as the largest size on axis {axis + 1}; expected "
+            "amperes, or another unit of the drive; correct the scale"
+        )
 
 
 def _moves_between_standstills(moving: BoolArray) -> IntArray:
@@ -400,6 +425,7 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     Raises:
         DataUnfit: as of `differentiate`.
     """
+    require_settings(conditioning)
     samples = len(run.time_s)
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):

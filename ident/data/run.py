@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, require_number
 from ident.data.channel_faults import JudgedChannels
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueChannel
@@ -103,6 +103,19 @@ class Run:
     def rate_hz(self) -> float:
         """Sampling rate [Hz]."""
         return float((len(self.time_s) - 1) / (self.time_s[-1] - self.time_s[0]))
+
+
+def require_named(run: Run) -> None:
+    """Refuse a run whose name is no text, or whose beginning is no time, before a message or a
+    report uses them.
+
+    Raises:
+        ModelError: for either.
+    """
+    require_kind("name of a run", run.name, str, "write Run('bare', time_s, ...)")
+    if run.started_s is not None:
+        remedy = "leave it out without a clock that the runs share"
+        require_number(f"started_s of {run.name!r}", run.started_s, remedy=remedy)
 
 
 def usual_conditioning(runs: Iterable[Run]) -> Conditioning:

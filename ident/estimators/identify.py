@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.data.run import Run, usual_conditioning
+from ident.data.run import Run, require_named, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
@@ -318,6 +318,7 @@ def each_run(
         require_kind(
             "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
         )
+        require_named(run)
         if (run.name, run.digest) in names:
             raise DataUnfit(
                 run.name, "found two runs of this name; expected another name for each; rename one"

@@ -57,7 +57,10 @@ class Payload:
     def __post_init__(self) -> None:
         require_kind("known", self.known, dict, "write its mass as {'m': 4.59}")
         for name, value in self.known.items():
-            require_kind(f"known[{name!r}]", value, Real, "give numbers in SI units: {'m': 4.59}")
+            remedy = "give numbers in SI units: {'m': 4.59}"
+            require_kind(f"known[{name!r}]", value, Real, remedy)
+            if isinstance(value, bool):
+                raise ModelError(f"known[{name!r}] is {value}; expected a number; {remedy}")
         foreign = sorted(set(self.known) - set(LINK_PARAMETERS))
         if foreign:
             found = ", ".join(map(repr, foreign))

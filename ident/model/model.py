@@ -61,7 +61,7 @@ class DriveTrain:
     def __post_init__(self) -> None:
         ratio = as_array("the drive train", self.ratio)
         object.__setattr__(self, "ratio", ratio)
-        is_square = ratio.ndim == 2 and ratio.shape[0] == ratio.shape[1]
+        is_square = ratio.ndim == 2 and ratio.shape[0] == ratio.shape[1] > 0
         if not is_square:
             remedy = ""
             if ratio.ndim == 1:

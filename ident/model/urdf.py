@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import atan2, cos, inf, isfinite, sin, sqrt
+from os import PathLike
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
@@ -458,7 +459,7 @@ def _root(urdf: str) -> Element:
     """Return <robot>, without a namespace."""
     try:
         robot = fromstring(urdf)
-    except (ParseError, TypeError) as error:
+    except (ParseError, TypeError, ValueError) as error:
         if UNBOUND_PREFIX in str(error):
             raise ModelError(
                 f"the URDF cannot be read: {error}, a prefix of a name whose namespace is not "
@@ -466,6 +467,11 @@ def _root(urdf: str) -> Element:
                 'xmlns:PREFIX="..." in <robot>, or elements without a prefix; a file with xacro: '
                 "is expanded by "
                 "`xacro robot.urdf.xacro > robot.urdf`"
+            ) from error
+        if not isinstance(urdf, (str, bytes, PathLike)):
+            raise ModelError(
+                f"the URDF is of type {type(urdf).__name__}; expected text: pass "
+                "Path(...).read_text()"
             ) from error
         if _looks_like_file_name(str(urdf)):
             raise ModelError(

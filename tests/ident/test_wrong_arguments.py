@@ -258,6 +258,82 @@ OF_A_CALL: list[tuple[str, Call, str]] = [
     ),
     ("NaN", lambda m, r: lax.identify(m, r, lax.Conditioning(float("nan"))), "'bare': "),
     (
+        "cut-off of text",
+        lambda m, r: lax.identify(m, r, lax.Conditioning("40")),
+        "position_cutoff_hz of the conditioning is of type str; expected Real; give a number",
+    ),
+    (
+        "share of text",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(standstill_share=None)),
+        "standstill_share of the conditioning is of type NoneType; expected Real",
+    ),
+    (
+        "broken order",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(position_order=2.5)),
+        "position_order of the conditioning is 2.5; expected a whole number",
+    ),
+    (
+        "order zero",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(position_order=0)),
+        "position_order of the conditioning is 0; expected 1 to 10; 4 is usual",
+    ),
+    (
+        "order of hundreds",
+        lambda m, r: lax.identify(m, r, lax.Conditioning(position_order=500)),
+        "position_order of the conditioning is 500; expected 1 to 10",
+    ),
+    (
+        "a number as the name of a run",
+        lambda m, r: lax.identify(m, [replace(one, name=k) for k, one in enumerate(r)]),
+        r"name of a run is of type int; expected str; write Run\('bare'",
+    ),
+    (
+        "no name of one run",
+        lambda m, r: differentiate(replace(r[0], name=None), m.drive_train),
+        "name of a run is of type NoneType; expected str",
+    ),
+    (
+        "a date as the beginning",
+        lambda m, r: lax.identify(m, [replace(one, started_s="monday") for one in r]),
+        "started_s of 'bare' is 'monday' of type str; expected a finite number; leave it out",
+    ),
+    (
+        "NaN as the beginning",
+        lambda m, r: lax.identify(m, [replace(one, started_s=float("nan")) for one in r]),
+        "started_s of 'bare' is nan; expected a finite number",
+    ),
+    (
+        "currents whose squares vanish",
+        lambda m, r: lax.identify(m, [replace(one, current_a=1e-200 * one.current_a) for one in r]),
+        "'bare': current_a has .*e-2.. as the largest size on axis 1; expected amperes",
+    ),
+    (
+        "currents whose squares overflow",
+        lambda m, r: lax.identify(m, [replace(one, current_a=1e200 * one.current_a) for one in r]),
+        r"'bare': current_a has .*e\+2.. as the largest size on axis 1; expected amperes",
+    ),
+    ("no ratio", lambda *_: lax.DriveTrain(np.zeros((0, 0))), r"found shape \(0, 0\)"),
+    (
+        "half a character",
+        lambda *_: lax.robot_from_urdf("\ud800"),
+        "looks like a file name; expected text|the URDF cannot be read",
+    ),
+    (
+        "half a character in a URDF",
+        lambda *_: lax.robot_from_urdf("<robot name='\ud800'/>"),
+        "the URDF cannot be read: .*surrogates not allowed; expected XML",
+    ),
+    (
+        "no URDF",
+        lambda *_: lax.robot_from_urdf(None),
+        "the URDF is of type NoneType; expected text: pass Path",
+    ),
+    (
+        "a truth value as a mass",
+        lambda *_: lax.Payload("disc", "flange", {"m": True}),
+        r"known\['m'\] is True; expected a number; give numbers in SI units",
+    ),
+    (
         "method",
         lambda m, r: lax.identify(m, r, lax.Conditioning(), method="foo"),
         "'foo'; expected one of ls, wls",

@@ -115,6 +115,40 @@ def test_no_verb_waits_for_a_pipe(
     assert "Traceback" not in "".join(capsys.readouterr())
 
 
+LONG_NAME = "x" * 300
+OF_LONG_NAMES = {
+    "an output that exists": ["fit", "a.mcap", LONG_NAME, "--out", "calibration.yaml"],
+    "data of an import": [
+        *("import", "configs/imports/tx40.yaml", "--data", LONG_NAME, "--out", "made.mcap"),
+    ],
+    "logs of a fleet": ["fleet", LONG_NAME, "--out", "made"],
+    "a controller": ["apply", VALID["cell"], "calibration.yaml", "--to", LONG_NAME],
+    "a rollback": ["rollback", VALID["cell"], "--to", LONG_NAME],
+} | {line: [word.replace("PIPE", LONG_NAME) for word in words] for line, words in LINES.items()}
+
+
+@pytest.mark.parametrize("line", OF_LONG_NAMES)
+def test_a_name_that_no_file_system_takes_is_not_called_a_full_disk(
+    line: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    code = main(OF_LONG_NAMES[line])
+    said = "".join(capsys.readouterr())
+    assert code not in (ExitCode.OK, ExitCode.UNEXPECTED)
+    assert "free space" not in said
+    assert "Traceback" not in said
+
+
+def test_an_output_whose_temporary_name_is_too_long_asks_for_a_shorter_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    name = "x" * 250 + ".html"
+    code = main(["certificate", "calibration.yaml", "--cell", VALID["cell"], "--out", name])
+    assert code == ExitCode.UNEXPECTED
+    assert "choose a shorter name" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "verb", [["info"], ["fit"], ["export", "bag"], ["export", "log", "--csv"], ["salvage"]]
 )

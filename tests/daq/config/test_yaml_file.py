@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,14 @@ from pydantic import Field
 from daq.config.cell_schema import CellModel
 from daq.config.drive import DriveModel
 from daq.config.import_description import ImportDescription
-from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model, read_yaml_bytes
+from daq.config.yaml_file import (
+    MAX_BYTES,
+    PATTERNS,
+    StrictModel,
+    parse_yaml,
+    read_model,
+    read_yaml_bytes,
+)
 from daq.errors import ConfigurationError, ConfigurationMissing, SchemaMismatch, YamlInvalid
 from daq.simulation.simulation_file import SimulationModel
 
@@ -136,6 +144,9 @@ def test_the_remedy_names_a_page_with_every_key(model: type[StrictModel], checko
         ("a: [1, 2\nb: 3\n", ":2", ""),
         ("a: 1\n---\nb: 2\n", ":2", "another document"),
         ("1: x\n", ":1", "key '1'"),
+        ("? [a, b]\n: x\n", ":1", "a sequence as a key"),
+        ("a:\n\tb: 1\n", ":2", ""),
+        ('a: "\\ud800"\n', ":1", "found invalid Unicode character"),
         ("a: \xff\x00", "", ""),
         ("[" * 3000, ":1", "lists in lists"),
         ("a: [" + "1," * 60_000 + "]", ":1", "more than 50000 values"),
@@ -147,6 +158,34 @@ def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, fou
         parse_yaml(text.encode("latin-1"), "file.yaml")
     assert f"file.yaml{line}" in str(caught.value)
     assert found in str(caught.value)
+    assert "found found" not in str(caught.value)
+    assert "Node(" not in str(caught.value)
+
+
+def _patterns(schema: object) -> Iterator[str]:
+    """Yield each pattern of a text in a JSON schema."""
+    if isinstance(schema, dict):
+        if isinstance(schema.get("pattern"), str):
+            yield schema["pattern"]
+        for part in schema.values():
+            yield from _patterns(part)
+    elif isinstance(schema, list):
+        for part in schema:
+            yield from _patterns(part)
+
+
+@pytest.mark.parametrize("model", [CellModel, DriveModel, ImportDescription, SimulationModel])
+def test_a_message_says_in_words_what_a_pattern_allows(model: type[StrictModel]) -> None:
+    patterns = set(_patterns(model.model_json_schema()))
+    assert patterns
+    assert patterns <= set(PATTERNS)
+
+
+def test_a_name_with_other_characters_is_refused_in_words() -> None:
+    with pytest.raises(SchemaMismatch) as caught:
+        read_model(parse_yaml(b"name: ../../evil\n", "file.yaml"), CellModel)
+    assert "beginning with a letter, a digit or _" in str(caught.value)
+    assert "pattern" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def test_every_failure_stops_all_axes(
 
 @pytest.mark.parametrize("interrupt", [GeneratorExit, KeyboardInterrupt, ZeroDivisionError])
 def test_leaving_the_loop_stops_all_axes(moving: Moving, interrupt: type[BaseException]) -> None:
-    network, stream, bus, _ = moving
+    network, stream, bus, events = moving
     with (
         pytest.raises(interrupt),
         closing(execute(network, stream, (FAR,), permission(), BOUNDS)) as samples,
@@ -223,11 +223,13 @@ def test_leaving_the_loop_stops_all_axes(moving: Moving, interrupt: type[BaseExc
             if sample.cycle == 60:
                 raise interrupt
     assert powerless(bus)
+    (ended,) = [event for event in events if event.kind is EventKind.ENDED]
+    assert ended.text == "its caller took no more samples"
     assert 0 < bus.nodes[0].position < 50_000
 
 
 def test_an_interrupt_inside_of_a_cycle_stops_all_axes(moving: Moving) -> None:
-    _, _, bus, _ = moving
+    _, _, bus, events = moving
 
     def interrupt(cycle: int) -> None:
         if cycle == 60:
@@ -237,6 +239,7 @@ def test_an_interrupt_inside_of_a_cycle_stops_all_axes(moving: Moving) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(moving, FAR)
     assert powerless(bus)
+    assert [event.text for event in events if event.kind is EventKind.ENDED] == ["interrupted"]
 
 
 def test_a_fault_during_the_last_stop_is_not_forgotten(moving: Moving) -> None:
