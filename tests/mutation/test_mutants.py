@@ -8,7 +8,15 @@ import ast
 from pathlib import Path
 
 import pytest
+from coverage import CoverageData
 
+from tests.mutation.coverage_map import (
+    NO_TESTS_WERE_COLLECTED,
+    CoverageMap,
+    environment_of,
+    lines_that_read,
+)
+from tests.mutation.fork_server import ForkServer
 from tests.mutation.mutants import Mutant, compiles, mutants_of
 from tests.mutation.study import Outcome, chosen_mutants, mirrored, room_of, summary
 
@@ -121,3 +129,76 @@ def test_a_planted_fault_can_be_taken_out_again() -> None:
     mutant = next(iter(mutants_of(source)))
     assert mutant == Mutant("comparison", 1, 6, 7, "<", "<=")
     assert mutant.planted(source) == b"x = a <= b\n"
+
+
+def _map_of(tmp_path: Path, source: str, executed: dict[str, list[int]]) -> CoverageMap:
+    """Coverage of one file by tests; the empty name is what runs at import."""
+    (tmp_path / "a.py").write_text(source)
+    data = CoverageData(no_disk=True)
+    for test, lines in executed.items():
+        data.set_context(test)
+        data.add_lines({str(tmp_path / "a.py"): lines})
+    return CoverageMap(data, {"tests/x/test_a.py::one": 3.0}, tmp_path)
+
+
+SOURCE = """LIMIT = 3
+TABLE = {
+    1: LIMIT,
+}
+def f(x):
+    return x < LIMIT
+def g(x):
+    return TABLE[x]
+"""
+
+
+def test_lines_that_read_a_name_are_those_of_its_assignment() -> None:
+    assert lines_that_read(SOURCE, 1) == (3, 6)
+    assert lines_that_read(SOURCE, 3) == (8,)
+    assert lines_that_read(SOURCE, 6) == ()
+
+
+def test_a_constant_is_tried_with_the_tests_that_read_it(tmp_path: Path) -> None:
+    executed = {"": [1, 2, 3, 5, 7], "tests/x/test_a.py::one": [6], "tests/y/test_b.py::two": [8]}
+    covered = _map_of(tmp_path, SOURCE, executed)
+    assert covered.tests_that_could_notice("a.py", 1) == ("tests/x/test_a.py::one",)
+    assert covered.tests_that_could_notice("a.py", 3) == ("tests/y/test_b.py::two",)
+    assert covered.tests_that_could_notice("a.py", 6) == ("tests/x/test_a.py::one",)
+    # Nothing reads what line 5 makes by name, so every test of the file is tried.
+    assert len(covered.tests_that_could_notice("a.py", 5)) == 2
+
+
+def test_a_line_that_nothing_executes_is_tried_with_the_tests_of_its_file(tmp_path: Path) -> None:
+    covered = _map_of(tmp_path, SOURCE, {"": [1, 2, 3, 5, 7], "tests/x/test_a.py::one": [6]})
+    assert not covered.executes("a.py", 8)
+    assert covered.executes("a.py", 1)
+    assert covered.tests_that_could_notice("a.py", 8) == ("tests/x/test_a.py::one",)
+
+
+def test_the_file_named_after_a_module_comes_first_and_then_the_cheapest(tmp_path: Path) -> None:
+    durations = {
+        "tests/x/test_dear.py::one": 3.0,
+        "tests/x/test_dear.py::two": 3.0,
+        "tests/x/test_cheap.py::one": 4.0,
+        "tests/x/test_own.py::one": 9.0,
+    }
+    covered = CoverageMap(CoverageData(no_disk=True), durations, tmp_path)
+    order = ["tests/x/test_own.py", "tests/x/test_cheap.py", "tests/x/test_dear.py"]
+    assert list(covered.cheapest_files(durations, "own")) == order
+    assert covered.affordable(list(durations), 10.0) == [
+        "tests/x/test_cheap.py::one",
+        "tests/x/test_dear.py::one",
+        "tests/x/test_dear.py::two",
+    ]
+    # However dear it is, one file is tried.
+    assert covered.affordable(list(durations), 1.0) == ["tests/x/test_cheap.py::one"]
+
+
+def test_a_fork_of_the_server_runs_the_named_tests_and_no_others() -> None:
+    own = "tests/mutation/test_mutants.py::test_a_planted_fault_can_be_taken_out_again"
+    with ForkServer(ROOT, environment_of(ROOT)) as server:
+        found = server.run([own], 300.0, 60.0)
+        nothing = server.run([f"{own}_at_all"], 300.0, 60.0)
+    assert found.status == 0
+    assert "1 passed" in found.printed
+    assert nothing.status == NO_TESTS_WERE_COLLECTED

@@ -704,3 +704,16 @@ def test_a_bus_that_is_cut_leaves_the_settings_of_all_axes_and_that_is_said() ->
         for note in error.value.__notes__
         if "settings of J1 (node 1), J2 (node 2) not restored" in note
     ]
+
+
+def test_a_request_after_the_time_for_closing_is_not_sent_and_says_so_alone() -> None:
+    network, bus = cell(1)
+    with network:
+        network.link.deadline_ns = network.link.clock()
+        sent = len(bus.sent)
+        with pytest.raises(ObjectAccessError) as failure:
+            network.objects(network.axes[0]).read(ObjectEntry(0x6041, 0, 16))
+        assert len(bus.sent) == sent
+        network.end_closing()
+    # Not "…, asked 2 times": it was not asked.
+    assert failure.value.reason == "the time for closing the network was over"

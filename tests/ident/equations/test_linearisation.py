@@ -17,10 +17,12 @@ from ident.equations.linearisation import (
     Jacobian,
     _sums_of_motors,
     independent_blocks,
+    jackknife_covariance,
     left_out_shifts,
     linearise,
     motor_jacobian,
 )
+from ident.errors import TooFewMoves
 from ident.estimators.estimate import Identification
 from tests.ident.recordings import Truth
 
@@ -200,3 +202,13 @@ def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -
 def test_clusters_of_different_runs_are_never_joined() -> None:
     _, grams, scores = _slow_line(np.random.default_rng(1), 150.0)
     assert len(independent_blocks(grams, scores, np.arange(len(grams)))) == len(grams)
+
+
+def test_one_move_fewer_than_can_be_left_out_is_refused_with_their_number(noisy: Evidence) -> None:
+    system = noisy.training.system()
+    few = replace(system, clusters=system.clusters[: MIN_MOVES_TO_LEAVE_OUT - 1])
+    estimate = noisy.estimate
+    with pytest.raises(TooFewMoves, match=f"{MIN_MOVES_TO_LEAVE_OUT - 1}"):
+        jackknife_covariance(
+            few, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False
+        )
