@@ -67,7 +67,8 @@ class StudiedRobot:
     @property
     def fingerprint(self) -> str:
         """Digest of the row and of the files that it names."""
-        cell = shipped_configurations() / "cells" / f"{self.cell}.yaml"
+        cells_folder = shipped_configurations() / "cells"
+        cell = cells_folder / f"{self.cell}.yaml"
         simulation = shipped_simulation(self.simulation)
         files = (
             cell.read_text(),
@@ -124,25 +125,30 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
         weighings: dict[str, list[Path]] = {first: [], robot.second: []}
         for number, (body, plan) in enumerate(mounted):
             weighings[body].append(folder / f"{body}-{number}.mcap")
+            last_noise_seed = 100 * seed + LAST_NOISE - number
+            log = weighings[body][-1]
             record_run(
                 job,
                 plan,
-                weighings[body][-1],
+                log,
                 mounted=body,
                 declared=False,
-                seed=100 * seed + LAST_NOISE - number,
+                seed=last_noise_seed,
             )
         calibration = load_calibration(folder / "calibration.yaml")
         weighed = {body: weigh_logs(calibration, mine).body for body, mine in weighings.items()}
     payloads: dict[str, float] = {}
     for role, name in (("payload", robot.second), ("first_payload", first)):
-        true = load_simulation(shipped_simulation(robot.simulation), name).payload
+        path = shipped_simulation(robot.simulation)
+        true = load_simulation(path, name).payload
         assert true is not None
+        mass_std_kg = weighed[name].mass_std_kg
         payloads |= {
             f"{role}_kg": true.mass_kg,
             f"{role}_error_percent": 100.0 * (weighed[name].mass_kg / true.mass_kg - 1.0),
-            f"{role}_std_percent": 100.0 * weighed[name].mass_std_kg / true.mass_kg,
+            f"{role}_std_percent": 100.0 * mass_std_kg / true.mass_kg,
         }
+    total = job.calibration["relative_error_percent"]["total"]
     return {
         "robot": robot.name,
         "seed": seed,
@@ -151,7 +157,7 @@ def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
         "true_gain": job.truth,
         "gain_error_percent": {axis: error for axis, (error, _) in job.gains.items()},
         "gain_std_percent": {axis: std for axis, (_, std) in job.gains.items()},
-        "floor_percent": job.calibration["relative_error_percent"]["total"],
+        "floor_percent": total,
     } | payloads
 
 
@@ -167,17 +173,26 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
     magnitudes of errors, and the share of 95 % intervals that hold.
     """
     errors, inside = gain_errors(rows)
-    payload = np.abs([row["payload_error_percent"] for row in rows])
+    payload_error_percent = [row["payload_error_percent"] for row in rows]
+    payload = np.abs(payload_error_percent)
+    floor_percent = [row["floor_percent"] for row in rows]
+    mean_floor_percent = float(np.mean(floor_percent))
+    seeds = [row["seed"] for row in rows]
+    mean_payload = float(np.mean(payload))
+    largest_payload = float(np.max(payload))
+    mean_inside = float(np.mean(inside))
+    robot = rows[0]["robot"]
+    gain_error_percent = rows[0]["gain_error_percent"]
     return {
-        "robot": rows[0]["robot"],
-        "seeds": [row["seed"] for row in rows],
-        "gains": len(rows[0]["gain_error_percent"]),
-        "floor_percent": float(np.mean([row["floor_percent"] for row in rows])),
+        "robot": robot,
+        "seeds": seeds,
+        "gains": len(gain_error_percent),
+        "floor_percent": mean_floor_percent,
         "mean_gain_error_percent": float(np.mean(errors)),
         "worst_gain_error_percent": float(np.max(errors)),
-        "mean_payload_error_percent": float(np.mean(payload)),
-        "worst_payload_error_percent": float(np.max(payload)),
-        "coverage_percent": 100.0 * float(np.mean(inside)),
+        "mean_payload_error_percent": mean_payload,
+        "worst_payload_error_percent": largest_payload,
+        "coverage_percent": 100.0 * mean_inside,
     }
 
 
@@ -185,11 +200,10 @@ def gain_errors(rows: Iterable[dict[str, Any]]) -> tuple[FloatArray, BoolArray]:
     """Magnitude of each gain's error [%] and whether it is inside its 95 % interval,
     all axes and seeds in a row.
     """
-    pairs = [
-        (abs(error), row["gain_std_percent"][axis])
-        for row in rows
-        for axis, error in row["gain_error_percent"].items()
-    ]
+    pairs = []
+    for row in rows:
+        for axis, error in row["gain_error_percent"].items():
+            pairs.append((abs(error), row["gain_std_percent"][axis]))
     errors, std = np.array(pairs).T
     return errors, errors < WITHIN * std
 
@@ -200,11 +214,13 @@ def pooled(rows: list[dict[str, Any]]) -> dict[str, Any]:
     masses = [
         abs(row["payload_error_percent"]) < WITHIN * row["payload_std_percent"] for row in rows
     ]
+    mean_inside = float(np.mean(inside))
+    mean_mass = float(np.mean(masses))
     return {
         "gains": len(inside),
-        "gain_coverage_percent": 100.0 * float(np.mean(inside)),
+        "gain_coverage_percent": 100.0 * mean_inside,
         "masses": len(masses),
-        "mass_coverage_percent": 100.0 * float(np.mean(masses)),
+        "mass_coverage_percent": 100.0 * mean_mass,
     }
 
 
@@ -232,9 +248,8 @@ def table(robots: list[dict[str, Any]]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Make the seeds that are missing, one after the other, and print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.any_robot", description=__doc__)
-    parser.add_argument(
-        "--only", nargs="+", choices=[robot.name for robot in ROBOTS], metavar="ROBOT"
-    )
+    choices = [robot.name for robot in ROBOTS]
+    parser.add_argument("--only", nargs="+", choices=choices, metavar="ROBOT")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument(
         "--part", nargs="+", choices=["gains", "effects"], default=["gains", "effects"]
@@ -251,17 +266,17 @@ def main(arguments: list[str] | None = None) -> int:
     if "gains" in options.part:
         document |= _gains(chosen, options.seeds)
     if "effects" in options.part:
-        effects = [
-            kept_effect(one, seed, OUT)
-            for one in PLANTED
-            if one.robot in chosen
-            for seed in options.seeds
-        ]
+        effects = []
+        for one in PLANTED:
+            if one.robot in chosen:
+                for seed in options.seeds:
+                    effects.append(kept_effect(one, seed, OUT))
         document["effects"] = effects
         sys.stdout.write(
             f"\nUndeclared effects:\n\n{table_of_effects(effects)}\n" if effects else ""
         )
-    replace_file(path, f"{json.dumps(document, indent=2)}\n".encode())
+    content = f"{json.dumps(document, indent=2)}\n".encode()
+    replace_file(path, content)
     return 0
 
 
@@ -269,8 +284,13 @@ def _gains(chosen: set[str], seeds: list[int]) -> dict[str, Any]:
     """Figures of the chosen robots, printed as a table;
     of all of them also the tables of the documentation.
     """
-    mine = [[kept(robot, seed) for seed in seeds] for robot in ROBOTS if robot.name in chosen]
-    everything = [row for rows in mine for row in rows]
+    mine = []
+    for robot in ROBOTS:
+        if robot.name in chosen:
+            mine.append([kept(robot, seed) for seed in seeds])
+    everything = []
+    for rows in mine:
+        everything.extend(rows)
     robots = [figures(rows) for rows in mine]
     over_all = pooled(everything)
     if len(robots) == len(ROBOTS) and set(seeds) >= set(SEEDS):

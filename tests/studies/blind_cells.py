@@ -117,7 +117,8 @@ def blind_cases(seed: int, count: int) -> tuple[EffectCase, ...]:
                 continue
             case = EffectCase(f"blind-{seed}-{number:02d}", truth, effects)
             try:
-                Plant(case.spec("measurement", None, 0))
+                spec = case.spec("measurement", None, 0)
+                Plant(spec)
             except SpecInvalid:  # two flexible drives on one motor
                 continue
             break

@@ -42,7 +42,8 @@ class PlantedEffect:
     @property
     def fingerprint(self) -> str:
         """Digest of the row and of the files that it names."""
-        cell = shipped_configurations() / "cells" / f"{self.cell}.yaml"
+        cells_folder = shipped_configurations() / "cells"
+        cell = cells_folder / f"{self.cell}.yaml"
         simulation = shipped_simulation(self.cell)
         files = (
             cell.read_text(),
@@ -100,15 +101,18 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
     found = as_json(printed.getvalue())
     wanted = (planted.name, planted.place)
     kept = {(one["name"], one["axis"]) for one in found["effects"]}
-    added = [one for turn in found["turns"] for one in turn["added"]]
-    sizes = [
-        coefficient
-        for one in added
-        if (one["effect"], one["axis"]) == wanted
-        for coefficient in one["coefficients"]
-        if coefficient["name"] == planted.coefficient
-    ]
+    added = []
+    for turn in found["turns"]:
+        added.extend(turn["added"])
+    sizes = []
+    for one in added:
+        if (one["effect"], one["axis"]) == wanted:
+            for coefficient in one["coefficients"]:
+                if coefficient["name"] == planted.coefficient:
+                    sizes.append(coefficient)
     changes = {one["axis"]: one for one in found["gain_changes"]}
+    sorted_differences = sorted(kept - {wanted})
+    total = found["before"]["cross_validated_error_percent"]["total"]
     return {
         "robot": planted.robot,
         "seed": seed,
@@ -119,9 +123,9 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
         "named_first": bool(added) and (added[0]["effect"], added[0]["axis"]) == wanted,
         "found_size": sizes[-1]["value"] if sizes else None,
         "found_size_std": sizes[-1]["std"] if sizes else None,
-        "others": [f"{name} on {place}" for name, place in sorted(kept - {wanted})],
+        "others": [f"{name} on {place}" for name, place in sorted_differences],
         "added": added,
-        "error_before_percent": found["before"]["cross_validated_error_percent"]["total"],
+        "error_before_percent": total,
         "error_after_percent": found["after"]["cross_validated_error_percent"]["total"],
         "gain_change_percent": {axis: one["change_percent"] for axis, one in changes.items()},
         "gain_error_before_percent": {

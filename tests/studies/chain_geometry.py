@@ -65,7 +65,8 @@ class WrongGeometry:
         """Build it into a plant, which starts where its loops close."""
         urdf = self.urdf(spec.urdf)
         robot = robot_with(cell.chain, self.urdf(cell.urdf), cell.gravity_m_s2)
-        start_rad = assemble(robot).position_rad[list(robot.axis_joints)]
+        position_rad = assemble(robot).position_rad
+        start_rad = position_rad[list(robot.axis_joints)]
         return replace(spec, urdf=urdf, start_rad=start_rad)
 
 
@@ -86,19 +87,23 @@ def study_case(job: Job, wrong: WrongGeometry | None, seed: int, verb: str) -> d
     """
     logs = []
     with contextlib.redirect_stdout(io.StringIO()):
-        for number, mounted in enumerate((None, job.cell.payloads[0].name)):
+        first_payload = job.cell.payloads[0]
+        for number, mounted in enumerate((None, first_payload.name)):
             logs.append(
                 job.folder
                 / f"{'bare' if mounted is None else 'loaded'}-{wrong}.mcap".replace(" ", "")
             )
             if not logs[-1].exists():
+                number_seed = 100 * seed + number
+                plan = job.folder / "plan.yaml"
+                log = logs[-1]
                 record_run(
                     job,
-                    job.folder / "plan.yaml",
-                    logs[-1],
+                    plan,
+                    log,
                     mounted=mounted,
                     declared=mounted is not None,
-                    seed=100 * seed + number,
+                    seed=number_seed,
                     changed=lambda spec: spec if wrong is None else wrong.plant(spec, job.cell),
                 )
     with contextlib.redirect_stdout(io.StringIO()) as printed:

@@ -35,9 +35,10 @@ def one(seed: int) -> dict[str, Any]:
         100.0 * (value / gain.truth - 1.0)
         for gain, value in zip(gains, paper.gains.tolist(), strict=True)
     ]
+    total = outcome.calibration.relative_error_percent.total
     return {
         "seed": seed,
-        "floor_percent": outcome.calibration.relative_error_percent.total,
+        "floor_percent": total,
         "ml_error_percent": ml,
         "tls_error_percent": tls,
         "scores": [
@@ -59,7 +60,8 @@ def main() -> int:
     }
     false_effects = sum(len(row["effects"]) for row in rows)
     result = {"runs": rows, **sizes, "false_effects": false_effects}
-    OUT.with_suffix(".json").write_text(json.dumps(result, indent=2) + "\n")
+    text = json.dumps(result, indent=2)
+    OUT.with_suffix(".json").write_text(text + "\n")
     lines = [
         "| seed | "
         "floor % | " + " | ".join(f"J{n + 1} %" for n in range(6)) + " | paper's TLS, mean / max % "

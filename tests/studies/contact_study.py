@@ -93,10 +93,13 @@ def later_residual(rng: np.random.Generator, tail: str, correlation_s: float, ho
     torques = []
     for hour in range(hours):
         gaussian = autoregression(rng, rows_an_hour, correlation_s)
-        kept = np.flatnonzero(np.abs(gaussian).max(axis=0) > KEPT_SIGMAS)
+        largest_absolute_gaussian = np.abs(gaussian).max(axis=0)
+        kept = np.flatnonzero(largest_absolute_gaussian > KEPT_SIGMAS)
         times.append((hour * rows_an_hour + kept) * ROW_S)
         torques.append(with_tail(gaussian[:, kept], tail))
-    return Later(np.concatenate(times), np.concatenate(torques, axis=1), hours)
+    torque = np.concatenate(torques, axis=1)
+    time_s = np.concatenate(times)
+    return Later(time_s, torque, hours)
 
 
 def learned_levels(
@@ -104,13 +107,15 @@ def learned_levels(
 ) -> FloatArray:
     """Threshold of each joint from quiet minutes, shape (JOINTS,)."""
     rows = round(60.0 * minutes / ROW_S)
-    ratio = np.abs(with_tail(autoregression(rng, rows, correlation_s), tail))
+    gaussian = autoregression(rng, rows, correlation_s)
+    ratio = np.abs(with_tail(gaussian, tail))
     time_s: FloatArray = np.arange(rows) * np.float64(ROW_S)
     levels = []
     for joint in range(JOINTS):
-        level = alarm_level(
-            ratio[joint], time_s, 2.0 * correlation_s, ALARMS_PER_HOUR / JOINTS, 60.0 * minutes
-        )
+        gap_s = 2.0 * correlation_s
+        alarms_per_hour = ALARMS_PER_HOUR / JOINTS
+        observed_s = 60.0 * minutes
+        level = alarm_level(ratio[joint], time_s, gap_s, alarms_per_hour, observed_s)
         levels.append(np.nan if level is None else level)
     return np.array(levels)
 
@@ -124,11 +129,14 @@ def alarms_an_hour(
     scale[:, 0] = 1.0
     band = Band(scale, ones, levels, correlation_s * ones, ones, ALARMS_PER_HOUR)
     shape = later.torque.shape
+    use = np.ones(shape, dtype=np.bool_)
+    torque_nm = growth * later.torque
+    scale_nm = np.ones(shape)
     watched = ExternalTorque(
         time_s=later.time_s,
-        torque_nm=growth * later.torque,
-        scale_nm=np.ones(shape),
-        use=np.ones(shape, dtype=np.bool_),
+        torque_nm=torque_nm,
+        scale_nm=scale_nm,
+        use=use,
         band=band,
         from_itself=False,
         left_out=0,
@@ -141,10 +149,12 @@ def least_level(later: Later, correlation_s: float) -> float:
     the lowest that any method could promise.
     """
     low = KEPT_SIGMAS
-    high = float(np.abs(later.torque).max())
+    absolute_torque = np.abs(later.torque)
+    high = float(absolute_torque.max())
     for _ in range(25):
         middle = 0.5 * (low + high)
-        if alarms_an_hour(np.full(JOINTS, middle), later, correlation_s) > ALARMS_PER_HOUR:
+        levels = np.full(JOINTS, middle)
+        if alarms_an_hour(levels, later, correlation_s) > ALARMS_PER_HOUR:
             low = middle
         else:
             high = middle
@@ -211,7 +221,10 @@ def main(arguments: list[str] | None = None) -> int:
             print_line("\n".join(rows))
             lines += rows
     if options.tables is not None:
-        replace_file(options.tables / "contact.csv", as_csv("\n".join(lines)).encode())
+        markdown = "\n".join(lines)
+        content = as_csv(markdown).encode()
+        path = options.tables / "contact.csv"
+        replace_file(path, content)
     return 0
 
 

@@ -114,27 +114,28 @@ class CaseTask:
 def simulate(task: CaseTask, cell: Cell) -> tuple[RawRun, ...]:
     """The four runs of a cell."""
     case = CASES[task.case]
-    truth = world_cell(task.seed, CASES[task.case].world)
+    world = CASES[task.case].world
+    truth = world_cell(task.seed, world)
     runs = []
     for number, (name, payload) in enumerate(RUNS):
         spec = replace(spec_of(truth, payload, number), effects=task.effects)
-        demand = case.motion(
-            cell, spec.start_rad, np.random.default_rng([task.seed, number]), DURATION_S
-        )
+        rng = np.random.default_rng([task.seed, number])
+        demand = case.motion(cell, spec.start_rad, rng, DURATION_S)
         if payload is None:
             declared = None
         else:
             declared = declared_payload(payload)
-        runs.append(follow(cell, spec, demand, name, declared, BETWEEN_S * number))
+        began_s = BETWEEN_S * number
+        runs.append(follow(cell, spec, demand, name, declared, began_s))
     return tuple(runs)
 
 
 def make_runs(task: CaseTask, cell: Cell) -> None:
     """Simulate the runs of a cell unless the same ones are there."""
-    spec = world_cell(task.seed, CASES[task.case].world).bare
-    source = digest_of_source(
-        "tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell")
-    )
+    world = CASES[task.case].world
+    spec = world_cell(task.seed, world).bare
+    rooms = (*MOVING, "tests.studies.followed_cell")
+    source = digest_of_source("tests.studies.followed_cell", rooms)
     fingerprint = digest(source, cell.digest, DURATION_S, spec.urdf, spec.axes, task.effects)
     if not is_finished(task.path, fingerprint):
         task.path.parent.mkdir(parents=True, exist_ok=True)
@@ -148,14 +149,18 @@ def make(task: CaseTask) -> str:
     begun_s = time.process_time()
     make_runs(task, cell)
     simulated_s = time.process_time() - begun_s
-    ways = ("ident.discovery.loop" if CASES[task.case].searched else "ident.estimators.identify",)
-    fingerprint = digest(*map(digest_of_source, ways), mark_of(task.path).read_text())
+    searched = CASES[task.case].searched
+    ways = ("ident.discovery.loop" if searched else "ident.estimators.identify",)
+    text = mark_of(task.path).read_text()
+    fingerprint = digest(*map(digest_of_source, ways), text)
     if is_finished(task.score_path, fingerprint):
         return f"{task.case} {task.seed}: kept"
     score = score_of(task, cell)
-    replace_file(task.score_path, json.dumps(asdict(score)).encode())
+    content = json.dumps(asdict(score)).encode()
+    replace_file(task.score_path, content)
     finish(task.score_path, fingerprint)
-    worst = float(np.abs(score.error_percent).max())
+    absolute_error_percent = np.abs(score.error_percent)
+    worst = float(absolute_error_percent.max())
     found = ", ".join(score.effects)
     return (
         f"{task.case} {task.seed}: worst gain {worst:.2f} %, simulated in {simulated_s:.1f} s, "
@@ -174,18 +179,24 @@ def score_of(task: CaseTask, cell: Cell) -> GainScore:
     error = found.training_error.total
     effects: tuple[PlacedEffect, ...] = ()
     if CASES[task.case].searched:
-        end = find_effects(gather(found, runs), np.random.default_rng(0))[-1].after
+        rng = np.random.default_rng(0)
+        last_effect = find_effects(gather(found, runs), rng)[-1]
+        end = last_effect.after
         estimate = end.estimate
         effects = end.effects
-        error = estimate.relative_error(end.training.system()).total
+        system = end.training.system()
+        error = estimate.relative_error(system).total
     spent_s = time.process_time() - begun_s
-    true = np.array(
-        [axis.gain_nm_per_a for axis in world_cell(task.seed, CASES[task.case].world).bare.axes]
-    )
+    world = CASES[task.case].world
+    bare = world_cell(task.seed, world).bare
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in bare.axes]
+    true = np.array(gain_nm_per_a)
+    error_percent = tuple((100.0 * (estimate.gains / true - 1.0)).tolist())
+    gain_difference = estimate.gains - true
     return GainScore(
         seed=task.seed,
-        error_percent=tuple((100.0 * (estimate.gains / true - 1.0)).tolist()),
-        z=tuple(((estimate.gains - true) / estimate.gains_std).tolist()),
+        error_percent=error_percent,
+        z=tuple((gain_difference / estimate.gains_std).tolist()),
         relative_error_percent=error,
         processor_s=spent_s,
         effects=tuple(placed.name_among(cell.axis_names) for placed in effects),
@@ -199,7 +210,9 @@ def pooled(scores: list[GainScore]) -> str:
     inside = np.abs([one.z for one in scores]) <= NORMAL_95
     share = 100.0 * inside.mean()
     if len(inside) > 1:
-        error = 100.0 * inside.mean(axis=1).std(ddof=1) / np.sqrt(len(inside))
+        count_root = np.sqrt(len(inside))
+        mean_inside = inside.mean(axis=1)
+        error = 100.0 * mean_inside.std(ddof=1) / count_root
     else:
         error = float("nan")
     return f"{share:.1f} ± {error:.1f} % of the 95 % intervals hold the truth"
@@ -215,9 +228,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
     )
-    parser.add_argument(
-        "--method", choices=(Method.ML.value, Method.IV.value), default=Method.ML.value
-    )
+    choices = (Method.ML.value, Method.IV.value)
+    parser.add_argument("--method", choices=choices, default=Method.ML.value)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)

@@ -109,9 +109,9 @@ class RunsTask:
     def plans(self) -> tuple[PlanTask, PlanTask]:
         """Plans of the first and of the second pair of runs."""
         first = FIRST_SEED + 2 * (self.number % PLAN_PAIRS)
-        return PlanTask(self.out, first, self.duration_s), PlanTask(
-            self.out, first + 1, self.duration_s
-        )
+        seed = first + 1
+        plan_task = PlanTask(self.out, seed, self.duration_s)
+        return PlanTask(self.out, first, self.duration_s), plan_task
 
 
 def tasks_of(
@@ -166,7 +166,8 @@ def load_coverage(tasks: Iterable[RunsTask]) -> Iterator[CoverageCell]:
         raw = read_runs(task.path)
         runs = tuple(run_of(run, cell) for run in raw)
         demands = tuple(demand_rad(run, cell) for run in raw)
-        yield CoverageCell(task.seed, truth_of(world_cell(task.seed, task.world)), runs, demands)
+        truth = truth_of(world_cell(task.seed, task.world))
+        yield CoverageCell(task.seed, truth, runs, demands)
 
 
 def make_coverage(
@@ -203,25 +204,26 @@ def difference(cell: Cell, spec: CellSpec, moves: Plan, folder: Path) -> tuple[s
         folder: for the log.
     """
     declared = declared_payload("disc")
-    direct = run_of(simulate_run(cell, spec, moves, "check", declared), cell)
+    run = simulate_run(cell, spec, moves, "check", declared)
+    direct = run_of(run, cell)
     bus = open_bus(bus_address(cell))
     try:
         with SimulatedCell(spec, bus):
-            record(
-                RecordingRequest(
-                    CELL,
-                    cell,
-                    moves,
-                    folder / "check.mcap",
-                    payload=declared,
-                    operator="study",
-                    granted_by="the study of coverage: a simulated cell",
-                    run_id="coverage-check",
-                )
+            request = RecordingRequest(
+                CELL,
+                cell,
+                moves,
+                folder / "check.mcap",
+                payload=declared,
+                operator="study",
+                granted_by="the study of coverage: a simulated cell",
+                run_id="coverage-check",
             )
+            record(request)
     finally:
         bus.shutdown()
-    recorded, _ = load_run(folder / "check.mcap")
+    path = folder / "check.mcap"
+    recorded, _ = load_run(path)
     arrays = ("time_s", "position_rad", "current_a", "move", "valid")
     differing = [
         name
@@ -240,6 +242,7 @@ def make_runs(task: RunsTask) -> str:
     first, second = (kept_plan(made, cell) for made in task.plans)
     moving = digest_of_source("tests.studies.direct_cell", MOVING)
     truth = world_cell(task.seed, task.world)
+    sorted_bodies = sorted(truth.bodies.items())
     fingerprint = digest(
         moving,
         cell.digest,
@@ -247,7 +250,7 @@ def make_runs(task: RunsTask) -> str:
         second.moves,
         truth.bare.urdf,
         truth.bare.axes,
-        sorted(truth.bodies.items()),
+        sorted_bodies,
     )
     if is_finished(path, fingerprint):
         return f"cell {task.seed}, {task.world}: kept"
@@ -287,9 +290,8 @@ def main(arguments: list[str] | None = None) -> int:
         cell = load_cell(CELL)
         moves = plan(cell, seed=FIRST_SEED, duration_s=10.0)
         with tempfile.TemporaryDirectory() as folder:
-            differing = difference(
-                cell, spec_of(study_cell(FIRST_SEED), "disc", 0), moves, Path(folder)
-            )
+            spec = spec_of(study_cell(FIRST_SEED), "disc", 0)
+            differing = difference(cell, spec, moves, Path(folder))
         sys.stdout.write(
             f"direct path and bus differ in: {', '.join(differing) or 'nothing, to the count'}\n"
         )

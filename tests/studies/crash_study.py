@@ -123,9 +123,8 @@ def recording(
         bus = open_bus(address)
         tap = Tap(bus)
         reported = cell_file.with_name("cell-on-hub.yaml")
-        reported.write_text(
-            _on_hub(cell_file.read_text(encoding="utf-8"), address), encoding="utf-8"
-        )
+        text = cell_file.read_text(encoding="utf-8")
+        reported.write_text(_on_hub(text, address), encoding="utf-8")
         command = [
             sys.executable,
             "-m",
@@ -197,9 +196,9 @@ def kill_once(cell_file: Path, plan: Path, folder: Path, target: int) -> Kill:
     part.unlink(missing_ok=True)
     saved.unlink(missing_ok=True)
     lost = tap.syncs - ASKED - recovered
-    return Kill(
-        target, tap.syncs - ASKED, recovered, lost, lost * CYCLE_MS, same, code, partial, refused
-    )
+    sent = tap.syncs - ASKED
+    lost_ms = lost * CYCLE_MS
+    return Kill(target, sent, recovered, lost, lost_ms, same, code, partial, refused)
 
 
 def _as_sent(samples: SampleBlock, answers: list[tuple[int, bytes]]) -> bool:
@@ -290,6 +289,7 @@ def damage(log: Path, changed: Iterator[bytes], tried: int) -> Damage:
             crashed[f"{type(error).__name__} in salvage"] += 1
     copy.unlink()
     mean = float(np.mean(shares)) if shares else 0.0
+    recovered_share = (min(shares, default=0.0), mean)
     return Damage(
         tried,
         dict(named),
@@ -297,7 +297,7 @@ def damage(log: Path, changed: Iterator[bytes], tried: int) -> Damage:
         wrong,
         dict(crashed),
         salvage_wrong,
-        (min(shares, default=0.0), mean),
+        recovered_share,
     )
 
 
@@ -355,10 +355,11 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
         cell_file = folder / "cell.yaml"
         plan = folder / "plan.yaml"
         log = folder / "whole.mcap"
-        text = (shipped_configurations() / "cells" / "demo.yaml").read_text(encoding="utf-8")
-        cell_file.write_text(
-            text.replace("../robots", str(shipped_configurations() / "robots")), encoding="utf-8"
-        )
+        demo_path = shipped_configurations() / "cells" / "demo.yaml"
+        text = demo_path.read_text(encoding="utf-8")
+        robots_folder = shipped_configurations() / "robots"
+        changed_text = text.replace("../robots", str(robots_folder))
+        cell_file.write_text(changed_text, encoding="utf-8")
         options = [
             "--out",
             str(plan),
@@ -376,30 +377,34 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
             recorder.wait()
         whole = read_log(log)
         length = len(whole.samples.cycle)
-        print_line(
+        line = (
             f"a whole recording: {tap.syncs} SYNCs, {length} samples, "
             f"{time.monotonic() - begun:.0f} s of wall time"
         )
+        print_line(line)
         done = []
         for number in range(kills):
-            done.append(kill_once(cell_file, plan, folder, chance.randrange(1, length)))
+            target = chance.randrange(1, length)
+            done.append(kill_once(cell_file, plan, folder, target))
             one = done[-1]
             print_line(
                 f"kill {number + 1}: sent {one.sent} = recovered {one.recovered} + lost "
                 f"{one.lost}, as sent: {one.same}"
             )
         data = log.read_bytes()
-        flips = damage(log, flipped(data, chance), damages)
+        changed = flipped(data, chance)
+        flips = damage(log, changed, damages)
         cuts = damage(log, cut(data, chance), damages)
     kept = (
         all(one.kept for one in done) and flips.kept and cuts.kept and tap.syncs == ASKED + length
     )
+    sync_difference = tap.syncs - ASKED
     return {
         "kept": kept,
         "promised_ms": PROMISED_MS,
         "seed": seed,
         "whole": {
-            "sent": tap.syncs - ASKED,
+            "sent": sync_difference,
             "logged": length,
             "as_sent": _as_sent(whole.samples, tap.answers),
         },
@@ -426,11 +431,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     document = study(options.kills, options.damages, options.seconds, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    print_line(
+    text = json.dumps(document, indent=1)
+    options.out.write_text(text + "\n", encoding="utf-8")
+    line = (
         f"largest loss of {len(document['kills'])} kills: {document['largest_loss_ms']} ms, "
         f"{PROMISED_MS:g} promised"
     )
+    print_line(line)
     for title in ("bit_flips", "truncations"):
         found = document[title]
         counts = ", ".join(

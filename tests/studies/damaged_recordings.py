@@ -55,11 +55,14 @@ def held(channels: FloatArray, samples: int) -> FloatArray:
 def held_readings(recording: Recording) -> None:
     """Print the error of a real arm with readings that are held."""
     (run,) = recording.runs
-    print_line(f"as recorded: {_error_percent(recording, run):.2f} %")
+    line = f"as recorded: {_error_percent(recording, run):.2f} %"
+    print_line(line)
     for hold_s in HOLDS_S:
         samples = round(hold_s * run.rate_hz)
-        position = replace(run, position_rad=held(run.position_rad, samples))
-        current = replace(run, current_a=held(run.current_a, samples))
+        position_rad = held(run.position_rad, samples)
+        position = replace(run, position_rad=position_rad)
+        current_a = held(run.current_a, samples)
+        current = replace(run, current_a=current_a)
         both = replace(position, current_a=current.current_a)
         errors = [_error_percent(recording, one) for one in (position, current, both)]
         of_each = "positions {:.2f} %, currents {:.2f} %, both {:.2f} %".format(*errors)
@@ -83,7 +86,8 @@ def _noise_a(run: Run) -> list[float]:
     frequency_hz = np.fft.rfftfreq(len(run.current_a), 1.0 / run.rate_hz)
     spectrum[frequency_hz < NOISE_HZ] = 0.0
     noise = np.fft.irfft(spectrum, len(run.current_a), axis=0)
-    rms: list[float] = np.sqrt(np.mean(noise**2, axis=0)).tolist()
+    rms_noise = np.sqrt(np.mean(noise**2, axis=0))
+    rms: list[float] = rms_noise.tolist()
     return rms
 
 
@@ -98,13 +102,15 @@ def limited_drive() -> None:
     runs = load_runs(task, imported=False)
     cell = load_cell(CELL)
     motor = LIMITED.effects[0].axis
-    truth = world_cell(LIMITED.seed, WORLD).bare.axes[motor].gain_nm_per_a
+    bare = world_cell(LIMITED.seed, WORLD).bare
+    truth = bare.axes[motor].gain_nm_per_a
     for words, keep_rows in (("with all samples", False), ("without what it did not give", True)):
         found = identify(model_of(cell), runs.fit, cell.conditioning, keep_rows=keep_rows)
         error = 100.0 * (found.estimate.gains[motor] / truth - 1.0)
         std = 100.0 * found.estimate.gains_std[motor] / abs(truth)
         left = found.training_error.axes[motor]
-        print_line(f"{words}: gain {error:+.2f} ± {std:.2f} % off, error of the axis {left:.1f} %")
+        line = f"{words}: gain {error:+.2f} ± {std:.2f} % off, error of the axis {left:.1f} %"
+        print_line(line)
         for one in diagnose(found, cell.axis_names):
             print_line(f"  {one.text}")
 
@@ -114,7 +120,8 @@ def held_readings_of_the_tx40() -> None:
     if (data_folder() / "tx40").is_dir():
         held_readings(tx40(data_folder()))
     else:
-        print_line(f"found no {data_folder() / 'tx40'}; the held readings are left out")
+        line = f"found no {data_folder() / 'tx40'}; the held readings are left out"
+        print_line(line)
 
 
 PARTS: dict[str, Callable[[], None]] = {

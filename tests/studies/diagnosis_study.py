@@ -79,7 +79,8 @@ def named(
         return [" ".join(("CurrentUnsigned", *error.axes))]
     except IdentificationError as error:
         names.append(type(error).__name__)
-    turned = find_turned_geometry(truth.model, read_instants(truth.model, runs, SMALL), gains)
+    instants = read_instants(truth.model, runs, SMALL)
+    turned = find_turned_geometry(truth.model, instants, gains)
     if turned is not None and is_confirmed(
         turned, truth.model, runs, SMALL, gains, gains_fixed=fixed, before_percent=error_percent
     ):
@@ -114,52 +115,58 @@ def delayed(
 ) -> list[str]:
     """Diagnoses where the currents or positions of some axes are late; NOISES_A in turn."""
     runs = []
-    for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
+    noise_a = NOISES_A[seed % len(NOISES_A)]
+    for run in small_recordings(truth, seed, noise_a=noise_a):
         current = run.current_a.copy()
         position = run.position_rad.copy()
         for axis in currents:
-            current[:, axis] = late(run.time_s, current[:, axis], 1e-3 * delay_ms)
+            delay_s = 1e-3 * delay_ms
+            current[:, axis] = late(run.time_s, current[:, axis], delay_s)
         for axis in positions:
             position[:, axis] = late(run.time_s, position[:, axis], 1e-3 * delay_ms)
-        runs.append(replace(run, current_a=current, position_rad=position))
+        changed_run = replace(run, current_a=current, position_rad=position)
+        runs.append(changed_run)
     return named(truth, runs, fixed=fixed)
 
 
 def offset(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
     """Diagnoses where the zero of J2 is off; NOISES_A in turn."""
     added = np.array([0.0, np.radians(degrees), 0.0])
-    runs = small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)])
-    return named(
-        truth, [replace(run, position_rad=run.position_rad + added) for run in runs], fixed=fixed
-    )
+    noise_a = NOISES_A[seed % len(NOISES_A)]
+    runs = small_recordings(truth, seed, noise_a=noise_a)
+    changed_runs = [replace(run, position_rad=run.position_rad + added) for run in runs]
+    return named(truth, changed_runs, fixed=fixed)
 
 
 def tilted(truth: Truth, seed: int, fixed: bool, degrees: float) -> list[str]:
     """Diagnoses of an arm whose base is not level; NOISES_A in turn."""
-    gravity_m_s2 = (
-        rotation_by(np.array([np.radians(degrees), 0.0, 0.0])) @ truth.model.robot.gravity_m_s2
-    )
+    vector_rad = np.array([np.radians(degrees), 0.0, 0.0])
+    gravity_m_s2 = rotation_by(vector_rad) @ truth.model.robot.gravity_m_s2
     return mounted(truth, seed, fixed, gravity_m_s2.tolist())
 
 
 def scaled(truth: Truth, seed: int, fixed: bool, factors: FloatArray | float) -> list[str]:
     """Diagnoses of currents that are recorded too large or too small."""
-    return named(truth, with_currents(small_recordings(truth, seed), factors), fixed=fixed)
+    runs = with_currents(small_recordings(truth, seed), factors)
+    return named(truth, runs, fixed=fixed)
 
 
 def sized(truth: Truth, seed: int, fixed: bool, axes: list[int], sign: float = 1.0) -> list[str]:
     """Diagnoses where drives report the size of their current."""
     runs = []
-    for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
+    noise_a = NOISES_A[seed % len(NOISES_A)]
+    for run in small_recordings(truth, seed, noise_a=noise_a):
         current = run.current_a.copy()
-        current[:, axes] = sign * np.abs(current[:, axes])
+        absolute_current = np.abs(current[:, axes])
+        current[:, axes] = sign * absolute_current
         runs.append(replace(run, current_a=current))
     return named(truth, runs, fixed=fixed)
 
 
 def carried(truth: Truth, seed: int, fixed: bool, body: FloatArray) -> list[str]:
     """Diagnoses where run r3 carries another body than it declares."""
-    return named(truth, small_recordings(truth, seed, count=6, bodies={3: body}), fixed=fixed)
+    runs = small_recordings(truth, seed, count=6, bodies={3: body})
+    return named(truth, runs, fixed=fixed)
 
 
 def lifted(truth: Truth, seed: int) -> list[str]:
@@ -167,18 +174,23 @@ def lifted(truth: Truth, seed: int) -> list[str]:
     as where a load is always carried.
     """
     names = []
-    for run in small_recordings(truth, seed, count=2, noise_a=NOISES_A[seed % len(NOISES_A)]):
+    noise_a = NOISES_A[seed % len(NOISES_A)]
+    for run in small_recordings(truth, seed, count=2, noise_a=noise_a):
         least = run.current_a.min(axis=0)
-        lifting = replace(run, current_a=run.current_a - least)
-        if unsigned_currents(lifting, truth.model.drive_train.ratio).any():
+        current_a = run.current_a - least
+        lifting = replace(run, current_a=current_a)
+        ratio = truth.model.drive_train.ratio
+        if unsigned_currents(lifting, ratio).any():
             names.append(f"CurrentUnsigned {run.name}")
     return names
 
 
 def mounted(truth: Truth, seed: int, fixed: bool, gravity_m_s2: Sequence[float]) -> list[str]:
     """Diagnoses of an arm whose cell declares another gravity; NOISES_A in turn."""
-    runs = small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)])
-    declared = replace(truth, model=with_gravity(truth.model, np.array(gravity_m_s2)))
+    noise_a = NOISES_A[seed % len(NOISES_A)]
+    runs = small_recordings(truth, seed, noise_a=noise_a)
+    model = with_gravity(truth.model, np.array(gravity_m_s2))
+    declared = replace(truth, model=model)
     return named(declared, runs, fixed=fixed)
 
 
@@ -187,12 +199,14 @@ def counted(truth: Truth, seed: int, fixed: bool, axis: int, current_sign: float
     NOISES_A in turn.
     """
     runs = []
-    for run in small_recordings(truth, seed, noise_a=NOISES_A[seed % len(NOISES_A)]):
+    noise_a = NOISES_A[seed % len(NOISES_A)]
+    for run in small_recordings(truth, seed, noise_a=noise_a):
         position = run.position_rad.copy()
         position[:, axis] *= -1.0
         current = run.current_a.copy()
         current[:, axis] *= current_sign
-        runs.append(replace(run, position_rad=position, current_a=current))
+        changed_run = replace(run, position_rad=position, current_a=current)
+        runs.append(changed_run)
     return named(truth, runs, fixed=fixed)
 
 
@@ -244,17 +258,21 @@ def main(arguments: Sequence[str]) -> int:
     truth = three_axes_truth()
     alarms = Counter[str]()
     for seed in range(given.cells):
-        runs = small_recordings(truth, seed, count=5, noise_a=NOISES_A[seed % len(NOISES_A)])
+        noise_a = NOISES_A[seed % len(NOISES_A)]
+        runs = small_recordings(truth, seed, count=5, noise_a=noise_a)
         for fixed in (False, True):
             alarms.update(named(truth, runs[:4], runs[4:], fixed=fixed))
         # As in the paper, whose gains are up to 30 % off their nameplates.
-        ratio = np.random.default_rng(seed).uniform(0.7, 1.3, size=3)
-        alarms.update(named(truth, runs[:4], runs[4:], nameplate=truth.gains / ratio))
+        rng = np.random.default_rng(seed)
+        ratio = rng.uniform(0.7, 1.3, size=3)
+        nameplate = truth.gains / ratio
+        alarms.update(named(truth, runs[:4], runs[4:], nameplate=nameplate))
         alarms.update(lifted(truth, seed))
-    _say(
+    line = (
         f"{given.cells} clean recordings, with free and with fixed gains, with nameplates up to 30 "
         f"% off, and with currents of one sign: {sum(alarms.values())} false alarms {dict(alarms)}"
     )
+    _say(line)
     rows.append(
         (
             "clean",

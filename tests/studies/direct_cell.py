@@ -96,28 +96,35 @@ def simulate_run(
     stream = DirectStream(cell, spec, began_s)
     scale = _scaling(cell, stream.ampere_per_unit)
     first = next(stream)  # as a recording does: it reads the positions before its log begins
-    permission = MotionPermission("a simulated cell", motor_limits(cell, scale))
+    limits = motor_limits(cell, scale)
+    permission = MotionPermission("a simulated cell", limits)
     planned = motor_moves(cell, plan, scale, first.position_counts)
     samples = [next(stream)]
     # The walk asks of network and stream what DirectStream has, and no more.
     with closing(execute(stream.network, cast(SyncStream, stream), planned, permission)) as walk:
         samples += walk
     time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
-    move = moves(tuple(stream.events), time_ns)
+    events = tuple(stream.events)
+    move = moves(events, time_ns)
     if move is None:
         raise ValueError(f"run {name}: the plan has no moves")
-    status = np.array([sample.statusword for sample in samples], dtype=np.uint16)
+    statuswords = [sample.statusword for sample in samples]
+    status = np.array(statuswords, dtype=np.uint16)
     bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
     masks = np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16)
+    demand_counts = np.array(stream.demand_counts[-len(samples) :], dtype=np.int32)
+    position_counts = np.array([sample.position_counts for sample in samples], dtype=np.int32)
+    current_raw = np.array([sample.current_raw for sample in samples], dtype=np.int16)
+    ampere_per_unit = np.array(stream.ampere_per_unit)
     return RawRun(
         name=name,
         payload=payload,
-        position_counts=np.array([sample.position_counts for sample in samples], dtype=np.int32),
-        demand_counts=np.array(stream.demand_counts[-len(samples) :], dtype=np.int32),
-        current_raw=np.array([sample.current_raw for sample in samples], dtype=np.int16),
+        position_counts=position_counts,
+        demand_counts=demand_counts,
+        current_raw=current_raw,
         limited=(status & masks) != 0,
         move=move,
-        ampere_per_unit=np.array(stream.ampere_per_unit),
+        ampere_per_unit=ampere_per_unit,
         began_s=began_s,
     )
 
@@ -127,14 +134,19 @@ def run_of(raw: RawRun, cell: Cell) -> Run:
     if cell.sync is None:
         raise ValueError(f"cell {cell.name}: no sync period")
     scale = _scaling(cell, raw.ampere_per_unit)
+    time_s = np.arange(len(raw.move), dtype=np.float64) / (1e6 / cell.sync.period_us)
+    counts = raw.position_counts.astype(np.int64)
+    position_rad = scale.joint_position(counts)
+    current_a = raw.current_raw * scale.current_per_unit
+    valid = ~raw.limited
     return Run(
         name=raw.name,
-        time_s=np.arange(len(raw.move), dtype=np.float64) / (1e6 / cell.sync.period_us),
-        position_rad=scale.joint_position(raw.position_counts.astype(np.int64)),
-        current_a=raw.current_raw * scale.current_per_unit,
+        time_s=time_s,
+        position_rad=position_rad,
+        current_a=current_a,
         payload=raw.payload,
         move=raw.move,
-        valid=~raw.limited,
+        valid=valid,
         started_s=raw.began_s,
     )
 
@@ -151,7 +163,8 @@ def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> SiScaling:
         AxisReadback(name, float(scale))
         for name, scale in zip(cell.axis_names, ampere_per_unit, strict=True)
     )
-    return scaling(cell, Readback(tuple(answers)))
+    readback = Readback(tuple(answers))
+    return scaling(cell, readback)
 
 
 class DirectStream:
@@ -175,7 +188,8 @@ class DirectStream:
                 f"cell {cell.name}: its sync period is not the simulated one, "
                 f"{spec.sync_period_us} us"
             )
-        self.pacing = LockstepSync(spec.sync_period_us * 1000)
+        period_ns = spec.sync_period_us * 1000
+        self.pacing = LockstepSync(period_ns)
         self.bus = self
         self.silent = False
         self.events: list[CellEvent] = []
@@ -183,19 +197,21 @@ class DirectStream:
         self.demand_counts: list[tuple[int, ...]] = []
         self._cycle = 0
         # Its nodes answer on a bus without readers.
-        self._cell = SimulatedCell(
-            spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None))
-        )
+        simple_namespace = SimpleNamespace(send=lambda _message: None)
+        bus = cast(can.BusABC, simple_namespace)
+        self._cell = SimulatedCell(spec, bus)
         self._cell.plant.time_s = began_s
         self.outgoing: list[can.Message] = []
         axes = drive_axes(cell)
         # No bus between this recorder and its amplifiers can fail: they need not be guarded.
+        node_ids = tuple(axis.node_id for axis in axes)
+        pdos = tuple(map(wanted_pdos, axes))
         self.network = cast(
             CanopenNetwork,
             SimpleNamespace(
                 axes=axes,
-                node_ids=tuple(axis.node_id for axis in axes),
-                pdos=tuple(map(wanted_pdos, axes)),
+                node_ids=node_ids,
+                pdos=pdos,
                 powered=set(),
                 begin_stop=lambda nodes: None,
                 begin_closing=lambda: None,
@@ -226,7 +242,8 @@ class DirectStream:
 
     def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         """Keep an event of the walk's."""
-        self.events.append(CellEvent(self.time_ns, axis, kind, code, text))
+        cell_event = CellEvent(self.time_ns, axis, kind, code, text)
+        self.events.append(cell_event)
 
     def advance(self) -> Sample:
         """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""
@@ -243,11 +260,13 @@ class DirectStream:
         self.time_ns = self._cycle * self.pacing.period_ns
         self.demand_counts.append(tuple(readings.demand))
         statuswords = tuple(node.drive.statusword() for node in nodes)
+        position_counts = tuple(readings.position)
+        current_raw = tuple(readings.current_demand)
         sample = Sample(
             self._cycle,
             self.time_ns,
-            tuple(readings.position),
-            tuple(readings.current_demand),
+            position_counts,
+            current_raw,
             statuswords,
         )
         self._cycle += 1

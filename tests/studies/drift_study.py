@@ -135,13 +135,17 @@ def most_percent(
     step = DRIFT_PERCENT / RAMP / std_percent
     days = before + int(np.ceil(FOUND_SIGMAS / step - 1e-9)) + 2
     ramp = _ramp(step, before, days)
-    sigmas = float(np.linalg.norm(ramp - ramp.mean())) / dispersion
+    ramp_difference = ramp - ramp.mean()
+    ramp_difference_norm = np.linalg.norm(ramp_difference)
+    sigmas = float(ramp_difference_norm) / dispersion
     limit = float(norm.isf(false_percent / 100.0 / AXES / 2.0))
     return 100.0 * float(norm.sf(limit - sigmas) + norm.cdf(-limit - sigmas))
 
 
 def _ramp(step: float, before: int, count: int) -> FloatArray:
-    return np.asarray(step * np.clip(np.arange(1, count + 1) - before, 0, RAMP), float)
+    difference = np.arange(1, count + 1) - before
+    clipped_difference = np.clip(difference, 0, RAMP)
+    return np.asarray(step * clipped_difference, float)
 
 
 def _days(values: FloatArray, stds: FloatArray, chart: Chart) -> Iterator[NDArray[np.bool_]]:
@@ -190,9 +194,8 @@ def main(arguments: list[str] | None = None) -> int:
     say("|---|---|---|---|---|---|\n")
     for count, dispersion in ((24, 1.0), (24, SCATTER), (24, 1.2), (24, 1.5), (104, SCATTER)):
         # A long history costs by the square of its length.
-        shares = false_alarms(
-            rng, options.histories // (1 + count // 60 * 7), dispersion=dispersion, count=count
-        )
+        histories = options.histories // (1 + count // 60 * 7)
+        shares = false_alarms(rng, histories, dispersion=dispersion, count=count)
         found = (shares.cusum, shares.single, shares.trend, shares.any)
         say(f"| {count} | {dispersion:g} | {' | '.join(f'{share:.2f}' for share in found)} |\n")
     say(

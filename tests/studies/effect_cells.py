@@ -31,7 +31,8 @@ class EffectCase:
 
     def spec(self, world: str, payload: str | None, run: int) -> CellSpec:
         """The plant of one of its runs, in one of WORLDS."""
-        return replace(spec_of(world_cell(self.seed, world), payload, run), effects=self.effects)
+        cell = world_cell(self.seed, world)
+        return replace(spec_of(cell, payload, run), effects=self.effects)
 
 
 def _effect(name: str, joint: int, **parameters: float) -> UndeclaredEffect:
@@ -105,14 +106,16 @@ def _cable(
     """A cable around two joints; its stiffness at the first of them,
     and the way at rest in radians of that joint.
     """
+    stiffness_n_per_m = stiffness_nm / radii_m[0] ** 2
+    rest_m = rest * abs(radii_m[0])
     return _effect(
         name,
         joint,
         other_axis=float(other),
         radius_m=radii_m[0],
         other_radius_m=radii_m[1],
-        stiffness_n_per_m=stiffness_nm / radii_m[0] ** 2,
-        rest_m=rest * abs(radii_m[0]),
+        stiffness_n_per_m=stiffness_n_per_m,
+        rest_m=rest_m,
     )
 
 
@@ -197,9 +200,8 @@ SMALLS = tuple(
 
 
 def _pair(number: int, kind: str, first: UndeclaredEffect, second: UndeclaredEffect) -> EffectCase:
-    return EffectCase(
-        f"{kind}-{number:02d}-{first.name}-{second.name}", 2101 + number, (first, second)
-    )
+    seed = 2101 + number
+    return EffectCase(f"{kind}-{number:02d}-{first.name}-{second.name}", seed, (first, second))
 
 
 APART = tuple(

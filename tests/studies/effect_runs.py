@@ -181,7 +181,8 @@ def imported_runs(raw: tuple[RawRun, ...], cell: Cell) -> tuple[Run, ...]:
             with (folder / f"{one.name}.csv").open("w", encoding="utf-8") as file:
                 file.write(",".join(["stamp", *positions, *currents]) + "\n")
                 rows = np.column_stack((stamp_us, run.position_rad, run.current_a))
-                np.savetxt(file, rows, fmt=["%d"] + ["%.9f"] * (rows.shape[1] - 1), delimiter=",")
+                fmt = ["%d"] + ["%.9f"] * (rows.shape[1] - 1)
+                np.savetxt(file, rows, fmt=fmt, delimiter=",")
             description = folder / f"{one.name}.yaml"
             text = IMPORT.format(
                 name=one.name,

@@ -214,9 +214,13 @@ def study(
     for lines in side_by_side(_work, mine, processes) if mine else ():
         for line in lines:
             _print_line(line)
-    paths = [task.path(name) for task in tasks for name in task.parts]
+    paths = []
+    for task in tasks:
+        for name in task.parts:
+            paths.append(task.path(name))
     documents = [json.loads(path.read_text()) for path in paths if path.is_file()]
-    return with_floors([Row(**with_tuples(document)) for document in documents])
+    rows = [Row(**with_tuples(document)) for document in documents]
+    return with_floors(rows)
 
 
 def with_floors(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -250,7 +254,8 @@ def _work(task: _Task) -> tuple[str, ...]:
     for part in lacking:
         path = task.path(part)
         row = _search(task.runs, part, simulation_s)
-        replace_file(path, json.dumps(asdict(row)).encode())
+        content = json.dumps(asdict(row)).encode()
+        replace_file(path, content)
         finish(path, fingerprint)
         lines.append(
             f"{part} {row.case}, {row.world}: {', '.join(row.named) or 'nothing'}; "
@@ -272,28 +277,34 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     begun_s = time.process_time()
     found = identify(model_of(cell), runs.fit, cell.conditioning)
     start = gather(found, runs.fit, runs.held_out)
-    steps = find_effects(start, np.random.default_rng(0), families=families)
+    rng = np.random.default_rng(0)
+    steps = find_effects(start, rng, families=families)
     spent_s = time.process_time() - begun_s
-    truth = np.array([axis.gain_nm_per_a for axis in world_cell(case.seed, task.world).bare.axes])
+    axes = world_cell(case.seed, task.world).bare.axes
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in axes]
+    truth = np.array(gain_nm_per_a)
     end = steps[-1].after
     axis = case.effects[0].axis if case.effects else None
     accepted = tuple(step.accepted for step in steps if step.accepted is not None)
     error_before = _gain_error(start, truth)
     error_after = _gain_error(end, truth)
     worst = int(np.argmax(error_after))
-    (error, std), refitted = _gains_of(end.estimate, truth), by_instruments(end)
-    aside = [
-        PlacedEffect(one.finding.effect, one.finding.axis)
-        for step in steps
-        for one in step.set_aside
-    ]
+    gains = _gains_of(end.estimate, truth)
+    (error, std), refitted = gains, by_instruments(end)
+    aside = []
+    for step in steps:
+        for one in step.set_aside:
+            placed_effect = PlacedEffect(one.finding.effect, one.finding.axis)
+            aside.append(placed_effect)
+    true = tuple(_true(effect) for effect in case.effects)
+    named = tuple(_placed(placed) for placed in end.effects)
     return Row(
         part=part,
         case=case.name,
         world=task.world,
         seed=case.seed,
-        true=tuple(_true(effect) for effect in case.effects),
-        named=tuple(_placed(placed) for placed in end.effects),
+        true=true,
+        named=named,
         ambiguity=() if not accepted else tuple(_placed(rival) for rival in accepted[0].ambiguity),
         error_before_percent=_holdout(start, axis),
         error_after_percent=_holdout(end, axis),
@@ -325,7 +336,8 @@ def _holdout(evidence: Evidence, axis: int | None) -> float:
 
 def _gain_error(evidence: Evidence, truth: FloatArray) -> FloatArray:
     """Absolute error of each gain [%], shape (n,)."""
-    return np.abs(_gains_of(evidence.estimate, truth)[0])
+    gains = _gains_of(evidence.estimate, truth)
+    return np.abs(gains[0])
 
 
 def _gains_of(estimate: Estimate, truth: FloatArray) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -378,7 +390,8 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         ]
     clean = [row for row in rows if row.part == "clean"]
     if clean:
-        error = np.mean([row.error_before_percent for row in clean])
+        error_before_percent = [row.error_before_percent for row in clean]
+        error = np.mean(error_before_percent)
         gain = max(row.max_gain_error_percent for row in clean)
         lines.append(
             f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect, "
@@ -534,12 +547,16 @@ def main(arguments: list[str] | None = None) -> int:
         else:
             name += f"-{options.duration:g}s"
         report = options.out / f"{name}.json"
-        replace_file(report, json.dumps({"rows": [asdict(row) for row in rows]}, indent=1).encode())
+        text = json.dumps({"rows": [asdict(row) for row in rows]}, indent=1)
+        content = text.encode()
+        replace_file(report, content)
         if blind:
-            shown = confusion([(row.true, row.named) for row in rows])
+            cells = [(row.true, row.named) for row in rows]
+            shown = confusion(cells)
         else:
             shown = table(rows)
-        replace_file(report.with_suffix(".csv"), as_csv(shown).encode())
+        path = report.with_suffix(".csv")
+        replace_file(path, as_csv(shown).encode())
         for line in (
             f"\n{name}: {len(rows)} of {len(chosen)} searched\n",
             table(rows),

@@ -64,7 +64,9 @@ def write_fault_table(out: Path, world: str, data: Path) -> None:
         make_plan(wanted)
     make_case(task)
     raw = read_runs(task.path)[:-HELD_OUT]
-    true_gains = np.array([axis.gain_nm_per_a for axis in world_cell(CLEAN.seed, world).bare.axes])
+    axes = world_cell(CLEAN.seed, world).bare.axes
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in axes]
+    true_gains = np.array(gain_nm_per_a)
     tx40 = data / "tx40"
     heads = ["fault", *(f"simulated, {way}" for way in WAYS)]
     if tx40.is_dir():
@@ -92,7 +94,8 @@ def _simulated(
         if way == "log" and fault is not None and fault.is_not_a_number:
             rows.append("cannot be recorded")
         else:
-            rows.append(simulated_outcome(raw, true_gains, fault, SIMULATED_AXIS, way).row())
+            row = simulated_outcome(raw, true_gains, fault, SIMULATED_AXIS, way).row()
+            rows.append(row)
     return rows
 
 
@@ -117,13 +120,17 @@ def judge_sound_recordings(data: Path) -> None:
         )
         alarms += len(faults)
         said = "; ".join(found(one) for one in faults) or "nothing"
-        print_line(f"{run.name}, {len(run.time_s)} samples of {len(ratio)} axes: {said}")
+        line = f"{run.name}, {len(run.time_s)} samples of {len(ratio)} axes: {said}"
+        print_line(line)
     print_line(f"{alarms} false alarms in {len(runs)} runs")
 
 
 def _simulated_run(simulation: str, cell_name: str) -> tuple[Run, FloatArray]:
     """A run of a shipped robot without load, and the ratio of its drive train."""
-    cell = load_cell(shipped_configurations() / "cells" / f"{cell_name}.yaml")
+    cells_folder = shipped_configurations() / "cells"
+    path = cells_folder / f"{cell_name}.yaml"
+    cell = load_cell(path)
     spec = load_simulation(shipped_simulation(simulation))
     moves = plan(cell, seed=SOUND_SEED, duration_s=SOUND_S)
-    return run_of(simulate_run(cell, spec, moves, simulation, None), cell), cell.ratio
+    run = simulate_run(cell, spec, moves, simulation, None)
+    return run_of(run, cell), cell.ratio

@@ -130,23 +130,28 @@ def damaged_raw(
     position = raw.position_counts.astype(np.float64)
     current = raw.current_raw.astype(np.float64)
     rate_hz = 1e9 / PERIOD_NS
-    turn = float(cell.axes[axis].counts_per_revolution or 0)
+    counts_per_revolution = cell.axes[axis].counts_per_revolution
+    turn = float(counts_per_revolution or 0)
     if fault.quantity is ChannelKind.POSITION:
-        position[:, axis] = fault.plant(SoundChannel(position[:, axis], 1.0, turn, rate_hz))
+        sound_channel = SoundChannel(position[:, axis], 1.0, turn, rate_hz)
+        position[:, axis] = fault.plant(sound_channel)
     else:
-        largest = float(np.max(np.abs(current[:, axis])))
+        absolute_current = np.abs(current[:, axis])
+        largest = float(np.max(absolute_current))
         current[:, axis] = fault.plant(SoundChannel(current[:, axis], 1.0, largest, rate_hz))
     return position, current
 
 
 def _readback(raw: RawRun, cell: Cell) -> Readback:
     answers = zip(cell.axis_names, raw.ampere_per_unit, strict=True)
-    return Readback(tuple(AxisReadback(name, float(scale)) for name, scale in answers))
+    axes = tuple(AxisReadback(name, float(scale)) for name, scale in answers)
+    return Readback(axes)
 
 
 def as_arrays(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray, _: Path) -> Run:
     """The run as a user of `ident` would make it."""
-    scale = scaling(cell, _readback(raw, cell))
+    readback = _readback(raw, cell)
+    scale = scaling(cell, readback)
     motor_rad = position * scale.rad_per_count
     position_rad = motor_rad @ scale.to_joint.T + scale.offset_rad
     return replace(
@@ -157,24 +162,27 @@ def as_arrays(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray
 def as_log(raw: RawRun, cell: Cell, position: FloatArray, current: FloatArray, path: Path) -> Run:
     """The run through a log as the recorder writes it."""
     readback = _readback(raw, cell)
-    info = RunInfo(raw.name, 1e9 / PERIOD_NS, raw.payload, "", "damage study", BEGAN_NS, BEGAN_NS)
-    content = LogContent.of(
-        cell, info, bundle(shipped_configurations() / "cells" / "demo.yaml"), readback
-    )
+    rate_hz = 1e9 / PERIOD_NS
+    info = RunInfo(raw.name, rate_hz, raw.payload, "", "damage study", BEGAN_NS, BEGAN_NS)
+    demo_path = shipped_configurations() / "cells" / "demo.yaml"
+    content = LogContent.of(cell, info, bundle(demo_path), readback)
     begun_ns = BEGAN_NS + round(1e9 * raw.began_s)
-    starts = np.flatnonzero(np.diff(raw.move, prepend=-1))
-    with LogWriter(
-        path, content, scaling(cell, readback).joint_position_of, clock_ns=lambda: 0
-    ) as log:
+    move_steps = np.diff(raw.move, prepend=-1)
+    starts = np.flatnonzero(move_steps)
+    joint_position = scaling(cell, readback).joint_position_of
+    with LogWriter(path, content, joint_position, clock_ns=lambda: 0) as log:
         for start in starts.tolist():
             stamp_ns = begun_ns + start * PERIOD_NS
-            log.event(CellEvent(stamp_ns, None, EventKind.MOVE_START, int(raw.move[start]), ""))
+            code = int(raw.move[start])
+            event = CellEvent(stamp_ns, None, EventKind.MOVE_START, code, "")
+            log.event(event)
         counts = position.astype(np.int64).tolist()
         units = current.astype(np.int64).tolist()
         for cycle, (own_counts, own_units) in enumerate(zip(counts, units, strict=True)):
             stamp_ns = begun_ns + cycle * PERIOD_NS
             status = (STATUS,) * len(own_counts)
-            log.write(Sample(cycle, stamp_ns, tuple(own_counts), tuple(own_units), status))
+            sample = Sample(cycle, stamp_ns, tuple(own_counts), tuple(own_units), status)
+            log.write(sample)
         log.conclude(valid=True)
     return load_run(path)[0]
 
@@ -189,19 +197,24 @@ def as_import(
     name = path.stem
     names = [f"q{axis}" for axis in range(1, 7)]
     columns = [f"i{axis}" for axis in range(1, 7)]
-    scale = scaling(cell, _readback(raw, cell))
+    readback = _readback(raw, cell)
+    scale = scaling(cell, readback)
     stamp_us = np.rint(1e6 * (BEGAN_NS * 1e-9 + raw.began_s)) + 1000.0 * np.arange(len(position))
     rows = np.column_stack(
         (stamp_us, position * scale.rad_per_count, current * scale.current_per_unit)
     )
     with (folder / f"{name}.csv").open("w", encoding="utf-8") as file:
         file.write(",".join(["stamp", *names, *columns]) + "\n")
-        np.savetxt(file, rows, fmt=["%d"] + ["%.9f"] * 12, delimiter=",")
-    text = IMPORT.replace("side: joint", "side: motor").format(
+        fmt = ["%d"] + ["%.9f"] * 12
+        np.savetxt(file, rows, fmt=fmt, delimiter=",")
+    positions = ", ".join(names)
+    currents = ", ".join(columns)
+    changed_import = IMPORT.replace("side: joint", "side: motor")
+    text = changed_import.format(
         name=name,
         cell="demo.yaml",
-        positions=", ".join(names),
-        currents=", ".join(columns),
+        positions=positions,
+        currents=currents,
         payload="null" if raw.payload is None else raw.payload.name,
     )
     description = folder / f"{name}.yaml"
@@ -230,7 +243,8 @@ def simulated_outcome(
         axis: that has it.
         way: of WAYS, which every run takes.
     """
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
 
     def fit() -> Identification:
         with tempfile.TemporaryDirectory() as name:
@@ -265,26 +279,32 @@ def tx40_outcome(folder: Path, fault: PlantedFault | None, axis: int, way: str) 
         way: "arrays" or "import".
     """
     shipped = shipped_configurations()
-    cell = load_cell(shipped / "cells" / "tx40.yaml")
+    path = shipped / "cells" / "tx40.yaml"
+    cell = load_cell(path)
     position = np.loadtxt(folder / "pos_read_data.csv", delimiter=",", skiprows=1)
     current = np.loadtxt(folder / "curr_data.csv", delimiter=",", skiprows=1)
     if fault is not None and fault.quantity is ChannelKind.POSITION:
         channel = SoundChannel(position[:, axis], _count(position[:, axis]), 2.0 * np.pi, 5000.0)
         position[:, axis] = fault.plant(channel)
     elif fault is not None:
-        largest = float(np.max(np.abs(current[:, axis])))
-        current[:, axis] = fault.plant(
-            SoundChannel(current[:, axis], largest / INT16_LARGEST, largest, 5000.0)
-        )
+        absolute_current = np.abs(current[:, axis])
+        largest = float(np.max(absolute_current))
+        sound_channel = SoundChannel(current[:, axis], largest / INT16_LARGEST, largest, 5000.0)
+        current[:, axis] = fault.plant(sound_channel)
 
     def fit() -> Identification:
-        gains = np.array([one.nameplate_gain for one in cell.axes])
+        nameplate_gains = [one.nameplate_gain for one in cell.axes]
+        gains = np.array(nameplate_gains)
         if way == "arrays":
-            joint_rad = position @ np.linalg.inv(cell.ratio).T
-            joint_rad += np.array([one.zero_offset_rad for one in cell.axes])
-            run = Run("tx40", np.arange(len(position)) / 5000.0, joint_rad, current)
+            ratio_inverse = np.linalg.inv(cell.ratio)
+            joint_rad = position @ ratio_inverse.T
+            zero_offset_rad = [one.zero_offset_rad for one in cell.axes]
+            joint_rad += np.array(zero_offset_rad)
+            time_s = np.arange(len(position)) / 5000.0
+            run = Run("tx40", time_s, joint_rad, current)
         else:
-            run = _imported_tx40(position, current, shipped / "imports" / "tx40.yaml")
+            description = shipped / "imports" / "tx40.yaml"
+            run = _imported_tx40(position, current, description)
         return identify(
             model_of(cell), (run,), cell.conditioning, fixed_gains=gains, axes=cell.axis_names
         )
@@ -307,4 +327,5 @@ def _imported_tx40(position: FloatArray, current: FloatArray, description: Path)
 def _count(values: FloatArray) -> float:
     """Smallest change of a channel."""
     steps = np.abs(np.diff(values))
-    return float(np.min(steps[steps > 1e-9 * np.ptp(values)]))
+    smallest_step = np.min(steps[steps > 1e-9 * np.ptp(values)])
+    return float(smallest_step)

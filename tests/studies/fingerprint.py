@@ -20,7 +20,8 @@ CHECKOUT = Path(__file__).parents[2]
 
 def digest(*things: object) -> str:
     """sha256 of tuples, frozen dataclasses, texts and numbers, by their exact `repr`, hex."""
-    return hashlib.sha256(repr(things).encode()).hexdigest()
+    encoded_things_repr = repr(things).encode()
+    return hashlib.sha256(encoded_things_repr).hexdigest()
 
 
 def digest_of_source(module: str, rooms: tuple[str, ...] = ROOMS) -> str:
@@ -75,10 +76,12 @@ def made_once(
     if not is_finished(path, fingerprint):
         shutil.rmtree(logs, ignore_errors=True)
         logs.mkdir(parents=True)
-        replace_file(path, f"{json.dumps(make(logs), indent=2)}\n".encode())
+        content = f"{json.dumps(make(logs), indent=2)}\n".encode()
+        replace_file(path, content)
         finish(path, fingerprint)
         shutil.rmtree(logs)
-    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    document: dict[str, Any] = json.loads(text)
     return document
 
 

@@ -57,7 +57,8 @@ class FloorScore:
 def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> FloorScore:
     """Compare the noise by each source with the error of a fit."""
     if fixed:
-        gains = np.array([axis.nameplate_gain for axis in cell.axes])
+        nameplate_gains = [axis.nameplate_gain for axis in cell.axes]
+        gains = np.array(nameplate_gains)
     else:
         gains = None
     found = identify(model_of(cell), runs, cell.conditioning, method=Method.ML, fixed_gains=gains)
@@ -82,7 +83,8 @@ def measure(name: str, cell: Cell, runs: Sequence[Run], *, fixed: bool) -> Floor
 
 def simulated(world: str, seed: int, duration_s: float, *, apart: bool) -> tuple[Cell, list[Run]]:
     """Four runs of one plan, or of one plan each."""
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
     if world == UNCHANGED:
         truth = study_cell(seed)
     else:
@@ -98,7 +100,8 @@ def simulated(world: str, seed: int, duration_s: float, *, apart: bool) -> tuple
         else:
             declared = declared_payload(payload)
         moves = plans[number % len(plans)]
-        raw = simulate_run(cell, spec_of(truth, payload, number), moves, f"run-{number}", declared)
+        spec = spec_of(truth, payload, number)
+        raw = simulate_run(cell, spec, moves, f"run-{number}", declared)
         runs.append(run_of(raw, cell))
     return cell, runs
 
@@ -110,7 +113,8 @@ def kr300(folder: Path) -> tuple[Cell, list[Run]]:
         Run(name, table[:, 0], np.deg2rad(table[:, 1:7]), table[:, 7:13])
         for name, table in tables.items()
     ]
-    return load_cell(folder / "kr300-cell.yaml"), runs
+    path = folder / "kr300-cell.yaml"
+    return load_cell(path), runs
 
 
 def tx40(folder: Path) -> tuple[Cell, list[Run]]:
@@ -129,7 +133,8 @@ def main(arguments: list[str] | None = None) -> int:
         prog="python -m tests.studies.floor_study", description=__doc__
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--worlds", choices=(*WORLDS, UNCHANGED), nargs="+", default=list(WORLDS))
+    choices = (*WORLDS, UNCHANGED)
+    parser.add_argument("--worlds", choices=choices, nargs="+", default=list(WORLDS))
     parser.add_argument("--duration", type=float, default=20.0, help="of each simulated run [s]")
     parser.add_argument(
         "--apart", action="store_true", help="a plan for each run: no move is repeated"

@@ -57,16 +57,18 @@ def point_to_point(
     samples = 1
     while samples < duration_s * rate_hz:
         target = tuple(float(value) for value in rng.uniform(low, high))
-        move = PlannedMove(
-            target, float(rng.uniform(0.35, 1.0)), float(rng.uniform(0.4, 1.0)), DWELL_S
-        )
+        velocity = float(rng.uniform(0.35, 1.0))
+        acceleration = float(rng.uniform(0.4, 1.0))
+        move = PlannedMove(target, velocity, acceleration, DWELL_S)
         path = path_of(cell, here, move)
         count = round((path.duration_s + DWELL_S) * rate_hz)
         positions.append(path.at(np.arange(1, count + 1) / rate_hz)[0])
         moves.append(np.full(count, len(moves), dtype=np.int64))
         here = np.array(target)
         samples = samples + count
-    return Demand(np.concatenate(positions), np.concatenate(moves), 0)
+    position_rad = np.concatenate(positions)
+    stacked_moves = np.concatenate(moves)
+    return Demand(position_rad, stacked_moves, 0)
 
 
 def without_rest(
@@ -100,9 +102,11 @@ def without_rest(
         positions[:, joint] = 0.5 * (low + high)[joint] + scale * way
     share = np.clip(time_s / APPROACH_S, 0.0, 1.0)[:, None]
     blend = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    position_rad = start_rad + blend * (positions - start_rad)
+    move = np.zeros(len(time_s), dtype=np.int64)
     return Demand(
-        start_rad + blend * (positions - start_rad),
-        np.zeros(len(time_s), dtype=np.int64),
+        position_rad,
+        move,
         round(APPROACH_S * rate_hz),
     )
 
@@ -132,7 +136,8 @@ def follow(
     amplifiers = AmplifierSet(spec, plant)
     plant.time_s = began_s
     amplifiers.loops["enabled"] = 1
-    plant.set_brakes(np.zeros(len(spec.axes), dtype=np.bool_))
+    closed = np.zeros(len(spec.axes), dtype=np.bool_)
+    plant.set_brakes(closed)
     piece_s = PIECE / _rate_hz(cell)
     counts = demand.position_rad @ spec.ratio.T * counts_per_rad(spec)
     speed = np.gradient(counts[::PIECE], piece_s, axis=0)
@@ -141,12 +146,15 @@ def follow(
     loops = amplifiers.loops
     for sample in range((len(speed) - 1) * PIECE):
         if sample % PIECE == 0:
-            acceleration = (speed[sample // PIECE + 1] - loops["demand_velocity"]) / piece_s
+            speed_difference = speed[sample // PIECE + 1] - loops["demand_velocity"]
+            acceleration = speed_difference / piece_s
             for motor, value in enumerate(acceleration):
                 # Twice as long as it lasts: a set-point that ends would stop.
+                duration_s = (2.0 * piece_s, 0.0, 0.0, 0.0)
+                profile_move = ProfileMove(duration_s, (float(value), 0.0, 0.0, 0.0), 0.0)
                 amplifiers.move(
                     motor,
-                    ProfileMove((2.0 * piece_s, 0.0, 0.0, 0.0), (float(value), 0.0, 0.0, 0.0), 0.0),
+                    profile_move,
                 )
         loops["limited"] = 0
         for _ in range(spec.substeps):
@@ -158,22 +166,28 @@ def follow(
     position, asked, current, limited = (
         np.array(column) for column in zip(*recorded[demand.first :], strict=True)
     )
+    ampere_per_unit = np.array([0.001 * axis.rated_current_a for axis in spec.axes])
+    position_counts = position.astype(np.int32)
+    demand_counts = asked.astype(np.int32)
+    current_raw = current.astype(np.int16)
     return RawRun(
         name=name,
         payload=payload,
-        position_counts=position.astype(np.int32),
-        demand_counts=asked.astype(np.int32),
-        current_raw=current.astype(np.int16),
+        position_counts=position_counts,
+        demand_counts=demand_counts,
+        current_raw=current_raw,
         limited=limited != 0,
         move=demand.move[demand.first : len(recorded)],
-        ampere_per_unit=np.array([0.001 * axis.rated_current_a for axis in spec.axes]),
+        ampere_per_unit=ampere_per_unit,
         began_s=began_s,
     )
 
 
 def _room(cell: Cell) -> tuple[FloatArray, FloatArray]:
-    limits = np.array([axis.limits.position for axis in cell.axes])
-    margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
+    positions = [axis.limits.position for axis in cell.axes]
+    limits = np.array(positions)
+    limit_difference = limits[:, 1] - limits[:, 0]
+    margin = POSITION_MARGIN * limit_difference
     return limits[:, 0] + margin, limits[:, 1] - margin
 
 

@@ -57,18 +57,23 @@ class RunsOfRobot:
     @property
     def path(self) -> Path:
         """File of the runs."""
-        return self.out / "runs" / f"{self.robot}-{self.seed}.npz"
+        runs_folder = self.out / "runs"
+        return runs_folder / f"{self.robot}-{self.seed}.npz"
 
     @property
     def cell(self) -> Cell:
         """The cell as declared."""
-        return load_cell(shipped_configurations() / "cells" / f"{self.studied.cell}.yaml")
+        cells_folder = shipped_configurations() / "cells"
+        path = cells_folder / f"{self.studied.cell}.yaml"
+        return load_cell(path)
 
     @property
     def true_gains(self) -> FloatArray:
         """Gains of the plant, shape (m,)."""
-        spec = load_simulation(shipped_simulation(self.studied.simulation))
-        return np.array([axis.gain_nm_per_a for axis in spec.axes])
+        path = shipped_simulation(self.studied.simulation)
+        spec = load_simulation(path)
+        gain_nm_per_a = [axis.gain_nm_per_a for axis in spec.axes]
+        return np.array(gain_nm_per_a)
 
 
 @functools.cache
@@ -85,26 +90,29 @@ def simulate(task: RunsOfRobot) -> tuple[RawRun, ...]:
     body = cell.payloads[0]
     runs: list[RawRun] = []
     for pair in range(PAIRS):
+        seed = 10 * task.seed + pair
         moves = plan(
             cell,
-            seed=10 * task.seed + pair,
+            seed=seed,
             duration_s=robot.seconds,
             exchanges=EXCHANGES,
             largest_condition=CONDITION,
         )
         for mounted in (None, body.name):
-            spec = load_simulation(shipped_simulation(robot.simulation), mounted)
+            path = shipped_simulation(robot.simulation)
+            spec = load_simulation(path, mounted)
             axes = tuple(
                 replace(axis, current_noise_a=robot.noise * axis.current_noise_a)
                 for axis in spec.axes
             )
             number = len(runs)
-            spec = replace(spec, axes=axes, seed=100 * task.seed + number)
+            number_seed = 100 * task.seed + number
+            spec = replace(spec, axes=axes, seed=number_seed)
             declared = None if mounted is None else body.payload
             name = f"{mounted or 'bare'}-{pair + 1}"
-            runs.append(
-                simulate_run(cell, spec, moves, name, declared, number * (robot.seconds + PAUSE_S))
-            )
+            began_s = number * (robot.seconds + PAUSE_S)
+            run = simulate_run(cell, spec, moves, name, declared, began_s)
+            runs.append(run)
     return tuple(runs)
 
 
@@ -128,4 +136,5 @@ def load_runs(task: RunsOfRobot) -> tuple[Run, ...]:
     def payload_of(name: str) -> Payload:
         return next(body.payload for body in cell.payloads if body.name == name)
 
-    return tuple(run_of(raw, cell) for raw in read_runs(task.path, payload_of))
+    runs = read_runs(task.path, payload_of)
+    return tuple(run_of(raw, cell) for raw in runs)

@@ -66,8 +66,10 @@ def units_of(
     units: list[MistakeUnit] = []
     for seed in seeds:
         for robot in robots:
-            axes = len(RunsOfRobot(out, robot, seed).cell.axes)
-            own = [MistakeUnit(out, robot, seed, Mistake.CLEAN.value, -1, 0)]
+            runs_of_robot = RunsOfRobot(out, robot, seed)
+            axes = len(runs_of_robot.cell.axes)
+            mistake_unit = MistakeUnit(out, robot, seed, Mistake.CLEAN.value, -1, 0)
+            own = [mistake_unit]
             for level in range(len(OFFSETS_DEG)):
                 own += [
                     MistakeUnit(out, robot, seed, Mistake.ZERO.value, axis, level)
@@ -96,7 +98,8 @@ def summary(rows: Sequence[MistakeRow]) -> str:
         "|" + "---|" * 11,
     ]
     kinds = dict.fromkeys((row.robot, row.mistake, row.size) for row in rows)
-    for robot, mistake, size in sorted(kinds, key=lambda kind: (kind[0], kind[1], kind[2])):
+    sorted_kinds = sorted(kinds, key=lambda kind: (kind[0], kind[1], kind[2]))
+    for robot, mistake, size in sorted_kinds:
         own = [
             row
             for row in rows
@@ -152,9 +155,9 @@ def _figures(rows: Sequence[MistakeRow]) -> str:
         return f"{counts} | {senses} | 0 | | "
     others = sum(bool(row.others) for row in fits)
     errors = f"{_mean(fits, 'error_before_percent')} → {_mean(fits, 'error_after_percent')}"
-    gains = [
-        [getattr(row, f"gain_error_{when}_percent") for row in fits] for when in ("before", "after")
-    ]
+    gains = []
+    for when in ("before", "after"):
+        gains.append([getattr(row, f"gain_error_{when}_percent") for row in fits])
     worst = " → ".join(f"{max(column):.2f}" for column in gains)
     return f"{counts} | {senses} | {others} | {errors} | {worst}"
 
@@ -224,12 +227,15 @@ def main(arguments: list[str] | None = None) -> int:
     rows = finished_rows(options.out, units, MistakeRow, fingerprint_of)
     table = to_csv(MistakeRow, rows).encode()
     options.out.mkdir(parents=True, exist_ok=True)
-    replace_file(options.out.with_suffix(".csv"), table)
+    path = options.out.with_suffix(".csv")
+    replace_file(path, table)
     every = units_of(options.out, STUDIED, options.seeds, kinds)
     if len(rows) == len(every) and {unit.name for unit in every} == {unit.name for unit in units}:
         replace_file(TABLE, table)
-        replace_file(SUMMARY, as_csv(summary(rows)).encode())
-    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}\n\n{totals(rows)}")
+        content = as_csv(summary(rows)).encode()
+        replace_file(SUMMARY, content)
+    line = f"\n{left} units of this piece were not begun\n\n{summary(rows)}\n\n{totals(rows)}"
+    print_line(line)
     return 0
 
 

@@ -202,13 +202,15 @@ def fitted(cell: Cell, runs: Sequence[Run]) -> Evidence:
     start = gather(found, runs)
     if not declared:
         return start
-    return with_declared(start, declared, np.random.default_rng(0))[-1].after
+    rng = np.random.default_rng(0)
+    return with_declared(start, declared, rng)[-1].after
 
 
 def observe_offsets(unit: MistakeUnit) -> tuple[OffsetRow, ...]:
     """Find the axes on which the clean runs of a robot would show a zero offset."""
     make_runs(unit.runs)
-    evidence = fitted(unit.runs.cell, load_runs(unit.runs))
+    runs = load_runs(unit.runs)
+    evidence = fitted(unit.runs.cell, runs)
     std = predicted_offset_std(evidence)
     prismatic = is_prismatic(evidence)
     least = [size_of(Mistake.ZERO, 0, prismatic=linear) for linear in prismatic]
@@ -229,9 +231,8 @@ def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]
     axis = cell.axis_names[unit.axis] if unit.axis >= 0 else ""
     row = blank(unit, axis, size)
     if mistake is Mistake.ZERO:
-        row = replace(
-            row, predicted_std=offsets.std[unit.axis], planted=offsets.observable[unit.axis]
-        )
+        predicted_std = offsets.std[unit.axis]
+        row = replace(row, predicted_std=predicted_std, planted=offsets.observable[unit.axis])
         if not row.planted:
             return (row,)
     planted = Planted(mistake, unit.axis, size)
@@ -239,13 +240,16 @@ def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]
     begun_s = time.process_time()
     try:
         start = fitted(wrong, runs)
-        steps = find_effects(start, np.random.default_rng(0), axes=cell.place_names)
+        rng = np.random.default_rng(0)
+        steps = find_effects(start, rng, axes=cell.place_names)
     except IdentificationError as error:
+        refused = str(error).replace("\n", " ")
+        processor_s = time.process_time() - begun_s
         return (
             replace(
                 row,
-                refused=str(error).replace("\n", " "),
-                processor_s=time.process_time() - begun_s,
+                refused=refused,
+                processor_s=processor_s,
             ),
         )
     spent_s = time.process_time() - begun_s
@@ -255,22 +259,31 @@ def search_unit(unit: MistakeUnit, offsets: OffsetRow) -> tuple[MistakeRow, ...]
     before = 100.0 * np.abs(start.estimate.gains / true - 1.0)
     after = 100.0 * np.abs(end.estimate.gains / true - 1.0)
     worst = int(np.argmax(after))
-    aside = [one.finding for step in steps for one in step.set_aside]
+    aside = []
+    for step in steps:
+        for one in step.set_aside:
+            aside.append(one.finding)
+    others = tuple(placed.name_among(cell.place_names) for placed in judged.others)
+    set_aside = tuple(f"{one.effect.name} on {cell.place_names[one.axis]}" for one in aside)
+    error_before_percent = start.estimate.relative_error(start.identification.system).total
+    error_after_percent = end.estimate.relative_error(end.identification.system).total
+    absolute_gain = abs(end.estimate.gains[worst])
+    gain_std_percent = float(100.0 * end.estimate.gains_std[worst] / absolute_gain)
+    gain_error_before_percent = float(before.max())
+    gain_error_after_percent = float(after[worst])
     row = replace(
         row,
         named=judged.named,
         value=judged.value,
         std=judged.std,
         z=judged.z,
-        others=tuple(placed.name_among(cell.place_names) for placed in judged.others),
-        set_aside=tuple(f"{one.effect.name} on {cell.place_names[one.axis]}" for one in aside),
-        error_before_percent=start.estimate.relative_error(start.identification.system).total,
-        error_after_percent=end.estimate.relative_error(end.identification.system).total,
-        gain_error_before_percent=float(before.max()),
-        gain_error_after_percent=float(after[worst]),
-        gain_std_percent=float(
-            100.0 * end.estimate.gains_std[worst] / abs(end.estimate.gains[worst])
-        ),
+        others=others,
+        set_aside=set_aside,
+        error_before_percent=error_before_percent,
+        error_after_percent=error_after_percent,
+        gain_error_before_percent=gain_error_before_percent,
+        gain_error_after_percent=gain_error_after_percent,
+        gain_std_percent=gain_std_percent,
         processor_s=spent_s,
     )
     return (row,)
@@ -293,7 +306,8 @@ def turned_unit(unit: MistakeUnit) -> tuple[MistakeRow, ...]:
     found = find_turned_geometry(model, instants, recording.gains)
     if found is not None and found.gravity is not None:
         found_m_s2 = found.gravity.found_m_s2
-        along = float(found_m_s2 @ true_m_s2) / (float(np.linalg.norm(found_m_s2)) * size)
+        found_norm_m_s2 = float(np.linalg.norm(found_m_s2))
+        along = float(found_m_s2 @ true_m_s2) / (found_norm_m_s2 * size)
         off_rad = math.acos(min(along, 1.0))
         std_rad = math.radians(found.gravity.std_deg)
         value = math.radians(found.gravity.turned_deg)
@@ -305,6 +319,7 @@ def turned_unit(unit: MistakeUnit) -> tuple[MistakeRow, ...]:
             model, recording.runs, cell.conditioning, method=Method.ML, fixed_gains=recording.gains
         )
     except IdentificationError as error:
-        return (replace(row, refused=str(error).replace("\n", " ")),)
+        refused = str(error).replace("\n", " ")
+        return (replace(row, refused=refused),)
     spent_s = time.process_time() - begun_s
     return (replace(row, error_before_percent=fit.training_error.total, processor_s=spent_s),)

@@ -64,10 +64,12 @@ def session(seed: int) -> dict[str, Run]:
 
 
 def _sticking(run: Run) -> Run:
-    speed = np.gradient(run.position_rad[:, 1]) * run.rate_hz
+    position_rad_gradient = np.gradient(run.position_rad[:, 1])
+    speed = position_rad_gradient * run.rate_hz
     added = np.zeros_like(run.current_a)
     added[:, 1] = 5.0 * np.sign(speed) * np.exp(-((speed / 0.35) ** 2)) / GAINS[1]
-    return replace(run, current_a=run.current_a + added)
+    current_a = run.current_a + added
+    return replace(run, current_a=current_a)
 
 
 def fitted(cell: Cell, runs: dict[str, Run]) -> Fit:
@@ -75,7 +77,8 @@ def fitted(cell: Cell, runs: dict[str, Run]) -> Fit:
     trained = [runs[name] for name in FIT]
     unseen = [runs[HELD_OUT]]
     found = identify(model_of(cell), trained, cell.conditioning, holdout=unseen)
-    steps = find_effects(gather(found, trained, unseen), np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    steps = find_effects(gather(found, trained, unseen), rng)
     return Fit(cell, (), (), (), found, steps, None)
 
 
@@ -84,14 +87,19 @@ def with_factor(right: Fit, factor: float) -> Fit:
     after = right.steps[-1].after
     gains = after.estimate.gains.copy()
     gains[WRONG_AXIS] *= factor
-    other = replace(estimate_with(Method.ML, after.training.system(), gains), gains_fixed=False)
-    step = replace(right.steps[-1], after=replace(after, estimate=other))
-    return replace(right, steps=(*right.steps[:-1], step))
+    system = after.training.system()
+    other = replace(estimate_with(Method.ML, system, gains), gains_fixed=False)
+    last_step = right.steps[-1]
+    changed_after = replace(after, estimate=other)
+    step = replace(last_step, after=changed_after)
+    steps = (*right.steps[:-1], step)
+    return replace(right, steps=steps)
 
 
 def ratios(seeds: range) -> Iterator[Ratio]:
     """Yield the ratios of every session, nameplate and factor."""
-    off = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    off = load_cell(path)
     axes = (
         replace(axis, nameplate_gain=float(gain))
         for axis, gain in zip(off.axes, GAINS, strict=True)
@@ -110,7 +118,8 @@ def ratios(seeds: range) -> Iterator[Ratio]:
                 compared = tuple(
                     one / other for one, other in zip(held.axes, nameplate.axes, strict=True)
                 )
-                yield Ratio(seed, name, factor, held.total / nameplate.total, compared)
+                total = held.total / nameplate.total
+                yield Ratio(seed, name, factor, total, compared)
 
 
 def main() -> None:
@@ -118,7 +127,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sessions", type=int, default=4)
     sys.stdout.write("seed  nameplate  gain      total  J1 to J6\n")
-    for ratio in ratios(range(3, 3 + parser.parse_args().sessions)):
+    sessions = parser.parse_args().sessions
+    for ratio in ratios(range(3, 3 + sessions)):
         sys.stdout.write(f"{ratio}\n")
         sys.stdout.flush()
 

@@ -70,9 +70,8 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
     The second payload is weighed as in the paper's Table 8: gains fixed, classical IDIM-WLS on the
     runs without load and one trajectory with the payload, of which nothing is known.
     """
-    system = _system(
-        model, [load_run(path)[0] for path in logs.fit], conditioning, instruments=True
-    )
+    runs = [load_run(path)[0] for path in logs.fit]
+    system = _system(model, runs, conditioning, instruments=True)
     bare = [run for run in (load_run(path)[0] for path in logs.fit) if run.payload is None]
     weighing = [
         _system(model, [*bare, load_run(path)[0]], conditioning) for path in logs.second_payload
@@ -82,12 +81,15 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
     scores = {}
     for name, estimator in ESTIMATORS.items():
         found = estimator(system)
+        second_payload_percent = tuple(
+            100.0 * (_mass(one, found.gains) / mass - 1.0) for one in weighing
+        )
+        error_percent = tuple(float(error) for error in 100.0 * (found.gains / true - 1.0))
+        relative_error_percent = found.relative_error(system).total
         scores[name] = Score(
-            error_percent=tuple(float(error) for error in 100.0 * (found.gains / true - 1.0)),
-            second_payload_percent=tuple(
-                100.0 * (_mass(one, found.gains) / mass - 1.0) for one in weighing
-            ),
-            relative_error_percent=found.relative_error(system).total,
+            error_percent=error_percent,
+            second_payload_percent=second_payload_percent,
+            relative_error_percent=relative_error_percent,
         )
     return scores
 
@@ -96,7 +98,8 @@ def _system(
     model: Model, runs: Sequence[Run], conditioning: Conditioning, *, instruments: bool = False
 ) -> System:
     """Equations of some runs; `iv` needs the instruments."""
-    return regrouped(reduce_runs(model, runs, conditioning, instruments=instruments))
+    standard = reduce_runs(model, runs, conditioning, instruments=instruments)
+    return regrouped(standard)
 
 
 def _mass(system: System, gains: FloatArray) -> float:
@@ -107,14 +110,22 @@ def _mass(system: System, gains: FloatArray) -> float:
 
 def summarise(scores: Sequence[Score]) -> Summary:
     """Over the cells of a noise floor."""
-    errors = np.abs([one.error_percent for one in scores])
-    masses = np.abs([one.second_payload_percent for one in scores])
+    error_percent = [one.error_percent for one in scores]
+    errors = np.abs(error_percent)
+    second_payload_percent = [one.second_payload_percent for one in scores]
+    masses = np.abs(second_payload_percent)
+    mean_relative_error_percent = np.mean([one.relative_error_percent for one in scores])
+    relative_error_percent = float(mean_relative_error_percent)
+    mean_percent = float(errors.mean())
+    max_percent = float(errors.max())
+    mean_mass = float(masses.mean())
+    second_payload_max_percent = float(masses.max())
     return Summary(
-        mean_percent=float(errors.mean()),
-        max_percent=float(errors.max()),
-        second_payload_percent=float(masses.mean()),
-        second_payload_max_percent=float(masses.max()),
-        relative_error_percent=float(np.mean([one.relative_error_percent for one in scores])),
+        mean_percent=mean_percent,
+        max_percent=max_percent,
+        second_payload_percent=mean_mass,
+        second_payload_max_percent=second_payload_max_percent,
+        relative_error_percent=relative_error_percent,
     )
 
 
@@ -162,7 +173,8 @@ def main(arguments: list[str] | None = None) -> int:
                 for name, one in of.items()
             ]
         for name in ESTIMATORS:
-            reported = summarise([of[name] for _, of in scored])
+            scores = [of[name] for _, of in scored]
+            reported = summarise(scores)
             result[_key(name)][floor] = asdict(reported)
             lines.append(
                 f"| {reported.relative_error_percent:.1f} | {name} | {reported.mean_percent:.2f} / "
@@ -171,7 +183,8 @@ def main(arguments: list[str] | None = None) -> int:
             )
     result["cells"] = cells
     for floor in options.floors:
-        ratio = result["tls"][floor]["mean_percent"] / result["ml"][floor]["mean_percent"]
+        mean_percent = result["tls"][floor]["mean_percent"]
+        ratio = mean_percent / result["ml"][floor]["mean_percent"]
         result.setdefault("tls_over_ml", {})[floor] = ratio
         lines.append(f"\nfloor {floor} %: mean gain error of tls / ml = {ratio:.2f}")
     OUT.parent.mkdir(parents=True, exist_ok=True)

@@ -30,14 +30,16 @@ def pack(folder: Path, file: Path) -> int:
     for path in sorted(folder.rglob("*")):
         mark = mark_of(path)
         if path.suffix in KINDS and mark.is_file():
+            text = mark.read_text(encoding="utf-8").strip()
             entry = {
                 "path": path.relative_to(folder).as_posix(),
-                "fingerprint": mark.read_text(encoding="utf-8").strip(),
+                "fingerprint": text,
                 "text": path.read_text(encoding="utf-8"),
             }
             lines.append(json.dumps(entry, sort_keys=True))
     file.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(file, "".join(f"{line}\n" for line in lines).encode())
+    content = "".join(f"{line}\n" for line in lines).encode()
+    replace_file(file, content)
     return len(lines)
 
 
@@ -52,7 +54,8 @@ def unpack(file: Path, folder: Path) -> int:
         if mark_of(path).is_file():
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, entry["text"].encode())
+        content = entry["text"].encode()
+        replace_file(path, content)
         finish(path, entry["fingerprint"])
         number += 1
     return number
@@ -66,7 +69,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("target", type=Path)
     options = parser.parse_args(arguments)
     act = pack if options.action == "pack" else unpack
-    print_line(f"{act(options.source, options.target)} rows: {options.source} -> {options.target}")
+    line = f"{act(options.source, options.target)} rows: {options.source} -> {options.target}"
+    print_line(line)
     return 0
 
 

@@ -94,14 +94,16 @@ def make_score(task: _Task) -> str:
     spent_s = time.process_time() - begun_s
     true = np.array(case.truth.gains_nm_per_a)
     error = found.estimate.gains - true
+    error_percent = tuple((100.0 * error / true).tolist())
     score = GainScore(
         seed=case.seed,
-        error_percent=tuple((100.0 * error / true).tolist()),
+        error_percent=error_percent,
         z=tuple((error / found.estimate.gains_std).tolist()),
         relative_error_percent=found.training_error.total,
         processor_s=spent_s,
     )
-    replace_file(task.path, json.dumps(asdict(score)).encode())
+    content = json.dumps(asdict(score)).encode()
+    replace_file(task.path, content)
     finish(task.path, fingerprint)
     return (
         f"{task.path.name}, {task.runs.world}: worst gain "
@@ -111,7 +113,8 @@ def make_score(task: _Task) -> str:
 
 def table(scores: Sequence[GainScore], axes: Sequence[str]) -> str:
     """Errors, scores and coverage by axis and of all."""
-    error = np.array([one.error_percent for one in scores])
+    error_percent = [one.error_percent for one in scores]
+    error = np.array(error_percent)
     z = np.array([one.z for one in scores])
     columns = [*((error[:, i], z[:, i]) for i in range(len(axes))), (error, z)]
     rows = (
@@ -142,9 +145,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--shard", type=shard, default=Shard(), help="i/n: every n-th cell from the i-th on"
     )
-    parser.add_argument(
-        "--method", nargs="+", choices=[one.value for one in Method], default=[Method.ML.value]
-    )
+    choices = [one.value for one in Method]
+    default = [Method.ML.value]
+    parser.add_argument("--method", nargs="+", choices=choices, default=default)
     parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")
     parser.add_argument("--processes", type=int, default=PROCESSES)
     parser.add_argument("--out", type=Path, default=OUT)
@@ -160,7 +163,8 @@ def main(arguments: list[str] | None = None) -> int:
         for method in options.method:
             paths = [_Task(task, method).path for task in tasks]
             scores = [GainScore(**json.loads(path.read_text())) for path in paths if path.is_file()]
-            noise = float(np.mean([score.relative_error_percent for score in scores]))
+            relative_error_percent = [score.relative_error_percent for score in scores]
+            noise = float(np.mean(relative_error_percent))
             _print_line(f"\n{world}, {method}: {len(scores)} cells, relative error {noise:.2f} %\n")
             _print_line(table(scores, axes) + "\n")
     return 0

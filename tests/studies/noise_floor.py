@@ -31,7 +31,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--factors", type=float, nargs="+", default=[1.0, 3.0])
     parser.add_argument("--duration", type=float, default=20.0, help="of each run [s]")
     options = parser.parse_args(arguments)
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
     sys.stdout.write("| seed | factor | relative error % | gain errors % |\n|---|---|---|---|\n")
     for seed in options.seeds:
         plans = [
@@ -45,9 +46,8 @@ def main(arguments: list[str] | None = None) -> int:
                     declared = None
                 else:
                     declared = declared_payload(payload)
-                raw = simulate_run(
-                    cell, spec_of(truth, payload, number), plans[moves], f"run-{number}", declared
-                )
+                spec = spec_of(truth, payload, number)
+                raw = simulate_run(cell, spec, plans[moves], f"run-{number}", declared)
                 runs.append(run_of(raw, cell))
             found = identify(model_of(cell), tuple(runs), cell.conditioning, method=Method.ML)
             true = [axis.gain_nm_per_a for axis in truth.bare.axes]

@@ -123,7 +123,8 @@ def record_runs(
             declared = None
         else:
             declared = declared_payload(payload)
-        raw = follow(cell, spec, demand, name, declared, BETWEEN_S * index)
+        began_s = BETWEEN_S * index
+        raw = follow(cell, spec, demand, name, declared, began_s)
         runs.append(run_of(raw, cell))
     return tuple(runs)
 
@@ -132,19 +133,29 @@ def score_recording(cell: Cell, world: str, number: int) -> RecordingScore:
     """Record the arm, fit it, and search its residual."""
     runs = record_runs(cell, world, number)
     found = identify(model_of(cell), runs, cell.conditioning)
-    steps = find_effects(gather(found, runs), np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    steps = find_effects(gather(found, runs), rng)
     end = steps[-1].after
-    true = np.array([axis.gain_nm_per_a for axis in world_cell(ARM_SEED, world).bare.axes])
+    axes = world_cell(ARM_SEED, world).bare.axes
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in axes]
+    true = np.array(gain_nm_per_a)
     plain = found.estimate
     searched = end.estimate
+    difference = searched.gains - true
+    error_percent = _percent(difference, true)
+    std_percent = _percent(searched.gains_std, np.abs(true))
+    gain_difference = plain.gains - true
+    plain_error_percent = _percent(gain_difference, true)
+    plain_std_percent = _percent(plain.gains_std, np.abs(true))
+    effects = tuple(placed.name_among(cell.axis_names) for placed in end.effects)
     return RecordingScore(
         world=world,
         number=number,
-        error_percent=_percent(searched.gains - true, true),
-        std_percent=_percent(searched.gains_std, np.abs(true)),
-        plain_error_percent=_percent(plain.gains - true, true),
-        plain_std_percent=_percent(plain.gains_std, np.abs(true)),
-        effects=tuple(placed.name_among(cell.axis_names) for placed in end.effects),
+        error_percent=error_percent,
+        std_percent=std_percent,
+        plain_error_percent=plain_error_percent,
+        plain_std_percent=plain_std_percent,
+        effects=effects,
     )
 
 
@@ -159,10 +170,12 @@ def make_score(task: RecordingTask, cell: Cell, fingerprint: str) -> str:
     begun_s = time.process_time()
     score = score_recording(cell, task.world, task.number)
     task.path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(task.path, json.dumps(asdict(score)).encode())
+    content = json.dumps(asdict(score)).encode()
+    replace_file(task.path, content)
     finish(task.path, fingerprint)
     spent_s = time.process_time() - begun_s
-    worst = float(np.abs(score.error_percent).max())
+    absolute_error_percent = np.abs(score.error_percent)
+    worst = float(absolute_error_percent.max())
     found = ", ".join(score.effects) or "nothing"
     return f"{task.world} {task.number}: worst gain {worst:.2f} %, {spent_s:.0f} s, {found}"
 
@@ -172,9 +185,8 @@ def make_scores(
 ) -> Iterator[str]:
     """Score recordings one after the other; begin none after `minutes`."""
     cell = load_cell(CELL)
-    simulating = digest_of_source(
-        "tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell")
-    )
+    rooms = (*MOVING, "tests.studies.followed_cell")
+    simulating = digest_of_source("tests.studies.followed_cell", rooms)
     searching = digest_of_source("ident.discovery.loop")
     arms = {world: world_cell(ARM_SEED, world).bare for world in PAIR_WORLDS}
     fingerprints = {
@@ -187,12 +199,15 @@ def make_scores(
     for task in tasks:
         if clock_s() >= end_s:
             return
-        yield make_score(task, cell, fingerprints[task.world])
+        fingerprint = fingerprints[task.world]
+        yield make_score(task, cell, fingerprint)
 
 
 def load_scores(folder: Path, world: str) -> tuple[RecordingScore, ...]:
     """Scores of a world that are there, by number."""
-    documents = [json.loads(path.read_text()) for path in sorted((folder / world).glob("*.json"))]
+    files = (folder / world).glob("*.json")
+    sorted_files = sorted(files)
+    documents = [json.loads(path.read_text()) for path in sorted_files]
     return tuple(RecordingScore(**with_tuples(document)) for document in documents)
 
 
@@ -234,7 +249,8 @@ def rms_interval(z: FloatArray) -> tuple[FloatArray, FloatArray]:
     count = len(z)
     square = z**2
     rms = np.sqrt(square.mean(axis=0))
-    without = np.sqrt((square.sum(axis=0) - square) / (count - 1))
+    difference = square.sum(axis=0) - square
+    without = np.sqrt(difference / (count - 1))
     spread = without - without.mean(axis=0)
     return rms, np.sqrt((count - 1) / count * (spread**2).sum(axis=0))
 
@@ -252,8 +268,10 @@ def tables(scores: Sequence[RecordingScore], axes: Sequence[str]) -> str:
         rms, error = rms_interval(z)
         cells = [f"{value:.2f} ± {one:.2f}" for value, one in zip(rms, error, strict=True)]
         lines.append(f"| {world} | {name} | {' | '.join(cells)} |")
-    errors = np.array([score.error_percent for score in scores])
-    stds = np.array([score.std_percent for score in scores])
+    error_percent = [score.error_percent for score in scores]
+    errors = np.array(error_percent)
+    std_percent = [score.std_percent for score in scores]
+    stds = np.array(std_percent)
     bias = [f"{value:+.2f}" for value in errors.mean(axis=0)]
     scatter = [f"{value:.2f}" for value in errors.std(axis=0, ddof=1)]
     sigma = [f"{value:.2f}" for value in np.sqrt((stds**2).mean(axis=0))]
@@ -313,7 +331,8 @@ def main(arguments: list[str] | None = None) -> int:
         written.append(shown)
     if options.tables is not None:
         text = "".join(as_csv(one) for one in written)
-        replace_file(options.tables / "pairs.csv", text.encode())
+        path = options.tables / "pairs.csv"
+        replace_file(path, text.encode())
     return 0
 
 

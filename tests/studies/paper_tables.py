@@ -77,7 +77,8 @@ class Merit:
 def one(logs: StudyLogs) -> dict[str, Merit]:
     """Fit and validate one cell; its tables are left in its folder."""
     folder = FOLDER / str(logs.seed)
-    cell = _cell_with_drawing(logs, folder / "cell.yaml")
+    path = folder / "cell.yaml"
+    cell = _cell_with_drawing(logs, path)
     discs = tuple(_disc_run(logs, plan, folder) for plan in DISC_PLANS)
     common = ("--cell", str(cell), "--json")
     fit = (
@@ -91,8 +92,9 @@ def one(logs: StudyLogs) -> dict[str, Merit]:
     )
     fitted = _drivegain(fit)["cases"]
     runs = (logs.validation[0], *discs, *logs.second_payload)
+    manufacturer_path = folder / "cases" / "manufacturer.yaml"
     beside = (
-        str(folder / "cases" / "manufacturer.yaml"),
+        str(manufacturer_path),
         *map(str, runs),
         "--beside",
         str(folder / "cases"),
@@ -106,27 +108,32 @@ def _merit(
     case: str, fitted: dict[str, Any], checked: dict[str, Any], truth: np.ndarray[Any, Any]
 ) -> Merit:
     gains = np.array([gain["value"] for gain in fitted["gains"]])
-    errors = [v for run in checked["runs"] if case in run["relative_error_percent"]
-              for v in run["relative_error_percent"][case]["axes"]]  # fmt: skip
-    masses = {
-        name: [
+    errors = []
+    for run in checked["runs"]:
+        if case in run["relative_error_percent"]:
+            errors.extend(run["relative_error_percent"][case]["axes"])
+    masses = {}
+    for name in ("disc", "plate"):
+        masses[name] = [
             run["masses"][case]["error_percent"]
             for run in checked["payloads"]
             if run["payload"] == name
         ]
-        for name in ("disc", "plate")
-    }
+    disc = float(np.mean(masses["disc"]))
+    plate = float(np.mean(masses["plate"]))
+    error = float(np.mean(errors))
     return Merit(
         gains=tuple((100.0 * np.abs(gains / truth - 1.0)).tolist()),
-        error=float(np.mean(errors)),
-        disc=float(np.mean(masses["disc"])),
-        plate=float(np.mean(masses["plate"])),
+        error=error,
+        disc=disc,
+        plate=plate,
     )
 
 
 def _drivegain(arguments: tuple[str, ...]) -> dict[str, Any]:
     """Run the command; what it prints as JSON."""
-    _print_line("drivegain " + " ".join(arguments))
+    line = "drivegain " + " ".join(arguments)
+    _print_line(line)
     printed = io.StringIO()
     with redirect_stdout(printed):
         code = drivegain(list(arguments))
@@ -141,7 +148,8 @@ def _cell_with_drawing(logs: StudyLogs, path: Path) -> Path:
     and the plate's weight.
     """
     rng = np.random.default_rng(np.random.SeedSequence(logs.seed, spawn_key=(4,)))
-    body = study_cell(logs.seed, FLOORS[logs.floor]).bodies["disc"]
+    noise_factor = FLOORS[logs.floor]
+    body = study_cell(logs.seed, noise_factor).bodies["disc"]
     drawn = _drawing(body, rng)
     document = yaml.safe_load(CELL.read_text(encoding="utf-8"))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -152,16 +160,19 @@ def _cell_with_drawing(logs: StudyLogs, path: Path) -> Path:
     document["payloads"].append(
         {"name": "plate", "mounting": "flange-b", "mass_kg": study_masses()["plate"]}
     )
-    path.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+    text = yaml.safe_dump(document, sort_keys=False)
+    path.write_text(text, encoding="utf-8")
     return path
 
 
 def _drawing(body: Body, rng: np.random.Generator) -> Body:
     sides = rng.choice([-1.0, 1.0], 4)
-    x, y, z = (float(v) for v in np.array(body.centre_m) * (1.0 + CENTRE_ERROR * sides[:3]))
+    centre_m = np.array(body.centre_m)
+    x, y, z = (float(v) for v in centre_m * (1.0 + CENTRE_ERROR * sides[:3]))
     scale = 1.0 + float(sides[3] * rng.uniform(*INERTIA_ERROR))
     xx, xy, xz, yy, yz, zz = (scale * value for value in body.inertia_kg_m2)
-    return Body(body.mass_kg, (x, y, z), (xx, xy, xz, yy, yz, zz))
+    inertia_kg_m2 = (xx, xy, xz, yy, yz, zz)
+    return Body(body.mass_kg, (x, y, z), inertia_kg_m2)
 
 
 def _disc_run(logs: StudyLogs, letter: str, folder: Path) -> Path:
@@ -176,22 +187,23 @@ def _disc_run(logs: StudyLogs, letter: str, folder: Path) -> Path:
     for leftover in (path, path.with_name(path.name + ".part")):
         leftover.unlink(missing_ok=True)
     _print_line(f"recording {path}")
-    spec = spec_of(study_cell(logs.seed, FLOORS[logs.floor]), "disc", 100 + ord(letter))
+    noise_factor = FLOORS[logs.floor]
+    spec = spec_of(study_cell(logs.seed, noise_factor), "disc", 100 + ord(letter))
     bus = open_bus(bus_address(cell))
     try:
         with SimulatedCell(spec, bus):
-            recorded = record(
-                RecordingRequest(
-                    CELL,
-                    cell,
-                    load_plan(plan_file, cell),
-                    path,
-                    payload=declared_payload("disc"),
-                    operator="study",
-                    granted_by="the study of the paper's tables: a simulated cell",
-                    run_id=f"paper-{logs.seed}-{letter}",
-                )
+            plan = load_plan(plan_file, cell)
+            request = RecordingRequest(
+                CELL,
+                cell,
+                plan,
+                path,
+                payload=declared_payload("disc"),
+                operator="study",
+                granted_by="the study of the paper's tables: a simulated cell",
+                run_id=f"paper-{logs.seed}-{letter}",
             )
+            recorded = record(request)
     finally:
         bus.shutdown()
     if not recorded.log.valid:
@@ -209,7 +221,9 @@ def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
     rows = []
     for case in CASES:
         of = [cell[case] for cell in merits.values()]
-        gains = [error for merit in of for error in merit.gains]
+        gains = []
+        for merit in of:
+            gains.extend(merit.gains)
         means = (
             np.mean(gains),
             np.max(gains),
@@ -217,33 +231,38 @@ def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
         )
         rows.append((case, *(percent(float(value)) for value in means)))
     seeds = ", ".join(map(str, merits))
+    headings = (
+        "set",
+        "gain error, mean",
+        "max",
+        "Table 6, mean",
+        "Table 7, mean %e",
+        "Table 8, mean %e",
+    )
+    notes = (
+        f"In %, cells of seed {seeds}. The error of the gains is against the truth of the "
+        "simulated cell.",
+    )
     return PaperTable(
         title="Order of merit",
-        headings=(
-            "set",
-            "gain error, mean",
-            "max",
-            "Table 6, mean",
-            "Table 7, mean %e",
-            "Table 8, mean %e",
-        ),
+        headings=headings,
         rows=tuple(rows),
-        notes=(
-            f"In %, cells of seed {seeds}. The error of the gains is against the truth of the "
-            "simulated cell.",
-        ),
+        notes=notes,
     )
 
 
 def write_tables(folder: Path, data: Path) -> None:
     """Write each table of a cell as CSV, and the paper's own beside it."""
     tables = []
-    for file in (folder / "cases" / "tables.md", folder / "tables.md"):
-        tables += file.read_text(encoding="utf-8").split("\n## ")[1:]
+    tables_path = folder / "cases" / "tables.md"
+    for file in (tables_path, folder / "tables.md"):
+        text = file.read_text(encoding="utf-8")
+        tables += text.split("\n## ")[1:]
     data.mkdir(exist_ok=True)
     for number, table in enumerate(tables, start=1):
         (data / f"paper-{number}.csv").write_text(as_csv(table), encoding="utf-8")
-        published = as_csv(paper_table(number).markdown())
+        markdown = paper_table(number).markdown()
+        published = as_csv(markdown)
         (data / f"paper-{number}-published.csv").write_text(published, encoding="utf-8")
 
 
@@ -267,11 +286,14 @@ def main(arguments: list[str] | None = None) -> int:
         options.seeds, (options.floor,), processes=options.processes, report_line=_print_line
     )
     merits = {cell.seed: one(cell) for cell in logs}
-    before, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
+    text = PAGE.read_text(encoding="utf-8")
+    before, rest = text.split(MARKS[0])
     made = merit_table(merits).markdown()
     after = rest.split(MARKS[1])[1]
     PAGE.write_text(f"{before}{MARKS[0]}\n\n{made}\n{MARKS[1]}{after}", encoding="utf-8")
-    write_tables(FOLDER / str(options.seeds[0]), DATA)
+    seed_text = str(options.seeds[0])
+    folder = FOLDER / seed_text
+    write_tables(folder, DATA)
     _print_line(made)
     return 0
 

@@ -72,7 +72,8 @@ class PivotCell:
     @property
     def fingerprint(self) -> str:
         """Digest of the row and of the files that it names."""
-        cell = shipped_configurations() / "cells" / f"{self.robot}.yaml"
+        cells_folder = shipped_configurations() / "cells"
+        cell = cells_folder / f"{self.robot}.yaml"
         simulation = shipped_simulation(self.robot)
         files = (
             cell.read_text(),
@@ -112,7 +113,9 @@ def cells() -> tuple[PivotCell, ...]:
     found = []
     for number, (robot, closure) in enumerate(PIVOTS):
         for place, size_nm in enumerate(SIZES_NM[robot]):
-            found.append(PivotCell(robot, closure, size_nm, seed=1 + 3 * number + place))
+            place_seed = 1 + 3 * number + place
+            pivot_cell = PivotCell(robot, closure, size_nm, seed=place_seed)
+            found.append(pivot_cell)
     for robot, seeds in SHIPPED_SEEDS.items():
         found += [PivotCell(robot, None, 0.0, seed) for seed in seeds]
     for robot, seeds in CLEAN_SEEDS.items():
@@ -142,15 +145,17 @@ def study_cell(cell: PivotCell, folder: Path) -> dict[str, Any]:
     changes = found["gain_changes"]
     before = [100.0 * (one["before"] / job.truth[one["axis"]] - 1.0) for one in changes]
     after = [100.0 * (one["after"] / job.truth[one["axis"]] - 1.0) for one in changes]
-    added = [one for turn in found["turns"] for one in turn["added"]]
+    added = []
+    for turn in found["turns"]:
+        added.extend(turn["added"])
     place = None if cell.closure is None else f"pivot {cell.closure}"
-    sizes = [
-        coefficient
-        for one in added
-        if (one["effect"], one["axis"]) == (FAMILY, place)
-        for coefficient in one["coefficients"]
-        if coefficient["name"] == "dry"
-    ]
+    sizes = []
+    for one in added:
+        if (one["effect"], one["axis"]) == (FAMILY, place):
+            for coefficient in one["coefficients"]:
+                if coefficient["name"] == "dry":
+                    sizes.append(coefficient)
+    total = found["before"]["cross_validated_error_percent"]["total"]
     return {
         "cell": cell.name,
         "planted": place or "none",
@@ -158,7 +163,7 @@ def study_cell(cell: PivotCell, folder: Path) -> dict[str, Any]:
         "named": [f"{one['name']} on {one['axis']}" for one in found["effects"]],
         "found_nm": sizes[-1]["value"] if sizes else None,
         "found_std_nm": sizes[-1]["std"] if sizes else None,
-        "error_before_percent": found["before"]["cross_validated_error_percent"]["total"],
+        "error_before_percent": total,
         "error_after_percent": found["after"]["cross_validated_error_percent"]["total"],
         "worst_gain_error_before_percent": max(map(abs, before), default=None),
         "worst_gain_error_after_percent": max(map(abs, after), default=None),
@@ -193,7 +198,10 @@ def verdict(rows: Sequence[dict[str, Any]]) -> str:
     clean = [row for row in rows if "-clean-" in row["cell"]]
     named = [row for row in planted if f"{FAMILY} on {row['planted']}" in row["named"]]
     others = [row for row in planted if set(row["named"]) - {f"{FAMILY} on {row['planted']}"}]
-    on_pivots = [row for row in shipped if any(" on pivot " in name for name in row["named"])]
+    on_pivots = []
+    for row in shipped:
+        if any(" on pivot " in name for name in row["named"]):
+            on_pivots.append(row)
     silent = [row for row in clean if not row["named"]]
     return (
         f"named as what it is in {len(named)} of {len(planted)}, another name in {len(others)}; "
@@ -214,7 +222,8 @@ def main(arguments: list[str] | None = None) -> int:
     for cell in cells():
         if cell.name not in chosen:
             continue
-        row = made_once(OUT, cell.name, cell.fingerprint, partial(study_cell, cell))
+        make = partial(study_cell, cell)
+        row = made_once(OUT, cell.name, cell.fingerprint, make)
         rows.append(row | {"cell": cell.name})
         sys.stdout.write(f"{'; '.join(line_of(rows[-1]))}\n")
         sys.stdout.flush()
@@ -233,7 +242,8 @@ def main(arguments: list[str] | None = None) -> int:
             ]
         )
         writer.writerows(map(line_of, rows))
-        replace_file(TABLE, table.getvalue().encode())
+        content = table.getvalue().encode()
+        replace_file(TABLE, content)
     return 0
 
 

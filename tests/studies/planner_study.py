@@ -64,7 +64,8 @@ def predicted_std(cell: Cell, runs: Sequence[Run]) -> PredictedStd:
     for_first = design.std_percent(recorded_information(design, motions[:FITTED_FIRST]))
     for_all = design.std_percent(recorded_information(design, motions))
     alone = for_all / _std_percent(everything)
-    return PredictedStd(alone, alone * _std_percent(first) / for_first)
+    scaled = alone * _std_percent(first) / for_first
+    return PredictedStd(alone, scaled)
 
 
 def _motion_of(run: Run, fitted: Identification) -> tuple[Excitation, tuple[int | None, ...]]:
@@ -79,7 +80,8 @@ def _motion_of(run: Run, fitted: Identification) -> tuple[Excitation, tuple[int 
 
 def _std_percent(fitted: Identification) -> FloatArray:
     estimate = fitted.estimate
-    return np.asarray(100.0 * estimate.gains_std / np.abs(estimate.gains))
+    absolute_gain = np.abs(estimate.gains)
+    return np.asarray(100.0 * estimate.gains_std / absolute_gain)
 
 
 def table_rows(world: str, found: Sequence[PredictedStd]) -> list[str]:
@@ -113,13 +115,17 @@ def main(arguments: list[str] | None = None) -> int:
     for world in options.world:
         found: list[PredictedStd] = []
         for number in range(options.recordings):
-            found.append(predicted_std(cell, record_runs(cell, world, number, effects=())))
-            print_line(f"{world} {number}: {np.round(found[-1].scaled, 2)}")
+            runs = record_runs(cell, world, number, effects=())
+            found.append(predicted_std(cell, runs))
+            line = f"{world} {number}: {np.round(found[-1].scaled, 2)}"
+            print_line(line)
         lines += table_rows(world, found)
     shown = "\n".join(lines)
     print_line(shown)
     if options.tables is not None:
-        replace_file(options.tables / "planner-std.csv", as_csv(shown).encode())
+        path = options.tables / "planner-std.csv"
+        content = as_csv(shown).encode()
+        replace_file(path, content)
     return 0
 
 

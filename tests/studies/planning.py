@@ -40,7 +40,8 @@ def main() -> None:
     )
     out.write("|---|---|---|---|---|---|\n")
     for name, seed in CASES:
-        experiment = experiment_of(load_cell(CELLS / f"{name}.yaml"))
+        path = CELLS / f"{name}.yaml"
+        experiment = experiment_of(load_cell(path))
         truth = _truth(experiment) if name == "demo" else None
         random = [_plan(experiment, other, 0) for other in RANDOM_SEEDS]
         started = time.process_time()
@@ -73,20 +74,22 @@ def _plan(experiment: Experiment, seed: int, exchanges: int) -> Plan:
 
 
 def _truth(experiment: Experiment) -> Experiment:
-    payload = ExpectedPayload(
-        frozenset({"m"}), np.array([PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS])
-    )
+    parameters = np.array([PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS])
+    known = frozenset({"m"})
+    payload = ExpectedPayload(known, parameters)
     expectation = replace(
         experiment.design.expectation,
         gains=GAINS,
         parameters=tx40_truth().parameters,
         payloads=(payload,),
     )
-    return replace(experiment, design=Design(expectation, experiment.design.base))
+    design = Design(expectation, experiment.design.base)
+    return replace(experiment, design=design)
 
 
 def _worst(experiment: Experiment, made: Plan) -> float:
-    excitation, _ = experiment.excitation(paths_of(experiment.cell, made.moves))
+    paths = paths_of(experiment.cell, made.moves)
+    excitation, _ = experiment.excitation(paths)
     return float(
         experiment.design.std_percent(experiment.design.information(excitation, RUNS)).max()
     )

@@ -54,7 +54,9 @@ def _places(channel: SoundChannel, count: int) -> IntArray:
     """
     rng = np.random.default_rng(SEED)
     size = np.abs(channel.values)
-    steps = np.abs(np.diff(channel.values, prepend=channel.values[0]))
+    prepend = channel.values[0]
+    channel_steps = np.diff(channel.values, prepend=prepend)
+    steps = np.abs(channel_steps)
     is_far = size > np.percentile(size, 60.0)
     is_moving = steps >= np.percentile(steps, 50.0)
     inside = np.zeros(len(size), dtype=np.bool_)
@@ -91,7 +93,8 @@ def _wrapped(
     def plant(channel: SoundChannel) -> FloatArray:
         whole = size(channel)
         lowest = -0.5 * whole if signed else 0.0
-        return np.asarray(np.mod(channel.values - lowest, whole) + lowest)
+        channel_difference = channel.values - lowest
+        return np.asarray(np.mod(channel_difference, whole) + lowest)
 
     return plant
 
@@ -106,13 +109,15 @@ def _turn(channel: SoundChannel) -> float:
 
 def _clipped(percentile: float) -> Callable[[SoundChannel], FloatArray]:
     def plant(channel: SoundChannel) -> FloatArray:
-        return np.minimum(channel.values, np.percentile(channel.values, percentile))
+        channel_percentile = np.percentile(channel.values, percentile)
+        return np.minimum(channel.values, channel_percentile)
 
     return plant
 
 
 def _clipped_both_ways(channel: SoundChannel) -> FloatArray:
-    limit = np.percentile(np.abs(channel.values), 85.0)
+    absolute_channel = np.abs(channel.values)
+    limit = np.percentile(absolute_channel, 85.0)
     return np.clip(channel.values, -limit, limit)
 
 
@@ -157,7 +162,8 @@ def _not_a_number(channel: SoundChannel) -> FloatArray:
 
 def _times_largest(factor: float) -> Callable[[SoundChannel], float]:
     def size(channel: SoundChannel) -> float:
-        return factor * float(np.max(np.abs(channel.values)))
+        largest_absolute_channel = np.max(np.abs(channel.values))
+        return factor * float(largest_absolute_channel)
 
     return size
 

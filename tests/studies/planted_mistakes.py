@@ -113,9 +113,8 @@ def plant(
     if planted.mistake is Mistake.CLEAN:
         return tuple(runs), cell
     if planted.mistake is Mistake.GRAVITY:
-        return tuple(runs), replace(
-            cell, gravity_m_s2=tilted(cell.gravity_m_s2, planted.size, float(seed))
-        )
+        gravity_m_s2 = tilted(cell.gravity_m_s2, planted.size, float(seed))
+        return tuple(runs), replace(cell, gravity_m_s2=gravity_m_s2)
     return tuple(_wrong(run, planted) for run in runs), cell
 
 
@@ -155,7 +154,8 @@ def tilted(
     along = gravity / size
     across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     across /= np.linalg.norm(across)
-    towards = np.cos(heading_rad) * across + np.sin(heading_rad) * np.cross(along, across)
+    along_cross = np.cross(along, across)
+    towards = np.cos(heading_rad) * across + np.sin(heading_rad) * along_cross
     x, y, z = (size * (np.cos(angle_rad) * along + np.sin(angle_rad) * towards)).tolist()
     return x, y, z
 
@@ -169,18 +169,22 @@ def value_of(evidence: Evidence, placed: PlacedEffect) -> tuple[float, float]:
     estimate = evidence.estimate
     own = own_unknowns(estimate, (placed,))
     units = [estimate.unknowns[place].unit for place in own]
-    unknown = sorted(set(units) - SI_OF_UNIT.keys())
+    difference = set(units) - SI_OF_UNIT.keys()
+    unknown = sorted(difference)
     if unknown:
         raise ValueError(
             f"{placed.effect.name} has the unit {unknown[0]!r}; expected one of "
             f"{', '.join(SI_OF_UNIT)}"
         )
-    scale = np.array([SI_OF_UNIT[unit] for unit in units])
+    si_of_units = [SI_OF_UNIT[unit] for unit in units]
+    scale = np.array(si_of_units)
     values = values_of(estimate, own) * scale
     place = len(estimate.gains) + own
-    covariance = estimate.covariance[np.ix_(place, place)] * np.outer(scale, scale)
+    scale_outer = np.outer(scale, scale)
+    covariance = estimate.covariance[np.ix_(place, place)] * scale_outer
     if len(values) == 1:
-        return float(values[0]), float(np.sqrt(covariance[0, 0]))
+        covariance_root = np.sqrt(covariance[0, 0])
+        return float(values[0]), float(covariance_root)
     length = float(np.linalg.norm(values))
     direction = values / length
     return length, float(np.sqrt(direction @ covariance @ direction))
@@ -200,7 +204,8 @@ def judge_mistake(evidence: Evidence, planted: Planted) -> NamedMistake:
     if not own:
         return NamedMistake(False, float("nan"), float("nan"), float("nan"), others)
     value, std = value_of(evidence, own[0])
-    return NamedMistake(True, value, std, (value - correcting_value(planted)) / std, others)
+    difference = value - correcting_value(planted)
+    return NamedMistake(True, value, std, difference / std, others)
 
 
 def correcting_value(planted: Planted) -> float:
@@ -234,7 +239,8 @@ def predicted_offset_std(evidence: Evidence) -> FloatArray:
         moved = [replace(data, position_rad=data.position_rad + step) for data in evidence.fit_runs]
         there = observe(model, moved, evidence.conditioning, rows)
         shifted = replace(rows, regressor=there.regressor, flange=there.flange)
-        column = (estimate.predicted_torque(shifted) - torque) / SHIFT
+        difference = estimate.predicted_torque(shifted) - torque
+        column = difference / SHIFT
         whitened = problem.whitened(column[:, None, :], model.drive_train.to_motor)[:, 0]
         absorbed = linalg.cho_solve(folds.full_factor, problem.jacobian.on_columns(whitened))
         left = whitened - problem.jacobian @ absorbed
@@ -244,10 +250,12 @@ def predicted_offset_std(evidence: Evidence) -> FloatArray:
             continue
         offset = float(left @ problem.residual) / size
         scores = np.bincount(problem.cluster, left * (problem.residual - left * offset))
-        deviations.append(float(np.linalg.norm(scores)) / size)
+        score_norm = float(np.linalg.norm(scores))
+        deviations.append(score_norm / size)
     return np.array(deviations)
 
 
 def is_prismatic(evidence: Evidence) -> tuple[bool, ...]:
     """Whether each axis is prismatic."""
-    return tuple(joint.kind is JointKind.PRISMATIC for joint in evidence.model.robot.axes)
+    axes = evidence.model.robot.axes
+    return tuple(joint.kind is JointKind.PRISMATIC for joint in axes)

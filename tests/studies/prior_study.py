@@ -79,12 +79,12 @@ def kept_runs(robot: PriorRobot, seed: int, out: Path) -> tuple[Cell, CellSpec, 
     """Return a cell, its truth without load and its four runs,
     which are simulated unless they are there.
     """
-    cell = load_cell(shipped_configurations() / "cells" / f"{robot.cell}.yaml")
+    cells_folder = shipped_configurations() / "cells"
+    cell = load_cell(cells_folder / f"{robot.cell}.yaml")
     spec = load_simulation(shipped_simulation(robot.simulation))
     path = out / f"{robot.name}-{seed}.npz"
-    source = digest_of_source(
-        "tests.studies.followed_cell", (*MOVING, "tests.studies.followed_cell")
-    )
+    rooms = (*MOVING, "tests.studies.followed_cell")
+    source = digest_of_source("tests.studies.followed_cell", rooms)
     fingerprint = digest(source, cell.digest, DURATION_S, spec.urdf, spec.axes, spec.effects)
     if not is_finished(path, fingerprint):
         out.mkdir(parents=True, exist_ok=True)
@@ -92,7 +92,8 @@ def kept_runs(robot: PriorRobot, seed: int, out: Path) -> tuple[Cell, CellSpec, 
         finish(path, fingerprint)
     body = cell.payloads[0]
     raw = read_runs(path, lambda name: Payload(name, body.mounting, {"m": body.mass_kg}))
-    return cell, spec, [run_of(one, cell) for one in raw]
+    runs = [run_of(one, cell) for one in raw]
+    return cell, spec, runs
 
 
 def simulated_runs(robot: PriorRobot, cell: Cell, seed: int) -> list[RawRun]:
@@ -100,16 +101,19 @@ def simulated_runs(robot: PriorRobot, cell: Cell, seed: int) -> list[RawRun]:
     body = cell.payloads[0]
     runs = []
     for number, mounted in enumerate((None, body.name, None, body.name)):
+        path = shipped_simulation(robot.simulation)
         spec = replace(
-            load_simulation(shipped_simulation(robot.simulation), mounted),
+            load_simulation(path, mounted),
             seed=1000 * seed + number,
         )
         rng = np.random.default_rng([seed, number])
         demand = point_to_point(cell, spec.start_rad, rng, DURATION_S)
         payload = None
         if mounted is not None:
-            payload = Payload(body.name, body.mounting, {"m": body.mass_kg})
-        runs.append(follow(cell, spec, demand, f"run-{number}", payload, BETWEEN_S * number))
+            known = {"m": body.mass_kg}
+            payload = Payload(body.name, body.mounting, known)
+        began_s = BETWEEN_S * number
+        runs.append(follow(cell, spec, demand, f"run-{number}", payload, began_s))
     return runs
 
 
@@ -172,14 +176,16 @@ def study(robot: PriorRobot, seed: int, out: Path) -> dict[str, Any]:
     cell, spec, runs = kept_runs(robot, seed, out)
     found = fitted(cell, runs)
     estimate = found.estimate
-    gains = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in spec.axes]
+    gains = np.array(gain_nm_per_a)
     standard = true_standard(spec, found.model)
     base = found.system.base.grouping @ standard
     count = len(base)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     cases = []
     for tolerance in TOLERANCES:
-        for kind, prior in priors(urdf_links(spec.urdf), tolerance, rng).items():
+        links = urdf_links(spec.urdf)
+        for kind, prior in priors(links, tolerance, rng).items():
             full = full_parameters(found.system, estimate, prior)
             cases.append(
                 {
@@ -188,14 +194,16 @@ def study(robot: PriorRobot, seed: int, out: Path) -> dict[str, Any]:
                     **case(full, estimate, gains, base, standard),
                 }
             )
+    parameter_difference = estimate.parameters[:count] - base
+    gain_difference = estimate.gains - gains
     return {
         "robot": robot.name,
         "seed": seed,
         "axes": list(cell.axis_names),
         "relative_error_percent": found.training_error.total,
-        "z": ((estimate.gains - gains) / estimate.gains_std).tolist(),
+        "z": (gain_difference / estimate.gains_std).tolist(),
         "std_percent": (100.0 * estimate.gains_std / np.abs(gains)).tolist(),
-        "base_z": ((estimate.parameters[:count] - base) / estimate.parameters_std[:count]).tolist(),
+        "base_z": (parameter_difference / estimate.parameters_std[:count]).tolist(),
         "cases": cases,
     }
 
@@ -211,18 +219,22 @@ def case(
     # Rotors, friction and offsets have no prior of their own.
     of_link = np.isfinite(full.prior_std)
     by_data = np.array([basis is RestsOn.DATA for basis in full.basis])
-    inside = np.abs(full.standard - standard) < NORMAL_95 * full.standard_std
+    standard_difference = np.abs(full.standard - standard)
+    inside = standard_difference < NORMAL_95 * full.standard_std
     check = full.check
+    gain_difference = full.gains - estimate.gains
+    smallest_eigenvalue = float(full.eigenvalues.min())
+    base_difference = full.base - base
     return {
         "z": ((full.gains - gains) / full.gains_std).tolist(),
-        "shift": ((full.gains - estimate.gains) / estimate.gains_std).tolist(),
+        "shift": (gain_difference / estimate.gains_std).tolist(),
         "std_ratio": (full.gains_std / estimate.gains_std).tolist(),
-        "base_z": ((full.base - base) / full.base_std).tolist(),
+        "base_z": (base_difference / full.base_std).tolist(),
         "data": int(by_data.sum()),
         "parameters": len(by_data),
         "data_inside": inside[by_data].tolist(),
         "prior_inside": inside[of_link & ~by_data].tolist(),
-        "least_eigenvalue": float(full.eigenvalues.min()),
+        "least_eigenvalue": smallest_eigenvalue,
         "bounded": full.bounded,
         "chi_square": check.chi_square,
         "degrees_of_freedom": check.degrees_of_freedom,
@@ -274,9 +286,11 @@ def of_prior(cells: Sequence[dict[str, Any]], tolerance: float) -> list[str]:
     """Row of the right priors of one tolerance."""
     cases = list(cases_of(cells, tolerance, "right"))
     z = np.concatenate([one["z"] for one in cases])
-    shift = np.abs(np.concatenate([one["shift"] for one in cases]))
+    shifts = [one["shift"] for one in cases]
+    shift = np.abs(np.concatenate(shifts))
     before = np.concatenate([one["z"] for one in cells])
-    after = before + np.concatenate([one["shift"] for one in cases])
+    stacked_shifts = np.concatenate([one["shift"] for one in cases])
+    after = before + stacked_shifts
     by_data = np.concatenate([one["data_inside"] for one in cases])
     by_prior = np.concatenate([one["prior_inside"] for one in cases])
     return [
@@ -331,7 +345,8 @@ def noticed(cells: Sequence[dict[str, Any]]) -> list[list[str]]:
         for tolerance in TOLERANCES:
             row = [robot.name, f"{100.0 * tolerance:.0f} %"]
             for kind in KINDS:
-                found = [one["noticed"] for one in cases_of(mine, tolerance, kind)]
+                cases = cases_of(mine, tolerance, kind)
+                found = [one["noticed"] for one in cases]
                 row.append(f"{sum(found)} of {len(found)}")
             rows.append(row)
     return rows
@@ -352,9 +367,8 @@ def by_gain(cells: Sequence[dict[str, Any]]) -> list[list[str]]:
                 cell["z"][number],
                 *(shift[number] for shift in shifts),
             ]
-            rows.append(
-                [cell["robot"], str(cell["seed"]), axis, *(f"{figure:.3f}" for figure in figures)]
-            )
+            seed_text = str(cell["seed"])
+            rows.append([cell["robot"], seed_text, axis, *(f"{figure:.3f}" for figure in figures)])
     return rows
 
 
@@ -382,7 +396,8 @@ def real_tx40(
         method=Method.ML,
         fixed_gains=recording.gains,
     )
-    prior = LinkPrior(urdf_links(cell.urdf), tolerance)
+    links = urdf_links(cell.urdf)
+    prior = LinkPrior(links, tolerance)
     full = full_parameters(found.system, found.estimate, prior)
     index = {name: number for number, name in enumerate(full.names)}
     given = np.full(len(index), np.nan)
@@ -396,7 +411,8 @@ def real_tx40(
         value = f"{full.standard[number]:.4g}"
         std = f"{full.standard_std[number]:.2g}"
         share = f"{100.0 * full.prior_share[number]:.0f}"
-        rows.append([name, full.units[number], said, value, std, full.basis[number].value, share])
+        basis = full.basis[number].value
+        rows.append([name, full.units[number], said, value, std, basis, share])
     published = published_base(folder)
     base_rows = []
     for number, name in enumerate(found.system.base.names):
@@ -451,9 +467,10 @@ def main(arguments: list[str] | None = None) -> int:
     for seed in range(1, options.cells + 1):
         for robot in ROBOTS:
             cells.append(kept(robot, seed, options.out))
-            print_line(
+            line = (
                 f"{robot.name} {seed}: relative error {cells[-1]['relative_error_percent']:.2f} %"
             )
+            print_line(line)
     summary = [without_prior(cells), *(of_prior(cells, tolerance) for tolerance in TOLERANCES)]
     for row in summary:
         for heading, figure in zip(HEADINGS, row, strict=False):
@@ -464,14 +481,17 @@ def main(arguments: list[str] | None = None) -> int:
         print_line(" | ".join(row))
     if options.cells >= CELLS:
         shift_names = [f"shift at {100.0 * tolerance:.0f} % σ" for tolerance in TOLERANCES]
+        path = TABLES / "prior.csv"
         write_csv(
-            TABLES / "prior.csv",
+            path,
             HEADINGS,
             [row + [""] * (len(HEADINGS) - len(row)) for row in summary],
         )
-        write_csv(TABLES / "prior-noticed.csv", ("robot", "tolerance", *KINDS), wrong)
+        prior_noticed_path = TABLES / "prior-noticed.csv"
+        write_csv(prior_noticed_path, ("robot", "tolerance", *KINDS), wrong)
+        prior_gains_path = TABLES / "prior-gains.csv"
         write_csv(
-            TABLES / "prior-gains.csv",
+            prior_gains_path,
             ("robot", "seed", "axis", "std %", "z", *shift_names),
             by_gain(cells),
         )
@@ -503,9 +523,11 @@ def main(arguments: list[str] | None = None) -> int:
         "basis",
         "prior's share of the variance %",
     )
-    write_csv(TABLES / "prior-tx40.csv", headings, rows)
+    prior_tx40_path = TABLES / "prior-tx40.csv"
+    write_csv(prior_tx40_path, headings, rows)
     headings = ("base parameter", "published", "std", "fit", "std", "with the prior", "std")
-    write_csv(TABLES / "prior-tx40-base.csv", headings, base_rows)
+    prior_tx40_base_path = TABLES / "prior-tx40-base.csv"
+    write_csv(prior_tx40_base_path, headings, base_rows)
     return 0
 
 

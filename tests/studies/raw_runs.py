@@ -21,10 +21,11 @@ def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
     for run in raw:
         # Steps of positions are small numbers, which pack better than positions; the first one is a
         # step from zero.
-        arrays[f"{run.name}.position_steps"] = np.diff(
-            run.position_counts, axis=0, prepend=np.int32(0)
-        ).T
-        arrays[f"{run.name}.error_counts"] = (run.demand_counts - run.position_counts).T
+        prepend = np.int32(0)
+        position_steps_counts = np.diff(run.position_counts, axis=0, prepend=prepend)
+        arrays[f"{run.name}.position_steps"] = position_steps_counts.T
+        demand_count_difference = run.demand_counts - run.position_counts
+        arrays[f"{run.name}.error_counts"] = demand_count_difference.T
         arrays[f"{run.name}.current_raw"] = run.current_raw.T
         arrays[f"{run.name}.limited"] = run.limited.T
         arrays[f"{run.name}.move"] = run.move.astype(np.int32)
@@ -34,7 +35,8 @@ def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
     }
     with path.open("wb") as file:
         # The stubs take every keyword for `allow_pickle`.
-        np.savez_compressed(file, runs=np.array(json.dumps(payloads)), **arrays)  # type: ignore[arg-type]
+        runs = np.array(json.dumps(payloads))
+        np.savez_compressed(file, runs=runs, **arrays)  # type: ignore[arg-type]
 
 
 def read_runs(
@@ -48,19 +50,19 @@ def read_runs(
     """
     raw = []
     with np.load(path) as arrays:
-        for name, (payload, began_s) in json.loads(str(arrays["runs"])).items():
+        document = json.loads(str(arrays["runs"]))
+        for name, (payload, began_s) in document.items():
             position = np.cumsum(arrays[f"{name}.position_steps"].T, axis=0, dtype=np.int32)
-            raw.append(
-                RawRun(
-                    name=name,
-                    payload=None if payload is None else payload_of(payload),
-                    began_s=began_s,
-                    position_counts=position,
-                    demand_counts=position + arrays[f"{name}.error_counts"].T,
-                    current_raw=np.ascontiguousarray(arrays[f"{name}.current_raw"].T),
-                    limited=np.ascontiguousarray(arrays[f"{name}.limited"].T),
-                    move=arrays[f"{name}.move"].astype(np.int64),
-                    ampere_per_unit=arrays[f"{name}.ampere_per_unit"],
-                )
+            raw_run = RawRun(
+                name=name,
+                payload=None if payload is None else payload_of(payload),
+                began_s=began_s,
+                position_counts=position,
+                demand_counts=position + arrays[f"{name}.error_counts"].T,
+                current_raw=np.ascontiguousarray(arrays[f"{name}.current_raw"].T),
+                limited=np.ascontiguousarray(arrays[f"{name}.limited"].T),
+                move=arrays[f"{name}.move"].astype(np.int64),
+                ampere_per_unit=arrays[f"{name}.ampere_per_unit"],
             )
+            raw.append(raw_run)
     return tuple(raw)

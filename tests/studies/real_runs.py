@@ -64,7 +64,8 @@ class Recording:
     @property
     def gains(self) -> FloatArray:
         """Nameplate gains, shape (m,)."""
-        return np.array([axis.nameplate_gain for axis in self.cell.axes])
+        nameplate_gains = [axis.nameplate_gain for axis in self.cell.axes]
+        return np.array(nameplate_gains)
 
 
 def data_folder() -> Path:
@@ -87,35 +88,42 @@ def tx40(folder: Path) -> Recording:
         run, cell = load_run(log)
     block_s = 0.5
     parts = 4
-    return Recording("tx40", cell, (run,), block_s, True, parts, (stretches(run, block_s) % parts,))
+    part_of = (stretches(run, block_s) % parts,)
+    return Recording("tx40", cell, (run,), block_s, True, parts, part_of)
 
 
 def kr300(folder: Path, left_out: str) -> Recording:
     """The KR300: three runs of 20 s at 250 Hz; so far one of them was left out."""
-    cell = load_cell(folder / "kr300" / "kr300-cell.yaml")
+    path = folder / "kr300" / "kr300-cell.yaml"
+    cell = load_cell(path)
     runs = []
     for name in KR300_RUNS:
         table = np.loadtxt(folder / "kr300" / f"kr300_{name}.csv", delimiter=",")
-        runs.append(Run(name, table[:, 0], np.deg2rad(table[:, 1:7]), table[:, 7:13]))
+        position_rad = np.deg2rad(table[:, 1:7])
+        runs.append(Run(name, table[:, 0], position_rad, table[:, 7:13]))
     part_of = tuple(np.full(len(run.time_s), int(run.name != left_out)) for run in runs)
     return Recording(f"kr300-{left_out}", cell, tuple(runs), 1.0, False, 1, part_of, left_out)
 
 
 def ur10(folder: Path) -> Recording:
     """The UR10: 27.5 s at 125 Hz from a ROS 2 bag; so far its last 40 % were left out."""
-    cell = load_cell(folder / "ur10" / "ur10-cell.yaml")
+    path = folder / "ur10" / "ur10-cell.yaml"
+    cell = load_cell(path)
     types = get_typestore(Stores.ROS2_HUMBLE)
     bag = folder / "ur10" / "ur10_exciting_trajectory.db3"
     with closing(sqlite3.connect(f"file:{bag}?mode=ro", uri=True)) as database:
         lines = database.execute("SELECT data FROM messages ORDER BY timestamp").fetchall()
     states: list[Any] = [types.deserialize_cdr(data, UR10_TYPE) for (data,) in lines]
     order = [states[0].name.index(axis) for axis in cell.axis_names]
-    position = np.array([state.position for state in states], dtype=np.float64)[:, order]
-    effort = np.array([state.effort for state in states], dtype=np.float64)[:, order]
+    positions = [state.position for state in states]
+    position = np.array(positions, dtype=np.float64)[:, order]
+    efforts = [state.effort for state in states]
+    effort = np.array(efforts, dtype=np.float64)[:, order]
     time_s = UR10_PERIOD_S * np.arange(len(states), dtype=np.float64)
     run = Run("ur10", time_s, position, effort)
     is_fit = np.arange(len(states)) < int(UR10_FIT_SHARE * len(states))
-    return Recording("ur10", cell, (run,), 1.0, False, 1, (is_fit.astype(np.int64),))
+    part_of = (is_fit.astype(np.int64),)
+    return Recording("ur10", cell, (run,), 1.0, False, 1, part_of)
 
 
 RECORDINGS: dict[str, Callable[[Path], Recording]] = {

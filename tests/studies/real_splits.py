@@ -94,12 +94,14 @@ class JudgedEffect:
     @property
     def error_before(self) -> RelativeError:
         """Relative error without it [%]."""
-        return of_squares(np.array(self.size_nm2), np.array(self.before_nm2))
+        size_nm2 = np.array(self.size_nm2)
+        return of_squares(size_nm2, np.array(self.before_nm2))
 
     @property
     def error_after(self) -> RelativeError:
         """Relative error with it [%]."""
-        return of_squares(np.array(self.size_nm2), np.array(self.after_nm2))
+        size_nm2 = np.array(self.size_nm2)
+        return of_squares(size_nm2, np.array(self.after_nm2))
 
 
 def written_effects(steps: Sequence[Step], holdout: Sequence[Run] = ()) -> tuple[PlacedEffect, ...]:
@@ -135,7 +137,8 @@ def sides_of(unit: SplitUnit) -> tuple[list[Run], list[Run]]:
     # short recording.
     if recording.stretches_are_moves or unit.split == REGION:
         runs = [replace(run, move=stretches(run, recording.stretch_s)) for run in runs]
-    return two_sides(runs, masks, model_of(recording.cell), recording.cell.conditioning)
+    model = model_of(recording.cell)
+    return two_sides(runs, masks, model, recording.cell.conditioning)
 
 
 def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
@@ -148,14 +151,16 @@ def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
         model_of(cell), rest, cell.conditioning, method=Method.ML, fixed_gains=recording.gains
     )
     # The search is given no row of the part that judges it.
-    steps = find_effects(gather(found, rest), np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    steps = find_effects(gather(found, rest), rng)
     spent_s = time.process_time() - begun_s
     written = written_effects(steps)
     start = gather(found, rest, unseen)
     # Where nothing is written; a refit would differ by rounding, and that alike in all blocks
     end = start
     if written:
-        end = with_effects(_around(start, steps[-1].after), written)
+        after = steps[-1].after
+        end = with_effects(_around(start, after), written)
     names = [placed.name_among(cell.axis_names) for placed in written]
     rows = [_judged(unit, cell.axis_names, EVERYTHING, start, end, tuple(names), spent_s)]
     for placed, name in zip(written, names, strict=True):
@@ -205,6 +210,14 @@ def _judged(
     total = judge_rise(change.sum(axis=0)[used], first.run[used])
     errors = of_squares(size, left_before), of_squares(size, left_after)
     points = np.subtract(errors[1].axes, errors[0].axes)
+    total_rise_points = errors[1].total - errors[0].total
+    raises = any(rise.is_shown for rise in rises)
+    largest_rise_points = float(np.nanmax(points))
+    raised_points = float(points[worst])
+    size_nm2 = tuple(size.tolist())
+    before_nm2 = tuple(left_before.tolist())
+    after_nm2 = tuple(left_after.tolist())
+    blocks = rises[worst].blocks
     return JudgedEffect(
         recording=unit.recording,
         split=unit.split,
@@ -212,20 +225,20 @@ def _judged(
         part=unit.part,
         effect=effect,
         written=written,
-        blocks=rises[worst].blocks,
+        blocks=blocks,
         raised_axis=axes[worst],
-        raised_points=float(points[worst]),
+        raised_points=raised_points,
         t=rises[worst].t,
         t_limit=rises[worst].limit,
-        raises=any(rise.is_shown for rise in rises),
+        raises=raises,
         total_t=total.t,
         total_t_limit=total.limit,
         total_raises=total.is_shown,
-        largest_rise_points=float(np.nanmax(points)),
-        total_rise_points=errors[1].total - errors[0].total,
-        size_nm2=tuple(size.tolist()),
-        before_nm2=tuple(left_before.tolist()),
-        after_nm2=tuple(left_after.tolist()),
+        largest_rise_points=largest_rise_points,
+        total_rise_points=total_rise_points,
+        size_nm2=size_nm2,
+        before_nm2=before_nm2,
+        after_nm2=after_nm2,
         processor_s=processor_s,
     )
 

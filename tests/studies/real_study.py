@@ -134,13 +134,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     if not (data_folder() / "tx40").is_dir():
-        print_line(
+        line = (
             f"found no {data_folder() / 'tx40'}; expected the recordings there, or "
             "DRIVEGAIN_DATA to name it"
         )
+        print_line(line)
         return 2
     units = units_of(options.only, options.splits, options.seeds)
-    source = digest_of_source("tests.studies.real_splits", ("daq.log", "ident", "tests.studies.re"))
+    rooms = ("daq.log", "ident", "tests.studies.re")
+    source = digest_of_source("tests.studies.real_splits", rooms)
 
     def fingerprint_of(unit: SplitUnit) -> str:
         return digest(source, unit)
@@ -160,14 +162,16 @@ def main(arguments: list[str] | None = None) -> int:
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
     rows = finished_rows(options.out, units, JudgedEffect, fingerprint_of)
     table = to_csv(JudgedEffect, rows).encode()
-    replace_file(options.out.with_suffix(".csv"), table)
+    path = options.out.with_suffix(".csv")
+    replace_file(path, table)
     is_all = {unit.name for unit in units_of(list(RECORDINGS), (TODAY, REGION), SEEDS)} <= {
         unit.name for unit in units
     }
     complete = sum(row.effect == EVERYTHING for row in rows) == len(units)
     if is_all and complete:
         replace_file(TABLE, table)
-        replace_file(SUMMARY, as_csv(summary(rows)).encode())
+        content = as_csv(summary(rows)).encode()
+        replace_file(SUMMARY, content)
     print_line(
         f"\n{left} units of this piece were not begun\n\n{summary(rows)}\n\n{raising_effects(rows)}"
     )

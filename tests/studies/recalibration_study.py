@@ -74,7 +74,9 @@ def truth(name: str | None, factor: float) -> CellSpec:
 
 def one_job(rig: Rig, factor: float, seed: int, *faults: FaultSpec) -> str:
     """A job with the cell as it is now; its outcome, or the error that ended it."""
-    mounted = MountedFile(rig.cells / "mounted", partial(truth, factor=factor), lambda error: None)
+    path = rig.cells / "mounted"
+    load = partial(truth, factor=factor)
+    mounted = MountedFile(path, load, lambda error: None)
     spec = replace(mounted.at_power_on(), faults=faults, seed=seed)
     bus = open_bus(bus_address(rig.cell))
     try:
@@ -105,22 +107,23 @@ def week_text(rig: Rig, factor: float) -> str:
 
 def study(weeks: int, seconds: float, folder: Path) -> int:
     """Run it; 1 where a quiet week was written, or the loss was not."""
-    shipped = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    shipped = load_cell(path)
     plans = [
         make_plan(shipped, folder / f"{seed}.yaml", seed=seed, duration_s=seconds)
         for seed in (10, 11, 12)
     ]
+    plan_text = str(plans[0])
     runs = [
-        {**RUNS[0], "plan_file": str(plans[0])},
+        {**RUNS[0], "plan_file": plan_text},
         {**RUNS[1], "plan_file": str(plans[0])},
         {**RUNS[0], "name": "bare-2", "plan_file": str(plans[1])},
         {**RUNS[1], "name": "loaded-2", "plan_file": str(plans[1])},
         {**RUNS[2], "plan_file": str(plans[2])},
     ]
     policy = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
-    rig = make_rig(
-        folder / "cell", plans[0], policy=policy, runs=runs, every_h=160, resume_within_h=36
-    )
+    cell_folder = folder / "cell"
+    rig = make_rig(cell_folder, plans[0], policy=policy, runs=runs, every_h=160, resume_within_h=36)
     wrong = []
     for week in range(weeks):
         factor = LOSS if week >= weeks // 2 else 1.0
@@ -131,11 +134,13 @@ def study(weeks: int, seconds: float, folder: Path) -> int:
         if week == 1:
             rig.closed.unlink()
         outcome = one_job(rig, factor, week, *((FAULT,) if week == 2 else ()))
-        print_line(f"week {week}: {outcome:12} {week_text(rig, factor)}")
+        line = f"week {week}: {outcome:12} {week_text(rig, factor)}"
+        print_line(line)
         rig.closed.touch()
         if week in (1, 2):
             rig.clock.go_on(days=1)
-            outcome = one_job(rig, factor, 100 + week)
+            week_seed = 100 + week
+            outcome = one_job(rig, factor, week_seed)
             print_line(f"  next day: {outcome:12} {week_text(rig, factor)}")
         wrong += [week] if outcome != expected else []
         rig.clock.go_on(days=7)
@@ -150,19 +155,23 @@ def kills(folder: Path) -> int:
     an AssertionError where one was not finished as it should be.
     """
     (folder / "whole").mkdir()
-    _, made = whole_job(folder / "whole")
-    counted = made_rig(new(folder / "counted"), made, metrics=None)
+    whole_folder = folder / "whole"
+    _, made = whole_job(whole_folder)
+    counted_folder = folder / "counted"
+    counted = made_rig(new(counted_folder), made, metrics=None)
     kill = Kill()
-    replace(counted, tools=kill.tools(counted.tools)).job()
+    tools = kill.tools(counted.tools)
+    replace(counted, tools=tools).job()
     for at, name in enumerate(kill.calls):
         for behind in (False, True):
             rig = made_rig(new(folder / f"{at}-{behind}"), made, metrics=None)
             finished_by_the_next(rig, Kill(at, behind=behind))
             shutil.rmtree(rig.folder)
-        print_line(
+        line = (
             f"call {at + 1} of {len(kill.calls)}, {name}: applied once, killed before it "
             "and behind it"
         )
+        print_line(line)
     return 0
 
 
@@ -171,24 +180,28 @@ def moments(folder: Path, count: int, seed: int = 1) -> int:
     it should.
     """
     (folder / "whole").mkdir()
-    _, made = whole_job(folder / "whole")
-    whole_s = job_duration_s(made_rig(new(folder / "timed"), made, metrics=None))
+    whole_folder = folder / "whole"
+    _, made = whole_job(whole_folder)
+    timed_folder = folder / "timed"
+    whole_s = job_duration_s(made_rig(new(timed_folder), made, metrics=None))
     chance = random.Random(seed)
     done = killed = written = 0
     while killed < count and done < 4 * count:
         rig = made_rig(new(folder / f"{done}"), made, metrics=None)
         # A killed job is a process of its own, and slower: most of those that are given twice the
         # time end before it.
-        was_killed, was_written = finished_from_any_moment(rig, chance.uniform(0.0, 2.0 * whole_s))
+        wait_s = chance.uniform(0.0, 2.0 * whole_s)
+        was_killed, was_written = finished_from_any_moment(rig, wait_s)
         shutil.rmtree(rig.folder)
         done = done + 1
         killed = killed + was_killed
         written = written + (was_killed and was_written)
-    print_line(
+    line = (
         f"{killed} jobs killed within {2.0 * whole_s:.1f} s, {written} of them after their write; "
         "every next job ended with 0, every file was the old or the new one, every --verify was "
         "right"
     )
+    print_line(line)
     return int(killed < count)
 
 
@@ -197,15 +210,16 @@ def recordings(folder: Path, count: int, seed: int = 1) -> int:
     up.
     """
     (folder / "whole").mkdir()
-    _, made = whole_job(folder / "whole")
+    whole_folder = folder / "whole"
+    _, made = whole_job(whole_folder)
     chance = random.Random(seed)
     for number in range(count):
         name = chance.choice(sorted(made.logs))
         share = chance.uniform(0.05, 0.9)
-        taken_up_from_a_recording(
-            make_rig(new(folder / f"{number}"), made.plan_file), made, name, share
-        )
-        print_line(f"killed in {name} with {share:.0%} of its log: the next job ended with 0")
+        rig = make_rig(new(folder / f"{number}"), made.plan_file)
+        taken_up_from_a_recording(rig, made, name, share)
+        line = f"killed in {name} with {share:.0%} of its log: the next job ended with 0"
+        print_line(line)
     return 0
 
 
@@ -231,10 +245,11 @@ def unchanged_years(years: int, seed: int = 1) -> int:
             if decide(axes, in_force, std, found, std).differs:
                 changes[year] += 1
                 in_force = found
-    print_line(
+    line = (
         f"{years} years of 52 jobs: a change in {(changes > 0).mean():.0%} of them, "
         f"{changes.mean():.2f} a year"
     )
+    print_line(line)
     return 0
 
 

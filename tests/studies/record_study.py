@@ -154,12 +154,13 @@ def record_study(
     runs = [_RunTask(out, seed, floor, run) for floor in floors for seed in seeds for run in RUNS]
     for floor in floors:
         for seed in seeds:
-            truth = truth_of(study_cell(seed, FLOORS[floor]))
+            cell = study_cell(seed, FLOORS[floor])
+            truth = truth_of(cell)
             path = _folder(out, floor, seed) / "truth.json"
             path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(
-                path, (json.dumps(asdict(truth), indent=1, default=_plain) + "\n").encode()
-            )
+            text = json.dumps(asdict(truth), indent=1, default=_plain)
+            content = (text + "\n").encode()
+            replace_file(path, content)
     (out / "plans").mkdir(parents=True, exist_ok=True)
     for line in side_by_side(_plan, plans, processes):
         report_line(line)
@@ -199,7 +200,9 @@ def _logs(out: Path, floor: str, seed: int) -> StudyLogs:
             f"found no {', '.join(missing)}; record with `python -m tests.studies.record_study "
             f"--seeds {seed} --floors {floor}`"
         )
-    truth = truth_from(json.loads((folder / "truth.json").read_text()))
+    text = (folder / "truth.json").read_text()
+    document = json.loads(text)
+    truth = truth_from(document)
     if truth.noise_factor != FLOORS[floor]:
         raise ValueError(
             f"{folder}: found noise factor {truth.noise_factor:g}, expected {FLOORS[floor]:g}; "
@@ -211,7 +214,8 @@ def _logs(out: Path, floor: str, seed: int) -> StudyLogs:
 def _plan(task: _PlanTask) -> str:
     """One plan, unless it is there and was made by the same planner."""
     cell = load_cell(CELL)
-    path = task.out / "plans" / f"{task.seed}-{task.plan}.yaml"
+    plans_folder = task.out / "plans"
+    path = plans_folder / f"{task.seed}-{task.plan}.yaml"
     number = 10 * task.seed + ord(task.plan) - ord("a")
     fingerprint = digest(
         digest_of_source("daq.workflow.plan"), cell.digest, number, task.duration_s
@@ -233,10 +237,10 @@ def _record(task: _RunTask) -> str:
     cell = load_cell(CELL)
     # From the file, as a technician's recording would be: the log then belongs to the plan that can
     # be read.
-    moves = load_plan(task.out / "plans" / f"{task.seed}-{task.run.plan}.yaml", cell)
-    spec = spec_of(
-        study_cell(task.seed, FLOORS[task.floor]), task.run.payload, RUNS.index(task.run)
-    )
+    plans_folder = task.out / "plans"
+    moves = load_plan(plans_folder / f"{task.seed}-{task.run.plan}.yaml", cell)
+    noise_factor = FLOORS[task.floor]
+    spec = spec_of(study_cell(task.seed, noise_factor), task.run.payload, RUNS.index(task.run))
     path = _folder(task.out, task.floor, task.seed) / f"{task.run.name}.mcap"
     fingerprint = _fingerprint(cell, spec, moves, task.run)
     title = f"{task.floor} %, seed {task.seed}, {task.run.name}"
@@ -248,20 +252,17 @@ def _record(task: _RunTask) -> str:
     bus = open_bus(bus_address(cell))
     try:
         with SimulatedCell(spec, bus):
-            recorded = record(
-                RecordingRequest(
-                    CELL,
-                    cell,
-                    moves,
-                    path,
-                    payload=None
-                    if task.run.payload is None
-                    else declared_payload(task.run.payload),
-                    operator="study",
-                    granted_by="the study of the estimators: a simulated cell",
-                    run_id=f"study-{task.floor}-{task.seed}-{task.run.name}",
-                )
+            request = RecordingRequest(
+                CELL,
+                cell,
+                moves,
+                path,
+                payload=None if task.run.payload is None else declared_payload(task.run.payload),
+                operator="study",
+                granted_by="the study of the estimators: a simulated cell",
+                run_id=f"study-{task.floor}-{task.seed}-{task.run.name}",
             )
+            recorded = record(request)
     finally:
         bus.shutdown()
     if not recorded.log.valid:
@@ -301,7 +302,8 @@ def _fingerprint(cell: Cell, spec: CellSpec, moves: Plan, run: StudyRun) -> str:
     passive = sorted(spec.passive.items())
     chain = (spec.closures, spec.motors, spec.platform, assembly, passive) if spec.closures else ()
     simulation = (*truth, *chain, spec.effects, spec.sync_period_us, spec.substeps, spec.seed)
-    probe = simulate_run(cell, spec, replace(moves, moves=moves.moves[:1]), run.name, declared)
+    changed_move = replace(moves, moves=moves.moves[:1])
+    probe = simulate_run(cell, spec, changed_move, run.name, declared)
     samples = (probe.position_counts.tobytes(), probe.current_raw.tobytes(), probe.move.tobytes())
     return digest(software(), VERSION, cell.digest, simulation, moves.moves, declared, samples)
 

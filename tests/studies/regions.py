@@ -80,8 +80,10 @@ def region_of(position: FloatArray, seed: int, parts: int = PARTS) -> IntArray:
     """
     spread = position.std(axis=0)
     scale = np.where(spread > 0.0, spread, 1.0)
-    weights = np.random.default_rng(seed).exponential(size=position.shape[1])
-    scaled = (position - position.mean(axis=0)) / scale * weights
+    rng = np.random.default_rng(seed)
+    weights = rng.exponential(size=position.shape[1])
+    position_difference = position - position.mean(axis=0)
+    scaled = position_difference / scale * weights
     part = np.zeros(len(position), dtype=np.int64)
     while parts > 1:
         halves = np.zeros_like(part)
@@ -100,7 +102,8 @@ def _upper_half(points: FloatArray) -> IntArray:
     centred = points - points.mean(axis=0)
     direction = np.linalg.svd(centred, full_matrices=False)[2][0]
     # The sign of a singular vector is a matter of rounding.
-    along = centred @ (direction * np.sign(direction[np.argmax(np.abs(direction))]))
+    direction_sign = np.sign(direction[np.argmax(np.abs(direction))])
+    along = centred @ (direction * direction_sign)
     upper = np.zeros(len(points), dtype=np.int64)
     upper[np.argsort(along, kind="stable")[len(points) // 2 :]] = 1
     return upper
@@ -112,7 +115,8 @@ def split_by_region(runs: Sequence[Run], stretch_s: float, seed: int) -> tuple[I
     means: list[FloatArray] = []
     for run, number in zip(runs, numbers, strict=True):
         means += [run.position_rad[number == one].mean(axis=0) for one in np.unique(number)]
-    part_of_stretch = region_of(np.array(means), seed)
+    position = np.array(means)
+    part_of_stretch = region_of(position, seed)
     first = 0
     parts = []
     for number in numbers:
@@ -142,9 +146,8 @@ def two_sides(
             valid = np.ones(run.position_rad.shape, dtype=np.bool_)
         else:
             valid = run.valid
-        rest.append(
-            _side(replace(run, name=f"{run.name}, the rest", valid=valid & ~mask[:, None]), ~mask)
-        )
+        changed_run = replace(run, name=f"{run.name}, the rest", valid=valid & ~mask[:, None])
+        rest.append(_side(changed_run, ~mask))
         unseen.append(
             _side(replace(run, name=f"{run.name}, left out", valid=valid & mask[:, None]), mask)
         )
@@ -164,7 +167,8 @@ def _side(run: Run, own: BoolArray) -> Run:
     a side that is one long stretch is a run of its own.
     """
     first = int(np.argmax(own))
-    last = len(own) - int(np.argmax(own[::-1]))
+    after_last = np.argmax(own[::-1])
+    last = len(own) - int(after_last)
     part = slice(first, last)
     if not own.any() or not own[part].all() or last - first < OWN_RUN_S * run.rate_hz:
         return run
@@ -192,7 +196,8 @@ def independent_sums(change: FloatArray, run: IntArray) -> FloatArray:
         deviation = sums - sums.mean() if len(sums) else sums
         products = (deviation[1:] * deviation[:-1])[run[1:] == run[:-1]]
         first = _firsts(run, 2)
-        is_independent = products.sum() <= CORRELATED * np.linalg.norm(products)
+        product_norm = np.linalg.norm(products)
+        is_independent = products.sum() <= CORRELATED * product_norm
         if is_independent or len(first) < LEAST_BLOCKS:
             return np.asarray(sums)
         sums = np.add.reduceat(sums, first)
@@ -214,6 +219,9 @@ def judge_rise(change: FloatArray, run: IntArray, level: float = LEVEL) -> Rise:
     sums = independent_sums(change, run)
     blocks = len(sums)
     if blocks < 2:
-        return Rise(float(sums.sum()), 0.0, blocks, float("inf"))
-    std = float(np.sqrt(blocks * np.var(sums, ddof=1)))
-    return Rise(float(sums.sum()), std, blocks, float(stdtrit(blocks - 1, 1.0 - level)))
+        rise = float(sums.sum())
+        return Rise(rise, 0.0, blocks, float("inf"))
+    sums_variance = np.var(sums, ddof=1)
+    std = float(np.sqrt(blocks * sums_variance))
+    limit = float(stdtrit(blocks - 1, 1.0 - level))
+    return Rise(float(sums.sum()), std, blocks, limit)

@@ -69,13 +69,15 @@ def write_tables(
     for name, (headings, lines) in tables.items():
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([headings, *lines])
-        replace_file(folder / name, text.getvalue().encode())
+        content = text.getvalue().encode()
+        replace_file(folder / name, content)
 
 
 def _summary(robot: dict[str, Any]) -> tuple[str, ...]:
+    gains_text = str(robot["gains"])
     return (
         robot["robot"],
-        str(robot["gains"]),
+        gains_text,
         f"{robot['floor_percent']:.1f}",
         f"{robot['mean_gain_error_percent']:.2f}",
         f"{robot['worst_gain_error_percent']:.2f}",

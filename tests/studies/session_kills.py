@@ -87,9 +87,12 @@ def kill(unit: KillUnit, made: MadeSession, calls: Sequence[TimedCall]) -> KillR
     chance = random.Random(f"{unit.seed} {unit.number}")
     moment = drawn_moment(list(calls), chance)
     if unit.real:
-        moment = Moment("record", chance.randrange(RECORDINGS), chance.uniform(0.0, RECORDING_S))
+        number = chance.randrange(RECORDINGS)
+        wait_s = chance.uniform(0.0, RECORDING_S)
+        moment = Moment("record", number, wait_s)
     with tempfile.TemporaryDirectory() as place:
-        rig = killed_rig(Path(place) / f"cell-{unit.number}", made, real=unit.real)
+        folder = Path(place) / f"cell-{unit.number}"
+        rig = killed_rig(folder, made, real=unit.real)
         if not unit.real:
             found = ends_well_after(rig, moment)
         else:
@@ -135,8 +138,9 @@ def summary(rows: Sequence[KillRow]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Kill what was not killed yet, and print what all kills have shown."""
+    prog = f"python -m {MODULE}"
     parser = argparse.ArgumentParser(
-        prog=f"python -m {MODULE}",
+        prog=prog,
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -155,18 +159,21 @@ def main(arguments: list[str] | None = None) -> int:
     units = [KillUnit(number, options.seed, real=True) for number in range(options.real)]
     units += [KillUnit(number, options.seed, real=False) for number in range(options.kills)]
     with tempfile.TemporaryDirectory() as place:
-        calls = timed_calls(killed_rig(Path(place) / "timed", made))
+        folder = Path(place) / "timed"
+        calls = timed_calls(killed_rig(folder, made))
     rows: list[KillRow] = []
 
     def done(unit: KillUnit) -> str:
+        fingerprint = digest(source, unit)
         (row,) = rows_of_unit(
-            options.out, unit, KillRow, digest(source, unit), lambda one: [kill(one, made, calls)]
+            options.out, unit, KillRow, fingerprint, lambda one: [kill(one, made, calls)]
         )
         rows.append(row)
         return f"{unit.name}: killed in or behind {row.tool}, {row.attempts} more start(s)"
 
     left = work_off(units, done, options.minutes, time.monotonic, print_line)
-    print_line(f"\n{left} kills were not begun\n{summary(rows)}")
+    line = f"\n{left} kills were not begun\n{summary(rows)}"
+    print_line(line)
     return 0
 
 

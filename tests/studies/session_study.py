@@ -84,21 +84,25 @@ class Plant:
             mounted = None
         else:
             mounted = request.payload.name
-        spec = load_simulation(shipped_simulation(self.robot.simulation), mounted)
+        path = shipped_simulation(self.robot.simulation)
+        spec = load_simulation(path, mounted)
         axes = tuple(
             replace(axis, current_noise_a=self.robot.noise * axis.current_noise_a)
             for axis in spec.axes
         )
         bus = open_bus(bus_address(request.cell))
         try:
-            with SimulatedCell(replace(spec, axes=axes, seed=1000 * self.seed + number), bus):
+            seed = 1000 * self.seed + number
+            changed_spec = replace(spec, axes=axes, seed=seed)
+            with SimulatedCell(changed_spec, bus):
                 return record(request, **further)
         finally:
             bus.shutdown()
 
     def truth(self, cell: Cell) -> dict[str, float]:
         """True gain by axis."""
-        spec = load_simulation(shipped_simulation(self.robot.simulation))
+        path = shipped_simulation(self.robot.simulation)
+        spec = load_simulation(path)
         return {
             axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)
         }
@@ -107,7 +111,8 @@ class Plant:
 def study(robot: StudiedRobot, seed: int, folder: Path) -> dict[str, Any]:
     """Both ways for one seed; of a way that ends with an error, its reason."""
     shutil.copytree(shipped_configurations(), folder / "configs")
-    cell_file = folder / "configs" / "cells" / f"{robot.cell}.yaml"
+    cells_folder = folder / "configs" / "cells"
+    cell_file = cells_folder / f"{robot.cell}.yaml"
     cell = load_cell(cell_file)
     by_payload_file = cell_file.with_name(f"{robot.cell}-by-payload.yaml")
     shipped = cell_file.read_text(encoding="utf-8")
@@ -153,19 +158,22 @@ def guided_way(plant: Plant, cell_file: Path, cell: Cell, folder: Path) -> dict[
         free=lambda _: 10**12,
     )
     payload = cell.payloads[0]
+    masses_kg = {payload.name: payload.mass_kg}
     operator = GivenAnswers(
         "the study",
-        {payload.name: payload.mass_kg},
+        masses_kg,
         lambda _: None,
         "the study: a simulated cell",
         writes=False,
     )
+    seed = 100 * plant.seed
+    sessions_folder = folder / "sessions"
     settings = GuidedSettings(
-        folder / "sessions",
+        sessions_folder,
         payload.name,
         target_percent=TARGET_PERCENT,
         block_s=BLOCK_S,
-        seed=100 * plant.seed,
+        seed=seed,
         min_free_mb=1.0,
     )
     journal = Journal(io.StringIO(), Form.TEXT, lambda: datetime.now(UTC))
@@ -234,11 +242,12 @@ def _worst_error(
         ("held-out", payload, second),
     ):
         logs.append(folder / f"{name}.mcap")
+        last_log = logs[-1]
         request = RecordingRequest(
             cell_file,
             cell,
             moves,
-            logs[-1],
+            last_log,
             payload=None if mounted is None else mounted.payload,
             operator="the study",
             granted_by="the study: a simulated cell",
@@ -308,8 +317,10 @@ def main(arguments: list[str] | None = None) -> int:
     for robot, seed in units:
         path = options.out / f"{robot.name}-{seed}.json"
         if is_finished(path, fingerprint(robot, seed)):
-            rows.append(json.loads(path.read_text(encoding="utf-8")))
-    print_line(f"\n{left} units of this piece were not begun\n\n{summary(rows)}")
+            text = path.read_text(encoding="utf-8")
+            rows.append(json.loads(text))
+    line = f"\n{left} units of this piece were not begun\n\n{summary(rows)}"
+    print_line(line)
     if options.tables is not None:
         write_tables(options.tables, rows)
     return 0

@@ -72,10 +72,11 @@ def row_of(unit: dict[str, Any]) -> SessionRow:
     steps = unit["step_by_step"]
     z = _z([unit])
     errors = [abs(error) for error in way.get("error_percent", {}).values()]
+    motion_s = way.get("motion_s", float("inf"))
     return SessionRow(
         robot=unit["robot"],
         seed=unit["seed"],
-        motion_s=way.get("motion_s", float("inf")),
+        motion_s=motion_s,
         changes=way.get("changes", 0),
         step_by_step_s=steps.get("duration_s") or float("inf"),
         ratio=ratio_of(unit),
@@ -108,17 +109,25 @@ def robot_row(name: str, own: Sequence[dict[str, Any]]) -> RobotRow:
     ended = [row for row in rows if np.isfinite(row.motion_s)]
     changed = [row.changes for row in ended] or [0]
     ratios = [row.ratio for row in rows]
+    median_motion_s = np.median([row.motion_s for row in rows])
+    motion_s = float(median_motion_s)
+    median_step_by_step_s = np.median([row.step_by_step_s for row in rows])
+    step_by_step_s = float(median_step_by_step_s)
+    targets_missed = sum(row.target_missed for row in rows)
+    ratio = float(np.median(ratios))
+    rms_z = _rms(_z(own))
+    worst_error_percent = max((row.worst_error_percent for row in ended), default=float("nan"))
     return RobotRow(
         robot=name,
         seeds=len(rows),
-        motion_s=float(np.median([row.motion_s for row in rows])),
+        motion_s=motion_s,
         changes=f"{min(changed)} to {max(changed)}",
-        step_by_step_s=float(np.median([row.step_by_step_s for row in rows])),
-        ratio=float(np.median(ratios)),
+        step_by_step_s=step_by_step_s,
+        ratio=ratio,
         worst_ratio=max(ratios),
-        targets_missed=sum(row.target_missed for row in rows),
-        rms_z=_rms(_z(own)),
-        worst_error_percent=max((row.worst_error_percent for row in ended), default=float("nan")),
+        targets_missed=targets_missed,
+        rms_z=rms_z,
+        worst_error_percent=worst_error_percent,
     )
 
 
@@ -171,5 +180,8 @@ def write_tables(folder: Path, units: Sequence[dict[str, Any]]) -> None:
     """Write the tables of the documentation."""
     names = [robot.name for robot in ROBOTS]
     in_order = sorted(units, key=lambda unit: (names.index(unit["robot"]), unit["seed"]))
-    replace_file(folder / "session.csv", to_csv(SessionRow, map(row_of, in_order)).encode())
-    replace_file(folder / "session-robots.csv", to_csv(RobotRow, robot_rows(in_order)).encode())
+    rows = map(row_of, in_order)
+    content = to_csv(SessionRow, rows).encode()
+    replace_file(folder / "session.csv", content)
+    path = folder / "session-robots.csv"
+    replace_file(path, to_csv(RobotRow, robot_rows(in_order)).encode())

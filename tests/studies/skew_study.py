@@ -86,7 +86,8 @@ class SkewScore:
     @property
     def z(self) -> float:
         """Error of the skew by instruments, in its σ."""
-        return (self.found_s - self.planted_s) / self.found_std
+        found_difference_s = self.found_s - self.planted_s
+        return found_difference_s / self.found_std
 
 
 def late(run: Run, delay_s: float) -> Run:
@@ -96,11 +97,12 @@ def late(run: Run, delay_s: float) -> Run:
     shift = round(delay_s * run.rate_hz)
     edge = abs(shift)
     kept = np.arange(edge, len(run.time_s) - edge)
+    current_a = run.current_a[kept - shift]
     return replace(
         run,
         time_s=run.time_s[kept],
         position_rad=run.position_rad[kept],
-        current_a=run.current_a[kept - shift],
+        current_a=current_a,
         move=None if run.move is None else run.move[kept],
         valid=None if run.valid is None else run.valid[kept],
     )
@@ -109,7 +111,8 @@ def late(run: Run, delay_s: float) -> Run:
 def score(task: SkewTask) -> tuple[SkewScore, ...]:
     """Simulate a cell and look for a skew in its runs, with each planted one in turn."""
     cell = load_cell(CELL)
-    plan = kept_plan(PlanTask(OUT, PLAN_SEED, DURATION_S), cell)
+    plan_task = PlanTask(OUT, PLAN_SEED, DURATION_S)
+    plan = kept_plan(plan_task, cell)
     truth = study_cell(task.seed, task.world.noise_factor, task.world.disturbance_percent)
     runs: list[Run] = []
     for number, (payload, name) in enumerate(RUNS):
@@ -117,7 +120,8 @@ def score(task: SkewTask) -> tuple[SkewScore, ...]:
             declared = None
         else:
             declared = declared_payload(payload)
-        raw = simulate_run(cell, spec_of(truth, payload, number), plan, name, declared)
+        spec = spec_of(truth, payload, number)
+        raw = simulate_run(cell, spec, plan, name, declared)
         runs.append(run_of(raw, cell))
     scores: list[SkewScore] = []
     for planted_s in task.planted_s:
@@ -128,19 +132,18 @@ def score(task: SkewTask) -> tuple[SkewScore, ...]:
         skew = time_skew(gather(found))
         if skew is None:
             raise ValueError(f"cell {task.seed}: the demanded motion is not known")
-        scores.append(
-            SkewScore(
-                floor=task.floor,
-                kind="loop" if task.world.disturbance_percent else "current",
-                planted_s=planted_s,
-                error_percent=found.training_error.total,
-                fit_s=skew.fit_seconds,
-                fit_std=skew.fit_std,
-                found_s=skew.seconds,
-                found_std=skew.std,
-                printed=skew.confirmed,
-            )
+        skew_score = SkewScore(
+            floor=task.floor,
+            kind="loop" if task.world.disturbance_percent else "current",
+            planted_s=planted_s,
+            error_percent=found.training_error.total,
+            fit_s=skew.fit_seconds,
+            fit_std=skew.fit_std,
+            found_s=skew.seconds,
+            found_std=skew.std,
+            printed=skew.confirmed,
         )
+        scores.append(skew_score)
     return tuple(scores)
 
 
@@ -163,9 +166,8 @@ def table(scores: Sequence[SkewScore]) -> str:
     """Tabulate the scores, a line a floor, kind of noise and planted skew."""
     lines = [f"| {' | '.join(HEADINGS)} |", "|---" * len(HEADINGS) + "|"]
     kinds = dict.fromkeys((one.floor, one.kind, one.planted_s) for one in scores)
-    for floor, kind, planted_s in sorted(
-        kinds, key=lambda kind: (float(kind[0]), kind[1], kind[2])
-    ):
+    sorted_kinds = sorted(kinds, key=lambda kind: (float(kind[0]), kind[1], kind[2]))
+    for floor, kind, planted_s in sorted_kinds:
         own = [
             one
             for one in scores
@@ -173,11 +175,12 @@ def table(scores: Sequence[SkewScore]) -> str:
         ]
         z = np.array([one.z for one in own])
         beyond = sum(abs(one.fit_s) > 2.0 * one.fit_std for one in own)
+        own_count_text = str(len(own))
         cells = (
             floor,
             kind,
             f"{1e3 * planted_s:+g}",
-            str(len(own)),
+            own_count_text,
             f"{np.mean([one.error_percent for one in own]):.1f}",
             str(sum(one.printed for one in own)),
             f"{1e3 * np.mean([one.fit_s for one in own]):+.2f}",
@@ -221,12 +224,14 @@ def main(arguments: Sequence[str]) -> int:
     for floor in WORLDS:
         for number in range(given.clean):
             planted_s = PLANTED_S if number < given.planted else (0.0,)
-            tasks.append(SkewTask(FIRST_SEED + number, floor, planted_s))
+            seed = FIRST_SEED + number
+            tasks.append(SkewTask(seed, floor, planted_s))
     scores: list[SkewScore] = []
     for number, found in enumerate(side_by_side(score, tasks, given.processes), start=1):
         scores += found
         if number % 10 == 0:
-            print_line(f"{number} of {len(tasks)} cells")
+            line = f"{number} of {len(tasks)} cells"
+            print_line(line)
     wrong = mistakes(scores)
     print_line(table(scores))
     if given.csv is not None:

@@ -20,7 +20,8 @@ def main(seconds: float) -> None:
     due_ns = time.monotonic_ns() + PERIOD_NS
     end_ns = due_ns + round(1e9 * seconds)
     while due_ns < end_ns:
-        time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
+        wait_ns = due_ns - time.monotonic_ns()
+        time.sleep(max(0, wait_ns) * 1e-9)
         now_ns = time.monotonic_ns()
         late_ms = 1e-6 * (now_ns - due_ns)
         if late_ms > LATE_MS:

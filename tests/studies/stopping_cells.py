@@ -82,7 +82,8 @@ def looks_of(unit: CellUnit) -> list[Look]:
     """Record a cell, and return the gains at every look at which they are known."""
     arm = ARMS[unit.arm]
     truth = arm.truth()
-    conditioning = Conditioning(standstill_rad_s=(0.03,) * len(truth.gains))
+    standstill_rad_s = (0.03,) * len(truth.gains)
+    conditioning = Conditioning(standstill_rad_s=standstill_rad_s)
     fit = GrowingFit(truth.model, conditioning, (MOUNTED,))
     looks = []
 
@@ -91,13 +92,14 @@ def looks_of(unit: CellUnit) -> list[Look]:
     ) -> None:
         error_percent = 100.0 * (gains / truth.gains - 1.0)
         std_percent = 100.0 * std / np.abs(gains)
+        recorded_s = (block - 1) * BLOCK_S + block_s
         looks.append(
             Look(
                 seed=unit.seed,
                 estimator=estimator,
                 block=block,
                 is_end=block_s == BLOCK_S,
-                recorded_s=(block - 1) * BLOCK_S + block_s,
+                recorded_s=recorded_s,
                 error_percent=tuple(error_percent.tolist()),
                 std_percent=tuple(std_percent.tolist()),
             )

@@ -99,20 +99,27 @@ class Figures:
 
 def figures(stops: Sequence[Look]) -> Figures:
     """Pool the gains of all cells."""
-    error = np.array([look.error_percent for look in stops])
+    error_percent = [look.error_percent for look in stops]
+    error = np.array(error_percent)
     z = np.array([look.z for look in stops])
     recorded_s = np.quantile([look.recorded_s for look in stops], (0.05, 0.5, 0.95))
     root = np.sqrt(len(stops))
     square = np.mean(z**2, axis=1)
     z_rms = float(np.sqrt(square.mean()))
+    square_std = square.std(ddof=1)
+    z_rms_se = float(square_std / root / (2.0 * z_rms))
+    coverage_percent = float(100.0 * np.mean(np.abs(z) <= NORMAL_95))
+    mean_error = error.mean(axis=1)
+    error_se = float(mean_error.std(ddof=1) / root)
+    mean_error_percent = float(error.mean())
     return Figures(
         cells=len(stops),
         recorded_s=(float(recorded_s[0]), float(recorded_s[1]), float(recorded_s[2])),
-        error_percent=float(error.mean()),
-        error_se=float(error.mean(axis=1).std(ddof=1) / root),
+        error_percent=mean_error_percent,
+        error_se=error_se,
         z_rms=z_rms,
-        z_rms_se=float(square.std(ddof=1) / root / (2.0 * z_rms)),
-        coverage_percent=float(100.0 * np.mean(np.abs(z) <= NORMAL_95)),
+        z_rms_se=z_rms_se,
+        coverage_percent=coverage_percent,
     )
 
 
@@ -202,13 +209,16 @@ def main(arguments: list[str] | None = None) -> int:
         cells = options.cells or ARMS[name].cells
         units = [CellUnit(name, number) for number in range(cells)]
         left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
-        found = by_cell(finished_rows(options.out, units, Look, fingerprint_of))
+        looks = finished_rows(options.out, units, Look, fingerprint_of)
+        found = by_cell(looks)
         looks_of_arm[name] = found
         is_all &= len(found) >= ARMS[name].cells
-        print_line(f"{name}: {left} cells of this piece were not begun")
+        line = f"{name}: {left} cells of this piece were not begun"
+        print_line(line)
     text = table(looks_of_arm)
     if is_all:
-        replace_file(TABLE, as_csv(text).encode())
+        content = as_csv(text).encode()
+        replace_file(TABLE, content)
     print_line(f"\n{text}")
     return 0
 

@@ -153,17 +153,19 @@ def study_cell(seed: int, noise_factor: float = 1.0, disturbance_percent: float 
         if body is None:
             raise ValueError(f"payload {name} of {path}: no body")
         bodies[name] = _drawn_body(body, payload_rng)
+    urdf = _drawn_links(bare.urdf, links_rng)
+    axes = tuple(
+        replace(
+            _drawn_axis(axis, axes_rng, noise_factor),
+            torque_disturbance_percent=disturbance_percent,
+            disturbance_correlation_s=float(time_s),
+        )
+        for axis, time_s in zip(bare.axes, correlation_s, strict=True)
+    )
     spec = replace(
         bare,
-        urdf=_drawn_links(bare.urdf, links_rng),
-        axes=tuple(
-            replace(
-                _drawn_axis(axis, axes_rng, noise_factor),
-                torque_disturbance_percent=disturbance_percent,
-                disturbance_correlation_s=float(time_s),
-            )
-            for axis, time_s in zip(bare.axes, correlation_s, strict=True)
-        ),
+        urdf=urdf,
+        axes=axes,
     )
     return StudyCell(seed, noise_factor, spec, bodies)
 
@@ -190,17 +192,22 @@ def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:
     axes = tuple(
         _rubbing(axis, float(factor)) for axis, factor in zip(cell.bare.axes, factors, strict=True)
     )
-    return replace(cell.bare, axes=axes, payload=body, seed=1000 * cell.seed + run)
+    seed = 1000 * cell.seed + run
+    return replace(cell.bare, axes=axes, payload=body, seed=seed)
 
 
 def _rubbing(axis: AxisSpec, factor: float) -> AxisSpec:
     """The same axis with all of its friction times a factor."""
+    viscous_nm_s_rad = factor * axis.viscous_nm_s_rad
+    coulomb_nm = factor * axis.coulomb_nm
+    motor_viscous_nm_s_rad = factor * axis.motor_viscous_nm_s_rad
+    motor_coulomb_nm = factor * axis.motor_coulomb_nm
     return replace(
         axis,
-        viscous_nm_s_rad=factor * axis.viscous_nm_s_rad,
-        coulomb_nm=factor * axis.coulomb_nm,
-        motor_viscous_nm_s_rad=factor * axis.motor_viscous_nm_s_rad,
-        motor_coulomb_nm=factor * axis.motor_coulomb_nm,
+        viscous_nm_s_rad=viscous_nm_s_rad,
+        coulomb_nm=coulomb_nm,
+        motor_viscous_nm_s_rad=motor_viscous_nm_s_rad,
+        motor_coulomb_nm=motor_coulomb_nm,
     )
 
 
@@ -209,29 +216,36 @@ def truth_of(cell: StudyCell) -> Truth:
     rng = np.random.default_rng(np.random.SeedSequence(cell.seed, spawn_key=(3,)))
     payloads = {}
     for name, body in cell.bodies.items():
+        centre_m = _triple(np.array(body.centre_m) + CAD_CENTRE_STD_M * rng.standard_normal(3))
+        inertia_kg_m2 = _scaled_inertia(body, 1.0 + CAD_INERTIA_STD * float(rng.standard_normal()))
         drawing = Body(
             body.mass_kg,
-            _triple(np.array(body.centre_m) + CAD_CENTRE_STD_M * rng.standard_normal(3)),
-            _scaled_inertia(body, 1.0 + CAD_INERTIA_STD * float(rng.standard_normal())),
+            centre_m,
+            inertia_kg_m2,
         )
         payloads[name] = PayloadTruth(body.mass_kg, link_parameters(body), link_parameters(drawing))
+    axes = tuple(asdict(axis) for axis in cell.bare.axes)
+    gains_nm_per_a = tuple(axis.gain_nm_per_a for axis in cell.bare.axes)
     return Truth(
         cell.seed,
         cell.noise_factor,
-        tuple(axis.gain_nm_per_a for axis in cell.bare.axes),
+        gains_nm_per_a,
         payloads,
-        tuple(asdict(axis) for axis in cell.bare.axes),
+        axes,
     )
 
 
 def truth_from(document: dict[str, Any]) -> Truth:
     """Rebuild a truth from its `dataclasses.asdict`, read back from JSON."""
+    payloads = {name: PayloadTruth(**payload) for name, payload in document["payloads"].items()}
+    gains_nm_per_a = tuple(document["gains_nm_per_a"])
+    axes = tuple(document["axes"])
     return Truth(
         seed=document["seed"],
         noise_factor=document["noise_factor"],
-        gains_nm_per_a=tuple(document["gains_nm_per_a"]),
-        payloads={name: PayloadTruth(**payload) for name, payload in document["payloads"].items()},
-        axes=tuple(document["axes"]),
+        gains_nm_per_a=gains_nm_per_a,
+        payloads=payloads,
+        axes=axes,
     )
 
 
@@ -258,7 +272,8 @@ def link_parameters(body: Body) -> dict[str, float]:
     """
     xx, xy, xz, yy, yz, zz = body.inertia_kg_m2
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    parts = pin.Inertia(body.mass_kg, np.array(body.centre_m), inertia).toDynamicParameters()
+    centre_m = np.array(body.centre_m)
+    parts = pin.Inertia(body.mass_kg, centre_m, inertia).toDynamicParameters()
     m, mx, my, mz, ixx, ixy, iyy, ixz, iyz, izz = (float(part) for part in parts)
     return dict(zip(LINK_PARAMETERS, (ixx, ixy, ixz, iyy, iyz, izz, mx, my, mz, m), strict=True))
 
@@ -267,16 +282,24 @@ def _drawn_axis(axis: AxisSpec, rng: np.random.Generator, noise_factor: float) -
     def around(value: float, spread: float) -> float:
         return value * (1.0 + spread * float(rng.uniform(-1.0, 1.0)))
 
+    gain_nm_per_a = around(axis.gain_nm_per_a, GAIN_SPREAD)
+    motor_inertia_kg_m2 = around(axis.motor_inertia_kg_m2, INERTIA_SPREAD)
+    viscous_nm_s_rad = around(axis.viscous_nm_s_rad, FRICTION_SPREAD)
+    coulomb_nm = around(axis.coulomb_nm, FRICTION_SPREAD)
+    motor_viscous_nm_s_rad = around(axis.motor_viscous_nm_s_rad, FRICTION_SPREAD)
+    motor_coulomb_nm = around(axis.motor_coulomb_nm, FRICTION_SPREAD)
+    offset_nm = around(axis.offset_nm, FRICTION_SPREAD)
+    current_noise_a = noise_factor * axis.current_noise_a
     return replace(
         axis,
-        gain_nm_per_a=around(axis.gain_nm_per_a, GAIN_SPREAD),
-        motor_inertia_kg_m2=around(axis.motor_inertia_kg_m2, INERTIA_SPREAD),
-        viscous_nm_s_rad=around(axis.viscous_nm_s_rad, FRICTION_SPREAD),
-        coulomb_nm=around(axis.coulomb_nm, FRICTION_SPREAD),
-        motor_viscous_nm_s_rad=around(axis.motor_viscous_nm_s_rad, FRICTION_SPREAD),
-        motor_coulomb_nm=around(axis.motor_coulomb_nm, FRICTION_SPREAD),
-        offset_nm=around(axis.offset_nm, FRICTION_SPREAD),
-        current_noise_a=noise_factor * axis.current_noise_a,
+        gain_nm_per_a=gain_nm_per_a,
+        motor_inertia_kg_m2=motor_inertia_kg_m2,
+        viscous_nm_s_rad=viscous_nm_s_rad,
+        coulomb_nm=coulomb_nm,
+        motor_viscous_nm_s_rad=motor_viscous_nm_s_rad,
+        motor_coulomb_nm=motor_coulomb_nm,
+        offset_nm=offset_nm,
+        current_noise_a=current_noise_a,
     )
 
 
@@ -284,7 +307,8 @@ def _drawn_body(body: Body, rng: np.random.Generator) -> Body:
     """The same mass, mounted a little elsewhere,
     and of another shape as far as its inertia goes.
     """
-    centre = np.array(body.centre_m) + PAYLOAD_CENTRE_M * rng.uniform(-1.0, 1.0, 3)
+    centre_m = np.array(body.centre_m)
+    centre = centre_m + PAYLOAD_CENTRE_M * rng.uniform(-1.0, 1.0, 3)
     scale = 1.0 + PAYLOAD_INERTIA_SPREAD * float(rng.uniform(-1.0, 1.0))
     return replace(body, centre_m=_triple(centre), inertia_kg_m2=_scaled_inertia(body, scale))
 

@@ -34,7 +34,8 @@ class PlanTask:
     @property
     def path(self) -> Path:
         """File of the plan."""
-        return self.out / "plans" / f"{self.seed}-{self.duration_s:g}s.yaml"
+        plans_folder = self.out / "plans"
+        return plans_folder / f"{self.seed}-{self.duration_s:g}s.yaml"
 
 
 def make_plan(task: PlanTask) -> str:

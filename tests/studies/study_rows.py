@@ -99,9 +99,11 @@ def rows_of_unit(
     path = rows_path(out, unit)
     if not is_finished(path, fingerprint):
         out.mkdir(parents=True, exist_ok=True)
-        replace_file(path, to_csv(kind, make(unit)).encode())
+        content = to_csv(kind, make(unit)).encode()
+        replace_file(path, content)
         finish(path, fingerprint)
-    return from_csv(kind, path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    return from_csv(kind, text)
 
 
 def finished_rows(
@@ -114,7 +116,8 @@ def finished_rows(
     for unit in units:
         path = rows_path(out, unit)
         if is_finished(path, fingerprint_of(unit)):
-            rows += from_csv(kind, path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            rows += from_csv(kind, text)
     return tuple(rows)
 
 

@@ -28,13 +28,17 @@ def _scores(count: int, too_small: float, common: float = 0.0) -> list[Recording
     for number in range(count):
         error = STD * (too_small * rng.standard_normal(2) + common)
         plain = PLAIN_STD * rng.standard_normal(2)
+        error_percent = tuple(error.tolist())
+        std_percent = tuple(STD.tolist())
+        plain_error_percent = tuple(plain.tolist())
+        plain_std_percent = tuple(PLAIN_STD.tolist())
         score = RecordingScore(
             world="measurement",
             number=number,
-            error_percent=tuple(error.tolist()),
-            std_percent=tuple(STD.tolist()),
-            plain_error_percent=tuple(plain.tolist()),
-            plain_std_percent=tuple(PLAIN_STD.tolist()),
+            error_percent=error_percent,
+            std_percent=std_percent,
+            plain_error_percent=plain_error_percent,
+            plain_std_percent=plain_std_percent,
             effects=("stribeck on J4",) if number % 3 else (),
         )
         scores.append(score)
@@ -43,7 +47,8 @@ def _scores(count: int, too_small: float, common: float = 0.0) -> list[Recording
 
 def test_each_recording_is_in_one_pair() -> None:
     pairs = disjoint_pairs(_scores(7, 1.0))
-    assert [(first.number, second.number) for first, second in pairs] == [(0, 1), (2, 3), (4, 5)]
+    expected = [(0, 1), (2, 3), (4, 5)]
+    assert [(first.number, second.number) for first, second in pairs] == expected
 
 
 @pytest.mark.parametrize("too_small", [1.0, 1.5])

@@ -46,13 +46,17 @@ def test_a_way_that_failed_is_missed_with_its_reason() -> None:
     assert row.ratio == math.inf
     assert math.isnan(row.rms_z)
     assert row.reason == "IdentificationError: J2 tripped"
-    all_rows = robot_rows([_unit(GUIDED, STEPS), _unit(failed, STEPS, 2)])
-    assert [one.robot for one in all_rows] == ["RX-90", "all"]
+    units = [_unit(GUIDED, STEPS), _unit(failed, STEPS, 2)]
+    all_rows = robot_rows(units)
+    robots = [one.robot for one in all_rows]
+    assert robots == ["RX-90", "all"]
     assert all_rows[0].targets_missed == 1
-    assert all_rows[0].rms_z == pytest.approx(math.sqrt(2.5))
+    rms_z = all_rows[0].rms_z
+    assert rms_z == pytest.approx(math.sqrt(2.5))
     # What did not end has no changes and no errors.
     assert all_rows[0].changes == "1 to 1"
-    assert all_rows[0].worst_error_percent == pytest.approx(0.8)
+    worst_error_percent = all_rows[0].worst_error_percent
+    assert worst_error_percent == pytest.approx(0.8)
     assert "RX-90-2: IdentificationError: J2 tripped" in summary([_unit(failed, STEPS, 2)])
 
 
@@ -64,7 +68,9 @@ def test_a_defect_of_the_code_ends_the_study() -> None:
 
 
 def test_the_other_way_that_never_was_enough_takes_for_ever() -> None:
-    assert row_of(_unit(GUIDED, {"duration_s": None, "worst_error_percent": {}})).ratio == 0.0
+    steps = {"duration_s": None, "worst_error_percent": {}}
+    unit = _unit(GUIDED, steps)
+    assert row_of(unit).ratio == 0.0
     refused = way_or_reason(_refuse)
     row = row_of(_unit(GUIDED, refused))
     assert row.ratio == 0.0
@@ -74,8 +80,10 @@ def test_the_other_way_that_never_was_enough_takes_for_ever() -> None:
 def test_tables_come_back_as_they_were_written(tmp_path: Path) -> None:
     units = [_unit(GUIDED, STEPS, 2), _unit(GUIDED, STEPS)]
     write_tables(tmp_path, units)
-    rows = from_csv(SessionRow, (tmp_path / "session.csv").read_text(encoding="utf-8"))
-    assert [row.seed for row in rows] == [1, 2]
+    text = (tmp_path / "session.csv").read_text(encoding="utf-8")
+    rows = from_csv(SessionRow, text)
+    seeds = [row.seed for row in rows]
+    assert seeds == [1, 2]
     assert rows[0].ratio == 1.0
 
 

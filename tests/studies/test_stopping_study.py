@@ -23,14 +23,17 @@ def _look(
     seed: int, estimator: str, block: int, std: float, *, error: float = 0.0, into_s: float = 8.0
 ) -> Look:
     """One gain at its σ, the other at half of it."""
+    recorded_s = 8.0 * (block - 1) + into_s
+    std_percent = (std, 0.5 * std)
+    error_percent = (error, -error)
     return Look(
         seed=seed,
         estimator=estimator,
         block=block,
         is_end=into_s == 8.0,
-        recorded_s=8.0 * (block - 1) + into_s,
-        error_percent=(error, -error),
-        std_percent=(std, 0.5 * std),
+        recorded_s=recorded_s,
+        error_percent=error_percent,
+        std_percent=std_percent,
     )
 
 
@@ -44,7 +47,8 @@ def _cell(seed: int, stds: tuple[float, ...], error: float = 1.0) -> list[Look]:
 
 
 def test_the_rules_stop_at_the_first_look_that_they_are_for() -> None:
-    looks = _cell(1, (2.0, 1.0, 1.05, 0.9, 0.8))
+    stds = (2.0, 1.0, 1.05, 0.9, 0.8)
+    looks = _cell(1, stds)
     quick = quick_after_each_move(looks, 0.95)
     assert quick is not None
     assert (quick.block, quick.recorded_s) == (2, 12.4)
@@ -59,13 +63,17 @@ def test_the_rules_stop_at_the_first_look_that_they_are_for() -> None:
 
 
 def test_recordings_of_a_fixed_length_end_with_the_median_cell() -> None:
-    cells = [_cell(1, (0.9, 0.8, 0.7)), _cell(2, (2.0, 0.9, 0.8)), _cell(3, (2.0, 2.0, 0.9))]
+    stds = (0.9, 0.8, 0.7)
+    cells = [_cell(1, stds), _cell(2, (2.0, 0.9, 0.8)), _cell(3, (2.0, 2.0, 0.9))]
     found = stops_of(cells, 1.0)
-    assert [look.block for look in found["ml, each block"]] == [1, 2, 3]
+    blocks = [look.block for look in found["ml, each block"]]
+    assert blocks == [1, 2, 3]
     assert [look.block for look in found["ml, length fixed before"]] == [2, 2, 2]
-    assert [look.recorded_s for look in found["quick, each move"]] == [4.4, 12.4, 20.4]
+    recorded_s = [look.recorded_s for look in found["quick, each move"]]
+    assert recorded_s == [4.4, 12.4, 20.4]
     assert [look.recorded_s for look in found["quick, length fixed before"]] == [12.4, 12.4, 12.4]
-    assert [look.seed for look in found["ml, two blocks in a row"]] == [1, 2]
+    seeds = [look.seed for look in found["ml, two blocks in a row"]]
+    assert seeds == [1, 2]
     assert not any(stops_of(cells, 0.1).values())
 
 
@@ -85,11 +93,14 @@ def test_the_figures_are_over_all_gains_and_cells() -> None:
 
 def test_the_looks_come_back_from_their_table_by_cell() -> None:
     looks = (*_cell(1, (2.0, 1.0)), *_cell(2, (1.0,)))
-    back = from_csv(Look, to_csv(Look, looks))
+    text = to_csv(Look, looks)
+    back = from_csv(Look, text)
     assert back == looks
-    assert [len(cell) for cell in by_cell(back)] == [6, 3]
+    cell_counts = [len(cell) for cell in by_cell(back)]
+    assert cell_counts == [6, 3]
     assert CellUnit("three", 7).name == "three-007"
-    lines = table({"three": by_cell(back)}).splitlines()
+    looks_of_arm = {"three": by_cell(back)}
+    lines = table(looks_of_arm).splitlines()
     assert [
         line for line in lines if f"| {TARGETS_PERCENT[-1]:g} | ml, each block | 2 of 2 |" in line
     ]

@@ -65,15 +65,19 @@ from tests.studies.warm_up_study import (
 @given(count=st.integers(1, 9), tasks=st.integers(0, 40))
 def test_the_shards_of_a_study_have_every_task_once(count: int, tasks: int) -> None:
     shards = [Shard(number, count).of(range(tasks)) for number in range(1, count + 1)]
-    assert sorted(task for part in shards for task in part) == list(range(tasks))
-    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+    sorted_tasks = sorted(task for part in shards for task in part)
+    assert sorted_tasks == list(range(tasks))
+    smallest = min(map(len, shards))
+    largest_difference = max(map(len, shards)) - smallest
+    assert largest_difference <= 1
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_declares(
     robot: StudiedRobot,
 ) -> None:
-    cell = load_cell(CHECKOUT / f"configs/cells/{robot.cell}.yaml")
+    path = CHECKOUT / f"configs/cells/{robot.cell}.yaml"
+    cell = load_cell(path)
     simulation = CHECKOUT / f"configs/simulation/{robot.simulation}.yaml"
     assert robot.second not in {payload.name for payload in cell.payloads}
     first, second = (
@@ -83,7 +87,8 @@ def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_de
     assert second is not None
     assert first.mass_kg == cell.payloads[0].mass_kg
     assert second.mass_kg < 0.7 * first.mass_kg
-    assert robot.fingerprint != replace(robot, seconds=robot.seconds + 1.0).fingerprint
+    changed_robot = replace(robot, seconds=robot.seconds + 1.0)
+    assert robot.fingerprint != changed_robot.fingerprint
 
 
 def test_what_is_made_once_is_not_made_again(tmp_path: Path) -> None:
@@ -94,13 +99,15 @@ def test_what_is_made_once_is_not_made_again(tmp_path: Path) -> None:
 
     made: list[Path] = []
     found = [made_once(tmp_path, "a", mark, make) for mark in ("one", "one", "two")]
-    assert [one["times"] for one in found] == [1, 1, 2]
+    times = [one["times"] for one in found]
+    assert times == [1, 1, 2]
     assert not made[0].exists()
 
 
 @pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: planted.robot)
 def test_a_planted_effect_exists_on_both_sides(planted: PlantedEffect) -> None:
-    cell = load_cell(CHECKOUT / f"configs/cells/{planted.cell}.yaml")
+    path = CHECKOUT / f"configs/cells/{planted.cell}.yaml"
+    cell = load_cell(path)
     assert planted.place in cell.place_names
     assert planted.size in planted.effect.parameters.values()
     known = {family[0].name: family[0] for family in EFFECTS}[planted.name]
@@ -132,8 +139,10 @@ def test_the_figures_of_a_robot_are_over_all_its_gains_and_seeds() -> None:
 
 
 def test_the_tables_of_robots_show_identified_gains_and_masses(tmp_path: Path) -> None:
-    masses = {f"{role}_{what}": value for role, kg in (("first_payload", 10.0), ("payload", 4.0))
-              for what, value in (("kg", kg), ("error_percent", -1.0), ("std_percent", 0.5))}  # fmt: skip  # noqa: E501
+    masses = {}
+    for role, kg in (("first_payload", 10.0), ("payload", 4.0)):
+        for what, value in (("kg", kg), ("error_percent", -1.0), ("std_percent", 0.5)):
+            masses[f"{role}_{what}"] = value  # fmt: skip
     row = {
         "robot": "arm", "seed": 1, "floor_percent": 3.0, "gain_unit": {"J1": "Nm/A"}, "nameplate_gain": {"J1": -20.0},  # noqa: E501
         "true_gain": {"J1": -25.0}, "gain_error_percent": {"J1": 4.0}, "gain_std_percent": {"J1": 2.6},  # noqa: E501
@@ -151,7 +160,8 @@ def test_the_tables_of_robots_show_identified_gains_and_masses(tmp_path: Path) -
 
 def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    position = np.cumsum(rng.integers(-40_000, 40_000, (500, 6)), axis=0).astype(np.int32)
+    cumulative = np.cumsum(rng.integers(-40_000, 40_000, (500, 6)), axis=0)
+    position = cumulative.astype(np.int32)
     raw = RawRun(
         name="disc-1",
         payload=declared_payload("disc"),
@@ -163,9 +173,12 @@ def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
         ampere_per_unit=rng.random(6),
         began_s=60.0,
     )
-    write_runs(tmp_path / "runs.npz", [raw])
-    (back,) = read_runs(tmp_path / "runs.npz")
-    assert (back.name, back.payload, back.began_s) == (raw.name, raw.payload, raw.began_s)
+    path = tmp_path / "runs.npz"
+    write_runs(path, [raw])
+    runs_path = tmp_path / "runs.npz"
+    (back,) = read_runs(runs_path)
+    expected = (raw.name, raw.payload, raw.began_s)
+    assert (back.name, back.payload, back.began_s) == expected
     for name in (
         "position_counts",
         "demand_counts",
@@ -180,34 +193,42 @@ def test_runs_come_back_with_their_demand(tmp_path: Path) -> None:
 def test_a_cell_follows_a_demand_without_any_rest() -> None:
     cell = load_cell(CELL)
     spec = spec_of(world_cell(7, "loop3"), None, 0)
-    demand = without_rest(cell, spec.start_rad, np.random.default_rng(1), 0.5)
+    rng = np.random.default_rng(1)
+    demand = without_rest(cell, spec.start_rad, rng, 0.5)
     raw = follow(cell, spec, demand, "bare-1", None)
     recorded = run_of(raw, cell).position_rad
     # A sample is read at the end of its cycle
     asked = demand.position_rad[demand.first + 1 :][: len(recorded)]
     assert 490 <= len(recorded) <= 500
-    assert np.max(np.abs(demand_rad(raw, cell) - asked)) < 1e-3
-    assert np.max(np.abs(recorded - asked)) < 0.05
-    assert np.all(np.max(np.abs(np.diff(recorded, axis=0)), axis=1) > 1e-5)
+    difference = demand_rad(raw, cell) - asked
+    largest_absolute_difference = np.max(np.abs(difference))
+    assert largest_absolute_difference < 1e-3
+    recorded_difference = np.abs(recorded - asked)
+    assert np.max(recorded_difference) < 0.05
+    recorded_steps = np.diff(recorded, axis=0)
+    absolute_recorded_step = np.abs(recorded_steps)
+    assert np.all(np.max(absolute_recorded_step, axis=1) > 1e-5)
 
 
 def test_cells_of_one_seed_have_one_truth_in_every_world() -> None:
     cells = [world_cell(7, world).bare for world in WORLDS]
     assert len({cell.urdf for cell in cells}) == 1
-    assert len({tuple(axis.gain_nm_per_a for axis in cell.axes) for cell in cells}) == 1
+    gain_nm_per_a = {tuple(axis.gain_nm_per_a for axis in cell.axes) for cell in cells}
+    assert len(gain_nm_per_a) == 1
     for cell, world in zip(cells, WORLDS.values(), strict=True):
-        assert {axis.torque_disturbance_percent for axis in cell.axes} == {
-            world.disturbance_percent
-        }
+        torque_disturbance_percent = {axis.torque_disturbance_percent for axis in cell.axes}
+        assert torque_disturbance_percent == {world.disturbance_percent}
         times_s = [axis.disturbance_correlation_s for axis in cell.axes]
         assert CORRELATION_S[0] <= min(times_s) < max(times_s) <= CORRELATION_S[1]
 
 
 def test_friction_differs_from_run_to_run_in_one_world_alone() -> None:
-    plain = spec_of(world_cell(7, "measurement"), None, 0)
+    cell = world_cell(7, "measurement")
+    plain = spec_of(cell, None, 0)
     ratios = []
     for run in range(24):
-        assert spec_of(world_cell(7, "measurement"), None, run).axes == plain.axes
+        spec = spec_of(world_cell(7, "measurement"), None, run)
+        assert spec.axes == plain.axes
         own = spec_of(world_cell(7, "runs"), None, run)
         ratios += [
             one.coulomb_nm / same.coulomb_nm for one, same in zip(own.axes, plain.axes, strict=True)
@@ -221,7 +242,8 @@ def test_blind_cells_are_the_same_however_many_are_drawn_and_can_be_built(seed: 
     cases = blind_cases(seed, 3)
     assert blind_cases(seed, 2) == cases[:2]
     for case in cases:
-        Plant(case.spec("loop3", "disc", 1))
+        spec = case.spec("loop3", "disc", 1)
+        Plant(spec)
         places = {(effect.name, effect.axis) for effect in case.effects}
         assert len(places) == len(case.effects) <= 3
         assert {effect.name for effect in case.effects} <= set(FAMILIES)
@@ -244,13 +266,14 @@ def test_the_confusion_table_counts_every_true_and_every_false_effect_once() -> 
             for column, text in zip(columns[1:], texts, strict=True)
             if text
         }
-    assert counts == {
+    expected = {
         ("spring", "spring"): 1,
         ("stribeck", "nonlinear-viscous"): 1,
         ("spring", NOTHING): 1,
         ("coupling", "stribeck"): 1,
         (NOTHING, "lag"): 2,
     }
+    assert counts == expected
 
 
 @dataclass(frozen=True)
@@ -275,8 +298,10 @@ ROW = SomeRow(
 
 
 def test_the_rows_of_a_study_come_back_from_their_table() -> None:
-    rows = (ROW, replace(ROW, flag=False, sizes=(), names=("lag on J1", "spring on J2")))
-    assert from_csv(SomeRow, to_csv(SomeRow, rows)) == rows
+    changed_row = replace(ROW, flag=False, sizes=(), names=("lag on J1", "spring on J2"))
+    rows = (ROW, changed_row)
+    text = to_csv(SomeRow, rows)
+    assert from_csv(SomeRow, text) == rows
 
 
 def test_a_unit_is_done_again_only_where_what_it_depends_on_differs(tmp_path: Path) -> None:
@@ -297,15 +322,18 @@ def test_a_unit_is_done_again_only_where_what_it_depends_on_differs(tmp_path: Pa
 def test_rows_carried_to_another_machine_are_finished_there_for_the_same_code_alone(
     tmp_path: Path,
 ) -> None:
-    made = tmp_path / "made" / "loop8" / "clean-00.json"
+    loop8_folder = tmp_path / "made" / "loop8"
+    made = loop8_folder / "clean-00.json"
     made.parent.mkdir(parents=True)
     made.write_text('{"case": "clean-00"}')
     finish(made, "of this code")
     (made.parent / "unfinished.json").write_text("{}")
     packed = tmp_path / "data" / "rows.jsonl"
 
-    assert pack(tmp_path / "made", packed) == 1
-    assert unpack(packed, tmp_path / "other") == 1
+    folder = tmp_path / "made"
+    assert pack(folder, packed) == 1
+    other_folder = tmp_path / "other"
+    assert unpack(packed, other_folder) == 1
 
     carried = tmp_path / "other" / "loop8" / "clean-00.json"
     assert carried.read_text() == made.read_text()
@@ -318,8 +346,10 @@ def test_blocks_of_a_guided_session_begin_after_each_change_of_the_payload() -> 
     bare_s, loaded_s, held_out_s, *_ = start_times_s(GUIDED)
 
     assert bare_s == 0.0
-    assert loaded_s == BLOCK_S + PAUSE_S + CHANGE_S
-    assert held_out_s == loaded_s + BLOCK_S + PAUSE_S
+    expected = BLOCK_S + PAUSE_S + CHANGE_S
+    assert loaded_s == expected
+    loaded_s_expected = loaded_s + BLOCK_S + PAUSE_S
+    assert held_out_s == loaded_s_expected
     assert start_times_s(GUIDED)[-1] == 6 * (BLOCK_S + PAUSE_S) + 3 * CHANGE_S
     assert start_times_s(BARE_THEN_LOADED)[-1] == 6 * (BLOCK_S + PAUSE_S) + CHANGE_S
 
@@ -336,7 +366,8 @@ def test_no_unit_is_begun_after_its_minutes() -> None:
 @settings(max_examples=25)
 @given(seed=st.integers(0, 1000), count=st.integers(12, 60))
 def test_regions_are_of_one_size_and_the_same_for_one_seed(seed: int, count: int) -> None:
-    position = np.random.default_rng(count).normal(size=(count, 6))
+    rng = np.random.default_rng(count)
+    position = rng.normal(size=(count, 6))
     part = region_of(position, seed)
     np.testing.assert_array_equal(part, region_of(position, seed))
     sizes = np.bincount(part, minlength=PARTS)
@@ -347,11 +378,13 @@ def test_regions_are_of_one_size_and_the_same_for_one_seed(seed: int, count: int
 def test_regions_are_apart_in_the_workspace_in_any_unit() -> None:
     corners = np.array([[0.0, 0.0], [0.0, 10.0], [10.0, 0.0], [10.0, 10.0]])
     place = np.tile(np.arange(4), 10)
-    position = corners[place] + 0.1 * np.random.default_rng(1).normal(size=(40, 2))
+    rng = np.random.default_rng(1)
+    position = corners[place] + 0.1 * rng.normal(size=(40, 2))
     for seed in range(5):
         part = region_of(position, seed)
         assert len({(int(one), int(corner)) for one, corner in zip(part, place, strict=True)}) == 4
-        np.testing.assert_array_equal(part, region_of(position * [1e-3, 1.0], seed))
+        expected = region_of(position * [1e-3, 1.0], seed)
+        np.testing.assert_array_equal(part, expected)
 
 
 def _circling_run(name: str = "run", axes: int = 2) -> Run:
@@ -367,8 +400,11 @@ ROWS = Conditioning(decimation_cutoff_hz=20.0, standstill_rad_s=(0.02,) * 6)
 def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
     runs = [_circling_run("a", 6), _circling_run("b", 6)]
     parts = split_by_region(runs, 0.5, seed=2)
-    assert {int(one) for part in parts for one in part} == set(range(PARTS))
-    rest, unseen = two_sides(runs, [part == 1 for part in parts], model_of(load_cell(CELL)), ROWS)
+    expected = set(range(PARTS))
+    assert {int(one) for part in parts for one in part} == expected
+    left_out = [part == 1 for part in parts]
+    model = model_of(load_cell(CELL))
+    rest, unseen = two_sides(runs, left_out, model, ROWS)
     assert [run.name for run in rest] == ["a, the rest", "b, the rest"]
     for one, other in zip(rest, unseen, strict=True):
         assert one.valid is not None
@@ -378,9 +414,9 @@ def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
 
 def test_a_side_in_one_long_stretch_is_a_run_of_its_own() -> None:
     run = _circling_run(axes=6)
-    (rest,), (unseen,) = two_sides(
-        [run], [np.arange(4000) >= 3000], model_of(load_cell(CELL)), ROWS
-    )
+    left_out = [np.arange(4000) >= 3000]
+    model = model_of(load_cell(CELL))
+    (rest,), (unseen,) = two_sides([run], left_out, model, ROWS)
     # 15 s are a run, 5 s are a part of one.
     assert (len(rest.time_s), len(unseen.time_s)) == (3000, 4000)
     assert rest.time_s[-1] == run.time_s[2999]
@@ -392,7 +428,9 @@ def test_a_side_without_a_moving_window_is_no_run(samples: int) -> None:
     position = run.position_rad.copy()
     position[:1100] = position[1100]
     still = replace(run, position_rad=position)
-    rest, unseen = two_sides([still], [np.arange(4000) < samples], model_of(load_cell(CELL)), ROWS)
+    left_out = [np.arange(4000) < samples]
+    model = model_of(load_cell(CELL))
+    rest, unseen = two_sides([still], left_out, model, ROWS)
     assert len(rest) == 1
     assert unseen == []
 
@@ -414,26 +452,27 @@ def test_noise_makes_a_rise_as_often_as_the_level_says() -> None:
     assert 0.02 <= np.mean(noise) <= 0.09
     harm = [judge_rise(rng.normal(loc=0.8, size=96), run, level=0.01).is_shown for _ in range(20)]
     assert all(harm)
-    assert not judge_rise(np.zeros(96), run).is_shown
+    is_shown = judge_rise(np.zeros(96), run).is_shown
+    assert not is_shown
     assert not judge_rise(np.ones(3), run[:3]).is_shown
 
 
 def test_a_planted_mistake_changes_what_it_says_alone() -> None:
     run = _circling_run()
     cell = load_cell(CELL)
-    ((moved,), same) = plant([run], cell, Planted(Mistake.ZERO, 1, 0.02), seed=1)
+    planted = Planted(Mistake.ZERO, 1, 0.02)
+    ((moved,), same) = plant([run], cell, planted, seed=1)
     assert same is cell
-    np.testing.assert_allclose(
-        moved.position_rad - run.position_rad, np.tile([0.0, 0.02], (4000, 1)), atol=1e-15
-    )
+    expected = np.tile([0.0, 0.02], (4000, 1))
+    position_difference_rad = moved.position_rad - run.position_rad
+    np.testing.assert_allclose(position_difference_rad, expected, atol=1e-15)
     ((late,), _) = plant([run], cell, Planted(Mistake.ENCODER, 0, 0.005), seed=1)
     np.testing.assert_allclose(late.position_rad[1:, 0], run.position_rad[:-1, 0], atol=1e-9)
     np.testing.assert_array_equal(late.position_rad[:, 1], run.position_rad[:, 1])
     np.testing.assert_array_equal(late.current_a, run.current_a)
     ((delayed,), _) = plant([run], cell, Planted(Mistake.CURRENT, 1, 0.0025), seed=1)
-    np.testing.assert_allclose(
-        delayed.current_a[1:, 1], run.current_a[1:, 1] - 2.0 * 0.0025, atol=1e-9
-    )
+    current_a_expected = run.current_a[1:, 1] - 2.0 * 0.0025
+    np.testing.assert_allclose(delayed.current_a[1:, 1], current_a_expected, atol=1e-9)
     np.testing.assert_array_equal(delayed.position_rad, run.position_rad)
     ((untouched,), tilt) = plant([run], cell, Planted(Mistake.GRAVITY, -1, radians(1.0)), seed=1)
     assert untouched is run
@@ -446,7 +485,9 @@ def test_a_planted_mistake_changes_what_it_says_alone() -> None:
 def test_a_tilt_keeps_the_size_of_gravity(heading: float, angle: float) -> None:
     gravity = np.array([1.0, -2.0, -9.0])
     turned = np.array(list(tilted(gravity.tolist(), angle, heading)))
-    assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(gravity))
+    turned_norm = np.linalg.norm(turned)
+    gravity_norm = np.linalg.norm(gravity)
+    assert turned_norm == pytest.approx(gravity_norm)
     assert turned @ gravity / (gravity @ gravity) == pytest.approx(np.cos(angle))
 
 
@@ -458,17 +499,21 @@ def _evidence_of(
     """
     unknowns = tuple(column for placed in effects for column in placed.columns)
     covariance = np.diag([0.0, 0.0, *np.square(std)])
+    parameters = np.array(values)
+    gains = np.ones(2)
     estimate = SimpleNamespace(
-        unknowns=unknowns, parameters=np.array(values), covariance=covariance, gains=np.ones(2)
+        unknowns=unknowns, parameters=parameters, covariance=covariance, gains=gains
     )
-    return cast(Evidence, SimpleNamespace(effects=effects, declared=0, estimate=estimate))
+    simple_namespace = SimpleNamespace(effects=effects, declared=0, estimate=estimate)
+    return cast(Evidence, simple_namespace)
 
 
 def test_a_mistake_is_named_on_its_own_axis_only_and_its_size_is_judged_in_sigmas() -> None:
     spring = PlacedEffect(Spring(), 0)
     lag = PlacedEffect(Lag(), 1)
     evidence = _evidence_of((spring, lag), [1.0, 0.0034], [0.1, 0.0002])
-    found = judge_mistake(evidence, Planted(Mistake.CURRENT, 1, 0.003))
+    planted = Planted(Mistake.CURRENT, 1, 0.003)
+    found = judge_mistake(evidence, planted)
     assert found.named
     assert (found.value, found.std) == pytest.approx((0.0034, 0.0002))
     assert found.z == pytest.approx(2.0)
@@ -476,7 +521,8 @@ def test_a_mistake_is_named_on_its_own_axis_only_and_its_size_is_judged_in_sigma
     elsewhere = judge_mistake(evidence, Planted(Mistake.CURRENT, 0, 0.003))
     assert not elsewhere.named
     assert elsewhere.others == (spring, lag)
-    assert not judge_mistake(evidence, Planted(Mistake.CLEAN)).named
+    named = judge_mistake(evidence, Planted(Mistake.CLEAN)).named
+    assert not named
 
 
 @pytest.mark.parametrize("planted_rad", [0.035, -0.035])
@@ -484,7 +530,8 @@ def test_a_zero_that_is_corrected_the_wrong_way_is_far_off(planted_rad: float) -
     """Positions that are too large by so much need it taken off."""
     zero = PlacedEffect(ZeroOffset(), 1)
     planted = Planted(Mistake.ZERO, 1, planted_rad)
-    right = judge_mistake(_evidence_of((zero,), [-planted_rad], [0.001]), planted)
+    evidence = _evidence_of((zero,), [-planted_rad], [0.001])
+    right = judge_mistake(evidence, planted)
     wrong = judge_mistake(_evidence_of((zero,), [planted_rad], [0.001]), planted)
     assert right.z == pytest.approx(0.0)
     assert abs(wrong.z) == pytest.approx(70.0)

@@ -67,7 +67,8 @@ class CrowdedTask(CaseTask):
     @property
     def path(self) -> Path:
         """File of the runs."""
-        return self.out / "crowded" / f"{self.seed}.npz"
+        crowded_folder = self.out / "crowded"
+        return crowded_folder / f"{self.seed}.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,24 +99,34 @@ def errors_of(task: CaseTask) -> CellErrors:
     cell = load_cell(CELL)
     make_runs(task, cell)
     runs = [run_of(raw, cell) for raw in read_runs(task.path)]
-    system = regrouped(reduce_runs(model_of(cell), runs, cell.conditioning))
-    true_gains = np.array([axis.gain_nm_per_a for axis in world_cell(task.seed, WORLD).bare.axes])
+    standard = reduce_runs(model_of(cell), runs, cell.conditioning)
+    system = regrouped(standard)
+    axes = world_cell(task.seed, WORLD).bare.axes
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in axes]
+    true_gains = np.array(gain_nm_per_a)
     estimates = {name: estimator(system) for name, estimator in ESTIMATORS.items()}
     title = ", ".join(f"{effect.name} on {cell.axis_names[effect.axis]}" for effect in task.effects)
-    shift = np.abs(estimates["tls"].gains - estimates["ml"].gains)
+    gain_difference = estimates["tls"].gains - estimates["ml"].gains
+    shift = np.abs(gain_difference)
+    relative_error_percent = estimates["ml"].relative_error(system).total
+    gain_errors_percent = {
+        name: 100.0 * np.abs(estimate.gains / true_gains - 1.0)
+        for name, estimate in estimates.items()
+    }
+    scores = {
+        name: (estimate.gains - true_gains) / estimate.gains_std
+        for name, estimate in estimates.items()
+    }
+    absolute_gain = np.abs(estimates["ml"].gains)
+    tls_shift_percent = 100.0 * shift / absolute_gain
+    tls_shift_sigmas = shift / estimates["ml"].gains_std
     return CellErrors(
         title=title,
-        relative_error_percent=estimates["ml"].relative_error(system).total,
-        gain_errors_percent={
-            name: 100.0 * np.abs(estimate.gains / true_gains - 1.0)
-            for name, estimate in estimates.items()
-        },
-        tls_shift_sigmas=shift / estimates["ml"].gains_std,
-        tls_shift_percent=100.0 * shift / np.abs(estimates["ml"].gains),
-        scores={
-            name: (estimate.gains - true_gains) / estimate.gains_std
-            for name, estimate in estimates.items()
-        },
+        relative_error_percent=relative_error_percent,
+        gain_errors_percent=gain_errors_percent,
+        tls_shift_sigmas=tls_shift_sigmas,
+        tls_shift_percent=tls_shift_percent,
+        scores=scores,
         parameters_over_noise=parameters_over_noise(system),
     )
 
@@ -138,10 +149,12 @@ def table(
     groups += [(f"any one of these, {len(bent)} cells", list(bent))]
     groups += [(f"one on every axis, {len(crowded)} cells", list(crowded))]
     for title, cells in groups:
-        fit_percent = float(np.mean([cell.relative_error_percent for cell in cells]))
+        relative_error_percent = [cell.relative_error_percent for cell in cells]
+        fit_percent = float(np.mean(relative_error_percent))
         sizes = []
         for name in ESTIMATORS:
-            errors = np.concatenate([cell.gain_errors_percent[name] for cell in cells])
+            gain_errors_percent = [cell.gain_errors_percent[name] for cell in cells]
+            errors = np.concatenate(gain_errors_percent)
             sizes.append(f"{errors.mean():.2f} / {errors.max():.2f}")
         sigmas = max(float(cell.tls_shift_sigmas.max()) for cell in cells)
         percents = max(float(cell.tls_shift_percent.max()) for cell in cells)
@@ -160,9 +173,8 @@ def main(arguments: list[str] | None = None) -> int:
     clean_tasks = [CaseTask(options.out, "clean", number) for number in range(CLEAN_CELLS)]
     bent_tasks = [CaseTask(options.out, "after-loop", number) for number in range(len(EFFECTS))]
     crowded_tasks = [CrowdedTask(options.out, "clean", number) for number in range(CROWDED_CELLS)]
-    found = list(
-        side_by_side(errors_of, [*clean_tasks, *bent_tasks, *crowded_tasks], options.processes)
-    )
+    tasks = [*clean_tasks, *bent_tasks, *crowded_tasks]
+    found = list(side_by_side(errors_of, tasks, options.processes))
     clean = found[:CLEAN_CELLS]
     bent = found[CLEAN_CELLS:-CROWDED_CELLS]
     text = table(clean, bent, found[-CROWDED_CELLS:])
@@ -171,13 +183,15 @@ def main(arguments: list[str] | None = None) -> int:
         name: float(np.mean([cell.gain_errors_percent[name] for cell in clean]))
         for name in ESTIMATORS
     }
-    print_line(f"clean cells: tls / ml = {means['tls'] / means['ml']:.2f}")
+    line = f"clean cells: tls / ml = {means['tls'] / means['ml']:.2f}"
+    print_line(line)
     for name in ("ml", "tls"):
         scores = np.concatenate([cell.scores[name] for cell in clean])
         print_line(
             f"clean cells: error / σ of {name}, root mean square {np.sqrt(np.mean(scores**2)):.2f}"
         )
-    ratios = np.concatenate([cell.parameters_over_noise for cell in found])
+    parameters_over_noises = [cell.parameters_over_noise for cell in found]
+    ratios = np.concatenate(parameters_over_noises)
     print_line(
         f"smallest singular values without and with the currents: ratio {ratios.min():.1f} to "
         f"{ratios.max():.1f}"

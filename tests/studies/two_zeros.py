@@ -59,9 +59,12 @@ def study(task: RunsOfRobot, off_deg: dict[int, float]) -> str:
     evidence = fitted(task.cell, runs)
     named: list[str] = []
     right: set[int] = set()
-    for found in check_geometry(evidence, np.random.default_rng(0)).mistakes:
-        value_deg = float(np.degrees(found.coefficients[0]))
-        std_deg = float(np.degrees(found.deviations[0]))
+    rng = np.random.default_rng(0)
+    for found in check_geometry(evidence, rng).mistakes:
+        coefficient_deg = np.degrees(found.coefficients[0])
+        value_deg = float(coefficient_deg)
+        deviation_deg = np.degrees(found.deviations[0])
+        std_deg = float(deviation_deg)
         if isinstance(found.effect, ZeroOffset) and found.axis in off_deg:
             z = (value_deg + off_deg[found.axis]) / std_deg
             right.add(found.axis)
@@ -84,7 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", nargs="+", choices=STUDIED, default=list(ROBOTS), metavar="ROBOT")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4])
+    default = [1, 2, 3, 4]
+    parser.add_argument("--seeds", nargs="+", type=int, default=default)
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     for robot in options.only:

@@ -55,7 +55,8 @@ def main() -> int:
         unseen = replace(run, name="left out", move=block, valid=valid & left_out)
         found = identify(model, [training], cell.conditioning, method=Method.ML, fixed_gains=gains)
         start = gather(found, [training], [unseen])
-        steps = find_effects(start, np.random.default_rng(0))
+        rng = np.random.default_rng(0)
+        steps = find_effects(start, rng)
         end = steps[-1].after
         if start.holdout is None or end.holdout is None:
             raise ValueError("nothing was left out")
@@ -65,15 +66,18 @@ def main() -> int:
         names = ", ".join(
             f"{placed.effect.name} on {cell.axis_names[placed.axis]}" for placed in end.effects
         )
-        print_line(f"fold {fold + 1}: {names or 'nothing'}")
+        line = f"fold {fold + 1}: {names or 'nothing'}"
+        print_line(line)
     print_line("\n| | " + " | ".join(cell.axis_names) + " | mean | total |\n|" + "---|" * (n + 3))
-    print_line(_row("nothing added", of_squares(size, before)))
+    error = of_squares(size, before)
+    print_line(_row("nothing added", error))
     print_line(_row("effects added", of_squares(size, after)))
     return 0
 
 
 def _row(name: str, error: RelativeError) -> str:
-    figures = (*error.axes, float(np.mean(error.axes)), error.total)
+    mean_axis = float(np.mean(error.axes))
+    figures = (*error.axes, mean_axis, error.total)
     return f"| {name} | " + " | ".join(f"{figure:.2f}" for figure in figures) + " |"
 
 

@@ -115,9 +115,8 @@ def simulated(
         is_loaded = role is not BlockRole.BARE
         spec = spec_of(drawn, PAYLOAD if is_loaded else None, number)
         if minutes is not None:
-            spec = replace(
-                spec, effects=tuple(warm_up(axis, minutes) for axis in range(len(spec.axes)))
-            )
+            effects = tuple(warm_up(axis, minutes) for axis in range(len(spec.axes)))
+            spec = replace(spec, effects=effects)
         plan = kept_plan(_plan_task(number), cell)
         payload = declared_payload(PAYLOAD) if is_loaded else None
         raw = simulate_run(cell, spec, plan, f"block-{number + 1}", payload, began_s)
@@ -135,7 +134,8 @@ def study(unit: WarmingCell) -> tuple[Row, ...]:
     """Both orders of one cell, each by both models of friction."""
     declared = load_cell(CELL)
     drawn = world_cell(unit.seed, WORLD)
-    truth = np.array([axis.gain_nm_per_a for axis in drawn.bare.axes])
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in drawn.bare.axes]
+    truth = np.array(gain_nm_per_a)
     rows = []
     for order, roles in ORDERS.items():
         steady_runs = simulated(drawn, declared, roles, None)
@@ -144,17 +144,20 @@ def study(unit: WarmingCell) -> tuple[Row, ...]:
             cell = replace(declared, friction_by_payload=by_payload)
             steady = _gains(cell, steady_runs, roles)
             warming = _gains(cell, warming_runs, roles)
+            bent_percent = _largest_change(steady.fitted, warming.fitted)
+            searched_bent_percent = _largest_change(steady.searched, warming.searched)
+            error_percent = _largest_change(truth, warming.fitted)
             row = Row(
                 seed=unit.seed,
                 time_constant_min=unit.time_constant_min,
                 order=order,
                 friction=friction,
-                bent_percent=_largest_change(steady.fitted, warming.fitted),
-                searched_bent_percent=_largest_change(steady.searched, warming.searched),
+                bent_percent=bent_percent,
+                searched_bent_percent=searched_bent_percent,
                 named=warming.named,
                 std_percent=warming.std_percent,
                 steady_std_percent=steady.fitted_std_percent,
-                error_percent=_largest_change(truth, warming.fitted),
+                error_percent=error_percent,
             )
             rows.append(row)
     return tuple(rows)
@@ -175,19 +178,23 @@ def _gains(cell: Cell, runs: Sequence[Run], roles: Sequence[BlockRole]) -> _Gain
     ]
     unseen = [run for run, role in zip(runs, roles, strict=True) if role is BlockRole.HELD_OUT]
     found = identify(model_of(cell), fit_runs, cell.conditioning)
-    end = find_effects(gather(found, fit_runs, unseen), np.random.default_rng(0))[-1].after
+    rng = np.random.default_rng(0)
+    effects = find_effects(gather(found, fit_runs, unseen), rng)
+    end = effects[-1].after
     estimate = end.estimate
+    named = tuple(f"{placed.effect.name} on J{placed.axis + 1}" for placed in end.effects)
     return _Gains(
         fitted=found.estimate.gains,
         searched=estimate.gains,
-        named=tuple(f"{placed.effect.name} on J{placed.axis + 1}" for placed in end.effects),
+        named=named,
         std_percent=_worst_std_percent(estimate),
         fitted_std_percent=_worst_std_percent(found.estimate),
     )
 
 
 def _worst_std_percent(estimate: Estimate) -> float:
-    return float(100.0 * np.max(estimate.gains_std / np.abs(estimate.gains)))
+    absolute_gain = np.abs(estimate.gains)
+    return float(100.0 * np.max(estimate.gains_std / absolute_gain))
 
 
 def _largest_change(steady: FloatArray, warming: FloatArray) -> float:
@@ -195,7 +202,8 @@ def _largest_change(steady: FloatArray, warming: FloatArray) -> float:
 
 
 def _plan_task(number: int) -> PlanTask:
-    return PlanTask(OUT, FIRST_PLAN + number, BLOCK_S)
+    seed = FIRST_PLAN + number
+    return PlanTask(OUT, seed, BLOCK_S)
 
 
 def fingerprint_of(unit: WarmingCell) -> str:
@@ -235,10 +243,14 @@ def summary(rows: Sequence[Row]) -> str:
 
 def _line(name: str, rows: Sequence[Row]) -> str:
     first = rows[0]
-    bent = np.mean([row.bent_percent for row in rows])
-    searched = np.mean([row.searched_bent_percent for row in rows])
-    error = np.mean([row.error_percent for row in rows])
-    std = np.mean([row.steady_std_percent for row in rows])
+    bent_percent = [row.bent_percent for row in rows]
+    bent = np.mean(bent_percent)
+    searched_bent_percent = [row.searched_bent_percent for row in rows]
+    searched = np.mean(searched_bent_percent)
+    error_percent = [row.error_percent for row in rows]
+    error = np.mean(error_percent)
+    steady_std_percent = [row.steady_std_percent for row in rows]
+    std = np.mean(steady_std_percent)
     figures = f"{bent:.2f} | {searched:.2f} | {error:.2f} | {std:.2f}"
     return f"| {name} | {first.order} | {first.friction} | {len(rows)} | {figures} |"
 
@@ -255,7 +267,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="after which no cell is begun")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
-    units = [WarmingCell(seed, minutes) for seed in options.seeds for minutes in TIME_CONSTANTS_MIN]
+    units = []
+    for seed in options.seeds:
+        for minutes in TIME_CONSTANTS_MIN:
+            units.append(WarmingCell(seed, minutes))
     for number in range(len(GUIDED)):
         print_line(make_plan(_plan_task(number)))
 
@@ -267,8 +282,11 @@ def main(arguments: list[str] | None = None) -> int:
 
     left = work_off(options.shard.of(units), done, options.minutes, time.monotonic, print_line)
     rows = finished_rows(options.out, units, Row, fingerprint_of)
-    replace_file(options.out / "warm-up.csv", to_csv(Row, rows).encode())
-    print_line(f"\n{left} cells of this piece were not begun\n\n{summary(rows)}")
+    content = to_csv(Row, rows).encode()
+    path = options.out / "warm-up.csv"
+    replace_file(path, content)
+    line = f"\n{left} cells of this piece were not begun\n\n{summary(rows)}"
+    print_line(line)
     return 0
 
 

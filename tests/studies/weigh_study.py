@@ -44,8 +44,9 @@ def errors(cell: WeighedCell, body: WeighedBody) -> dict[str, list[float]]:
     mass = cell.body[-1]
     first = cell.body[6:9]
     centre, std = body.centre_m
+    mass_difference_kg = body.mass_kg - mass
     return {
-        "error": [body.mass_kg - mass, *(centre - first / mass).tolist()],
+        "error": [mass_difference_kg, *(centre - first / mass).tolist()],
         "std": [body.mass_std_kg, *std.tolist()],
         "mass_kg": [mass],
     }
@@ -56,7 +57,8 @@ def table(cells: list[dict[str, Any]]) -> str:
     lines = ["| way | quantity | rms error | rms z | inside 1.96 σ |", "|---|---|---|---|---|"]
     for way in WAYS:
         error, std = (np.array([cell[way][key] for cell in cells]) for key in ("error", "std"))
-        mass = np.array([cell[way]["mass_kg"] for cell in cells])
+        mass_kg = [cell[way]["mass_kg"] for cell in cells]
+        mass = np.array(mass_kg)
         shown: FloatArray = np.column_stack((100.0 * error[:, :1] / mass, 1000.0 * error[:, 1:]))
         z = error / std
         for index, quantity in enumerate(QUANTITIES):
@@ -89,8 +91,10 @@ def main(arguments: list[str] | None = None) -> int:
     for seed in range(options.cells):
         path = folder / f"{seed}.json"
         if not path.exists():
-            replace_file(path, json.dumps(cell_figures(options.arm, seed)).encode())
-        cells.append(json.loads(path.read_text(encoding="utf-8")))
+            content = json.dumps(cell_figures(options.arm, seed)).encode()
+            replace_file(path, content)
+        text = path.read_text(encoding="utf-8")
+        cells.append(json.loads(text))
     sys.stdout.write(f"{len(cells)} cells of {options.arm}\n\n{table(cells)}\n")
     return 0
 

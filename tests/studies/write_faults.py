@@ -79,7 +79,8 @@ def made_scene(verb: str, folder: Path, out: Path) -> Scene:
 
 
 def _made_from(name: str) -> str:
-    return digest_of_source(f"tests.daq.jobs.{name}", ("daq", "drivers", "ident", "tests"))
+    rooms = ("daq", "drivers", "ident", "tests")
+    return digest_of_source(f"tests.daq.jobs.{name}", rooms)
 
 
 def rows_at(scene: Scene, unit: CallUnit) -> list[FaultRow]:
@@ -98,19 +99,23 @@ def counts(rows: Sequence[FaultRow]) -> list[FaultCount]:
         groups.setdefault((row.verb, row.call, error), []).append(row)
     found = []
     for (verb, call, error), of_group in groups.items():
-        found.append(
-            FaultCount(
-                verb=verb,
-                call=call,
-                error=error,
-                cases=len(of_group),
-                old_file=sum(row.content == Content.OLD.value for row in of_group),
-                new_file=sum(row.content == Content.NEW.value for row in of_group),
-                both=sum(row.content == Content.MIXED.value for row in of_group),
-                false_sentences=sum(bool(row.false_sentences) for row in of_group),
-                bad_states=sum(bool(row.bad_states) for row in of_group),
-            )
+        old_file = sum(row.content == Content.OLD.value for row in of_group)
+        new_file = sum(row.content == Content.NEW.value for row in of_group)
+        both = sum(row.content == Content.MIXED.value for row in of_group)
+        false_sentences = sum(bool(row.false_sentences) for row in of_group)
+        bad_states = sum(bool(row.bad_states) for row in of_group)
+        fault_count = FaultCount(
+            verb=verb,
+            call=call,
+            error=error,
+            cases=len(of_group),
+            old_file=old_file,
+            new_file=new_file,
+            both=both,
+            false_sentences=false_sentences,
+            bad_states=bad_states,
         )
+        found.append(fault_count)
     return found
 
 
@@ -120,7 +125,8 @@ def with_other_verbs(
     """Rows of some verbs, and those of the others that a table has, in the order of `VERBS`."""
     found = list(rows)
     if table.is_file():
-        for row in from_csv(FaultRow, table.read_text(encoding="utf-8")):
+        text = table.read_text(encoding="utf-8")
+        for row in from_csv(FaultRow, text):
             if row.verb not in verbs:
                 found.append(row)
     return tuple(sorted(found, key=lambda row: VERBS.index(row.verb)))
@@ -128,8 +134,9 @@ def with_other_verbs(
 
 def main(arguments: list[str] | None = None) -> int:
     """Take the calls that were not taken yet; 1 where a sentence was false or a state bad."""
+    prog = f"python -m {MODULE}"
     parser = argparse.ArgumentParser(
-        prog=f"python -m {MODULE}",
+        prog=prog,
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -143,7 +150,8 @@ def main(arguments: list[str] | None = None) -> int:
     if reason:
         print_line(reason)
         return 1
-    source = digest_of_source(MODULE, ("daq", "drivers", "ident", "tests"))
+    rooms = ("daq", "drivers", "ident", "tests")
+    source = digest_of_source(MODULE, rooms)
 
     def fingerprint_of(unit: CallUnit) -> str:
         # Not the number of bytes, which a time or a path in a file may change.
@@ -154,7 +162,8 @@ def main(arguments: list[str] | None = None) -> int:
     end_s = time.monotonic() + 60.0 * options.minutes
     for verb in options.verbs:
         with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
-            scene = made_scene(verb, Path(folder).resolve(), options.out)
+            path = Path(folder).resolve()
+            scene = made_scene(verb, path, options.out)
 
             def done(unit: CallUnit, scene: Scene = scene) -> str:
                 found = rows_of_unit(
@@ -169,24 +178,28 @@ def main(arguments: list[str] | None = None) -> int:
 
             every_unit += scene.units()
             units = list(scene.units())[:: options.every]
-            minutes = max(0.0, end_s - time.monotonic()) / 60.0
+            end_difference_s = end_s - time.monotonic()
+            minutes = max(0.0, end_difference_s) / 60.0
             left += work_off(units, done, minutes, time.monotonic, print_line)
             scene.close()
     rows = finished_rows(options.out, every_unit, FaultRow, fingerprint_of)
     for row in rows:
         for text in (*row.false_sentences, *row.bad_states):
-            print_line(
+            line = (
                 f"{row.verb} {row.number} {row.call} {row.file} {row.error} "
                 f"{row.is_lasting}: {text}"
             )
+            print_line(line)
     wrong = sum(bool(row.false_sentences or row.bad_states) for row in rows)
     print_line(f"{len(rows)} cases, {wrong} of them wrong; {left} calls were not begun")
     if options.tables is not None and left == 0:
         table_of_rows = options.tables / "write-fault-rows.csv"
         every_row = with_other_verbs(table_of_rows, rows, options.verbs)
-        replace_file(table_of_rows, to_csv(FaultRow, every_row).encode())
+        content = to_csv(FaultRow, every_row).encode()
+        replace_file(table_of_rows, content)
         every_count = to_csv(FaultCount, counts(every_row))
-        replace_file(options.tables / "write-faults.csv", every_count.encode())
+        write_faults_path = options.tables / "write-faults.csv"
+        replace_file(write_faults_path, every_count.encode())
     return int(wrong > 0)
 
 

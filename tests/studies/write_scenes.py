@@ -78,8 +78,10 @@ class Injection:
         if self.name == KILL:
             return Fault(number)
         if self.name == SHORT:
-            return Fault(number, is_lasting=self.is_lasting, length=max(1, size // 2))
-        return Fault(number, getattr(errno, self.name), self.is_lasting)
+            length = max(1, size // 2)
+            return Fault(number, is_lasting=self.is_lasting, length=length)
+        error = getattr(errno, self.name)
+        return Fault(number, error, self.is_lasting)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +110,8 @@ class CallUnit:
             found.append(Injection(KILL))
         for error in ERRORS:
             for is_lasting in (False, True):
-                found.append(Injection(errno.errorcode[error], is_lasting))
+                injection = Injection(errno.errorcode[error], is_lasting)
+                found.append(injection)
         return (*found, *self._short)
 
     @property
@@ -121,7 +124,8 @@ class CallUnit:
             found.append(Injection(KILL))
         error = ERRORS[self.number % len(ERRORS)]
         is_lasting = self.number // len(ERRORS) % 2 == 1
-        found.append(Injection(errno.errorcode[error], is_lasting))
+        injection = Injection(errno.errorcode[error], is_lasting)
+        found.append(injection)
         return (*found, *self._short[:1])
 
     @property
@@ -235,7 +239,8 @@ class Scene(ABC):
     def units(self) -> Iterator[CallUnit]:
         """Every changing call."""
         for number, call in enumerate(self.calls):
-            yield CallUnit(self.verb, number, call.name, self.kind_of(call.path), call.size)
+            file = self.kind_of(call.path)
+            yield CallUnit(self.verb, number, call.name, file, call.size)
 
     def kind_of(self, path: Path) -> str:
         """What a path is, in words."""
@@ -342,7 +347,8 @@ class Scene(ABC):
             yield "the history has no calibration after the next command"
 
     def _files(self) -> dict[Path, bytes]:
-        return {path: path.read_bytes() for path in self.place.rglob("*") if path.is_file()}
+        files = self.place.rglob("*")
+        return {path: path.read_bytes() for path in files if path.is_file()}
 
     def is_counted(self, path: Path) -> bool:
         """Whether a change of this file is one of the calls."""
@@ -385,7 +391,8 @@ class ApplyScene(Scene):
     @property
     def cell(self) -> Path:
         """The demonstration's cell."""
-        return self.place / "configs" / "cells" / "demo.yaml"
+        configs_folder = self.place / "configs"
+        return configs_folder / "cells" / "demo.yaml"
 
     def prepare(self) -> None:
         """Copy the shipped configurations, and make a calibration."""
@@ -457,10 +464,12 @@ class DrivesScene(ApplyScene):
         self.cell.write_text(json.dumps(document), encoding="utf-8")
         self.calibration = calibration_for(self.cell)
         # Short waits: nobody else is on this bus.
+        bounds = Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05)
+        policy = SdoPolicy(0.3, 3)
         network.CanopenNetwork = partial(  # type: ignore[misc,assignment]
             CanopenNetwork,
-            bounds=Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05),
-            policy=SdoPolicy(0.3, 3),
+            bounds=bounds,
+            policy=policy,
         )
 
     @property
@@ -495,7 +504,8 @@ class DrivesScene(ApplyScene):
         if content is not Content.MIXED:
             return
         now = json.loads(self.gains())
-        possible = zip(json.loads(self.old), json.loads(self.new), strict=True)
+        document = json.loads(self.old)
+        possible = zip(document, json.loads(self.new), strict=True)
         for gains, (old, new) in zip(now, possible, strict=True):
             if not set(gains) <= {*old, *new}:
                 yield f"a drive has {gains}, neither {old} nor {new}"
@@ -593,11 +603,13 @@ class SessionScene(JobScene):
 
     def conclude(self, journal: Journal) -> Conclusion:
         """Run the session, with an operator who does and approves everything."""
+        settings = settings_of(self.rig)
+        operator = given_answers(self.rig)
         return calibrate(
             self.cell,
             self.rig.cell,
-            settings_of(self.rig),
-            given_answers(self.rig),
+            settings,
+            operator,
             self.rig.tools,
             journal,
             lock_folder=self.place,

@@ -71,7 +71,8 @@ def _is_new(_: re.Match[str], facts: Facts) -> bool:
 
 
 def _subject_as_before(found: re.Match[str], facts: Facts) -> bool:
-    return facts.is_as_before(Path(found["subject"]))
+    path = Path(found["subject"])
+    return facts.is_as_before(path)
 
 
 def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
@@ -92,7 +93,8 @@ def _subject_not_begun(found: re.Match[str], facts: Facts) -> bool:
 
 
 def _written_with_path(found: re.Match[str], facts: Facts) -> bool:
-    backup = facts.after.get(Path(found["backup"]))
+    path = Path(found["backup"])
+    backup = facts.after.get(path)
     return facts.content is Content.NEW and backup == facts.before[facts.controller]
 
 
