@@ -276,7 +276,8 @@ def _weighted_mean(
     prior: FloatArray | float, prior_weight: float, found: FloatArray, weight: int
 ) -> FloatArray:
     """Mean of a prior and of what was found."""
-    return np.asarray((prior_weight * prior + weight * found) / (prior_weight + weight))
+    total = prior_weight * prior + weight * found
+    return np.asarray(total / (prior_weight + weight))
 
 
 def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
@@ -580,11 +581,15 @@ def cusum_paths(
     for i in range(1, values.shape[-1]):
         last = min(i, chart.baseline) - 1
         baseline_variance = 1.0 / weights[..., last]
-        std = dispersion * np.sqrt(stds[..., i] ** 2 + baseline_variance)
+        variance = stds[..., i] ** 2 + baseline_variance
+        std = dispersion * np.sqrt(variance)
         z = (values[..., i] - means[..., last]) / std
+        # C⁺ + z − k and C⁻ − z − k, never below zero
+        above = upper[..., i - 1] + z - chart.reference
+        below = lower[..., i - 1] - z - chart.reference
         deviations[..., i] = z
-        upper[..., i] = np.maximum(0.0, upper[..., i - 1] + z - chart.reference)
-        lower[..., i] = np.maximum(0.0, lower[..., i - 1] - z - chart.reference)
+        upper[..., i] = np.maximum(0.0, above)
+        lower[..., i] = np.maximum(0.0, below)
     return deviations, upper, lower
 
 
