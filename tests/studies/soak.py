@@ -358,7 +358,8 @@ def soak(bus: ChaosBus, folder: Path, options: argparse.Namespace) -> list[Row]:
         )
         with cell_running(place) as cell, console(place.cell, unread=True):
             while next_rate(rows, rates) == rate_hz:
-                terminal = len(rows) % 2 == 1
+                earlier = sum(one.rate_hz == rate_hz for one in rows)
+                terminal = earlier % 2 == 1
                 row, verdict = record(place, cell, seconds, terminal=terminal)
                 rows.append(row)
                 append_row(results, row)
