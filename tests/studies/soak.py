@@ -276,6 +276,9 @@ def record(place: Place, cell: Verb, seconds: float, *, terminal: bool) -> tuple
                     )
                 )
             watch.add("recorder", process.pid)
+            # Without a reader of its screen it would not end.
+            stack.callback(screen.go_on)
+            stack.callback(process.kill)
             play_screen(process, screen, seconds + START_S + OVERDUE_S)
             ended_ns = time.time_ns()
     screen.close()
