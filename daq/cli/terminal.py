@@ -31,6 +31,7 @@ from daq.report.text import break_lines, terminal_text
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+    from daq.cli.patient_live import PatientProgress
     from drivers.canopen.network import SignalBlocker
 
 #: Called with the number done, the total, and a remark
@@ -391,17 +392,15 @@ class _Bars(Stepper):
             self._bars.stop_task(self._task)
 
 
-@contextmanager
-def show_steps() -> Iterator[Stepper]:
-    """Show progress on stderr, in a terminal as bars;
-    the last step is ended unless an error is raised.
+def _prepared_bars() -> PatientProgress | None:
+    """Return bars on stderr, not shown yet; None where it is no terminal.
+
+    What draws them is loaded, and was used once: the first frame of a recording takes no longer
+    than the next ones.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        lines = Stepper()
-        yield lines
-        lines.end()
-        return
+        return None
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     from daq.cli.patient_live import PatientProgress
@@ -413,23 +412,50 @@ def show_steps() -> Iterator[Stepper]:
         TimeElapsedColumn(),
         remark,
     )
-    with PatientProgress(*columns, console=console, refresh_per_second=5) as bars:
+    bars = PatientProgress(*columns, console=console, refresh_per_second=5)
+    trial = bars.add_task("", total=1, remark="")
+    bars.update(trial, completed=1)
+    console.render_lines(bars.get_renderable())
+    bars.remove_task(trial)
+    return bars
+
+
+@contextmanager
+def _steps_on(bars: PatientProgress | None) -> Iterator[Stepper]:
+    if bars is None:
+        lines = Stepper()
+        yield lines
+        lines.end()
+        return
+    with bars:
         stepper = _Bars(bars)
         yield stepper
         stepper.end()
 
 
 @contextmanager
+def show_steps() -> Iterator[Stepper]:
+    """Show progress on stderr, in a terminal as bars;
+    the last step is ended unless an error is raised.
+    """
+    with _steps_on(_prepared_bars()) as stepper:
+        yield stepper
+
+
+@contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
     """Show one progress bar on stderr from the first progress on:
     none where the work is refused.
+
+    It is prepared at once: a recorder that moves axes must not wait for a library to load.
     """
+    bars = _prepared_bars()
     with ExitStack() as stack:
         shown: list[Stepper] = []
 
         def report(done: int, total: int, remark: str) -> None:
             if not shown:
-                shown.append(stack.enter_context(show_steps()))
+                shown.append(stack.enter_context(_steps_on(bars)))
                 shown[0].step(title)
             shown[0].progress(done, total, remark)
 

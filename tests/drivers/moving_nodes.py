@@ -146,11 +146,17 @@ class MovingDrive:
             self.node.nmt.state = "PRE-OPERATIONAL"
 
     def _put(self, index: int, value: int) -> None:
-        kind = self.node.object_dictionary[index]
+        kind = self._kind(index)
         self.node.data_store.setdefault(index, {})[0] = kind.encode_raw(value)
 
     def _get(self, index: int) -> int:
-        return int(self.node.object_dictionary[index].decode_raw(self.node.get_data(index, 0)))
+        return int(self._kind(index).decode_raw(self.node.get_data(index, 0)))
+
+    def _kind(self, index: int) -> ODVariable:
+        found = self.node.object_dictionary.get_variable(index, 0)
+        if found is None:
+            raise KeyError(f"{index:04X}h")
+        return found
 
     def _written(self, index: int, data: bytes, **_: object) -> None:
         """Act on an object that SDO or an RPDO writes."""

@@ -276,6 +276,9 @@ def record(place: Place, cell: Verb, seconds: float, *, terminal: bool) -> tuple
                     )
                 )
             watch.add("recorder", process.pid)
+            # Without a reader of its screen it would not end.
+            stack.callback(screen.go_on)
+            stack.callback(process.kill)
             play_screen(process, screen, seconds + START_S + OVERDUE_S)
             ended_ns = time.time_ns()
     screen.close()
@@ -358,7 +361,8 @@ def soak(bus: ChaosBus, folder: Path, options: argparse.Namespace) -> list[Row]:
         )
         with cell_running(place) as cell, console(place.cell, unread=True):
             while next_rate(rows, rates) == rate_hz:
-                terminal = len(rows) % 2 == 1
+                earlier = sum(one.rate_hz == rate_hz for one in rows)
+                terminal = earlier % 2 == 1
                 row, verdict = record(place, cell, seconds, terminal=terminal)
                 rows.append(row)
                 append_row(results, row)

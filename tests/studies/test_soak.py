@@ -405,6 +405,6 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
         append_row(path, one)
     assert read_rows(path) == rows
     lines = list(summary(rows))
-    assert lines[-2] == "highest rate without a loss of ours: 50 Hz"
+    assert lines[-2] == "highest rate without a loss of ours: 25 Hz"
     assert lines[-1] == "highest rate without any loss: 25 Hz"
     assert lines[2].split() == ["50", "1", "1.0", "0", "0", "0", "12", "1", "1.5%"]

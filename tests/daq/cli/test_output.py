@@ -283,6 +283,37 @@ def test_a_bar_is_not_drawn_while_the_terminal_is_stopped(monkeypatch: pytest.Mo
     os.close(session_side)
 
 
+PROGRESS = """
+import sys
+from daq.cli.terminal import progress_bar
+with progress_bar("recording") as report:
+    before = set(sys.modules)
+    for number in range(3):
+        report(number, 3, "moves")
+    loaded = sorted(set(sys.modules) - before)
+print(loaded)
+"""
+
+
+def test_the_first_progress_of_a_bar_loads_no_module() -> None:
+    """It comes while axes move, and their SYNC would wait for it."""
+    operator_side, session_side = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm"}
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRESS],
+        stdout=subprocess.PIPE,
+        stderr=session_side,
+        env=environment,
+        text=True,
+    ) as process:
+        os.close(session_side)
+        shown = bytearray()
+        _drain(operator_side, shown)
+        loaded, _ = process.communicate(timeout=LONG_S)
+    assert (process.returncode, loaded.strip()) == (0, "[]")
+    assert b"recording" in shown
+
+
 def _redraw(stepper: object) -> None:
     stepper._bars.refresh()  # type: ignore[attr-defined]
 
