@@ -11,12 +11,9 @@ import pytest
 from coverage import CoverageData
 
 from tests.mutation.coverage_map import (
-    NO_TESTS_WERE_COLLECTED,
     CoverageMap,
-    environment_of,
     lines_that_read,
 )
-from tests.mutation.fork_server import ForkServer
 from tests.mutation.mutants import Mutant, compiles, mutants_of
 from tests.mutation.study import Outcome, chosen_mutants, mirrored, room_of, summary
 
@@ -192,13 +189,3 @@ def test_the_file_named_after_a_module_comes_first_and_then_the_cheapest(tmp_pat
     ]
     # However dear it is, one file is tried.
     assert covered.affordable(list(durations), 1.0) == ["tests/x/test_cheap.py::one"]
-
-
-def test_a_fork_of_the_server_runs_the_named_tests_and_no_others() -> None:
-    own = "tests/mutation/test_mutants.py::test_a_planted_fault_can_be_taken_out_again"
-    with ForkServer(ROOT, environment_of(ROOT)) as server:
-        found = server.run([own], 300.0, 60.0)
-        nothing = server.run([f"{own}_at_all"], 300.0, 60.0)
-    assert found.status == 0
-    assert "1 passed" in found.printed
-    assert nothing.status == NO_TESTS_WERE_COLLECTED

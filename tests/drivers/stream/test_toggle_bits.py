@@ -90,4 +90,4 @@ def test_the_second_axis_is_watched_while_the_first_is_missing_or_toggles() -> N
         (stale,) = found[2]
         assert (stale[0], stale[1]) == (1, BIT)
         assert "J2 (node 2): statusword bit 14 has not toggled for 2 cycles, 2 ms" in str(stale[2])
-        assert not [one for number in (0, 1, 3) for one in found[number]]
+        assert found[0] + found[1] + found[3] == []
