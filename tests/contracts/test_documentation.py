@@ -26,9 +26,10 @@ PAGES = sorted((ROOT / "docs").rglob("*.md"))
 
 
 def test_pages_named_in_code_and_messages_exist() -> None:
-    listed = subprocess.run(
+    completed = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split("\n")
+    )
+    listed = completed.stdout.split("\n")
     places = [name for name in listed if re.search(r"\.(py|md|yaml|toml|svg)$|^Makefile$", name)]
     named = 0
     for place in places:
@@ -80,18 +81,22 @@ def test_every_page_is_in_the_navigation() -> None:
 
 
 def test_pictures_are_small_and_load_nothing() -> None:
-    pictures = [one for one in (ROOT / "docs" / "pictures").iterdir() if one.is_file()]
+    pictures_folder = ROOT / "docs" / "pictures"
+    files = pictures_folder.iterdir()
+    pictures = [one for one in files if one.is_file()]
     assert pictures
     for picture in pictures:
         assert picture.stat().st_size < LARGEST_PICTURE_BYTES, picture
         if picture.suffix == ".svg":
-            addresses = re.findall(r"https?://[^\"')\s]+", picture.read_text(encoding="utf-8"))
+            text = picture.read_text(encoding="utf-8")
+            addresses = re.findall(r"https?://[^\"')\s]+", text)
             assert set(addresses) <= {"http://www.w3.org/2000/svg"}, picture
 
 
 @pytest.fixture(scope="module")
 def drawings() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("drawings", ROOT / "docs" / "drawings.py")
+    drawings_path = ROOT / "docs" / "drawings.py"
+    spec = importlib.util.spec_from_file_location("drawings", drawings_path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -102,21 +107,25 @@ def drawings() -> ModuleType:
 @pytest.mark.parametrize("name", ["five-bar", "orthoglide", "dualv"])
 def test_drawn_mechanisms_are_those_of_the_cells(drawings: Any, name: str) -> None:
     shown = drawings.mechanism(name)
-    robot = robot_of(load_cell(ROOT / "configs" / "cells" / f"{name}.yaml"))
+    cells_folder = ROOT / "configs" / "cells"
+    path = cells_folder / f"{name}.yaml"
+    robot = robot_of(load_cell(path))
     assert len(shown.motors) == robot.axis_count
     assert len(shown.passive) == len(robot.passive_joints)
     assert len(shown.closures) == len(robot.closures)
     # Loops close in the drawing, and the platform is drawn on the link that carries the payload.
     assert all(np.allclose(first, second, atol=1e-9) for first, second in shown.closures)
     body = np.array(shown.bodies[shown.carrier])
-    assert (shown.platform > body.min(axis=0) - 1e-9).all() and (
+    smallest_body = body.min(axis=0)
+    assert (shown.platform > smallest_body - 1e-9).all() and (
         shown.platform < body.max(axis=0) + 1e-9
     ).all()
 
 
 def test_the_picture_of_the_mechanisms_is_up_to_date(drawings: Any) -> None:
     drawn = drawings.mechanisms()
-    kept = (ROOT / "docs" / "pictures" / "mechanisms.svg").read_text(encoding="utf-8")
+    pictures_folder = ROOT / "docs" / "pictures"
+    kept = (pictures_folder / "mechanisms.svg").read_text(encoding="utf-8")
     number = r"-?\d+\.\d"
     assert re.sub(number, "#", drawn) == re.sub(number, "#", kept), "run `make screenshots`"
     # The last digit of a coordinate is the processor's.
@@ -137,24 +146,29 @@ CHAINS = {
 @pytest.mark.parametrize("row", CHAINS)
 def test_what_is_identifiable_on_a_closed_chain_is_as_documented(row: str) -> None:
     name, shown = CHAINS[row]
-    cell = load_cell(ROOT / "configs" / "cells" / f"{name}.yaml")
+    cells_folder = ROOT / "configs" / "cells"
+    path = cells_folder / f"{name}.yaml"
+    cell = load_cell(path)
     model = model_of(cell)
     draw = np.random.default_rng(1)
-    robot, (lower, upper) = model.robot, np.array([axis.limits.position for axis in cell.axes]).T
-    found = reach(robot, model.assembly, 0.6 * draw.uniform(lower, upper, (400, len(lower))))
+    positions = np.array([axis.limits.position for axis in cell.axes])
+    robot, (lower, upper) = model.robot, positions.T
+    axes_rad = 0.6 * draw.uniform(lower, upper, (400, len(lower)))
+    found = reach(robot, model.assembly, axes_rad)
     position = found.position_rad[found.closed][:, list(robot.axis_joints)]
     speed, acceleration = draw.standard_normal((2, *position.shape))
-    columns = np.concatenate(
-        list(model.regressor(Motion(position, speed, 8.0 * acceleration))), axis=1
-    ).T
-    base = base_parameters(triangle_of(columns.T), tuple(column.name for column in model.columns))
+    acceleration_rad_s2 = 8.0 * acceleration
+    motion = Motion(position, speed, acceleration_rad_s2)
+    columns = np.concatenate(list(model.regressor(motion)), axis=1).T
+    triangle = triangle_of(columns.T)
+    base = base_parameters(triangle, tuple(column.name for column in model.columns))
     counts = (
         f"{robot.joint_count}, {robot.axis_count}, {model.assembly.mobility} | {columns.shape[1]} "
         f"→ {len(base.names)}"
     )
-    assert (f"| {row} | {counts} |") in (ROOT / "docs" / "explanation" / "method.md").read_text(
-        encoding="utf-8"
-    )
+    explanation_folder = ROOT / "docs" / "explanation"
+    text = (explanation_folder / "method.md").read_text(encoding="utf-8")
+    assert (f"| {row} | {counts} |") in text
     payload = np.linalg.norm(columns[:, model.flange], axis=0)
     names = (column.name.rstrip("0123456789") for column in model.columns[model.flange])
     seen = [name for name, size in zip(names, payload, strict=True) if size > 1e-9 * payload.max()]

@@ -61,9 +61,8 @@ def _below(kind: type[Any]) -> Iterator[type[Exception]]:
 def _made(kind: type[Exception]) -> Exception:
     if kind.__init__ is Exception.__init__:
         return kind("some text")
-    given = [
-        p for p in inspect.signature(kind).parameters.values() if p.kind is not p.VAR_POSITIONAL
-    ]
+    parameters = inspect.signature(kind).parameters
+    given = [p for p in parameters.values() if p.kind is not p.VAR_POSITIONAL]
     by_name = {p.name: EVIDENCE[p.annotation] for p in given if p.kind is p.KEYWORD_ONLY}
     return kind(*[EVIDENCE[p.annotation] for p in given if p.kind is not p.KEYWORD_ONLY], **by_name)
 

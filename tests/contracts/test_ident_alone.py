@@ -48,14 +48,16 @@ for name in ident.__all__:
 
 
 def _run(checkout: Path, code: str, also: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": str(checkout)}
+    gains_from_arrays_path = checkout / "examples" / "gains_from_arrays.py"
     return subprocess.run(
         [
             sys.executable,
             "-c",
             f"ALSO = {also}\n" + REFUSING + code,
-            str(checkout / "examples" / "gains_from_arrays.py"),
+            str(gains_from_arrays_path),
         ],
-        env={**os.environ, "PYTHONPATH": str(checkout)},
+        env=env,
         capture_output=True,
         text=True,
         check=False,
@@ -66,11 +68,13 @@ def test_the_example_fits_with_numpy_and_scipy_alone(checkout: Path) -> None:
     done = _run(checkout, EXAMPLE)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("±") == 3
-    assert done.stdout.splitlines()[-1] == "(19998, 3)"
+    last_line = done.stdout.splitlines()[-1]
+    assert last_line == "(19998, 3)"
 
 
 @pytest.mark.parametrize("package", ["yaml", "pydantic", "can", "daq"])
 def test_what_is_refused_cannot_be_imported(checkout: Path, package: str) -> None:
-    refused = _run(checkout, f"import {package}")
+    code = f"import {package}"
+    refused = _run(checkout, code)
     assert refused.returncode == 1
     assert "refused by the test" in refused.stderr

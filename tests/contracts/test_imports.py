@@ -37,10 +37,11 @@ def _lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
         "import sys; sys.path.insert(0, ''); from importlinter.cli import lint_imports_command; "
         "lint_imports_command()"
     )
+    env = {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"}
     return subprocess.run(
         [sys.executable, "-c", code, "--no-cache"],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"},
+        env=env,
         capture_output=True,
         text=True,
         check=False,
@@ -162,16 +163,17 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The packages copied, and all their contracts broken at once."""
     folder = tmp_path_factory.mktemp("broken")
     for package in PACKAGES:
-        shutil.copytree(
-            ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__")
-        )
+        ignore = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / package, folder / package, ignore=ignore)
     shutil.copyfile(ROOT / "pyproject.toml", folder / "pyproject.toml")
     begin = "from __future__ import annotations\n"
     for file, line, _ in BROKEN:
         path = folder / file
-        path.write_text(path.read_text().replace(begin, f"{begin}\n{line}\n", 1))
+        changed_text = path.read_text().replace(begin, f"{begin}\n{line}\n", 1)
+        path.write_text(changed_text)
     for package in PACKAGES:
-        (folder / package / "nowhere.py").write_text('"""A module that no layer names."""\n')
+        nowhere_path = folder / package / "nowhere.py"
+        nowhere_path.write_text('"""A module that no layer names."""\n')
     circle = folder / CIRCLE[0]
     circle.write_text(circle.read_text().replace(begin, f"{begin}\nimport {CIRCLE[1]}\n", 1))
     done = _lint_imports(folder)
@@ -228,7 +230,8 @@ def test_the_helper_of_the_front_doors_imports_the_standard_library_alone() -> N
     whatever it imports, all three would.
     """
     imported = set[str]()
-    for node in ast.walk(ast.parse((ROOT / "lazy_names.py").read_text())):
+    text = (ROOT / "lazy_names.py").read_text()
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             imported.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -85,11 +85,13 @@ def test_no_class_or_public_function_is_defined_twice() -> None:
     """An independent simulator (`drivers.simulation`) may have its own."""
     modules: dict[str, list[str]] = {}
     for package in ("daq", "drivers", "ident"):
-        for file in sorted((ROOT / package).rglob("*.py")):
+        files = (ROOT / package).rglob("*.py")
+        for file in sorted(files):
             where = str(file.relative_to(ROOT))
             if not where.startswith("drivers/simulation/"):
                 for name in _defined(file.read_text()):
                     modules.setdefault(name, []).append(where)
     twice = {name: found for name, found in modules.items() if len(found) > 1}
     assert {name: found for name, found in twice.items() if name not in SAME_NAME} == {}
-    assert sorted(set(SAME_NAME) - set(twice)) == []
+    difference = set(SAME_NAME) - set(twice)
+    assert sorted(difference) == []

@@ -86,7 +86,8 @@ def test_what_is_in_public_signatures_is_exported() -> None:
                     if not field.startswith("_") and one.__name__ not in ident.__all__:
                         missing[one.__name__] = name
     assert {name: where for name, where in missing.items() if name not in OPAQUE} == {}
-    assert sorted(set(OPAQUE) - set(missing)) == []
+    difference = set(OPAQUE) - set(missing)
+    assert sorted(difference) == []
 
 
 @pytest.mark.parametrize("name", [name for name, thing in _public() if callable(thing)])

@@ -27,18 +27,24 @@ def test_the_lock_has_hashes_and_no_address() -> None:
 
 
 def test_every_dependency_is_in_the_lock() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    text = (ROOT / "pyproject.toml").read_text()
+    project = tomllib.loads(text)
+    dependencies = project["project"]["dependencies"]
+    dev = project["dependency-groups"]["dev"]
+    requires = project["build-system"]["requires"]
     asked = [
-        *project["project"]["dependencies"],
-        *project["dependency-groups"]["dev"],
-        *project["build-system"]["requires"],
+        *dependencies,
+        *dev,
+        *requires,
     ]
-    locked = {_normal(name) for name in re.findall(r"^([a-zA-Z0-9_.-]+)==", LOCK, re.MULTILINE)}
+    matches = re.findall(r"^([a-zA-Z0-9_.-]+)==", LOCK, re.MULTILINE)
+    locked = {_normal(name) for name in matches}
     assert {_normal(re.split(r"[<>=~! ;\[]", one)[0]) for one in asked} <= locked
 
 
 def test_the_decisions_are_numbered_once() -> None:
-    pages = sorted((ROOT / "docs" / "decisions").glob("*"))
+    decisions_folder = ROOT / "docs" / "decisions"
+    pages = sorted(decisions_folder.glob("*"))
     numbers = [page.name[:4] for page in pages]
     assert len(set(numbers)) == len(numbers) > 0
     for page in pages:
@@ -51,27 +57,32 @@ def test_every_verb_shows_an_example_of_itself(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([name, "--help"]) == 0
-    assert f"Example: drivegain {name}" in " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    assert f"Example: drivegain {name}" in " ".join(printed.split())
 
 
 def test_every_file_that_the_documents_point_to_is_there() -> None:
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
+    files = (ROOT / "docs").rglob("*.md")
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *files):
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
 def test_every_make_target_that_the_documents_name_exists() -> None:
-    made = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    text = (ROOT / "Makefile").read_text()
+    matches = re.findall(r"^([a-z]+):", text, re.MULTILINE)
+    made = set(matches)
     for page in ("README.md", "CONTRIBUTING.md"):
         for target in re.findall(r"\bmake ([a-z]+)\b(?=`|\n|  )", (ROOT / page).read_text()):
             assert target in made, f"{page}: make {target}"
 
 
 def test_every_command_of_the_readme_is_one(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "README.md").read_text()
     commands = re.findall(
         r"^drivegain "
         r"([a-z]+)(.*)$",
-        (ROOT / "README.md").read_text(),
+        text,
         re.MULTILINE,
     )
     assert len(commands) >= 5

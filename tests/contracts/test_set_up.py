@@ -26,14 +26,16 @@ Requirement already satisfied: pip==25.0 in ./lib (from -r requirements.lock (li
 
 @pytest.fixture
 def set_up(checkout: Path) -> dict[str, Any]:
-    return run_path(str(checkout / ".ci" / "set_up.py"))
+    set_up_path = checkout / ".ci" / "set_up.py"
+    return run_path(str(set_up_path))
 
 
 def test_it_is_said_how_many_packages_of_how_many(set_up: dict[str, Any]) -> None:
     progress = set_up["Progress"](5)
     for line in SAID.splitlines(keepends=True):
         progress = progress.heard(line)
-    assert list(progress.fetched) == ["numpy 2.4.6", "can 4.5", "cmeel_qhull 8.0.2.1", "pip 25.0"]
+    expected = ["numpy 2.4.6", "can 4.5", "cmeel_qhull 8.0.2.1", "pip 25.0"]
+    assert list(progress.fetched) == expected
     assert progress.words(0) == "fetched 4 of 4 packages, 16 MB: pip 25.0"
     progress = progress.heard("Installing collected packages: numpy, can, cmeel_qhull\n")
     assert progress.words(2) == "unpacked 2 of 3 packages"
@@ -51,9 +53,11 @@ def test_the_lock_is_counted_with_what_other_machines_need(
 def test_what_pip_complains_of_is_shown(checkout: Path, tmp_path: Path) -> None:
     lock = tmp_path / "requirements.lock"
     lock.write_text(f"no-such-package==1.0 --hash=sha256:{64 * '0'}\n")
+    env = {**os.environ, "PIP_NO_INDEX": "1"}
+    set_up_path = checkout / ".ci" / "set_up.py"
     done = subprocess.run(
-        [sys.executable, checkout / ".ci" / "set_up.py", lock],
-        env={**os.environ, "PIP_NO_INDEX": "1"},
+        [sys.executable, set_up_path, lock],
+        env=env,
         capture_output=True,
         text=True,
         check=False,
@@ -104,8 +108,9 @@ def set_up_with(
 
 def interpreter_of(environment: Path) -> str:
     """Return which interpreter an environment was made by."""
+    python_folder = environment / "bin" / "python"
     said = subprocess.run(
-        [environment / "bin" / "python", "-c", "which"], capture_output=True, text=True, check=True
+        [python_folder, "-c", "which"], capture_output=True, text=True, check=True
     )
     return said.stdout.strip()
 
@@ -126,7 +131,8 @@ def test_an_environment_of_another_interpreter_is_made_again(makefile: Path) -> 
 def test_an_environment_stays_where_no_interpreter_is_named(makefile: Path) -> None:
     set_up_with(makefile, "PYTHON=./two")
     assert "setting up" not in set_up_with(makefile).stdout
-    assert interpreter_of(makefile / ".venv") == "two"
+    environment = makefile / ".venv"
+    assert interpreter_of(environment) == "two"
 
 
 def test_an_interpreter_that_does_not_run_destroys_no_environment(makefile: Path) -> None:
@@ -134,11 +140,13 @@ def test_an_interpreter_that_does_not_run_destroys_no_environment(makefile: Path
     done = set_up_with(makefile, "PYTHON=./three")
     assert done.returncode != 0
     assert "drivegain needs Python 3.11 or later" in done.stderr
-    assert interpreter_of(makefile / ".venv") == "one"
+    environment = makefile / ".venv"
+    assert interpreter_of(environment) == "one"
 
 
 def test_another_environment_leaves_the_usual_one_as_it_is(makefile: Path) -> None:
     set_up_with(makefile, "PYTHON=./one")
     assert set_up_with(makefile, "PYTHON=./two", "VENV=out/venv-two").returncode == 0
-    assert interpreter_of(makefile / "out" / "venv-two") == "two"
+    environment = makefile / "out" / "venv-two"
+    assert interpreter_of(environment) == "two"
     assert interpreter_of(makefile / ".venv") == "one"

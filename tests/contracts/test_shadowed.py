@@ -74,4 +74,5 @@ def test_an_empty_folder_shadows_nothing(checkout: Path, tmp_path: Path) -> None
 def test_another_import_that_fails_stays_what_it_is(checkout: Path, tmp_path: Path) -> None:
     _shadow(tmp_path, "yaml.py", "raise ImportError('a yaml of my own')\n")
     failed = _run(checkout, tmp_path, USE["daq"])
-    assert failed.stderr.splitlines()[-1] == "ImportError: a yaml of my own"
+    last_line = failed.stderr.splitlines()[-1]
+    assert last_line == "ImportError: a yaml of my own"

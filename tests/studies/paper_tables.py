@@ -221,7 +221,7 @@ def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
     rows = []
     for case in CASES:
         of = [cell[case] for cell in merits.values()]
-        gains = []
+        gains: list[float] = []
         for merit in of:
             gains.extend(merit.gains)
         means = (

@@ -68,7 +68,7 @@ def test_a_defect_of_the_code_ends_the_study() -> None:
 
 
 def test_the_other_way_that_never_was_enough_takes_for_ever() -> None:
-    steps = {"duration_s": None, "worst_error_percent": {}}
+    steps: dict[str, Any] = {"duration_s": None, "worst_error_percent": {}}
     unit = _unit(GUIDED, steps)
     assert row_of(unit).ratio == 0.0
     refused = way_or_reason(_refuse)

@@ -33,16 +33,21 @@ def random_problem(rng: np.random.Generator) -> Linearisation:
         parts.append(own[is_seen])
         seen.append(np.flatnonzero(is_seen))
     raw = rng.normal(size=len(motor)) + 0.3 * np.sin(np.arange(len(motor)))
+    residual = raw - jacobian @ fitted_to(jacobian, raw)
+    current = 5.0 * rng.normal(size=len(motor))
+    source = np.arange(len(motor))
+    gamma = np.ones(MOTORS)
+    free = np.arange(WIDTH)
     return Linearisation(
         jacobian=Jacobian(tuple(parts), tuple(seen), WIDTH),
-        residual=raw - jacobian @ fitted_to(jacobian, raw),
-        current=5.0 * rng.normal(size=len(motor)),
+        residual=residual,
+        current=current,
         motor=motor,
         cluster=cluster,
-        source=np.arange(len(motor)),
-        gamma=np.ones(MOTORS),
+        source=source,
+        gamma=gamma,
         noise=np.ones(MOTORS),
-        free=np.arange(WIDTH),
+        free=free,
         scale=np.ones(WIDTH),
     )
 

@@ -39,7 +39,8 @@ def _held_out(small: Evidence, count: int) -> Evidence:
     rows = small.rows_without_effects
     first = len(small.datasets) - count
     training = rows.only(rows.run < first)
-    return replace(small, held_out=count, training=training, holdout=rows.only(rows.run >= first))
+    holdout = rows.only(rows.run >= first)
+    return replace(small, held_out=count, training=training, holdout=holdout)
 
 
 def _planted(
@@ -53,7 +54,8 @@ def _planted(
 
 def _sticks(data: Dataset) -> FloatArray:
     v = data.velocity_rad_s[:, 1]
-    return acting_on(1, 3, 6.0 * np.sign(v) * np.exp(-np.abs(v) / 0.3))
+    torque_nm = 6.0 * np.sign(v) * np.exp(-np.abs(v) / 0.3)
+    return acting_on(1, 3, torque_nm)
 
 
 def _only_in(
@@ -64,7 +66,9 @@ def _only_in(
 
 
 def _asymmetric(data: Dataset) -> FloatArray:
-    return acting_on(0, 3, 4.0 * np.abs(data.velocity_rad_s[:, 0]))
+    absolute_velocity_rad_s = np.abs(data.velocity_rad_s[:, 0])
+    torque_nm = 4.0 * absolute_velocity_rad_s
+    return acting_on(0, 3, torque_nm)
 
 
 def _steps(start: Evidence, effects: tuple[PlacedEffect, ...]) -> tuple[Step, ...]:
@@ -89,7 +93,9 @@ def _steps(start: Evidence, effects: tuple[PlacedEffect, ...]) -> tuple[Step, ..
         for one in effects
     ]
     turns = [Step((), (), np.zeros(3), one, after) for one in found]
-    return (*turns, Step((), (), np.zeros(3), None, after))
+    limits_nm = np.zeros(3)
+    step = Step((), (), limits_nm, None, after)
+    return (*turns, step)
 
 
 def _by_place(step: Step) -> dict[PlacedEffect, EffectVerdict]:
@@ -102,7 +108,8 @@ def sticking(small: Evidence, small_truth: Truth) -> Evidence:
 
 
 def test_a_true_effect_is_confirmed_and_stays(sticking: Evidence) -> None:
-    (*_, last) = accept_on_holdout(sticking, _steps(sticking, (STICKING,)), axes=NAMES)
+    steps = _steps(sticking, (STICKING,))
+    (*_, last) = accept_on_holdout(sticking, steps, axes=NAMES)
     assert last.after.effects == (STICKING,)
     (verdict,) = last.verdicts
     assert verdict.judgement is Judgement.CONFIRMED
@@ -114,12 +121,12 @@ def test_a_refuted_effect_leaves_and_the_rest_is_fitted_again(
     small: Evidence, small_truth: Truth
 ) -> None:
     """Runs of the fit have a torque that the held-out one lacks: no law of the arm."""
-    fitted = _only_in(("run0", "run1", "run2"), _asymmetric)
+    names = ("run0", "run1", "run2")
+    fitted = _only_in(names, _asymmetric)
     start = _planted(small, small_truth, lambda data: _sticks(data) + fitted(data))
     said: list[str] = []
-    (*_, last) = accept_on_holdout(
-        start, _steps(start, (STICKING, ASYMMETRIC)), axes=NAMES, progress=said.append
-    )
+    steps = _steps(start, (STICKING, ASYMMETRIC))
+    (*_, last) = accept_on_holdout(start, steps, axes=NAMES, progress=said.append)
     assert last.after.effects == (STICKING,)
     verdicts = _by_place(last)
     assert verdicts[ASYMMETRIC].judgement is Judgement.REFUTED
@@ -167,7 +174,9 @@ def test_sigma_contains_what_an_undecided_effect_would_move(small_truth: Truth) 
         linear.estimate.predicted_torque(linear.rows_without_effects) / small_truth.gains[:, None]
     )
     added_a = np.zeros_like(current_a)
-    added_a[1] = 0.3 * current_a[1] ** 3 / np.max(np.abs(current_a[1])) ** 2
+    absolute_current_a = np.abs(current_a[1])
+    largest_absolute_current_a = np.max(absolute_current_a)
+    added_a[1] = 0.3 * current_a[1] ** 3 / largest_absolute_current_a**2
     start = with_effects(_held_out(with_current(linear, added_a), 1), ())
     families = tuple(family for family in EFFECTS if family[0].name == "saturation")
     steps = find_effects(start, np.random.default_rng(0), Gates(draws=199), families)
@@ -179,7 +188,8 @@ def test_sigma_contains_what_an_undecided_effect_would_move(small_truth: Truth) 
     assert verdict.judgement is Judgement.UNDECIDED
     errors = last.after.estimate.gains - small_truth.gains
     assert abs(errors[1]) > 3.0 * start.estimate.gains_std[1]
-    assert np.all(np.abs(errors) < 3.0 * last.after.estimate.gains_std)
+    gains_std = last.after.estimate.gains_std
+    assert np.all(np.abs(errors) < 3.0 * gains_std)
     assert last.choice_std is not None
     assert last.after.estimate.gains_std == pytest.approx(
         np.hypot(start.estimate.gains_std, last.choice_std), rel=1e-6
@@ -187,9 +197,11 @@ def test_sigma_contains_what_an_undecided_effect_would_move(small_truth: Truth) 
 
 
 def test_a_refuted_effect_adds_nothing_to_sigma(small: Evidence, small_truth: Truth) -> None:
-    fitted = _only_in(("run0", "run1", "run2"), _asymmetric)
+    names = ("run0", "run1", "run2")
+    fitted = _only_in(names, _asymmetric)
     start = _planted(small, small_truth, fitted)
-    (*_, last) = accept_on_holdout(start, _steps(start, (ASYMMETRIC,)), axes=NAMES)
+    steps = _steps(start, (ASYMMETRIC,))
+    (*_, last) = accept_on_holdout(start, steps, axes=NAMES)
     (verdict,) = last.verdicts
     assert verdict.judgement is Judgement.REFUTED
     assert last.left_open == ()
@@ -207,24 +219,31 @@ def test_what_is_left_passes_every_gate_again(sticking: Evidence) -> None:
     covariance[own, :] = 0.0
     covariance[:, own] = 0.0
     covariance[own, own] = 1e-12
-    certain = replace(joined, estimate=replace(joined.estimate, covariance=covariance))
+    estimate = replace(joined.estimate, covariance=covariance)
+    certain = replace(joined, estimate=estimate)
     model = linearised(certain, {})
-    last = end_search(steps, model, Gates(draws=199), rng=np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    last = end_search(steps, model, Gates(draws=199), rng=rng)
     assert last.after.effects == ()
     assert last.left_open == (SPRING,)
-    assert last.set_aside[-1].words.startswith("without what has left, ")
+    words = last.set_aside[-1].words
+    assert words.startswith("without what has left, ")
     # Where nothing has left, the search itself has just asked.
-    unchanged = (*steps[:-1], replace(steps[-1], after=certain))
-    assert end_search(
-        unchanged, model, Gates(draws=199), rng=np.random.default_rng(0)
-    ).after.effects == (SPRING,)
+    last_step = steps[-1]
+    changed_step = replace(last_step, after=certain)
+    unchanged = (*steps[:-1], changed_step)
+    gates = Gates(draws=199)
+    after = end_search(unchanged, model, gates, rng=np.random.default_rng(0)).after
+    assert after.effects == (SPRING,)
 
 
 def test_few_held_out_moves_decide_nothing(small: Evidence, small_truth: Truth) -> None:
     start = _planted(small, small_truth, _sticks)
     assert start.holdout is not None
-    moves = np.unique(start.holdout.move)[:2]
-    short = replace(start, holdout=start.holdout.only(np.isin(start.holdout.move, moves)))
+    unique_moves = np.unique(start.holdout.move)
+    moves = unique_moves[:2]
+    holdout = start.holdout.only(np.isin(start.holdout.move, moves))
+    short = replace(start, holdout=holdout)
     found = with_effects(start, (STICKING,))
     assert found.holdout is not None
     few = replace(found, holdout=found.holdout.only(np.isin(found.holdout.move, moves)))
@@ -236,9 +255,12 @@ def test_effects_that_are_no_better_together_than_none_are_not_written(
     small: Evidence, small_truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Even where no single one was refuted: here because the judge was bribed."""
-    start = _planted(small, small_truth, _only_in(("run0", "run1", "run2"), _asymmetric))
+    names = ("run0", "run1", "run2")
+    torque = _only_in(names, _asymmetric)
+    start = _planted(small, small_truth, torque)
     monkeypatch.setattr(acceptance, "judge_change", lambda *_: (Judgement.CONFIRMED, "bribed"))
-    (*_, last) = accept_on_holdout(start, _steps(start, (ASYMMETRIC,)), axes=NAMES)
+    steps = _steps(start, (ASYMMETRIC,))
+    (*_, last) = accept_on_holdout(start, steps, axes=NAMES)
     assert last.after.effects == ()
     (verdict,) = last.verdicts
     assert not verdict.written
@@ -250,7 +272,8 @@ def test_effects_that_are_no_better_together_than_none_are_not_written(
 def test_declared_effects_are_not_judged(sticking: Evidence) -> None:
     after = replace(with_effects(sticking, (SPRING, STICKING)), declared=1)
     declared = replace(with_effects(sticking, (SPRING,)), declared=1)
-    steps = (Step((), (), np.zeros(3), None, after),)
+    limits_nm = np.zeros(3)
+    steps = (Step((), (), limits_nm, None, after),)
     (last,) = accept_on_holdout(declared, steps, axes=NAMES)
     assert SPRING in last.after.effects
     assert last.after.declared == 1

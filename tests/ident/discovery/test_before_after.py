@@ -67,7 +67,8 @@ def after(start: Evidence) -> Evidence:
 @pytest.fixture(scope="module")
 def compared(start: Evidence, after: Evidence) -> Account:
     limits = np.zeros(6)
-    steps = (Step((), (), limits, None, after), Step((), (), limits, None, after))
+    step = Step((), (), limits, None, after)
+    steps = (step, Step((), (), limits, None, after))
     return account(start, steps)
 
 
@@ -76,8 +77,9 @@ def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, compare
     and weighed by the gains.
     """
     estimate = start.estimate
+    in_sample = compared.total.before.in_sample
     for rows, error in (
-        (start.training, compared.total.before.in_sample),
+        (start.training, in_sample),
         (start.holdout, compared.total.before.holdout),
     ):
         assert rows is not None
@@ -97,7 +99,8 @@ def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, compare
 
 def test_an_uncoupled_axis_has_the_error_of_table_6(start: Evidence, compared: Account) -> None:
     """Motors 1 to 4 drive their joints alone: ‖e‖/‖v‖ is ‖ρ‖/‖Y‖ there."""
-    assert compared.total.before.in_sample.axes[:4] == pytest.approx(
+    in_sample = compared.total.before.in_sample
+    assert in_sample.axes[:4] == pytest.approx(
         start.identification.training_error.axes[:4], rel=1e-6
     )
 
@@ -108,7 +111,8 @@ def test_parts_of_the_data_add_up(start: Evidence) -> None:
     whole = error_on(rows, start.estimate)
     parts = CurrentError(np.zeros(6), np.zeros(6))
     for run in range(3):
-        parts = parts + error_on(rows.only(rows.run == run), start.estimate)
+        observation = rows.only(rows.run == run)
+        parts = parts + error_on(observation, start.estimate)
     assert parts.relative(weights).total == pytest.approx(whole.relative(weights).total)
     assert parts.relative(weights).axes == pytest.approx(whole.relative(weights).axes)
 
@@ -152,7 +156,8 @@ def test_held_out_errors_are_compared_by_move(start: Evidence, after: Evidence) 
         for rows, estimate in ((start.holdout, start.estimate), (after.holdout, after.estimate))
     )
     assert change.rise == pytest.approx(after_nm2 - before_nm2)
-    assert change.moves == len(np.unique(start.holdout.move))
+    unique_moves = np.unique(start.holdout.move)
+    assert change.moves == len(unique_moves)
     assert not change.is_rise
     without_the_spring = holdout_change(after, start)
     assert without_the_spring is not None
@@ -185,17 +190,14 @@ def test_the_declared_model_is_found_again_behind_its_effects(
 
 def test_gains_carry_their_own_sigma(start: Evidence, after: Evidence, compared: Account) -> None:
     for motor, gain in enumerate(compared.total.gains):
-        assert (gain.before, gain.before_std) == (
-            start.estimate.gains[motor],
-            start.estimate.gains_std[motor],
-        )
+        expected = (start.estimate.gains[motor], start.estimate.gains_std[motor])
+        assert (gain.before, gain.before_std) == expected
         assert (gain.after, gain.after_std) == (
             after.estimate.gains[motor],
             after.estimate.gains_std[motor],
         )
-        assert gain.change_percent == pytest.approx(
-            100.0 * (gain.after - gain.before) / gain.before
-        )
+        after_difference = gain.after - gain.before
+        assert gain.change_percent == pytest.approx(100.0 * after_difference / gain.before)
 
 
 def test_the_jackknife_of_a_gain_is_that_of_its_estimate(start: Evidence) -> None:
@@ -204,7 +206,8 @@ def test_the_jackknife_of_a_gain_is_that_of_its_estimate(start: Evidence) -> Non
     assert moves is not None
     shifts = moves.shifts(moves.blocks())[:, : len(start.estimate.gains)]
     blocks = len(shifts)
-    std = np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    shift_difference = shifts - shifts.mean(axis=0)
+    std = np.sqrt((blocks - 1) / blocks * np.sum(shift_difference**2, axis=0))
     assert std == pytest.approx(start.estimate.gains_std, rel=0.02)
 
 
@@ -213,11 +216,14 @@ def test_an_effect_that_is_not_there_changes_no_gain_and_one_that_is_does(
 ) -> None:
     saturation = PlacedEffect(Saturation(), 1)
     weights = small.estimate.gains
-    idle = before_after(assess(small, weights), assess(with_effects(small, (saturation,)), weights))
+    evidence = with_effects(small, (saturation,))
+    idle = before_after(assess(small, weights), assess(evidence, weights))
     assert not any(gain.significant for gain in idle.gains)
     # The change shares its noise with both estimates: it is known better than either where the
     # effect says little.
-    assert idle.gains[0].change_std < 0.5 * idle.gains[0].before_std
+    change_std = idle.gains[0].change_std
+    before_std = idle.gains[0].before_std
+    assert change_std < 0.5 * before_std
     runs = []
     for run in small_runs:
         current = run.current_a.copy()
@@ -228,9 +234,10 @@ def test_an_effect_that_is_not_there_changes_no_gain_and_one_that_is_does(
         assess(bent, weights), assess(with_effects(bent, (saturation,)), weights)
     )
     assert changed.gains[1].significant
-    assert abs(changed.gains[1].after - small_truth.gains[1]) < abs(
-        changed.gains[1].before - small_truth.gains[1]
-    )
+    after_difference = abs(changed.gains[1].after - small_truth.gains[1])
+    before = changed.gains[1].before
+    before_difference = before - small_truth.gains[1]
+    assert after_difference < abs(before_difference)
 
 
 def test_a_left_out_run_is_predicted_by_the_others_alone(
@@ -238,7 +245,8 @@ def test_a_left_out_run_is_predicted_by_the_others_alone(
 ) -> None:
     weights = after.estimate.gains
     found = left_out_runs(after, weights)
-    assert [run.run for run in found.runs] == ["run0", "run1", "run2"]
+    runs = [run.run for run in found.runs]
+    assert runs == ["run0", "run1", "run2"]
     # By another way: run 0 given as a hold-out run.
     by_hand = with_effects(gathered(truth, sprung[1:3], sprung[:1]), (SPRING,))
     assert by_hand.holdout is not None
@@ -253,7 +261,8 @@ def test_a_left_out_run_is_predicted_by_the_others_alone(
 
 
 def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> None:
-    floors = (MotorNoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0),) * 5 + (None,)
+    motor_noise_floor = MotorNoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0)
+    floors = (motor_noise_floor,) * 5 + (None,)
     error = floor_on(start.training, start.estimate, floors).relative(start.estimate.gains)
     used = start.training.motor_use[0]
     rms_a = np.sqrt(np.mean(start.training.current[0, used] ** 2))
@@ -273,11 +282,15 @@ def test_a_refuted_floor_bounds_no_error(
         for noise_a in factors * left_a
     )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
-    made = account(start, [Step((), (), np.zeros(6), None, after)])
+    limits_nm = np.zeros(6)
+    steps = [Step((), (), limits_nm, None, after)]
+    made = account(start, steps)
     assert made.floors == floors
     assert made.left_a == pytest.approx(left_a)
-    assert np.isnan(made.floor.axes).tolist() == [False, False, True] * 2
-    ratio = np.array(made.floor.axes) / made.total.after.in_sample.axes
+    expected = [False, False, True] * 2
+    assert np.isnan(made.floor.axes).tolist() == expected
+    axes = np.array(made.floor.axes)
+    ratio = axes / made.total.after.in_sample.axes
     assert ratio[[0, 3]] == pytest.approx(factors[[0, 3]])
     assert made.holdout_floor is not None
     assert np.isnan(made.holdout_floor.axes).tolist() == [False, False, True] * 2
@@ -295,7 +308,9 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
         for left in left_a
     )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: floors)
-    made = account(start, [Step((), (), np.zeros(6), None, after)])
+    step = Step((), (), np.zeros(6), None, after)
+    steps = [step]
+    made = account(start, steps)
     before = made.total.before
     last = made.total.after
     pairs = (
@@ -313,16 +328,19 @@ def test_no_floor_exceeds_the_error_on_the_same_rows(
     assert made.floor.axes[2] == pytest.approx(last.in_sample.axes[2])
     assert made.floors == floors  # as measured
     # The lower limit of such a floor, a seventh below it, is below the error.
-    expected = np.array([floor.least_a for floor in floors]) / left_a
+    least_a = [floor.least_a for floor in floors]
+    expected = np.array(least_a) / left_a
     assert np.all(expected < 1.0)
-    ratio = np.array(made.least_floor.axes) / last.in_sample.axes
+    axes = np.array(made.least_floor.axes)
+    ratio = axes / last.in_sample.axes
     assert ratio == pytest.approx(expected)
     # Standstill alone bounds nothing.
     at_rest = tuple(
         replace(floor, source=FloorSource.STANDSTILL, is_bound=False) for floor in floors
     )
     monkeypatch.setattr(before_after_module, "noise_floors", lambda *_: at_rest)
-    unbound = account(start, [Step((), (), np.zeros(6), None, after)])
+    limits_nm = np.zeros(6)
+    unbound = account(start, [Step((), (), limits_nm, None, after)])
     assert np.isnan(unbound.least_floor.axes).all()
     assert unbound.floor == made.floor
 
@@ -331,7 +349,8 @@ def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) ->
     runs = noisy_runs[:2]
     found = identify(truth.model, runs, CONDITIONING, fixed_gains=GAINS)
     start = gather(found, runs)
-    changed = before_after(assess(start, GAINS), assess(with_effects(start, (SPRING,)), GAINS))
+    evidence = with_effects(start, (SPRING,))
+    changed = before_after(assess(start, GAINS), assess(evidence, GAINS))
     assert all(gain.change_std == 0.0 and not gain.significant for gain in changed.gains)
 
 
@@ -345,12 +364,16 @@ def test_a_change_and_its_estimates_leave_out_the_same_blocks(
     assert first.moves is not None
     assert last.moves is not None
     slow = (np.arange(len(first.moves.runs)) // 8 % 2)[:, None] * 2.0 - 1.0
-    correlated = replace(
-        first, moves=replace(first.moves, scores=np.abs(first.moves.scores) * slow)
-    )
+    absolute_score = np.abs(first.moves.scores)
+    scores = absolute_score * slow
+    moves = replace(first.moves, scores=scores)
+    correlated = replace(first, moves=moves)
     assert correlated.moves is not None
     starts = correlated.moves.blocks()
     assert len(starts) < len(last.moves.blocks())
-    shifts = (last.moves.shifts(starts) - correlated.moves.shifts(starts)[:, :1])[:, 0]
-    expected = np.sqrt((len(starts) - 1) / len(starts) * np.sum((shifts - shifts.mean()) ** 2))
-    assert before_after(correlated, last).gains[0].change_std == pytest.approx(expected)
+    difference = last.moves.shifts(starts) - correlated.moves.shifts(starts)[:, :1]
+    shifts = difference[:, 0]
+    shift_difference = shifts - shifts.mean()
+    expected = np.sqrt((len(starts) - 1) / len(starts) * np.sum(shift_difference**2))
+    first_gain = before_after(correlated, last).gains[0]
+    assert first_gain.change_std == pytest.approx(expected)

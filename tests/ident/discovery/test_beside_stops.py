@@ -31,7 +31,8 @@ def _clear_rows(evidence: Evidence) -> NDArray[np.bool_]:
     r).
     """
     allowed = evidence.conditioning.standstill_share
-    strict = replace(evidence.conditioning, standstill_share=CLEAR_SHARE * allowed)
+    standstill_share = CLEAR_SHARE * allowed
+    strict = replace(evidence.conditioning, standstill_share=standstill_share)
     masks = [row_masks(evidence.model, data, strict)[0] for data in evidence.datasets]
     return np.concatenate(masks, axis=1)
 
@@ -46,7 +47,8 @@ def _refuted(small: Evidence, truth: Truth, torque_nm: FloatArray) -> str:
     """What the gate says of presliding that is fitted to runs with this torque on the joint."""
     of_joints = np.zeros((len(truth.gains), len(torque_nm)))
     of_joints[AXIS] = torque_nm
-    added_a = truth.model.drive_train.to_motor @ of_joints / truth.gains[:, None]
+    to_motor = truth.model.drive_train.to_motor
+    added_a = to_motor @ of_joints / truth.gains[:, None]
     joined = with_effects(with_current(small, added_a), (PLACED,))
     return refuted_clear_of_stops(joined, PLACED)
 

@@ -80,7 +80,8 @@ def test_terms_that_push_together_at_low_speed_are_named_with_speed_and_size(
     # Drag by a root of the speed where there is none, and 20 Nm less dry friction than the axis
     # has.
     worn = _with_friction(clean, truth, lambda speed: 25.0 * speed ** (1.0 / 3.0) - 20.0)
-    placed = PlacedEffect(NonlinearViscous(1.0 / 3.0), AXIS)
+    effect = NonlinearViscous(1.0 / 3.0)
+    placed = PlacedEffect(effect, AXIS)
     fitted = with_effects(worn, (placed,))
     said = pushing(fitted, AXIS)
     assert said.startswith("the friction of this axis would push the arm at rest (-1")
@@ -91,10 +92,13 @@ def test_terms_that_push_together_at_low_speed_are_named_with_speed_and_size(
 
 def test_the_search_writes_no_friction_that_drives_the_arm(clean: Evidence, truth: Truth) -> None:
     worn = _with_friction(clean, truth, lambda speed: 25.0 * speed ** (1.0 / 3.0) - 20.0)
-    steps = find_effects(worn, np.random.default_rng(0), GATES)
+    rng = np.random.default_rng(0)
+    steps = find_effects(worn, rng, GATES)
     end = steps[-1].after
     assert all(pushing(end, axis) == "" for axis in range(3))
-    aside = [one for step in steps for one in step.set_aside]
+    aside = []
+    for step in steps:
+        aside.extend(step.set_aside)
     assert any("would push the arm" in one.reason(NAMES) for one in aside)
 
 
@@ -110,8 +114,11 @@ def test_friction_that_brakes_is_still_found(
     clean: Evidence, truth: Truth, effect: SpeedFriction, friction_nm: object
 ) -> None:
     worn = _with_friction(clean, truth, friction_nm)
-    end = find_effects(worn, np.random.default_rng(0), GATES)[-1].after
-    assert [(placed.effect.name, placed.axis) for placed in end.effects] == [(effect.name, AXIS)]
+    rng = np.random.default_rng(0)
+    effects = find_effects(worn, rng, GATES)
+    end = effects[-1].after
+    expected = [(effect.name, AXIS)]
+    assert [(placed.effect.name, placed.axis) for placed in end.effects] == expected
     assert pushing(end, AXIS) == ""
 
 
@@ -124,7 +131,8 @@ def test_a_direction_in_which_the_arm_would_be_driven_is_seen(
     for value in (50.0, -50.0):
         parameters = fitted.estimate.parameters.copy()
         parameters[index] = value
-        lopsided = replace(fitted, estimate=replace(fitted.estimate, parameters=parameters))
+        estimate = replace(fitted.estimate, parameters=parameters)
+        lopsided = replace(fitted, estimate=estimate)
         found = re.search(r"would push the arm at (-?[0-9.]+) rad/s", pushing(lopsided, AXIS))
         assert found is not None
         assert (float(found[1]) < 0.0) == (value > 0.0)
@@ -134,7 +142,8 @@ def test_a_direction_in_which_the_arm_would_be_driven_is_seen(
 def test_columns_are_the_torque_at_the_speed_of_the_joint(effect: SpeedFriction) -> None:
     velocity = np.linspace(-2.0, 2.0, 101)
     columns = effect.at_speed(velocity)
-    assert columns.shape == (len(effect.coefficients), len(velocity))
+    expected = (len(effect.coefficients), len(velocity))
+    assert columns.shape == expected
     is_even = isinstance(effect, AsymmetricViscous)
     np.testing.assert_allclose(
         columns, effect.at_speed(-velocity) * (1.0 if is_even else -1.0), atol=1e-12
@@ -145,7 +154,8 @@ def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
     """Without load the axis brakes; with it, what the payload adds to the friction is more than
     there was.
     """
-    by_payload = replace(truth, model=replace(truth.model, friction_by_payload=True))
+    model = replace(truth.model, friction_by_payload=True)
+    by_payload = replace(truth, model=model)
     rng = np.random.default_rng(12)
     runs = [
         record(
@@ -160,10 +170,12 @@ def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
         )
         for number, payload in enumerate((None, MOUNTED))
     ]
-    fitted = with_effects(gathered(by_payload, tuple(runs)), (PlacedEffect(Stribeck(0.3), AXIS),))
+    effects = (PlacedEffect(Stribeck(0.3), AXIS),)
+    fitted = with_effects(gathered(by_payload, tuple(runs)), effects)
     assert pushing(fitted, AXIS) == ""
     names = [column.name for column in fitted.estimate.unknowns]
     parameters = fitted.estimate.parameters.copy()
     parameters[names.index("fs2_loaded")] -= 30.0
-    lighter = replace(fitted, estimate=replace(fitted.estimate, parameters=parameters))
+    estimate = replace(fitted.estimate, parameters=parameters)
+    lighter = replace(fitted, estimate=estimate)
     assert "would push the arm" in pushing(lighter, AXIS)

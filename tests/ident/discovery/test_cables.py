@@ -52,14 +52,17 @@ def _cabled(
 
     def torque(data: Dataset) -> FloatArray:
         way = data.position_rad[:, 1:] @ np.array(radii)
-        force = STIFFNESS * np.clip(way - start_rad, 0.0, None)
+        slack_taken_rad = np.clip(way - start_rad, 0.0, None)
+        force = STIFFNESS * slack_taken_rad
         return np.stack((np.zeros_like(force), radii[0] * force, radii[1] * force))
 
     return bent(small, truth, torque)
 
 
 def _found(start: Evidence) -> tuple[tuple[PlacedEffect, ...], Evidence]:
-    last = find_effects(start, np.random.default_rng(0), GATES, OF_POSITION, geometry=())[-1].after
+    rng = np.random.default_rng(0)
+    effects = find_effects(start, rng, GATES, OF_POSITION, geometry=())
+    last = effects[-1].after
     return last.effects, last
 
 
@@ -79,11 +82,13 @@ def test_a_slack_cable_is_named_with_its_start_and_its_radii(
     assert placed.axis == 1
     assert effect.other_axis == 3
     direction_rad = np.arctan2(radii[1], radii[0])
-    turn_rad = np.angle(np.exp(1j * (effect.direction_rad - direction_rad)))
+    direction_difference_rad = effect.direction_rad - direction_rad
+    turn_rad = np.angle(np.exp(1j * direction_difference_rad))
     assert abs(turn_rad) < 0.1
     assert effect.start_rad == pytest.approx(start_rad, abs=0.1)
     assert _coefficients(after) == pytest.approx(STIFFNESS, rel=0.15)
-    z = (after.estimate.gains - small_truth.gains) / after.estimate.gains_std
+    gain_difference = after.estimate.gains - small_truth.gains
+    z = gain_difference / after.estimate.gains_std
     assert np.abs(z).max() < 3.0
 
 
@@ -91,14 +96,16 @@ def test_a_hose_that_pushes_too_is_a_cable_with_one_potential(
     small: Evidence, small_truth: Truth
 ) -> None:
     (placed,), after = _found(_cabled(small, small_truth, radii=RADII, start_rad=-100.0))
-    assert placed == PlacedEffect(Cable(3), 1)
+    expected = PlacedEffect(Cable(3), 1)
+    assert placed == expected
     stiffness = STIFFNESS * np.outer(RADII, RADII)
     assert _coefficients(after) == pytest.approx(stiffness[np.triu_indices(2)], rel=0.15, abs=1.0)
 
 
 def test_a_spring_of_one_joint_stays_one(small: Evidence, small_truth: Truth) -> None:
     effects, _ = _found(_cabled(small, small_truth, radii=(1.0, 0.0), start_rad=-100.0))
-    assert effects == (PlacedEffect(Spring(), 1),)
+    expected = (PlacedEffect(Spring(), 1),)
+    assert effects == expected
 
 
 def test_a_hinge_of_one_joint_stays_one(small: Evidence, small_truth: Truth) -> None:
@@ -122,7 +129,8 @@ def test_no_cable_is_tried_in_few_moves(small_truth: Truth) -> None:
     )
     start = _cabled(gathered(small_truth, runs), small_truth, radii=RADII, start_rad=0.3)
     problem = search_problem_of(start)
-    assert problem.folds.moves < SlackCable(3, 0.5).least_moves
+    least_moves = SlackCable(3, 0.5).least_moves
+    assert problem.folds.moves < least_moves
     assert propose_cables(problem, GATES, OF_POSITION) == {}
     names = {
         finding.effect.name
@@ -133,6 +141,7 @@ def test_no_cable_is_tried_in_few_moves(small_truth: Truth) -> None:
 
 def test_a_cable_is_led_along_neighbouring_joints() -> None:
     robot = three_axes_truth().model.robot
-    six = replace(robot, joints=robot.joints * 2)
+    joints = robot.joints * 2
+    six = replace(robot, joints=joints)
     reached = [other for other in range(2, 7) if is_placeable(Cable(other), 0, six)]
     assert reached == [2, 3]

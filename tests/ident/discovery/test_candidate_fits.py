@@ -78,7 +78,8 @@ def test_candidates_that_the_model_contains_leave_the_others_of_their_batch_as_t
     first, second = _candidates(rng, folds, [2, 2])
     alone = _fits(folds, [first, second])
     assert _fits(folds, [contained]) == (None,)
-    together = _fits(folds, [contained, first, contained, second])
+    candidates = [contained, first, contained, second]
+    together = _fits(folds, candidates)
     assert together[0] is None
     assert together[2] is None
     for own, beside in zip(alone, (together[1], together[3]), strict=True):

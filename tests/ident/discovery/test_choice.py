@@ -58,13 +58,19 @@ def test_a_rival_adds_its_distance_by_its_odds(
     effect = Stribeck(SPEED_RAD_S)
     other = NonlinearViscous(1.0 / 3.0)
     joined, instead = (with_effects(sticking, (PlacedEffect(one, 1),)) for one in (effect, other))
-    rival = _finding(other, fold_errors=FOLDS - lead + 1e-3 * np.resize((-1.0, 1.0), 8))
-    finding = _finding(effect, (PlacedEffect(other, 1),))
+    fold_errors = FOLDS - lead + 1e-3 * np.resize((-1.0, 1.0), 8)
+    rival = _finding(other, fold_errors=fold_errors)
+    ambiguity = (PlacedEffect(other, 1),)
+    finding = _finding(effect, ambiguity)
     problem = search_problem_of(joined)
-    added = choice_covariance(problem, joined.estimate, ((finding, (rival,)),), ())
+    accepted = ((finding, (rival,)),)
+    added = choice_covariance(problem, joined.estimate, accepted, ())
     apart = instead.estimate.gains - joined.estimate.gains
     spread = np.sqrt(np.diag(added)[:3])
-    assert spread == pytest.approx(np.sqrt(weight) * np.abs(apart), abs=0.1 * np.abs(apart).max())
+    largest_absolute_apart = np.abs(apart).max()
+    assert spread == pytest.approx(
+        np.sqrt(weight) * np.abs(apart), abs=0.1 * largest_absolute_apart
+    )
 
 
 def test_what_is_no_noise_but_too_small_adds_what_it_would_move(
@@ -75,12 +81,16 @@ def test_what_is_no_noise_but_too_small_adds_what_it_would_move(
     """
     effect = Stribeck(SPEED_RAD_S)
     sticking = _sticking(small, small_truth, 2.0)
-    joined = with_effects(sticking, (PlacedEffect(effect, 1),))
+    effects = (PlacedEffect(effect, 1),)
+    joined = with_effects(sticking, effects)
     problem = search_problem_of(sticking)
     errors = problem.folds.square_sum(problem.folds.residual).sum(axis=1)
-    found = _finding(effect, fold_errors=errors - 1e3 + FOLDS)
-    std = np.sqrt(np.diag(choice_covariance(problem, sticking.estimate, (), (found,)))[:3])
-    apart = np.abs(joined.estimate.gains - sticking.estimate.gains)
+    fold_errors = errors - 1e3 + FOLDS
+    found = _finding(effect, fold_errors=fold_errors)
+    diagonal = np.diag(choice_covariance(problem, sticking.estimate, (), (found,)))
+    std = np.sqrt(diagonal[:3])
+    gain_difference = joined.estimate.gains - sticking.estimate.gains
+    apart = np.abs(gain_difference)
     assert std == pytest.approx(apart, abs=0.1 * apart.max())
 
 
@@ -94,12 +104,17 @@ def test_a_small_effect_is_possible_and_no_noise_and_fails_a_gate_of_size() -> N
         replace(found, folds_better=0.5),
     ):
         assert is_small(small, gates)
-        assert not is_small(replace(small, probability=0.02), gates)
-        assert not is_small(replace(small, coefficients=np.array([-99.0])), gates)
+        finding = replace(small, probability=0.02)
+        assert not is_small(finding, gates)
+        coefficients = np.array([-99.0])
+        changed_small = replace(small, coefficients=coefficients)
+        assert not is_small(changed_small, gates)
 
 
 def test_an_effect_without_rivals_adds_nothing(sticking: Evidence) -> None:
     effect = Stribeck(SPEED_RAD_S)
-    joined = with_effects(sticking, (PlacedEffect(effect, 1),))
+    effects = (PlacedEffect(effect, 1),)
+    joined = with_effects(sticking, effects)
     problem = search_problem_of(joined)
-    assert not choice_covariance(problem, joined.estimate, ((_finding(effect), ()),), ()).any()
+    accepted = ((_finding(effect), ()),)
+    assert not choice_covariance(problem, joined.estimate, accepted, ()).any()

@@ -75,7 +75,8 @@ def _planted(
         seconds = 14.0 if mechanism is THREE_LEGS else 18.0
     made = recorded(mechanism, 7, seconds=seconds, noise_a=0.01)
     runs = []
-    index = [one.name for one in made.model.robot.joints].index(joint)
+    joints = made.model.robot.joints
+    index = [one.name for one in joints].index(joint)
     driven = list(made.model.robot.axis_joints)
     for run in made.runs:
         data = differentiate(run, made.model.drive_train, made.conditioning)
@@ -92,7 +93,8 @@ def _planted(
             load = np.zeros(len(q))
         needed = followed.to_joints[:, index] * (size * torque(q, v, load))[:, None]
         a = followed.to_motors
-        motors = np.einsum("kmd,kd->km", a @ np.linalg.inv(np.swapaxes(a, 1, 2) @ a), needed)
+        inverse = np.linalg.inv(np.swapaxes(a, 1, 2) @ a)
+        motors = np.einsum("kmd,kd->km", a @ inverse, needed)
         current = run.current_a.copy()
         current[1:-1] += motors / mechanism.gains
         runs.append(replace(run, current_a=current))
@@ -111,13 +113,16 @@ def test_an_effect_is_named_on_its_joint(
         size = {"five-bar": 1.0, "planar": 0.06, "three-legs": 150.0}[mechanism.name]
     made, runs = _planted(mechanism, joint, torque, size)
     identified = identify(made.model, runs, made.conditioning, keep_rows=True)
-    steps = find_effects(gather(identified), np.random.default_rng(0), GATES)
+    rng = np.random.default_rng(0)
+    steps = find_effects(gather(identified), rng, GATES)
     places = [one.name for one in made.model.robot.places]
-    found = [(placed.effect.name, places[placed.axis]) for placed in steps[-1].after.effects]
+    effects = steps[-1].after.effects
+    found = [(placed.effect.name, places[placed.axis]) for placed in effects]
     assert found == [(family, joint)]
     gains = steps[-1].after.estimate
+    absolute_gain = np.abs(gains.gains)
     assert np.all(
-        np.abs(gains.gains / mechanism.gains - 1.0) < 4.0 * gains.gains_std / np.abs(gains.gains)
+        np.abs(gains.gains / mechanism.gains - 1.0) < 4.0 * gains.gains_std / absolute_gain
     )
     axes = [f"J{number}" for number in range(1, len(mechanism.gains) + 1)]
     calibration = calibration_of(identified, axes, mechanism.gains, steps=steps)
@@ -127,7 +132,9 @@ def test_an_effect_is_named_on_its_joint(
     else:
         named = axes[places.index(joint)]
     assert (accepted.name, accepted.axis) == (family, named)
-    assert placed_effect(accepted, calibration)[0] == steps[-1].after.effects[0]
+    last_step = steps[-1]
+    expected = last_step.after.effects[0]
+    assert placed_effect(accepted, calibration)[0] == expected
     without = calibration_of(identified, axes, mechanism.gains)
     assert _error(calibration, made, runs[0]) < 0.8 * _error(without, made, runs[0])
 
@@ -138,9 +145,8 @@ def _error(calibration: Calibration, made: Made, run: Run) -> float:
     use = row_masks(made.model, data, made.conditioning)[0]
     filter_ = row_filter(data, made.conditioning)
     measured = filter_(measured_torque(calibration, made.model, data.current_a, data.motion()).T)
-    return relative_error(
-        measured, filter_(predict_torque(calibration, made.model, data).T), use
-    ).total
+    predicted_nm = filter_(predict_torque(calibration, made.model, data).T)
+    return relative_error(measured, predicted_nm, use).total
 
 
 def test_internal_preload_is_in_no_comparison() -> None:
@@ -149,15 +155,19 @@ def test_internal_preload_is_in_no_comparison() -> None:
     calibration = calibration_of(
         identified, ["J1", "J2", "J3", "J4"][: len(PLANAR.gains)], PLANAR.gains
     )
+    gains = tuple(
+        replace(g, value=float(v)) for g, v in zip(calibration.gains, PLANAR.gains, strict=True)
+    )
     calibration = replace(
         calibration,
-        gains=tuple(
-            replace(g, value=float(v)) for g, v in zip(calibration.gains, PLANAR.gains, strict=True)
-        ),
+        gains=gains,
     )
-    data = differentiate(made.runs[0], made.model.drive_train, made.conditioning)
-    whole, _ = np.linalg.qr(made.model.follow(data.motion()).to_motors, mode="complete")
-    preload = whole[:, :, made.model.assembly.mobility :].sum(axis=2)
+    run = made.runs[0]
+    data = differentiate(run, made.model.drive_train, made.conditioning)
+    to_motors = made.model.follow(data.motion()).to_motors
+    whole, _ = np.linalg.qr(to_motors, mode="complete")
+    mobility = made.model.assembly.mobility
+    preload = whole[:, :, mobility:].sum(axis=2)
     preloaded = data.current_a + 0.5 * preload / PLANAR.gains
     arguments = calibration, made.model
     seen = measured_torque(*arguments, data.current_a, data.motion())
@@ -171,12 +181,10 @@ def test_internal_preload_is_in_no_comparison() -> None:
     )
     shown = measured_current(*arguments, preloaded, data.motion())
     assert_allclose(shown * PLANAR.gains, seen, rtol=0.0, atol=1e-10)
-    assert (
-        _error(
-            calibration, made, replace(made.runs[0], current_a=_at_samples(made.runs[0], preloaded))
-        )
-        < 5.0
-    )
+    first_run = made.runs[0]
+    current_a = _at_samples(first_run, preloaded)
+    changed_run = replace(made.runs[0], current_a=current_a)
+    assert _error(calibration, made, changed_run) < 5.0
 
 
 def test_internal_preload_is_no_error() -> None:
@@ -204,11 +212,12 @@ def test_internal_preload_is_no_error() -> None:
     shown = [
         search_problem.folds.linearisation.shown(motor) for motor in range(len(estimate.gains))
     ]
-    assert sum(shown) == pytest.approx(made.model.assembly.mobility * np.sum(rows.motor_use[0]))
-    worse = replace(estimate, parameters=1.01 * estimate.parameters)
-    change = holdout_change(
-        replace(evidence, holdout=rows), replace(evidence, holdout=rows, estimate=worse)
-    )
+    mobility = made.model.assembly.mobility
+    assert sum(shown) == pytest.approx(mobility * np.sum(rows.motor_use[0]))
+    parameters = 1.01 * estimate.parameters
+    worse = replace(estimate, parameters=parameters)
+    changed_evidence = replace(evidence, holdout=rows, estimate=worse)
+    change = holdout_change(replace(evidence, holdout=rows), changed_evidence)
     assert change is not None
     assert change.is_rise
     rise = error_on(rows, worse).left - error_on(rows, estimate).left
@@ -224,11 +233,12 @@ def test_an_effect_is_taken_out_of_the_rows_of_all_motors() -> None:
     placed = PlacedEffect(Spring(), 1)
     joined = with_effects(bare, (placed,))
     estimate = joined.estimate
-    declared = replace(
-        estimate, parameters=np.delete(estimate.parameters, own_unknowns(estimate, (placed,)))
-    )
+    parameters = np.delete(estimate.parameters, own_unknowns(estimate, (placed,)))
+    declared = replace(estimate, parameters=parameters)
+    without_effects = without_effects_of(search_problem_of(joined), estimate, (placed,))
+    search_problem = without_effects.search_problem
     problems = (
-        without_effects_of(search_problem_of(joined), estimate, (placed,)).search_problem,
+        search_problem,
         prepare_search(made.model, joined.fit_runs, bare.training, declared),
     )
     found, expected = (
@@ -261,9 +271,10 @@ def test_no_diagnosis_fails_on_a_closed_chain(mechanism: Mechanism) -> None:
 def test_a_clean_closed_chain_has_no_effect() -> None:
     for mechanism in (FIVE_BAR, PLANAR):
         made = recorded(mechanism, 8, seconds=18.0, noise_a=0.01)
+        rng = np.random.default_rng(0)
         steps = find_effects(
             gather(identify(made.model, made.runs, made.conditioning, keep_rows=True)),
-            np.random.default_rng(0),
+            rng,
             GATES,
         )
         assert not steps[-1].after.effects

@@ -59,7 +59,8 @@ def balanced() -> Evidence:
 
 @pytest.fixture(scope="module")
 def declared(balanced: Evidence) -> tuple[Step, ...]:
-    return with_declared(balanced, [NEAR], np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    return with_declared(balanced, [NEAR], rng)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,8 @@ def unbalanced() -> Evidence:
 
 def _errors(evidence: Evidence) -> FloatArray:
     """Error of each gain over its σ."""
-    return np.asarray((evidence.estimate.gains - GAINS) / evidence.estimate.gains_std)
+    gain_difference = evidence.estimate.gains - GAINS
+    return np.asarray(gain_difference / evidence.estimate.gains_std)
 
 
 def _assert_known(evidence: Evidence) -> None:
@@ -98,35 +100,44 @@ def test_declared_it_is_fitted_from_a_rough_geometry(
 
 
 def test_left_out_it_is_found_on_its_joint(balanced: Evidence) -> None:
-    steps = find_effects(balanced, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
+    rng = np.random.default_rng(0)
+    steps = find_effects(balanced, rng, GATES, LIKE_IT, geometry=())
     found = [
         (step.accepted.effect.name, step.accepted.axis)
         for step in steps
         if step.accepted is not None
     ]
     assert found == [("counterbalance", AXIS)]
-    _assert_known(steps[-1].after)
+    evidence = steps[-1].after
+    _assert_known(evidence)
 
 
 def test_a_search_keeps_what_is_declared_and_finds_nothing_beside_it(
     declared: tuple[Step, ...],
 ) -> None:
     start = declared[-1].after
-    steps = find_effects(start, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
+    rng = np.random.default_rng(0)
+    steps = find_effects(start, rng, GATES, LIKE_IT, geometry=())
     assert [step.accepted for step in steps] == [None]
-    assert steps[-1].after.effects == start.effects
-    assert steps[-1].after.estimate.gains == pytest.approx(start.estimate.gains)
+    after = steps[-1].after
+    assert after.effects == start.effects
+    last_step = steps[-1]
+    assert last_step.after.estimate.gains == pytest.approx(start.estimate.gains)
 
 
 def test_no_balancer_is_found_where_there_is_none(unbalanced: Evidence) -> None:
-    steps = find_effects(unbalanced, np.random.default_rng(0), GATES, LIKE_IT, geometry=())
+    rng = np.random.default_rng(0)
+    steps = find_effects(unbalanced, rng, GATES, LIKE_IT, geometry=())
     assert [step.accepted for step in steps] == [None]
 
 
 def test_declared_where_there_is_none_it_bends_no_gain(unbalanced: Evidence) -> None:
-    after = with_declared(unbalanced, [NEAR], np.random.default_rng(0))[-1].after
-    shift = (after.estimate.gains - unbalanced.estimate.gains) / after.estimate.gains_std
-    assert np.max(np.abs(shift)) < 1.5
+    rng = np.random.default_rng(0)
+    after = with_declared(unbalanced, [NEAR], rng)[-1].after
+    gain_difference = after.estimate.gains - unbalanced.estimate.gains
+    shift = gain_difference / after.estimate.gains_std
+    largest_absolute_shift = np.max(np.abs(shift))
+    assert largest_absolute_shift < 1.5
     assert np.max(np.abs(_errors(after))) < 3.5
 
 
@@ -136,11 +147,13 @@ def test_a_calibration_predicts_with_it(balanced: Evidence, declared: tuple[Step
     data = balanced.datasets[0]
     torque = predict_torque(made, balanced.model, data)[:, AXIS]
     measured = GAINS[AXIS] * data.current_a[:, AXIS]
-    assert np.linalg.norm(torque - measured) < 0.12 * np.linalg.norm(measured)
+    torque_difference_norm = np.linalg.norm(torque - measured)
+    measured_norm = np.linalg.norm(measured)
+    assert torque_difference_norm < 0.12 * measured_norm
+    rng = np.random.default_rng(0)
+    counterbalance = Counterbalance(0.35, 1.7)
     with pytest.raises(EffectImpossible, match="physics allows"):
-        with_declared(
-            balanced, [PlacedEffect(Counterbalance(0.35, 1.7), AXIS)], np.random.default_rng(0)
-        )
+        with_declared(balanced, [PlacedEffect(counterbalance, AXIS)], rng)
 
 
 def _leaning(free_m: float) -> Evidence:
@@ -150,7 +163,8 @@ def _leaning(free_m: float) -> Evidence:
     upright = heavy_model()
     lean_rad = np.radians(-3.0)
     declared = 9.81 * np.array([0.0, np.sin(lean_rad), -np.cos(lean_rad)])
-    model = replace(upright, robot=replace(upright.robot, gravity_m_s2=declared))
+    robot = replace(upright.robot, gravity_m_s2=declared)
+    model = replace(upright, robot=robot)
     runs = heavy_runs(balanced=True, free_m=free_m)
     return gather(identify(model, runs, CONDITIONING, keep_rows=True, judge=False))
 
@@ -162,7 +176,8 @@ def test_a_balancer_that_only_a_leaning_base_makes_impossible_stays_and_the_sear
     before = steps[-1].after
     assert "preload" in impossible_declared(before, JOINTS)
     # Its own families apart: with this little preload another name of a spring explains as much.
-    found = find_effects(before, np.random.default_rng(0), GATES, families=())
+    rng = np.random.default_rng(0)
+    found = find_effects(before, rng, GATES, families=())
     after = found[-1].after
     assert [placed.effect.name for placed in after.effects] == [
         "counterbalance",

@@ -39,7 +39,9 @@ def _change(by_move: FloatArray, level: float = 1.0) -> ErrorChange:
 
 
 def test_a_fall_that_is_more_than_noise_is_confirmed() -> None:
-    change = _change(np.random.default_rng(0).normal(-5.0, 3.0, (20, MOTORS)))
+    rng = np.random.default_rng(0)
+    by_move = rng.normal(-5.0, 3.0, (20, MOTORS))
+    change = _change(by_move)
     assert judge_change(change)[0] is Judgement.CONFIRMED
 
 
@@ -47,7 +49,8 @@ def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
     """The noise of the other motors hides it in the total;
     a motor that was not named proves nothing by itself.
     """
-    by_move = np.random.default_rng(7).normal(0.0, 5.0, (20, MOTORS))
+    rng = np.random.default_rng(7)
+    by_move = rng.normal(0.0, 5.0, (20, MOTORS))
     by_move[:, 1:] -= by_move[:, 1:].mean(axis=0) - 0.01
     by_move[:, 0] = np.random.default_rng(8).normal(-0.5, 0.5, 20)
     change = _change(by_move)
@@ -61,7 +64,8 @@ def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
     nothing.
     """
     falls = np.array([-30.0, -27.0, -25.0, -24.0, -22.0, -20.0, -19.0, -15.0, -14.0, -3.0])
-    one_rise = compare_by_move(np.append(falls, 76.0), np.arange(11))
+    move = np.arange(11)
+    one_rise = compare_by_move(np.append(falls, 76.0), move)
     assert one_rise.rise < 0.0
     assert abs(one_rise.sigmas) < 1.7  # t(10) at 95 % is 1.8
     assert one_rise.falls(0.95)
@@ -70,14 +74,16 @@ def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
 
 def test_a_fall_that_two_blocks_make_alone_is_none() -> None:
     rest = np.array([-13.0, -9.0, -2.0, -3.0, -1.0, 10.0, -4.0])
-    two_falls = compare_by_move(np.append(rest, [-2747.0, -1627.0]), np.arange(9))
+    move = np.arange(9)
+    two_falls = compare_by_move(np.append(rest, [-2747.0, -1627.0]), move)
     assert two_falls.rise < -4000.0
     assert not two_falls.falls(0.95)
 
 
 def test_a_rise_in_total_is_no_fall_of_most_blocks() -> None:
     """Nine moves better and one much worse: the error rises, whatever the trimmed mean says."""
-    change = compare_by_move(np.append(np.full(9, -10.0) + np.arange(9), 200.0), np.arange(10))
+    move = np.arange(10)
+    change = compare_by_move(np.append(np.full(9, -10.0) + np.arange(9), 200.0), move)
     assert change.rise > 0.0
     assert not change.falls(0.95)
 
@@ -127,20 +133,26 @@ def test_joined_blocks_are_enough_to_judge_by() -> None:
     of four blocks nothing is judged, and a gate would be open.
     """
     change = np.array([2.0, 2.0, 2.0, 0.5, -0.5, -2.0, -2.0, -2.0])
-    assert compare_by_block(change, np.arange(8), np.zeros(8, dtype=np.int64)).moves == 8
+    run = np.zeros(8, dtype=np.int64)
+    moves = compare_by_block(change, np.arange(8), run).moves
+    assert moves == 8
     twice = np.repeat(change, 2)
-    assert compare_by_block(twice, np.arange(16), np.zeros(16, dtype=np.int64)).moves == 8
+    move = np.arange(16)
+    assert compare_by_block(twice, move, np.zeros(16, dtype=np.int64)).moves == 8
 
 
 def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
-    change = _change(np.random.default_rng(0).normal(5.0, 3.0, (20, MOTORS)))
+    rng = np.random.default_rng(0)
+    by_move = rng.normal(5.0, 3.0, (20, MOTORS))
+    change = _change(by_move)
     judgement, reason = judge_change(change)
     assert judgement is Judgement.REFUTED
     assert "rises by" in reason
 
 
 def test_harm_on_another_motor_refutes_what_helps_in_total() -> None:
-    by_move = np.random.default_rng(1).normal(0.0, 1.0, (20, MOTORS))
+    rng = np.random.default_rng(1)
+    by_move = rng.normal(0.0, 1.0, (20, MOTORS))
     by_move[:, 0] -= 10.0
     assert judge_change(_change(by_move))[0] is Judgement.CONFIRMED
     by_move[:, 2] += 3.0
@@ -154,7 +166,8 @@ def test_harm_on_another_motor_refutes_what_helps_in_total() -> None:
 
 def test_a_rise_below_a_hundredth_of_the_error_refutes_nothing() -> None:
     """5.76 % against 5.76 %, however certain the difference is."""
-    sure = np.full((20, MOTORS), 0.001) + np.random.default_rng(2).normal(0.0, 1e-5, (20, MOTORS))
+    rng = np.random.default_rng(2)
+    sure = np.full((20, MOTORS), 0.001) + rng.normal(0.0, 1e-5, (20, MOTORS))
     change = _change(sure)
     assert change.total.is_rise
     assert not change.is_rise
@@ -172,7 +185,8 @@ def test_two_moves_confirm_nothing_and_let_no_doubled_error_pass(rise: float) ->
 
 def test_a_motor_that_may_be_much_worse_is_not_confirmed() -> None:
     """Two of a dozen moves are five times as bad on one motor: noise, perhaps."""
-    by_move = np.random.default_rng(3).normal(-8.0, 2.0, (12, MOTORS))
+    rng = np.random.default_rng(3)
+    by_move = rng.normal(-8.0, 2.0, (12, MOTORS))
     by_move[:, 1] = 0.0
     by_move[:2, 1] = 80.0, 30.0
     change = _change(by_move)

@@ -44,16 +44,24 @@ def _folds(rng: np.random.Generator, torque: FloatArray) -> Folds:
         + loud * rng.normal(size=MOVES * ROWS)
         + np.repeat(0.5 * rng.normal(size=MOVES), ROWS)
     )
+    residual = raw - jacobian @ np.linalg.lstsq(jacobian, raw, rcond=None)[0]
+    current = 5.0 * rng.normal(size=len(raw))
+    motor = np.zeros(len(raw), dtype=np.int64)
+    cluster = np.repeat(np.arange(MOVES), ROWS)
+    source = np.arange(len(raw))
+    seen = (np.arange(WIDTH),)
+    gamma = np.ones(1)
+    free = np.arange(WIDTH)
     problem = Linearisation(
-        jacobian=Jacobian((jacobian.T,), (np.arange(WIDTH),), WIDTH),
-        residual=raw - jacobian @ np.linalg.lstsq(jacobian, raw, rcond=None)[0],
-        current=5.0 * rng.normal(size=len(raw)),
-        motor=np.zeros(len(raw), dtype=np.int64),
-        cluster=np.repeat(np.arange(MOVES), ROWS),
-        source=np.arange(len(raw)),
-        gamma=np.ones(1),
+        jacobian=Jacobian((jacobian.T,), seen, WIDTH),
+        residual=residual,
+        current=current,
+        motor=motor,
+        cluster=cluster,
+        source=source,
+        gamma=gamma,
         noise=np.ones(1),
-        free=np.arange(WIDTH),
+        free=free,
         scale=np.ones(WIDTH),
     )
     return cut_into_folds(problem)
@@ -70,9 +78,11 @@ def _trial(
     rng: np.random.Generator, coefficient: float, *, large: int, others: float
 ) -> CandidateTrial:
     column = _column(rng, large, others)
-    folds = _folds(rng, coefficient * column)
+    torque = coefficient * column
+    folds = _folds(rng, torque)
     sorted_column = column[folds.linearisation.source, None]
-    (trial,) = score_candidates(folds, sorted_column, [slice(0, 1)])
+    candidates = [slice(0, 1)]
+    (trial,) = score_candidates(folds, sorted_column, candidates)
     assert trial is not None
     return trial
 
@@ -83,20 +93,24 @@ def _judged(problem: SearchProblem, *trials: CandidateTrial) -> list[Finding]:
     """
     shaped = [replace(one, held_out=np.zeros((8, 3)), fallen=np.ones(3)) for one in trials]
     families = [FamilyTrials(0, ((Saturation(), one),)) for one in shaped]
-    ranked = rank_families(problem, families, np.random.default_rng(2), GATES)
+    rng = np.random.default_rng(2)
+    ranked = rank_families(problem, families, rng, GATES)
     return [next(f for f in ranked if f.coefficients is one.coefficients) for one in shaped]
 
 
 def test_without_the_moves_of_most_leverage_is_a_fit_of_the_others() -> None:
     rng = np.random.default_rng(1)
     column = _column(rng, 3, 0.2)
-    folds = _folds(rng, 2.0 * column)
+    torque = 2.0 * column
+    folds = _folds(rng, torque)
     problem = folds.linearisation
     columns = column[problem.source, None]
-    (trial,) = score_candidates(folds, columns, [slice(0, 1)])
+    candidates = [slice(0, 1)]
+    (trial,) = score_candidates(folds, columns, candidates)
     assert trial is not None
     assert trial.rest is not None
-    largest = np.argsort(trial.gram[:, 0, 0])[-LEVERAGE:]
+    gram_order = np.argsort(trial.gram[:, 0, 0])
+    largest = gram_order[-LEVERAGE:]
     others = ~np.isin(problem.cluster, largest)
     both = np.hstack((whole(problem.jacobian), columns))[others]
     fitted = np.linalg.lstsq(both, problem.residual[others], rcond=None)[0]
@@ -115,7 +129,8 @@ def test_without_the_moves_of_most_leverage_is_a_fit_of_the_others() -> None:
 def test_a_saturation_that_rests_on_few_moves_is_tested_by_the_others_where_they_show_it(
     search_problem: SearchProblem,
 ) -> None:
-    trial = _trial(np.random.default_rng(3), 3.0, large=2, others=0.1)
+    rng = np.random.default_rng(3)
+    trial = _trial(rng, 3.0, large=2, others=0.1)
     assert moves_behind(trial.gram) < FEW_MOVES
     (finding,) = _judged(search_problem, trial)
     assert finding.probability is not None
@@ -127,14 +142,14 @@ def test_a_saturation_that_rests_on_few_moves_is_tested_by_the_others_where_they
 def test_a_saturation_on_two_moves_alone_is_not_tested_and_says_what_to_record(
     search_problem: SearchProblem, others: float
 ) -> None:
-    trial = _trial(np.random.default_rng(4), 3.0, large=2, others=others)
+    rng = np.random.default_rng(4)
+    trial = _trial(rng, 3.0, large=2, others=others)
     assert moves_behind(trial.gram) < FEWEST_MOVES
     (finding,) = _judged(search_problem, trial)
     assert finding.probability is None
     assert not finding.passed
-    assert finding.refusals[0] == (
-        f"it rests on two moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}"
-    )
+    expected = f"it rests on two moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}"
+    assert finding.refusals[0] == (expected)
     assert finding.too_few_moves == finding.refusals[0]
 
 

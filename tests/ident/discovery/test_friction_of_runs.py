@@ -55,7 +55,8 @@ def _session(truth: Truth, seed: int) -> Evidence:
         rubbing = replace(truth, parameters=parameters)
         payload = MOUNTED if index % 2 else None
         run = record(rubbing, f"run{index}", rng, payload, noise_a=0.1, seconds=22.0)
-        runs.append(replace(run, started_s=40.0 * index))
+        started_s = 40.0 * index
+        runs.append(replace(run, started_s=started_s))
     return gathered(truth, tuple(runs))
 
 
@@ -84,8 +85,9 @@ def test_friction_that_differs_from_run_to_run_adds_no_effect(
 def test_load_friction_is_named_alone_where_friction_differs_from_run_to_run(
     small_truth: Truth,
 ) -> None:
+    clean = _session(small_truth, 1)
     start = bent(
-        _session(small_truth, 1),
+        clean,
         small_truth,
         lambda data: acting_on(
             1,
@@ -93,7 +95,9 @@ def test_load_friction_is_named_alone_where_friction_differs_from_run_to_run(
             LOAD_FRICTION * np.abs(_load(small_truth, data)) * np.sign(data.velocity_rad_s[:, 1]),
         ),
     )
-    end = find_effects(start, np.random.default_rng(0))[-1].after
+    rng = np.random.default_rng(0)
+    last_effect = find_effects(start, rng)[-1]
+    end = last_effect.after
     assert [(placed.effect.name, placed.axis) for placed in end.effects] == [("load-friction", 1)]
     assert end.estimate.parameters[len(end.rows_without_effects.columns)] == pytest.approx(
         LOAD_FRICTION, rel=0.2
@@ -131,7 +135,8 @@ def test_decorrelated_rows_have_the_identity_as_covariance(seed: int) -> None:
     same_run = run[:, None] == run[None]
     covariance = np.eye(30) + shared.T @ shared * same_run
     columns = rng.normal(size=(4, 30))
-    halved = scatter.decorrelate(0, np.eye(30))
+    identity = np.eye(30)
+    halved = scatter.decorrelate(0, identity)
     np.testing.assert_allclose(halved @ covariance @ halved, np.eye(30), atol=1e-9)
     np.testing.assert_allclose(scatter.correlate(0, columns), columns @ covariance, atol=1e-9)
     np.testing.assert_allclose(

@@ -47,21 +47,24 @@ def lossy(small: Evidence, small_truth: Truth) -> Evidence:
     def lost(data: Dataset) -> FloatArray:
         load = _load(small_truth, data)
         drives = load * data.velocity_rad_s[:, AXIS] > 0.0
-        return acting_on(AXIS, 3, np.where(drives, load / ETA, load * ETA) - load)
+        torque_nm = np.where(drives, load / ETA, load * ETA) - load
+        return acting_on(AXIS, 3, torque_nm)
 
     return bent(small, small_truth, lost)
 
 
 def _step(evidence: Evidence, *effects: Effect) -> Step:
     if effects:
-        after = with_effects(evidence, tuple(PlacedEffect(effect, AXIS) for effect in effects))
+        placed_effects = tuple(PlacedEffect(effect, AXIS) for effect in effects)
+        after = with_effects(evidence, placed_effects)
     else:
         after = evidence
     families = ((Stribeck(0.1),), (Efficiency(1.0),))
-    findings = rank_effects(
-        search_problem_of(after), np.random.default_rng(0), Gates(draws=99), families
-    )
-    return Step(findings, (), np.zeros(3), None, after)
+    rng = np.random.default_rng(0)
+    gates = Gates(draws=99)
+    findings = rank_effects(search_problem_of(after), rng, gates, families)
+    limits_nm = np.zeros(3)
+    return Step(findings, (), limits_nm, None, after)
 
 
 def _gain_error(evidence: Evidence, truth: Truth) -> float:
@@ -77,21 +80,25 @@ def test_the_shares_are_those_of_the_true_load(small: Evidence, small_truth: Tru
         )
         for data in small.datasets
     ]
-    load, velocity = np.concatenate(rows, axis=-1)[:, small.training.use[AXIS]]
+    stacked_rows = np.concatenate(rows, axis=-1)
+    load, velocity = stacked_rows[:, small.training.use[AXIS]]
     drives = load * velocity > 0.0
-    expected = float(np.mean(drives)), float(np.sum(load[drives] ** 2) / np.sum(load**2))
+    mean_drive = float(np.mean(drives))
+    expected = mean_drive, float(np.sum(load[drives] ** 2) / np.sum(load**2))
     assert driving_shares(small.training, small.estimate)[AXIS] == pytest.approx(expected, abs=0.01)
 
 
 def test_the_contrast_of_both_sides_shows_the_loss_and_its_law_the_gain(
     lossy: Evidence, small_truth: Truth
 ) -> None:
-    found = gear_losses(_step(lossy, LoadFriction(0)))[AXIS]
+    step = _step(lossy, LoadFriction(0))
+    found = gear_losses(step)[AXIS]
     assert found.gain_factor is not None
     assert found.loss == pytest.approx(LOSS, rel=0.05)
     assert found.efficiency == pytest.approx(ETA, rel=0.02)
     assert found.gain_factor == pytest.approx(1.0 / np.sqrt(1.0 - LOSS**2), rel=0.01)
-    fitted = with_effects(lossy, (PlacedEffect(LoadFriction(0), AXIS),))
+    effects = (PlacedEffect(LoadFriction(0), AXIS),)
+    fitted = with_effects(lossy, effects)
     # 2.5 % that no residual shows: the product of the law's two directions.
     assert _gain_error(fitted, small_truth) == pytest.approx(
         1.0 / found.gain_factor - 1.0, abs=0.006
@@ -113,7 +120,8 @@ def test_where_the_motor_drives_throughout_the_gain_carries_the_loss(
     """
     observation = lossy.rows_without_effects
     standard = observation.base.independent
-    direction = observation.regressor[AXIS, standard.index(14 * AXIS + 12)]
+    column = 14 * AXIS + 12
+    direction = observation.regressor[AXIS, standard.index(column)]
     load = np.concatenate(
         [
             decimate_rows(data, lossy.conditioning, _load(small_truth, data))
@@ -126,7 +134,8 @@ def test_where_the_motor_drives_throughout_the_gain_carries_the_loss(
     use[AXIS] &= drives
     motor_use[AXIS] &= drives
     kept = replace(observation, use=use, motor_use=motor_use)
-    driven = replace(lossy, rows_without_effects=kept, training=kept, estimate=ml(kept.system()))
+    estimate = ml(kept.system())
+    driven = replace(lossy, rows_without_effects=kept, training=kept, estimate=estimate)
     found = gear_losses(_step(driven))[AXIS]
     assert found.lean > 0.98
     assert found.gain_carries_it
@@ -137,5 +146,7 @@ def test_what_was_not_tested_is_not_known_and_a_negative_loss_is_no_efficiency()
     unknown = GearLoss(0.6, 0.8, None, None)
     assert unknown.gain_carries_it
     assert unknown.efficiency is None
-    assert GearLoss(0.6, 0.8, -0.1, 0.01).gain_factor is None
-    assert GearLoss(0.5, 0.5, 0.0, 0.3).hidden_shift == 0.0
+    gear_loss = GearLoss(0.6, 0.8, -0.1, 0.01)
+    assert gear_loss.gain_factor is None
+    hidden_shift = GearLoss(0.5, 0.5, 0.0, 0.3).hidden_shift
+    assert hidden_shift == 0.0

@@ -83,15 +83,19 @@ CLEAN = Mistake("nothing", 0, ())
 def _declared(mistake: Mistake) -> Truth:
     truth = three_axes_truth()
     robot = truth.model.robot
-    turned = rotation_by(np.array([mistake.tilt_rad, 0.0, 0.0])) @ robot.gravity_m_s2
-    return replace(truth, model=Model(replace(robot, gravity_m_s2=turned), truth.model.drive_train))
+    vector_rad = np.array([mistake.tilt_rad, 0.0, 0.0])
+    turned = rotation_by(vector_rad) @ robot.gravity_m_s2
+    changed_robot = replace(robot, gravity_m_s2=turned)
+    model = Model(changed_robot, truth.model.drive_train)
+    return replace(truth, model=model)
 
 
 def _with_mistake(run: Run, mistake: Mistake) -> Run:
     position = run.position_rad.copy()
     axis = mistake.axis
     position[:, axis] += mistake.zero_rad
-    position[:, axis] = np.interp(run.time_s - mistake.late_s, run.time_s, position[:, axis])
+    time_difference_s = run.time_s - mistake.late_s
+    position[:, axis] = np.interp(time_difference_s, run.time_s, position[:, axis])
     return replace(run, position_rad=position)
 
 
@@ -154,12 +158,16 @@ def test_a_mistake_is_named_alone_with_its_size_and_bends_no_gain(mistake: Mista
     start = _fitted(mistake)
     last = _searched(mistake)[-1].after
     (placed,) = last.effects
-    assert (placed.effect.name, placed.axis) == (mistake.name, mistake.axis)
+    expected = (mistake.name, mistake.axis)
+    assert (placed.effect.name, placed.axis) == expected
     values, deviations = coefficients_of(last.estimate, placed)
-    assert np.all(np.abs(values - mistake.values) < 3.0 * deviations)
-    assert np.all(deviations < 0.15 * abs(mistake.values[0]))
+    difference = np.abs(values - mistake.values)
+    assert np.all(difference < 3.0 * deviations)
+    absolute_mistake = abs(mistake.values[0])
+    assert np.all(deviations < 0.15 * absolute_mistake)
     truth = three_axes_truth()
-    off = np.abs(last.estimate.gains - truth.gains)
+    gain_difference = last.estimate.gains - truth.gains
+    off = np.abs(gain_difference)
     assert np.all(off < 3.0 * last.estimate.gains_std)
     clean = _fitted(CLEAN)
     assert (
@@ -175,20 +183,25 @@ def test_a_mistake_is_named_alone_with_its_size_and_bends_no_gain(mistake: Mista
 @pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
 def test_the_check_beside_a_fit_names_it_too(mistake: Mistake) -> None:
     (found,) = _checked(mistake).mistakes
-    assert (found.effect.name, found.axis) == (mistake.name, mistake.axis)
-    assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
+    expected = (mistake.name, mistake.axis)
+    assert (found.effect.name, found.axis) == expected
+    coefficient_difference = np.abs(found.coefficients - mistake.values)
+    assert np.all(coefficient_difference < 3.0 * found.deviations)
 
 
 def test_a_wrong_zero_and_a_leaning_base_are_both_named_with_their_sizes() -> None:
     """Alone, each takes over a part of the other."""
     both = Mistake("both", 1, (), zero_rad=ZERO_RAD, tilt_rad=TILT_RAD)
-    found = {one.effect.name: one for one in _checked(both).mistakes}
+    mistakes = _checked(both).mistakes
+    found = {one.effect.name: one for one in mistakes}
     assert set(found) == {"zero-offset", "gravity-direction"}
     zero = found["zero-offset"]
     assert zero.axis == 1
-    assert abs(zero.coefficients[0] + ZERO_RAD) < 3.0 * zero.deviations[0]
+    absolute_coefficient = abs(zero.coefficients[0] + ZERO_RAD)
+    assert absolute_coefficient < 3.0 * zero.deviations[0]
     turn = found["gravity-direction"]
-    assert np.all(np.abs(turn.coefficients - (-TILT_RAD, 0.0)) < 3.0 * turn.deviations)
+    coefficient_difference = np.abs(turn.coefficients - (-TILT_RAD, 0.0))
+    assert np.all(coefficient_difference < 3.0 * turn.deviations)
 
 
 @pytest.mark.parametrize(("j2_deg", "slide_m"), [(2.0, 0.006), (2.0, -0.006), (-1.0, 0.006)])
@@ -196,28 +209,35 @@ def test_two_wrong_zeros_are_both_named_with_their_sizes(j2_deg: float, slide_m:
     """Whichever was found first had a value that no correction of the file would have confirmed."""
     offset = np.array([0.0, np.radians(j2_deg), slide_m, 0.0])
     runs = tuple(replace(run, position_rad=run.position_rad + offset) for run in _polar_runs())
-    check = check_geometry(gathered(polar_truth(), runs), np.random.default_rng(0), GATES)
+    evidence = gathered(polar_truth(), runs)
+    rng = np.random.default_rng(0)
+    check = check_geometry(evidence, rng, GATES)
     found = {one.axis: one for one in check.mistakes}
     assert set(found) == {1, 2}
     for axis, one in found.items():
         assert one.effect.name == "zero-offset"
-        assert abs(one.coefficients[0] + offset[axis]) < 3.0 * one.deviations[0]
+        absolute_coefficient = abs(one.coefficients[0] + offset[axis])
+        assert absolute_coefficient < 3.0 * one.deviations[0]
 
 
 def test_a_wrong_zero_and_late_currents_are_both_named() -> None:
-    delays = Delays((), currents_ms=(3.0, 3.0, 3.0))
+    currents_ms = (3.0, 3.0, 3.0)
+    delays = Delays((), currents_ms=currents_ms)
     runs = tuple(_delayed(_with_mistake(run, MISTAKES[0]), delays) for run in _runs()[:4])
-    check = check_geometry(gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES)
+    evidence = gathered(three_axes_truth(), runs)
+    rng = np.random.default_rng(0)
+    check = check_geometry(evidence, rng, GATES)
     found = {(one.effect.name, one.axis): one for one in check.mistakes}
-    assert set(found) == {("zero-offset", 1), ("time-skew", 0)}
-    assert (
-        abs(found["zero-offset", 1].coefficients[0] + ZERO_RAD)
-        < 3.0 * found["zero-offset", 1].deviations[0]
-    )
-    assert (
-        abs(found["time-skew", 0].coefficients[0] - 0.003)
-        < 3.0 * found["time-skew", 0].deviations[0]
-    )
+    expected = {("zero-offset", 1), ("time-skew", 0)}
+    assert set(found) == expected
+    coefficients = found["zero-offset", 1].coefficients
+    absolute_coefficient = abs(coefficients[0] + ZERO_RAD)
+    first_deviation = found["zero-offset", 1].deviations[0]
+    assert absolute_coefficient < 3.0 * first_deviation
+    first_coefficient = found["time-skew", 0].coefficients[0]
+    absolute_first_coefficient = abs(first_coefficient - 0.003)
+    deviations = found["time-skew", 0].deviations
+    assert absolute_first_coefficient < 3.0 * deviations[0]
 
 
 @dataclass(frozen=True)
@@ -258,10 +278,12 @@ def _delayed(run: Run, delays: Delays) -> Run:
         ]
         return np.stack(moved, axis=1)
 
+    position_rad = late(run.position_rad, delays.positions_ms)
+    current_a = late(run.current_a, delays.currents_ms)
     return replace(
         run,
-        position_rad=late(run.position_rad, delays.positions_ms),
-        current_a=late(run.current_a, delays.currents_ms),
+        position_rad=position_rad,
+        current_a=current_a,
     )
 
 
@@ -272,33 +294,35 @@ def test_the_check_names_what_is_late_with_its_delay(name: str) -> None:
     """
     delays = DELAYS[name]
     runs = tuple(_delayed(run, delays) for run in _runs()[:4])
-    found = check_geometry(
-        gathered(three_axes_truth(), runs), np.random.default_rng(0), GATES
-    ).mistakes
-    assert [(one.effect.name, one.axis) for one in found] == [
-        (effect, axis) for effect, axis, _ in delays.said
-    ]
+    evidence = gathered(three_axes_truth(), runs)
+    rng = np.random.default_rng(0)
+    found = check_geometry(evidence, rng, GATES).mistakes
+    expected = [(effect, axis) for effect, axis, _ in delays.said]
+    assert [(one.effect.name, one.axis) for one in found] == expected
     for one, (_, _, delay_ms) in zip(found, delays.said, strict=True):
-        assert abs(one.coefficients[0] - 1e-3 * delay_ms) < 3.0 * one.deviations[0] < 1e-3
+        absolute_coefficient = abs(one.coefficients[0] - 1e-3 * delay_ms)
+        assert absolute_coefficient < 3.0 * one.deviations[0] < 1e-3
 
 
 def test_a_current_behind_a_filter_is_late_once() -> None:
     """A delay fits its beginning alone; the position of that joint is not late as well."""
     share = 0.4  # of a new sample
-    delay_s = (1.0 / share - 1.0) / _runs()[0].rate_hz
+    rate_hz = _runs()[0].rate_hz
+    delay_s = (1.0 / share - 1.0) / rate_hz
     runs: list[Run] = []
     for run in _runs()[:4]:
         current = run.current_a.copy()
+        current_difference = current[:, 1] - current[0, 1]
         current[:, 1] = (
-            signal.lfilter([share], [1.0, share - 1.0], current[:, 1] - current[0, 1])
-            + current[0, 1]
+            signal.lfilter([share], [1.0, share - 1.0], current_difference) + current[0, 1]
         )
         runs.append(replace(run, current_a=current))
-    check = check_geometry(
-        gathered(three_axes_truth(), tuple(runs)), np.random.default_rng(0), GATES
-    )
+    evidence = gathered(three_axes_truth(), tuple(runs))
+    rng = np.random.default_rng(0)
+    check = check_geometry(evidence, rng, GATES)
     assert [(one.effect.name, one.axis) for one in check.mistakes] == [("lag", 1)]
-    assert check.mistakes[0].coefficients[0] == pytest.approx(delay_s, rel=0.1)
+    first_coefficient = check.mistakes[0].coefficients[0]
+    assert first_coefficient == pytest.approx(delay_s, rel=0.1)
 
 
 def test_undeclared_friction_is_no_late_current() -> None:
@@ -310,21 +334,26 @@ def test_undeclared_friction_is_no_late_current() -> None:
         velocity = np.gradient(run.position_rad[:, 1], run.time_s)
         current[:, 1] += 4.0 * np.tanh(velocity / 0.3) / truth.gains[1]
         runs.append(replace(run, current_a=current))
-    found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES)
+    evidence = gathered(truth, tuple(runs))
+    rng = np.random.default_rng(0)
+    found = check_geometry(evidence, rng, GATES)
     assert found.mistakes == ()
 
 
 @pytest.mark.parametrize("zero_deg", [-15.0, 30.0])
 def test_the_check_gives_a_large_zero_its_size(zero_deg: float) -> None:
     """The column of a zero is for small ones: by it alone, 30° are 35 ± 1°."""
-    mistake = Mistake("zero-offset", 1, (-np.radians(zero_deg),), zero_rad=np.radians(zero_deg))
+    zero_rad = np.radians(zero_deg)
+    mistake = Mistake("zero-offset", 1, (-np.radians(zero_deg),), zero_rad=zero_rad)
     (found,) = _checked(mistake).mistakes
     assert (found.effect.name, found.axis) == ("zero-offset", 1)
-    assert np.all(np.abs(found.coefficients - mistake.values) < 3.0 * found.deviations)
+    coefficient_difference = np.abs(found.coefficients - mistake.values)
+    assert np.all(coefficient_difference < 3.0 * found.deviations)
 
 
 def test_a_clean_recording_names_nothing_and_shows_the_direction_of_gravity() -> None:
-    assert _searched(CLEAN)[-1].after.effects == ()
+    after = _searched(CLEAN)[-1].after
+    assert after.effects == ()
     check = _checked(CLEAN)
     assert check.mistakes == ()
     assert check.hidden_zeros == (0, 2)  # about the vertical, and behind the last joint
@@ -341,15 +370,18 @@ def test_the_direction_of_gravity_has_the_sigma_of_the_joint_fit() -> None:
     for seed in range(16):
         runs = small_recordings(truth, 1000 + seed)
         evidence = gather(identify(truth.model, runs, SMALL, keep_rows=True))
-        gravity = check_geometry(evidence, np.random.default_rng(0), GATES).gravity
+        rng = np.random.default_rng(0)
+        gravity = check_geometry(evidence, rng, GATES).gravity
         assert gravity is not None
         turn = turn_between(gravity.declared_m_s2, gravity.found_m_s2)
-        far.append(turn / np.sqrt(np.diag(gravity.covariance_rad2)))
+        covariance_rad2_diagonal = np.diag(gravity.covariance_rad2)
+        far.append(turn / np.sqrt(covariance_rad2_diagonal))
         along = turn / np.linalg.norm(turn)
         assert gravity.turn_std_rad == pytest.approx(
             np.sqrt(along @ gravity.covariance_rad2 @ along)
         )
-    assert 0.8 < np.sqrt(np.mean(np.square(far))) < 1.2
+    mean_squared_far = np.mean(np.square(far))
+    assert 0.8 < np.sqrt(mean_squared_far) < 1.2
 
 
 def test_a_slide_between_two_joints_shows_millimetres_of_its_zero() -> None:
@@ -358,11 +390,14 @@ def test_a_slide_between_two_joints_shows_millimetres_of_its_zero() -> None:
     """
     moved = np.array([0.0, 0.0, 0.006, 0.0])
     runs = tuple(replace(run, position_rad=run.position_rad + moved) for run in _polar_runs())
-    found = check_geometry(gathered(polar_truth(), runs), np.random.default_rng(0), GATES)
+    evidence = gathered(polar_truth(), runs)
+    rng = np.random.default_rng(0)
+    found = check_geometry(evidence, rng, GATES)
     assert found.hidden_zeros == (0, 3)
     (slide,) = found.mistakes
     assert (slide.effect.name, slide.axis) == ("zero-offset", 2)
-    assert abs(slide.coefficients[0] + 0.006) < 3.0 * slide.deviations[0] < 0.0012
+    absolute_coefficient = abs(slide.coefficients[0] + 0.006)
+    assert absolute_coefficient < 3.0 * slide.deviations[0] < 0.0012
 
 
 def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> None:
@@ -381,7 +416,8 @@ def test_slides_that_come_before_every_joint_show_nothing_of_their_zeros() -> No
         )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
-    found = check_geometry(gathered(truth, runs), np.random.default_rng(0), GATES)
+    evidence = gathered(truth, runs)
+    found = check_geometry(evidence, np.random.default_rng(0), GATES)
     assert {0, 1, 2} <= set(found.hidden_zeros)
 
 
@@ -394,10 +430,11 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
     """One of the two was named alone, with a σ of a twelfth of its size."""
     truth = three_axes_truth()
     robot = truth.model.robot
-    lean = rotation_by(np.array([0.0, TILT_RAD, 0.0])) @ robot.gravity_m_s2
-    leaning = replace(
-        truth, model=Model(replace(robot, gravity_m_s2=lean), truth.model.drive_train)
-    )
+    vector_rad = np.array([0.0, TILT_RAD, 0.0])
+    lean = rotation_by(vector_rad) @ robot.gravity_m_s2
+    changed_robot = replace(robot, gravity_m_s2=lean)
+    model = Model(changed_robot, truth.model.drive_train)
+    leaning = replace(truth, model=model)
     rng = np.random.default_rng(8)
     less = np.array([0.06, 1.0, 1.0])
     runs: list[Run] = []
@@ -417,14 +454,19 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
         )
     # The gain of J1 is not seen
     fixed = identify(leaning.model, runs, SMALL, fixed_gains=truth.gains)
-    check = check_geometry(gather(fixed, runs), np.random.default_rng(0), GATES)
+    evidence = gather(fixed, runs)
+    check = check_geometry(evidence, np.random.default_rng(0), GATES)
     assert len(check.mistakes) == 1
     (alike,) = check.alike
     named = {(one.effect.name, one.axis) for one in alike.findings}
-    assert named == {("gravity-direction", 0), ("zero-offset", 1)}
+    expected = {("gravity-direction", 0), ("zero-offset", 1)}
+    assert named == expected
     for one in alike.findings:
-        assert np.degrees(np.linalg.norm(one.coefficients)) == pytest.approx(2.0, abs=0.5)
-        assert np.degrees(np.max(one.deviations)) > 0.01  # a lost direction would have none
+        coefficient_norm = np.linalg.norm(one.coefficients)
+        coefficient_norm_deg = np.degrees(coefficient_norm)
+        assert coefficient_norm_deg == pytest.approx(2.0, abs=0.5)
+        largest_deviation = np.max(one.deviations)
+        assert np.degrees(largest_deviation) > 0.01  # a lost direction would have none
     assert alike.axes_to_move == (0,)
 
 
@@ -436,36 +478,41 @@ def test_check_geometry_with_an_undeclared_spring_names_no_zero() -> None:
         current = run.current_a.copy()
         current[:, 1] += 6.0 * run.position_rad[:, 1] / truth.gains[1]
         runs.append(replace(run, current_a=current))
-    found = check_geometry(gathered(truth, tuple(runs)), np.random.default_rng(0), GATES)
+    evidence = gathered(truth, tuple(runs))
+    rng = np.random.default_rng(0)
+    found = check_geometry(evidence, rng, GATES)
     assert found.mistakes == ()
 
 
 def test_check_geometry_names_a_small_zero_beside_a_large_spring_of_another_axis() -> None:
     """The spring explains more, but nothing of what the zero does to the arm."""
-    mistake = replace(MISTAKES[0], zero_rad=0.5 * ZERO_RAD)
+    zero_rad = 0.5 * ZERO_RAD
+    mistake = replace(MISTAKES[0], zero_rad=zero_rad)
     truth = three_axes_truth()
     runs: list[Run] = []
     for run in _runs()[:4]:
         current = run.current_a.copy()
         current[:, 2] += 2.0 * run.position_rad[:, 2] / truth.gains[2]
         runs.append(replace(_with_mistake(run, mistake), current_a=current))
-    (found,) = check_geometry(
-        gathered(truth, tuple(runs)), np.random.default_rng(0), GATES
-    ).mistakes
+    evidence = gathered(truth, tuple(runs))
+    rng = np.random.default_rng(0)
+    (found,) = check_geometry(evidence, rng, GATES).mistakes
     assert (found.effect.name, found.axis) == ("zero-offset", 1)
-    assert np.degrees(found.coefficients[0]) == pytest.approx(-1.0, abs=0.3)
+    coefficient_deg = np.degrees(found.coefficients[0])
+    assert coefficient_deg == pytest.approx(-1.0, abs=0.3)
 
 
 def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
     mistake = MISTAKES[0]
     start = _fitted(mistake)
     steps = _searched(mistake)
-    calibration = calibration_of(
-        start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps
-    )
+    nameplate = (33.0, 33.0, -24.0)
+    axes = ("J1", "J2", "J3")
+    calibration = calibration_of(start.identification, axes, nameplate, steps=steps)
     (accepted,) = calibration.effects
     assert (accepted.name, accepted.axis, accepted.settings) == ("zero-offset", "J2", {})
-    assert accepted.coefficients[0].value == pytest.approx(-ZERO_RAD, abs=0.002)
+    coefficient = accepted.coefficients[0].value
+    assert coefficient == pytest.approx(-ZERO_RAD, abs=0.002)
     last = steps[-1].after
     # Its verdict is that of all motors together, and so are its errors.
     assert start.holdout_error is not None
@@ -476,14 +523,17 @@ def test_the_correction_is_in_the_prediction_of_a_calibration() -> None:
     predicted = predict_current(calibration, start.model, data)
     moving = data.motor_moving.all(axis=1)
     left = (predicted - data.current_a)[moving]
-    assert np.sqrt(np.mean(left**2)) < 1.1 * NOISE_A
+    rms = np.sqrt(np.mean(left**2))
+    assert rms < 1.1 * NOISE_A
     # The corrected model predicts the same; the declared one does not.
     declared = tuple(
         one for one in calibration.parameters if not one.name.startswith("zero-offset")
     )
     without = replace(calibration, effects=(), parameters=declared)
-    bad = (predict_current(without, start.model, data) - data.current_a)[moving]
-    assert np.sqrt(np.mean(bad**2)) > 1.05 * np.sqrt(np.mean(left**2))
+    difference = predict_current(without, start.model, data) - data.current_a
+    bad = difference[moving]
+    rms_bad = np.sqrt(np.mean(bad**2))
+    assert rms_bad > 1.05 * np.sqrt(np.mean(left**2))
     assert last.model is not start.model
 
 
@@ -491,19 +541,23 @@ def test_a_body_is_weighed_with_the_corrected_geometry() -> None:
     mistake = MISTAKES[2]
     start = _fitted(mistake)
     steps = _searched(mistake)
-    calibration = calibration_of(
-        start.identification, ("J1", "J2", "J3"), (33.0, 33.0, -24.0), steps=steps
-    )
-    loaded = _with_mistake(_runs()[4], mistake)
+    nameplate = (33.0, 33.0, -24.0)
+    axes = ("J1", "J2", "J3")
+    calibration = calibration_of(start.identification, axes, nameplate, steps=steps)
+    run = _runs()[4]
+    loaded = _with_mistake(run, mistake)
     weighed = weigh(calibration, start.model, [loaded], start.conditioning)
-    assert abs(weighed.mass_kg - PAYLOAD_TRUTH["m"]) < 3.0 * weighed.mass_std_kg
-    level = replace(start.model, robot=three_axes_truth().model.robot)
+    mass_difference_kg = abs(weighed.mass_kg - PAYLOAD_TRUTH["m"])
+    assert mass_difference_kg < 3.0 * weighed.mass_std_kg
+    robot = three_axes_truth().model.robot
+    level = replace(start.model, robot=robot)
+    parameters = tuple(
+        one for one in calibration.parameters if not one.name.startswith("gravity-direction")
+    )
     without = replace(
         calibration,
         effects=(),
-        parameters=tuple(
-            one for one in calibration.parameters if not one.name.startswith("gravity-direction")
-        ),
+        parameters=parameters,
         covariance_factor=None,
     )
     expected = weigh(without, level, [loaded], start.conditioning)
@@ -518,9 +572,11 @@ def test_before_and_after_are_of_the_same_rows() -> None:
     assert whole.holdout_change is not None
     assert whole.holdout_change.rise < -2.0 * whole.holdout_change.std
     assert [placed.effect.name for placed in whole.total.added] == ["late-position"]
-    left_out = left_out_runs(steps[-1].after, start.estimate.gains)
+    evidence = steps[-1].after
+    left_out = left_out_runs(evidence, start.estimate.gains)
     assert left_out.together is not None
-    assert left_out.together.total < 1.1 * whole.total.after.in_sample.total
+    in_sample = whole.total.after.in_sample
+    assert left_out.together.total < 1.1 * in_sample.total
 
 
 def test_a_correction_that_leaves_is_taken_back() -> None:
@@ -549,9 +605,9 @@ def test_a_gantry_that_leans_is_named_and_upright_it_bends_no_gain() -> None:
     truth = gantry_truth()
     robot = truth.model.robot
     lean = np.array([0.03, -0.04, 0.0])
-    leaning = Model(
-        replace(robot, gravity_m_s2=rotation_by(lean) @ robot.gravity_m_s2), truth.model.drive_train
-    )
+    gravity_m_s2 = rotation_by(lean) @ robot.gravity_m_s2
+    changed_robot = replace(robot, gravity_m_s2=gravity_m_s2)
+    leaning = Model(changed_robot, truth.model.drive_train)
     rng = np.random.default_rng(9)
     runs = tuple(
         record(
@@ -566,13 +622,15 @@ def test_a_gantry_that_leans_is_named_and_upright_it_bends_no_gain() -> None:
         )
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     )
-    last = find_effects(
-        gathered(replace(truth, model=leaning), runs), np.random.default_rng(0), GATES, ()
-    )[-1].after
+    changed_truth = replace(truth, model=leaning)
+    effects = find_effects(gathered(changed_truth, runs), np.random.default_rng(0), GATES, ())
+    last = effects[-1].after
     (placed,) = last.effects
     assert isinstance(placed.effect, GravityDirection)
     found = last.model.robot.gravity_m_s2
     _, deviations = coefficients_of(last.estimate, placed)
     lean_left_rad = np.linalg.norm(found[:2]) / np.linalg.norm(found)
-    assert lean_left_rad < 3.0 * np.linalg.norm(deviations)
-    assert np.all(np.abs(last.estimate.gains - truth.gains) < 3.0 * last.estimate.gains_std)
+    deviation_norm = np.linalg.norm(deviations)
+    assert lean_left_rad < 3.0 * deviation_norm
+    gain_difference = np.abs(last.estimate.gains - truth.gains)
+    assert np.all(gain_difference < 3.0 * last.estimate.gains_std)

@@ -24,7 +24,8 @@ def causes(robot: Robot) -> list[str]:
 
 def leaning(robot: Robot, angle_deg: float) -> Robot:
     angle = np.deg2rad(angle_deg)
-    return replace(robot, gravity_m_s2=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
+    gravity_m_s2 = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    return replace(robot, gravity_m_s2=gravity_m_s2)
 
 
 def test_an_upright_arm_hides_the_first_zero_by_symmetry_and_the_last_one_by_its_link(
@@ -34,21 +35,24 @@ def test_an_upright_arm_hides_the_first_zero_by_symmetry_and_the_last_one_by_its
 
 
 def test_a_base_that_leans_by_two_degrees_is_upright_still(arm: Robot) -> None:
-    assert zero_hidden_by(leaning(arm, 2.0), 0) is ZeroHiddenBy.SYMMETRY
+    robot = leaning(arm, 2.0)
+    assert zero_hidden_by(robot, 0) is ZeroHiddenBy.SYMMETRY
 
 
 @pytest.mark.parametrize("angle_deg", [20.0, 90.0])
 def test_on_a_wall_the_first_zero_is_hidden_by_the_moves_alone(
     arm: Robot, angle_deg: float
 ) -> None:
-    assert zero_hidden_by(leaning(arm, angle_deg), 0) is ZeroHiddenBy.MOVES
+    robot = leaning(arm, angle_deg)
+    assert zero_hidden_by(robot, 0) is ZeroHiddenBy.MOVES
 
 
 def test_slides_before_any_turning_joint_shift_the_whole_arm() -> None:
     """A turn about the vertical behind horizontal slides is none of the whole arm:
     their torques show it.
     """
-    assert causes(gantry_truth().model.robot) == [
+    robot = gantry_truth().model.robot
+    assert causes(robot) == [
         "symmetry",
         "symmetry",
         "symmetry",

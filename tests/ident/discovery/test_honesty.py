@@ -58,12 +58,14 @@ def _shows_its_own(folds: Folds, other: Folds) -> float:
     three, if it has no influence.
     """
     own = _fold_of_rows(folds) == 0
-    return float(np.mean((other.residual - folds.residual)[own]))
+    residual_difference = other.residual - folds.residual
+    return float(np.mean(residual_difference[own]))
 
 
 def _changed(problem: Linearisation, folds: Folds) -> Linearisation:
     first = np.unique(folds.linearisation.cluster[_fold_of_rows(folds) == 0])
-    return replace(problem, residual=problem.residual + 3.0 * np.isin(problem.cluster, first))
+    residual = problem.residual + 3.0 * np.isin(problem.cluster, first)
+    return replace(problem, residual=residual)
 
 
 def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearisation) -> None:
@@ -75,7 +77,8 @@ def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearis
     changed = cut_into_folds(_changed(problem, folds))
     change = changed.residual - folds.residual
     assert change[fold == 0] == pytest.approx(3.0)
-    assert np.max(np.abs(change[fold != 0])) > 1e-3
+    absolute_change = np.abs(change[fold != 0])
+    assert np.max(absolute_change) > 1e-3
 
 
 def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +102,8 @@ def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.Monk
     # forbids it.
     pieces = 4 * problem.cluster + np.arange(len(problem.cluster)) % 4
     parted = replace(problem, cluster=pieces)
-    kept = cut_into_folds(parted, move_of=np.arange(4 * problem.cluster_count) // 4)
+    move_of = np.arange(4 * problem.cluster_count) // 4
+    kept = cut_into_folds(parted, move_of=move_of)
     leaked = cut_into_folds(parted)
     assert max(_folds_a_move(kept)) == 1
     assert min(_folds_a_move(leaked)) == 4
@@ -113,7 +117,8 @@ def _folds_a_move(folds: Folds) -> list[int]:
 
 def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evidence) -> None:
     rows = small.training.run < 2
-    short = replace(small, training=small.training.only(rows), datasets=small.datasets[:2])
+    training = small.training.only(rows)
+    short = replace(small, training=training, datasets=small.datasets[:2])
     search_problem = search_problem_of(short)
     folds = search_problem.folds
     assert folds.moves < folds.linearisation.cluster_count  # cut into pieces, as there are few
@@ -126,25 +131,27 @@ def test_the_same_seed_gives_the_same_verdict(small: Evidence) -> None:
     first, second = (
         rank_effects(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2)
     )
-    assert [(f.effect, f.axis, f.probability, f.held_out_fall) for f in first] == [
-        (f.effect, f.axis, f.probability, f.held_out_fall) for f in second
-    ]
+    expected = [(f.effect, f.axis, f.probability, f.held_out_fall) for f in second]
+    assert [(f.effect, f.axis, f.probability, f.held_out_fall) for f in first] == expected
 
 
 def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(
     search_problem: SearchProblem,
 ) -> None:
     """A family is scored on each fold with the setting that the others chose, best on it or not."""
-    (tested,) = search_problem.test([tuple(Cogging(order) for order in range(1, 13))], 0)
+    families = [tuple(Cogging(order) for order in range(1, 13))]
+    (tested,) = search_problem.test(families, 0)
     scored = tested.nested()
     trials = [trial for _, trial in tested.members]
     left_out = np.stack([trial.held_out.sum(axis=1) for trial in trials])
     for fold in range(search_problem.folds.count):
         chosen = max(range(len(trials)), key=lambda index: trials[index].training_fall[fold])
-        assert np.array_equal(scored[fold], trials[chosen].held_out[fold])
+        held_out = trials[chosen].held_out
+        assert np.array_equal(scored[fold], held_out[fold])
     # Among twelve settings that mean nothing, the best of each fold looks like an effect.
     before = search_problem.folds.square_sum(search_problem.folds.residual).sum()
-    assert left_out.min(axis=0).sum() < before
+    smallest_left_out = left_out.min(axis=0)
+    assert smallest_left_out.sum() < before
     assert scored.sum() > left_out.min(axis=0).sum()
 
 
@@ -154,11 +161,9 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
     folds = cut_into_folds(problem)
     own = _fold_of_rows(folds) == 0
     columns = rng.normal(size=(len(own), 3))
-    changed = cut_into_folds(
-        replace(
-            folds.linearisation, residual=folds.linearisation.residual + 5.0 * own * columns[:, 0]
-        )
-    )
+    residual = folds.linearisation.residual + 5.0 * own * columns[:, 0]
+    changed_linearisation = replace(folds.linearisation, residual=residual)
+    changed = cut_into_folds(changed_linearisation)
     before, after = (
         score_candidates(one, columns, [slice(i, i + 1) for i in range(3)])
         for one in (folds, changed)
@@ -191,8 +196,11 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
     cache: ColumnCache = {}
     false = known = 0
     for _ in range(20):
-        sign = rng.choice((-1.0, 1.0), size=(3, int(observed.move.max()) + 1))[:, observed.move]
-        problem = search_problem_of(with_current(small, (sign - 1.0) * noise), cache)
+        largest_move = int(observed.move.max())
+        sign = rng.choice((-1.0, 1.0), size=(3, largest_move + 1))[:, observed.move]
+        added_a = (sign - 1.0) * noise
+        evidence = with_current(small, added_a)
+        problem = search_problem_of(evidence, cache)
         false += any(finding.passed for finding in rank_effects(problem, rng, GATES, families))
         alone = tuple(family for family in families if family[0].name in KNOWN)
         known += any(
@@ -234,13 +242,17 @@ def _noise_trial(
     gram = np.einsum("mra,mrb->mab", x, x)
     score = np.einsum("mra,mr->ma", x, e)
     coefficients = np.linalg.solve(gram.sum(axis=0), score.sum(axis=0))
+    fallen = np.array([float(score.sum(axis=0) @ coefficients)])
+    scatter = score - gram @ coefficients
+    held_out = np.zeros((8, 1))
+    training_fall = np.zeros(8)
     return CandidateTrial(
         coefficients=coefficients,
-        fallen=np.array([float(score.sum(axis=0) @ coefficients)]),
-        training_fall=np.zeros(8),
-        held_out=np.zeros((8, 1)),
+        fallen=fallen,
+        training_fall=training_fall,
+        held_out=held_out,
         score=score.sum(axis=0),
-        scatter=score - gram @ coefficients,
+        scatter=scatter,
         gram=gram,
     )
 
@@ -260,9 +272,9 @@ def test_the_bootstrap_keeps_its_size(
         trial = replace(
             _noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3)
         )
-        (finding,) = rank_families(
-            search_problem, [FamilyTrials(0, ((effect, trial),))], rng, GATES
-        )
+        members = ((effect, trial),)
+        tested = [FamilyTrials(0, members)]
+        (finding,) = rank_families(search_problem, tested, rng, GATES)
         assert finding.probability is not None
         false += finding.probability <= 0.05
     assert least <= false <= most

@@ -28,7 +28,8 @@ LATE = PlacedEffect(LatePosition(), 1)
 
 def contradiction(value: float, std: float, fitted: float, placed: PlacedEffect = LATE) -> str:
     """What is said of one coefficient."""
-    return _contradiction(placed, np.array([value]), np.array([fitted]), np.array([[std**2]]))
+    covariance = np.array([[std**2]])
+    return _contradiction(placed, np.array([value]), np.array([fitted]), covariance)
 
 
 @pytest.mark.parametrize(
@@ -50,10 +51,12 @@ def test_contradiction_by_instruments_is_said_with_its_size(value_ms: float, sai
 def test_contradiction_of_instruments_that_show_nothing_refutes_no_named_effect() -> None:
     """Without point-to-point moves of that joint σ by instruments is larger than the effect."""
     assert contradiction(0.5, 3.0, 4.2) == ""
-    unnamed = PlacedEffect(Smooth(next(iter(Abscissa))), 1)
+    variable = next(iter(Abscissa))
+    unnamed = PlacedEffect(Smooth(variable), 1)
     count = len(unnamed.effect.coefficients)
     covariance = 9.0 * np.eye(count)
-    assert _contradiction(unnamed, np.full(count, 0.5), np.full(count, 4.2), covariance) != ""
+    fitted = np.full(count, 4.2)
+    assert _contradiction(unnamed, np.full(count, 0.5), fitted, covariance) != ""
 
 
 @given(
@@ -78,5 +81,7 @@ def test_a_delay_that_explains_little_must_be_far_from_zero(delay_ms: float, sta
         runs.append(replace(run, position_rad=position))
     fitted = with_effects(gathered(three_axes_truth(), tuple(runs)), (LATE,))
     joint = linearised(fitted, ColumnCache())
-    _, why = beside_others(joint, fitted.effects[0], np.random.default_rng(0), Gates())
+    rng = np.random.default_rng(0)
+    placed = fitted.effects[0]
+    _, why = beside_others(joint, placed, rng, Gates())
     assert ("it explains little, and is less than 5 σ from zero" in why) is not stays

@@ -35,7 +35,8 @@ def _late(*delays_ms: float) -> Evidence:
             np.interp(run.time_s - 1e-3 * delay_ms, run.time_s, current)
             for current, delay_ms in columns
         ]
-        runs.append(replace(run, current_a=np.stack(late, axis=1)))
+        current_a = np.stack(late, axis=1)
+        runs.append(replace(run, current_a=current_a))
     return gathered(three_axes_truth(), tuple(runs))
 
 
@@ -43,7 +44,8 @@ def _found(*delays_ms: float) -> LateCurrents | None:
     evidence = _late(*delays_ms)
     problem = search_problem_of(evidence)
     rates = torque_rates(evidence)
-    return find_late_currents(problem, try_delays(problem, rates), rates)
+    tested = try_delays(problem, rates)
+    return find_late_currents(problem, tested, rates)
 
 
 def test_differences_of_rows_are_nearly_the_rate_of_torque() -> None:
@@ -51,7 +53,9 @@ def test_differences_of_rows_are_nearly_the_rate_of_torque() -> None:
     use = evidence.training.motor_use
     rough = rough_torque_rates(evidence)[use]
     exact = torque_rates(evidence)[use]
-    cosine = float(rough @ exact) / float(np.linalg.norm(rough) * np.linalg.norm(exact))
+    rough_norm = np.linalg.norm(rough)
+    exact_norm = np.linalg.norm(exact)
+    cosine = float(rough @ exact) / float(rough_norm * exact_norm)
     assert cosine > 0.9
 
 
@@ -102,9 +106,13 @@ def test_one_current_that_is_left_to_test_is_no_common_delay() -> None:
 def test_a_long_delay_has_its_size_in_the_fit(delay_ms: float) -> None:
     """Without its filter, jumps of the torque shorten it."""
     evidence = _late(0.0, delay_ms, 0.0)
-    fitted = with_delays(evidence, (PlacedEffect(Lag(), 1),), np.array([7e-4 * delay_ms]))
+    effects = (PlacedEffect(Lag(), 1),)
+    fitted = with_delays(evidence, effects, np.array([7e-4 * delay_ms]))
     (placed,) = fitted.effects
     seconds, std = coefficients_of(fitted.estimate, placed)
-    assert abs(seconds[0] - 1e-3 * delay_ms) < 3.0 * std[0] < 1e-3
-    assert placed.effect.settings["backwards"] == int(delay_ms < 0.0)
-    assert placed.effect.settings["filter_s"] == pytest.approx(5e-4 * abs(delay_ms), rel=0.1)
+    absolute_second = abs(seconds[0] - 1e-3 * delay_ms)
+    assert absolute_second < 3.0 * std[0] < 1e-3
+    expected = int(delay_ms < 0.0)
+    assert placed.effect.settings["backwards"] == expected
+    filter_s = placed.effect.settings["filter_s"]
+    assert filter_s == pytest.approx(5e-4 * abs(delay_ms), rel=0.1)

@@ -36,13 +36,13 @@ def _resting(truth: Truth, runs: int = 3) -> tuple[Dataset, ...]:
     rng = np.random.default_rng(8)
     made = []
     for number in range(runs):
-        data = differentiate(
-            record(truth, f"run{number}", rng, seconds=22.0), truth.model.drive_train, CONDITIONING
-        )
+        run = record(truth, f"run{number}", rng, seconds=22.0)
+        data = differentiate(run, truth.model.drive_train, CONDITIONING)
         current = data.current_a.copy()
         for motor, still in enumerate(~data.motor_moving.T):
             for part in _parts(still):
-                t = np.linspace(-1.0, 1.0, part.stop - part.start)
+                difference = part.stop - part.start
+                t = np.linspace(-1.0, 1.0, difference)
                 current[part, motor] = rng.normal() + rng.normal() * t + 0.3 * rng.normal() * t**2
         made.append(replace(data, current_a=current))
     return tuple(made)
@@ -55,7 +55,8 @@ def _parts(still: NDArray[np.bool_]) -> list[slice]:
 
 def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
     rng = np.random.default_rng(seed)
-    noise_a = NOISE_A[: runs[0].current_a.shape[1]]
+    current_a = runs[0].current_a
+    noise_a = NOISE_A[: current_a.shape[1]]
     return tuple(
         replace(
             data, current_a=data.current_a + noise_a * rng.standard_normal(data.current_a.shape)
@@ -78,9 +79,8 @@ def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
             at = np.arange(len(q))
             return np.stack([np.interp(at - 2.4 * number, at, axis) for axis in q.T], axis=1)
 
-        made = record(
-            small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=later
-        )
+        rng = np.random.default_rng(8)
+        made = record(small_truth, f"run{number}", rng, seconds=22.0, bend=later)
         return differentiate(made, small_truth.model.drive_train, SMALL)
 
     return tuple(run(number) for number in range(3))
@@ -95,7 +95,8 @@ def _all(floors: tuple[MotorNoiseFloor | None, ...]) -> tuple[MotorNoiseFloor, .
 def _expected_a(data: Dataset) -> FloatArray:
     """σ of a filtered row of white noise."""
     taps = decimator(data.rate_hz, CONDITIONING.decimation_cutoff_hz).taps
-    return np.asarray(NOISE_A[: data.current_a.shape[1]] * np.linalg.norm(taps))
+    tap_norm = np.linalg.norm(taps)
+    return np.asarray(NOISE_A[: data.current_a.shape[1]] * tap_norm)
 
 
 def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
@@ -107,10 +108,12 @@ def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
 
 def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dataset, ...]) -> None:
     drawn = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
-    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(
-        resting[0]
-    )
-    reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
+    noise_a = []
+    for floors in drawn:
+        noise_a.append([floor.noise_a for floor in floors])
+    relative = np.array(noise_a) / _expected_a(resting[0])
+    std_percent = [floor.std_percent for floor in drawn[0]]
+    reported = np.mean(std_percent) / 100.0
     # 120 estimates: their mean is known to std_percent/√120, their scatter to 1/√240 of itself;
     # three of those.
     assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
@@ -124,7 +127,8 @@ def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(
     above: list[bool] = []
     above_limit: list[bool] = []
     for seed in range(40):
-        floors = _all(noise_floors(_noisy(resting, seed), CONDITIONING))
+        datasets = _noisy(resting, seed)
+        floors = _all(noise_floors(datasets, CONDITIONING))
         for floor, expected in zip(floors, _expected_a(resting[0]), strict=True):
             above.append(floor.noise_a > expected)
             above_limit.append(floor.least_a > expected)
@@ -147,9 +151,8 @@ def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ..
             for part in _parts(still)[::4]:
                 current[(part.start + part.stop) // 2 : part.stop, motor] += 200.0 * NOISE_A[motor]
         slipping.append(replace(data, current_a=current))
-    for floor, expected in zip(
-        _all(noise_floors(slipping, CONDITIONING)), _expected_a(resting[0]), strict=True
-    ):
+    floors = noise_floors(slipping, CONDITIONING)
+    for floor, expected in zip(_all(floors), _expected_a(resting[0]), strict=True):
         assert floor.noise_a < 2.0 * expected
 
 
@@ -161,7 +164,8 @@ def test_what_moves_or_is_invalid_has_no_say(resting: tuple[Dataset, ...]) -> No
     ]
     assert noise_floors(elsewhere, CONDITIONING) == noise_floors(noisy, CONDITIONING)
     unseen = [replace(data, valid=np.zeros_like(data.valid)) for data in noisy]
-    assert noise_floors(unseen, CONDITIONING) == (None,) * 6
+    expected = (None,) * 6
+    assert noise_floors(unseen, CONDITIONING) == expected
 
 
 def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(
@@ -176,7 +180,8 @@ def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(
         motor_moving=first.motor_moving[short],
         valid=first.valid[short],
     )
-    assert noise_floors((cut,), CONDITIONING) == (None,) * 6
+    expected = (None,) * 6
+    assert noise_floors((cut,), CONDITIONING) == expected
     switched_off = [replace(data, current_a=np.zeros_like(data.current_a)) for data in resting]
     assert noise_floors(switched_off, CONDITIONING) == (None,) * 6
     always_moving = [
@@ -188,14 +193,16 @@ def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(
 def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(
     repeated: tuple[Dataset, ...],
 ) -> None:
+    motor_moving = np.zeros_like(repeated[0].motor_moving)
+    current_a = np.zeros_like(repeated[0].current_a)
     still = replace(
         repeated[0],
-        motor_moving=np.zeros_like(repeated[0].motor_moving),
-        current_a=np.zeros_like(repeated[0].current_a),
+        motor_moving=motor_moving,
+        current_a=current_a,
     )
-    for floor, expected in zip(
-        _all(noise_floors(_noisy([still]), SMALL)), _expected_a(still), strict=True
-    ):
+    datasets = _noisy([still])
+    floors = noise_floors(datasets, SMALL)
+    for floor, expected in zip(_all(floors), _expected_a(still), strict=True):
         assert floor.parts == 11
         assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
 
@@ -210,13 +217,15 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
     scaled = [replace(data, current_a=factor * (data.current_a + offset)) for data in noisy]
     for one, other in zip(floors, _all(noise_floors(scaled, CONDITIONING)), strict=True):
         assert other.noise_a == pytest.approx(factor * one.noise_a, rel=1e-6)
-        assert (other.parts, other.freedom) == (one.parts, one.freedom)
+        expected = (one.parts, one.freedom)
+        assert (other.parts, other.freedom) == expected
 
 
 def test_standstill_alone_is_no_bound(
     resting: tuple[Dataset, ...], repeated: tuple[Dataset, ...]
 ) -> None:
-    at_rest = _all(noise_floors(_noisy(resting), CONDITIONING, (FloorSource.STANDSTILL,)))
+    floors = noise_floors(_noisy(resting), CONDITIONING, (FloorSource.STANDSTILL,))
+    at_rest = _all(floors)
     assert not any(floor.is_bound for floor in at_rest)
     in_motion = _all(noise_floors(_noisy(repeated), SMALL, MOVES))
     assert all(floor.is_bound for floor in in_motion)
@@ -232,10 +241,12 @@ def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> 
     assert all(
         floor.source is FloorSource.REPEATED_MOVES and floor.parts > 30 for floor in drawn[0]
     )
-    relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(
-        repeated[0]
-    )
-    reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
+    noise_a = []
+    for floors in drawn:
+        noise_a.append([floor.noise_a for floor in floors])
+    relative = np.array(noise_a) / _expected_a(repeated[0])
+    std_percent = [floor.std_percent for floor in drawn[0]]
+    reported = np.mean(std_percent) / 100.0
     assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
     # 60 estimates: their scatter is known to 1/√120 of itself, 9 %; three of those.
     assert relative.std() == pytest.approx(reported, rel=0.27)
@@ -246,7 +257,8 @@ def test_pairs_that_share_a_move_have_less_freedom(repeated: tuple[Dataset, ...]
     same = _noisy((repeated[0],) * 3)
     three, two = (_all(noise_floors(runs, SMALL, MOVES)) for runs in (same, same[:2]))
     for many, few in zip(three, two, strict=True):
-        assert many.parts == 2 * few.parts
+        expected = 2 * few.parts
+        assert many.parts == expected
         assert many.freedom == pytest.approx(1.6 * few.freedom)
 
 
@@ -272,17 +284,16 @@ def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> Non
     def run(number: int) -> Dataset:
         def shaken(q: FloatArray) -> FloatArray:
             phase = np.array([0.0, 1.0, 2.0]) + 2.5 * number
-            return np.asarray(q + 1e-3 * np.sin(0.05 * np.arange(len(q))[:, None] + phase))
+            phase_sine = np.sin(0.05 * np.arange(len(q))[:, None] + phase)
+            return np.asarray(q + 1e-3 * phase_sine)
 
-        made = record(
-            small_truth, f"run{number}", np.random.default_rng(8), seconds=22.0, bend=shaken
-        )
+        rng = np.random.default_rng(8)
+        made = record(small_truth, f"run{number}", rng, seconds=22.0, bend=shaken)
         return differentiate(made, small_truth.model.drive_train, SMALL)
 
     runs = _noisy([run(0), run(1)])
-    for floor, expected in zip(
-        _all(noise_floors(runs, SMALL, MOVES)), _expected_a(runs[0]), strict=True
-    ):
+    floors = noise_floors(runs, SMALL, MOVES)
+    for floor, expected in zip(_all(floors), _expected_a(runs[0]), strict=True):
         assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
 
 
@@ -302,24 +313,30 @@ def test_the_smaller_of_both_estimates_is_taken(
         loud = (
             3.0 * rng.standard_normal(data.current_a.shape) * (data.motor_moving == loud_in_motion)
         )
-        runs.append(replace(data, current_a=data.current_a + loud))
-    for floor, expected in zip(_all(noise_floors(runs, SMALL)), _expected_a(runs[0]), strict=True):
+        current_a = data.current_a + loud
+        runs.append(replace(data, current_a=current_a))
+    floors = noise_floors(runs, SMALL)
+    for floor, expected in zip(_all(floors), _expected_a(runs[0]), strict=True):
         assert floor.source is source
         assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
 
 
 def test_other_paths_payloads_and_rates_are_no_repetition(repeated: tuple[Dataset, ...]) -> None:
     first, second, _ = _noisy(repeated)
+    position_rad = second.position_rad + np.array([0.05, 0.0, 0.0])
+    rate_hz = 1.01 * second.rate_hz
+    valid = np.zeros_like(second.valid)
     others = (
         # 1 % of the travel
-        replace(second, position_rad=second.position_rad + np.array([0.05, 0.0, 0.0])),
+        replace(second, position_rad=position_rad),
         replace(second, payload=MOUNTED),
-        replace(second, rate_hz=1.01 * second.rate_hz),
-        replace(second, valid=np.zeros_like(second.valid)),
+        replace(second, rate_hz=rate_hz),
+        replace(second, valid=valid),
         first,  # one run given twice
     )
     for other in others:
-        assert noise_floors((first, other), SMALL, MOVES) == (None,) * 3
+        expected = (None,) * 3
+        assert noise_floors((first, other), SMALL, MOVES) == expected
 
 
 def test_a_floor_far_above_the_error_of_a_model_is_refuted() -> None:

@@ -24,9 +24,9 @@ def test_a_zero_of_some_degrees_is_seen_by_the_search_alone(
     monkeypatch.syspath_prepend(str(EXAMPLES))
     example = import_module("gains_from_arrays")
     nameplate = example.NAMEPLATE_NM_A
-    model = ident.Model(
-        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
-    )
+    robot = ident.robot_from_urdf(example.URDF)
+    drive_train = ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    model = ident.Model(robot, drive_train)
     right = [
         example.record(model, "bare", None, 1),
         example.record(model, "loaded", example.DISC, 2),
@@ -36,13 +36,16 @@ def test_a_zero_of_some_degrees_is_seen_by_the_search_alone(
     gains = ident.identify(model, right).estimate.gains
     found = ident.identify(model, mistaken)
     change = np.abs(found.estimate.gains / gains - 1.0)
-    deviation = found.estimate.gains_std / np.abs(found.estimate.gains)
+    absolute_gain = np.abs(found.estimate.gains)
+    deviation = found.estimate.gains_std / absolute_gain
     assert (change > 0.04).all()
     assert (change < 0.15).all()
     assert (deviation < 0.035).all()  # no warning by its size
     assert ident.diagnose(found, AXES, nameplate) == ()
-    assert ident.find_turned_geometry(model, found.instants, nameplate) is None
+    turned_geometry = ident.find_turned_geometry(model, found.instants, nameplate)
+    assert turned_geometry is None
     steps = ident.find_effects(ident.gather(found, mistaken), np.random.default_rng(0))
     (placed,) = steps[-1].after.effects
     assert placed.name_among(AXES) == "zero-offset on J2"
-    assert steps[-1].after.estimate.gains == pytest.approx(gains, rel=0.03)
+    estimate = steps[-1].after.estimate
+    assert estimate.gains == pytest.approx(gains, rel=0.03)

@@ -47,7 +47,8 @@ class LobedFriction(ident.Effect):
         """Columns, shape (2, k)."""
         angle_rad = self.lobes * signals.position_rad[axis]
         direction = np.sign(signals.velocity_rad_s[axis])
-        return np.asarray(np.stack((np.cos(angle_rad), np.sin(angle_rad))) * direction)
+        cosine_and_sine = np.stack((np.cos(angle_rad), np.sin(angle_rad)))
+        return np.asarray(cosine_and_sine * direction)
 
 
 OWN = tuple(LobedFriction(lobes) for lobes in (2.0, 3.0, 4.0))
@@ -56,15 +57,16 @@ OWN = tuple(LobedFriction(lobes) for lobes in (2.0, 3.0, 4.0))
 def _lobed(data: Dataset) -> FloatArray:
     position_rad = data.position_rad[:, 1]
     size_nm = COSINE_NM * np.cos(LOBES * position_rad) + SINE_NM * np.sin(LOBES * position_rad)
-    return acting_on(1, 3, size_nm * np.sign(data.velocity_rad_s[:, 1]))
+    velocity_sign = np.sign(data.velocity_rad_s[:, 1])
+    torque_nm = size_nm * velocity_sign
+    return acting_on(1, 3, torque_nm)
 
 
 def test_it_is_found_where_it_is_and_its_setting_is_refined(
     small: Evidence, small_truth: Truth
 ) -> None:
-    steps = find_effects(
-        bent(small, small_truth, _lobed), np.random.default_rng(0), GATES, own_effects=OWN
-    )
+    rng = np.random.default_rng(0)
+    steps = find_effects(bent(small, small_truth, _lobed), rng, GATES, own_effects=OWN)
     (placed,) = steps[-1].after.effects
     assert isinstance(placed.effect, LobedFriction)
     assert placed.axis == 1
@@ -82,9 +84,8 @@ def test_a_coarse_grid_is_refined_before_rivals_are_compared(
 ) -> None:
     """No value that is given is near the true one: terms without a name explain more than each."""
     coarse = tuple(LobedFriction(lobes) for lobes in COARSE_LOBES)
-    steps = find_effects(
-        bent(small, small_truth, _lobed), np.random.default_rng(0), GATES, own_effects=coarse
-    )
+    rng = np.random.default_rng(0)
+    steps = find_effects(bent(small, small_truth, _lobed), rng, GATES, own_effects=coarse)
     (placed,) = steps[-1].after.effects
     assert isinstance(placed.effect, LobedFriction)
     assert placed.axis == 1
@@ -92,9 +93,12 @@ def test_a_coarse_grid_is_refined_before_rivals_are_compared(
 
 
 def test_it_is_not_found_where_it_is_not(small: Evidence) -> None:
-    steps = find_effects(small, np.random.default_rng(0), GATES, own_effects=OWN)
-    assert steps[-1].after.effects == ()
-    assert "lobed-friction" in {finding.effect.name for finding in steps[0].findings}
+    rng = np.random.default_rng(0)
+    steps = find_effects(small, rng, GATES, own_effects=OWN)
+    last_step = steps[-1]
+    assert last_step.after.effects == ()
+    findings = steps[0].findings
+    assert "lobed-friction" in {finding.effect.name for finding in findings}
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +115,10 @@ class TightSpot(ident.Effect):
 
     def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        distance = (signals.position_rad[axis] - self.centre_rad) / self.width_rad
-        return np.asarray(np.sign(signals.velocity_rad_s[axis]) * np.exp(-(distance**2)))[None]
+        position_difference_rad = signals.position_rad[axis] - self.centre_rad
+        distance = position_difference_rad / self.width_rad
+        velocity_sign = np.sign(signals.velocity_rad_s[axis])
+        return np.asarray(velocity_sign * np.exp(-(distance**2)))[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +135,11 @@ SPOT_NM = 12.0
 
 
 def _rubbing(data: Dataset) -> FloatArray:
-    distance = (data.position_rad[:, 1] - CENTRE_RAD) / WIDTH_RAD
-    return acting_on(1, 3, SPOT_NM * np.exp(-(distance**2)) * np.sign(data.velocity_rad_s[:, 1]))
+    position_difference_rad = data.position_rad[:, 1] - CENTRE_RAD
+    distance = position_difference_rad / WIDTH_RAD
+    velocity_sign = np.sign(data.velocity_rad_s[:, 1])
+    torque_nm = SPOT_NM * np.exp(-(distance**2)) * velocity_sign
+    return acting_on(1, 3, torque_nm)
 
 
 def test_two_real_settings_are_refined_and_nothing_joins_for_the_rest(
@@ -138,9 +147,8 @@ def test_two_real_settings_are_refined_and_nothing_joins_for_the_rest(
 ) -> None:
     """At the values that are given, a rest would stay, and be taken for another friction."""
     given = tuple(TightSpot(centre_rad, 0.8) for centre_rad in (-1.0, 0.0, 1.0))
-    steps = find_effects(
-        bent(small, small_truth, _rubbing), np.random.default_rng(0), GATES, own_effects=given
-    )
+    rng = np.random.default_rng(0)
+    steps = find_effects(bent(small, small_truth, _rubbing), rng, GATES, own_effects=given)
     (placed,) = steps[-1].after.effects
     assert isinstance(placed.effect, TightSpot)
     assert placed.axis == 1
@@ -149,8 +157,10 @@ def test_two_real_settings_are_refined_and_nothing_joins_for_the_rest(
 
 
 def test_which_settings_are_refined_is_for_the_class_to_say() -> None:
-    assert TightSpot(0.0, 0.8).refined == ("centre_rad", "width_rad")
-    assert TightSpot(0.0, 0.8).refined_once_chosen == ("centre_rad", "width_rad")
+    refined = TightSpot(0.0, 0.8).refined
+    assert refined == ("centre_rad", "width_rad")
+    refined_once_chosen = TightSpot(0.0, 0.8).refined_once_chosen
+    assert refined_once_chosen == ("centre_rad", "width_rad")
     assert StayingSpot(0.0, 0.8).refined == ()
     assert LobedFriction(2.0).refined == ()  # one alone is refined between its neighbours
 
@@ -170,12 +180,14 @@ class WritingFriction(LobedFriction):
 
 def test_one_that_writes_into_the_signals_is_refused(small: Evidence) -> None:
     """Every effect reads the same arrays: the search would go on with other positions."""
+    rng = np.random.default_rng(0)
+    own_effects = [WritingFriction(2.0)]
     with pytest.raises(
         ident.EffectRefused,
         match=r"'writing-friction': found ValueError .*read-only.* copy what "
         r"it changes",
     ):
-        find_effects(small, np.random.default_rng(0), GATES, own_effects=[WritingFriction(2.0)])
+        find_effects(small, rng, GATES, own_effects=own_effects)
 
 
 def test_mistakes_of_the_description_compete_with_it(
@@ -188,7 +200,8 @@ def test_mistakes_of_the_description_compete_with_it(
         run = record(
             small_truth, f"run{number}", rng, MOUNTED if number % 2 else None, noise_a=0.03
         )
-        runs.append(replace(run, position_rad=run.position_rad + np.radians([0.0, 2.0, 0.0])))
+        position_rad = run.position_rad + np.radians([0.0, 2.0, 0.0])
+        runs.append(replace(run, position_rad=position_rad))
     mistaken = gathered(small_truth, tuple(runs))
     tested: set[str] = set()
 

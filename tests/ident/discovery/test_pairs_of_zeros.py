@@ -41,19 +41,18 @@ def test_two_zeros_that_hide_each_other_are_both_named_with_their_sizes() -> Non
     """None of the two passes alone: only the upper arm is turned."""
     runs = tuple(replace(run, position_rad=run.position_rad + OPPOSITE_RAD) for run in _runs())
     evidence = gathered(tx40_truth(), runs)
-    found = {
-        one.axis: one for one in check_geometry(evidence, np.random.default_rng(0), GATES).mistakes
-    }
+    rng = np.random.default_rng(0)
+    mistakes = check_geometry(evidence, rng, GATES).mistakes
+    found = {one.axis: one for one in mistakes}
     assert set(found) == {1, 2}
     for axis, one in found.items():
         assert isinstance(one.effect, ZeroOffset)
-        assert (
-            abs(one.coefficients[0] + OPPOSITE_RAD[axis])
-            < 3.0 * one.deviations[0]
-            < np.radians(2.0)
-        )
+        absolute_coefficient = abs(one.coefficients[0] + OPPOSITE_RAD[axis])
+        assert absolute_coefficient < 3.0 * one.deviations[0] < np.radians(2.0)
 
 
 def test_right_zeros_make_no_pair() -> None:
-    check = check_geometry(gathered(tx40_truth(), _runs()), np.random.default_rng(0), GATES)
+    evidence = gathered(tx40_truth(), _runs())
+    rng = np.random.default_rng(0)
+    check = check_geometry(evidence, rng, GATES)
     assert check.mistakes == ()

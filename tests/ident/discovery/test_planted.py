@@ -136,9 +136,10 @@ def _meshed(t: TrueSignals, efficiency: float) -> FloatArray:
     what a gear keeps of the power.
     """
     through = t.load + t.frictions[t.axis]
-    return np.asarray(
+    difference = (
         np.where(through * t.velocity > 0.0, through / efficiency, through * efficiency) - through
     )
+    return np.asarray(difference)
 
 
 def _pushed(t: TrueSignals, half_gap_rad: float) -> FloatArray:
@@ -146,7 +147,8 @@ def _pushed(t: TrueSignals, half_gap_rad: float) -> FloatArray:
     which follows its motor from flank to flank.
     """
     through = t.load + t.frictions[t.axis]
-    width = 0.15 * np.sqrt(np.mean(through**2))
+    rms_through = np.sqrt(np.mean(through**2))
+    width = 0.15 * rms_through
     flank = 1.0 - 2.0 / (1.0 + np.exp(2.0 * through / width))
     return np.asarray(-half_gap_rad * t.pull() * t.accelerated(flank))
 
@@ -160,7 +162,8 @@ def _between(t: TrueSignals, other: int, along: FloatArray) -> FloatArray:
 
 def _rubbing(t: TrueSignals, other: int) -> FloatArray:
     both = t.velocities[t.axis] + t.velocities[other]
-    return _between(t, other, 2.0 * np.sign(both) + 0.8 * both)
+    along = 2.0 * np.sign(both) + 0.8 * both
+    return _between(t, other, along)
 
 
 def _inertial(t: TrueSignals, other: int) -> FloatArray:
@@ -181,9 +184,8 @@ def _slack_cable(t: TrueSignals, other: int) -> FloatArray:
     """A cable that pulls where the joint is before the other one, around both at one radius;
     half of it on each.
     """
-    force = np.where(
-        t.positions[t.axis] > t.positions[other], t.positions[t.axis] - t.positions[other], 0.0
-    )
+    position_difference = t.positions[t.axis] - t.positions[other]
+    force = np.where(t.positions[t.axis] > t.positions[other], position_difference, 0.0)
     torque = np.zeros_like(t.positions)
     torque[t.axis], torque[other] = 15.0 * force, -15.0 * force
     return torque
@@ -199,16 +201,17 @@ def _lengthening(angle: FloatArray, foot_m: float, lever_m: float, force_n: floa
 
 
 def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
+    velocity_sign = np.sign(t.velocity)
     return np.asarray(
-        np.exp2(-clock_s / (constant_s * np.log(2.0)))
-        * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity)
+        np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * velocity_sign + 2.0 * t.velocity)
     )
 
 
 def _heated(t: TrueSignals) -> FloatArray:
     """Dry friction that grows with temperature, and viscous friction that falls."""
     above_k = t.temperatures[t.axis] - 40.0
-    return np.asarray(above_k * (0.15 * np.sign(t.velocity) - 0.1 * t.velocity))
+    velocity_sign = np.sign(t.velocity)
+    return np.asarray(above_k * (0.15 * velocity_sign - 0.1 * t.velocity))
 
 
 def _saturated(torque: FloatArray, gain: float, half_a: float) -> FloatArray:
@@ -285,7 +288,8 @@ class Arm:
 
 @pytest.fixture(scope="module")
 def arm(truth: Truth, noisy: Evidence) -> Arm:
-    return Arm(truth, noisy, {}, {data.name: _true(truth, data) for data in noisy.datasets})
+    signals = {data.name: _true(truth, data) for data in noisy.datasets}
+    return Arm(truth, noisy, {}, signals)
 
 
 def warmth(run: Run, started_s: float) -> FloatArray:
@@ -308,9 +312,8 @@ def small_arm(small_truth: Truth, small_runs: tuple[Run, ...]) -> Arm:
         for index, run in enumerate(small_runs)
     )
     clean = gathered(small_truth, runs)
-    return Arm(
-        small_truth, clean, {}, {data.name: _true(small_truth, data) for data in clean.datasets}
-    )
+    signals = {data.name: _true(small_truth, data) for data in clean.datasets}
+    return Arm(small_truth, clean, {}, signals)
 
 
 def _true(truth: Truth, data: Dataset) -> TrueSignals:
@@ -337,17 +340,23 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
         )
         return np.asarray(moved - at_rest)
 
+    to_motor = truth.model.drive_train.to_motor
+    motor_torques = to_motor @ np.einsum("jck,c->jk", columns, parameters)
+    ratio = truth.model.drive_train.ratio
+    motor_angles = ratio @ motion.position_rad.T
+    loads = np.einsum("jck,c->jk", columns, parameters * rigid)
+    frictions = np.einsum("jck,c->jk", columns, parameters * rubbing)
+    time_s = data.time_s - data.time_s[0]
     return TrueSignals(
         axis=0,
         positions=motion.position_rad.T,
         velocities=motion.velocity_rad_s.T,
         accelerations=motion.acceleration_rad_s2.T,
-        motor_angles=truth.model.drive_train.ratio @ motion.position_rad.T,
-        loads=np.einsum("jck,c->jk", columns, parameters * rigid),
-        frictions=np.einsum("jck,c->jk", columns, parameters * rubbing),
-        motor_torques=truth.model.drive_train.to_motor
-        @ np.einsum("jck,c->jk", columns, parameters),
-        time_s=data.time_s - data.time_s[0],
+        motor_angles=motor_angles,
+        loads=loads,
+        frictions=frictions,
+        motor_torques=motor_torques,
+        time_s=time_s,
         started_s=data.started_s or 0.0,
         rate_hz=data.rate_hz,
         pulls=pulls,
@@ -357,13 +366,16 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
 
 def _with(arm: Arm, planted: Planted) -> Evidence:
     def torque(data: Dataset) -> FloatArray:
-        made = planted.torque(replace(arm.signals[data.name], axis=planted.axis))
+        changed_signal = replace(arm.signals[data.name], axis=planted.axis)
+        made = planted.torque(changed_signal)
         if made.ndim == 2:
             on_all = made
         else:
             on_all = acting_on(planted.axis, len(arm.truth.gains), made)
-        if _family(planted.family)[0].side in {GearSide.MOTOR, GearSide.ALL_MOTORS}:
-            return np.asarray(arm.truth.model.drive_train.direction.T @ on_all)
+        side = _family(planted.family)[0].side
+        if side in {GearSide.MOTOR, GearSide.ALL_MOTORS}:
+            direction = arm.truth.model.drive_train.direction
+            return np.asarray(direction.T @ on_all)
         return on_all
 
     return bent(arm.clean, arm.truth, torque)
@@ -376,7 +388,8 @@ def _family(name: str) -> tuple[Effect, ...]:
 def test_every_family_is_planted() -> None:
     """Those of joints without a motor in test_closed_chains.py."""
     on_axes = {family[0].name for family in EFFECTS if family[0].with_motor}
-    assert {case.family for case in (*CASES, *SMALL_CASES)} == on_axes
+    families = {case.family for case in (*CASES, *SMALL_CASES)}
+    assert families == on_axes
 
 
 @pytest.mark.parametrize("planted", CASES, ids=lambda planted: planted.family)
@@ -393,7 +406,9 @@ def test_so_it_is_on_a_smaller_arm(small_arm: Arm, planted: Planted) -> None:
 
 def _is_named(arm: Arm, planted: Planted) -> None:
     start = _with(arm, planted)
-    findings = rank_effects(search_problem_of(start, arm.cache), np.random.default_rng(0), GATES)
+    search_problem = search_problem_of(start, arm.cache)
+    rng = np.random.default_rng(0)
+    findings = rank_effects(search_problem, rng, GATES)
     best = findings[0]
     assert best.passed
     names = [(placed.effect.name, placed.axis) for placed in (best.placed, *best.ambiguity)]
@@ -402,9 +417,9 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     after = with_effects(start, (own.placed,))
     count = len(planted.expected)
     found = after.estimate.parameters[len(after.rows_without_effects.columns) :][:count]
-    assert found == pytest.approx(
-        np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected))
-    )
+    largest_absolute_expected = max(np.abs(planted.expected))
+    expected = np.array(planted.expected)
+    assert found == pytest.approx(expected, rel=0.2, abs=0.1 * largest_absolute_expected)
     assert training_error(after).axes[planted.axis] < training_error(start).axes[planted.axis]
 
 
@@ -419,7 +434,9 @@ def test_a_fast_effect_is_no_delay_and_no_wrong_zero(small_arm: Arm, planted: Pl
     """The check of the description called a spring in the gear of J1 a position that is early by
     3.5 ms.
     """
-    check = check_geometry(_with(small_arm, planted), np.random.default_rng(0), GATES)
+    evidence = _with(small_arm, planted)
+    rng = np.random.default_rng(0)
+    check = check_geometry(evidence, rng, GATES)
     assert check.mistakes == ()
 
 
@@ -428,13 +445,14 @@ def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effec
     found.
     """
     start = _with(arm, planted)
-    first, last = find_effects(
-        start, np.random.default_rng(0), GATES, (_family(planted.family),), geometry=()
-    )
+    rng = np.random.default_rng(0)
+    families = (_family(planted.family),)
+    first, last = find_effects(start, rng, GATES, families, geometry=())
     assert first.accepted is not None
     assert first.accepted.axis == planted.axis
     assert last.accepted is None
-    before = with_effects(start, (PlacedEffect(first_order, planted.axis),))
+    effects = (PlacedEffect(first_order, planted.axis),)
+    before = with_effects(start, effects)
     plain, whole = (
         float(np.abs(one.estimate.gains / arm.truth.gains - 1.0)[planted.axis])
         for one in (before, first.after)
@@ -444,11 +462,11 @@ def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effec
 
 def test_the_filter_of_a_lag_keeps_its_gain(arm: Arm) -> None:
     """What a first-order expansion lacks goes into the gain."""
-    found, plain, whole = _gain_errors(
-        arm, next(case for case in CASES if case.family == "lag"), Lag()
-    )
+    planted = next(case for case in CASES if case.family == "lag")
+    found, plain, whole = _gain_errors(arm, planted, Lag())
     assert found.settings["filter_s"] == pytest.approx(0.01, rel=0.1)
-    assert whole < min(0.5 * plain, 0.01)
+    smallest = min(0.5 * plain, 0.01)
+    assert whole < smallest
 
 
 def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
@@ -458,26 +476,32 @@ def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
     planted = Planted(
         "saturation", 2, lambda t: _saturated(t.motor_torque, GAINS[2], 12.0) - t.motor_torque, ()
     )
-    (family,) = search_problem_of(_with(arm, planted)).test((_family("saturation"),), 2)
+    evidence = _with(arm, planted)
+    families = (_family("saturation"),)
+    (family,) = search_problem_of(evidence).test(families, 2)
     first, both = (moves_behind(trial.gram) for _, trial in family.members)
     assert both < FEWEST_MOVES < first
     found, plain, whole = _gain_errors(arm, planted, Saturation())
     assert found == Saturation(two_terms=1)
-    assert whole < min(0.5 * plain, 0.01)
+    smallest = min(0.5 * plain, 0.01)
+    assert whole < smallest
 
 
 def test_a_richer_form_needs_no_possible_simpler_one(small_arm: Arm) -> None:
     problem = search_problem_of(small_arm.clean)
-    (family,) = problem.test((_family("saturation"),), 1)
+    families = (_family("saturation"),)
+    (family,) = problem.test(families, 1)
     (plain, one), (whole, both) = family.members
+    coefficients = np.array([-1e9])
+    changed_both = replace(both, coefficients=np.array([1.0, 1.0]))
     trials = (
-        replace(one, coefficients=np.array([-1e9])),
-        replace(both, coefficients=np.array([1.0, 1.0])),
+        replace(one, coefficients=coefficients),
+        changed_both,
     )
     members = tuple(zip((plain, whole), trials, strict=True))
-    (finding,) = rank_families(
-        problem, (replace(family, members=members),), np.random.default_rng(0), GATES
-    )
+    tested = (replace(family, members=members),)
+    rng = np.random.default_rng(0)
+    (finding,) = rank_families(problem, tested, rng, GATES)
     assert finding.effect == whole
 
 
@@ -485,20 +509,25 @@ def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
     """A spring on joint 2 must pass its gates on whichever motor gives the torque."""
     order = np.array([2, 0, 1, 3, 5, 4])
     start = _with(arm, CASES[0])
-    model = Model(arm.truth.model.robot, DriveTrain(RATIO[order]))
+    drive_train = DriveTrain(RATIO[order])
+    robot = arm.truth.model.robot
+    model = Model(robot, drive_train)
     training = replace(
         start.training,
         model=model,
         current=start.training.current[order],
         motor_use=start.training.motor_use[order],
     )
-    turned = replace(start, model=model, training=training, estimate=ml(training.system()))
+    estimate = ml(training.system())
+    turned = replace(start, model=model, training=training, estimate=estimate)
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
-    findings = rank_effects(search_problem_of(turned), np.random.default_rng(0), GATES, families)
-    assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
-    same = rank_effects(
-        search_problem_of(start, arm.cache), np.random.default_rng(0), GATES, families
-    )
+    rng = np.random.default_rng(0)
+    findings = rank_effects(search_problem_of(turned), rng, GATES, families)
+    effect = findings[0].effect
+    passed = findings[0].passed
+    assert (effect.name, findings[0].axis, passed) == ("spring", 1, True)
+    search_problem = search_problem_of(start, arm.cache)
+    same = rank_effects(search_problem, np.random.default_rng(0), GATES, families)
     assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
 
 
@@ -513,11 +542,13 @@ def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ..
 def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
     truth: Truth, clean_runs: tuple[Run, ...], noisy_runs: tuple[Run, ...]
 ) -> None:
-    never_still = replace(CONDITIONING, standstill_rad_s=(0.0,) * 6)
+    standstill_rad_s = (0.0,) * 6
+    never_still = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
     whole = identify(truth.model, noisy_runs, never_still)
     assert len(whole.system.clusters) >= 4 * 11
     assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
-    few = round(5.0 * clean_runs[0].rate_hz)
+    rate_hz = clean_runs[0].rate_hz
+    few = round(5.0 * rate_hz)
     short = tuple(
         replace(
             run,
@@ -539,11 +570,8 @@ def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
     clean = small_arm.clean
     bare = clean.rows_without_effects
     estimate = clean.estimate
-    exact = (
-        small_arm.truth.model.drive_train.to_motor
-        @ estimate.predicted_torque(bare)
-        / estimate.gains[:, None]
-    )
+    to_motor = small_arm.truth.model.drive_train.to_motor
+    exact = to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
     gains = []
     claimed = []
     for _ in range(24):
@@ -552,18 +580,23 @@ def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
         drawn = rng.normal(size=exact.shape)
         for row in range(1, exact.shape[1]):
             noise[:, row] = 0.67 * noise[:, row - 1] + np.sqrt(1 - 0.67**2) * drawn[:, row]
-        found = with_current(clean, exact + 0.05 * noise - bare.current).estimate
+        added_a = exact + 0.05 * noise - bare.current
+        found = with_current(clean, added_a).estimate
         gains.append(found.gains)
         claimed.append(found.gains_std)
-    ratio = np.mean(claimed, axis=0) / np.std(gains, axis=0, ddof=1)
+    gain_std = np.std(gains, axis=0, ddof=1)
+    mean_claimed = np.mean(claimed, axis=0)
+    ratio = mean_claimed / gain_std
     # 24 draws know a deviation to 15 % (1/√46); three of those on either side.
     assert np.all(ratio > 0.6)
     assert np.all(ratio < 1.6)
 
 
 def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
-    start = _with(small_arm, next(case for case in SMALL_CASES if case.family == "load-friction"))
-    steps = find_effects(start, np.random.default_rng(1))
+    planted = next(case for case in SMALL_CASES if case.family == "load-friction")
+    start = _with(small_arm, planted)
+    rng = np.random.default_rng(1)
+    steps = find_effects(start, rng)
     assert [step.accepted is not None for step in steps] == [True, False]
 
 
@@ -578,16 +611,19 @@ def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
     )
     start = _with(arm, grown)
     families = _family("saturation"), _family("stribeck"), _family("spring")
-    (step,) = find_effects(start, np.random.default_rng(0), GATES, families)
+    rng = np.random.default_rng(0)
+    (step,) = find_effects(start, rng, GATES, families)
     assert step.accepted is None
     aside = {one.finding.effect.name: one for one in step.set_aside}
     assert set(aside) == {"smooth-load", "saturation"}
     assert "the gain of J2 by" in aside["saturation"].reason(("J1", "J2", "J3", "J4", "J5", "J6"))
-    assert aside["saturation"].rival == PlacedEffect(aside["smooth-load"].finding.effect, 1)
+    effect = aside["smooth-load"].finding.effect
+    rival = aside["saturation"].rival
+    assert rival == PlacedEffect(effect, 1)
     # With it the gain would be off by more than three times as much.
-    bent_by_name = with_effects(
-        start, (PlacedEffect(aside["saturation"].finding.effect, 1),)
-    ).estimate
+    finding = aside["saturation"].finding
+    effects = (PlacedEffect(finding.effect, 1),)
+    bent_by_name = with_effects(start, effects).estimate
     before, after = (
         np.abs(one.gains / arm.truth.gains - 1.0)[1] for one in (start.estimate, bent_by_name)
     )
@@ -597,21 +633,23 @@ def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
 def test_friction_against_temperature_is_named_first_and_the_worst_gain_gets_better(
     small_arm: Arm,
 ) -> None:
-    start = _with(
-        small_arm, next(case for case in SMALL_CASES if case.family == "temperature-friction")
-    )
-    steps = find_effects(start, np.random.default_rng(1))
+    planted = next(case for case in SMALL_CASES if case.family == "temperature-friction")
+    start = _with(small_arm, planted)
+    rng = np.random.default_rng(1)
+    steps = find_effects(start, rng)
     first = steps[0].accepted
     assert first is not None
     assert (first.effect.name, first.axis) == ("temperature-friction", 1)
+    last_step = steps[-1]
     before, after = (
         np.abs(evidence.estimate.gains / small_arm.truth.gains - 1.0).max()
-        for evidence in (start, steps[-1].after)
+        for evidence in (start, last_step.after)
     )
     assert after < before
 
 
 def test_drives_that_warm_up_without_an_effect_give_none(small_arm: Arm) -> None:
-    (step,) = find_effects(small_arm.clean, np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    (step,) = find_effects(small_arm.clean, rng)
     assert step.accepted is None
     assert "temperature-friction" in {finding.effect.name for finding in step.findings}

@@ -52,14 +52,18 @@ class _Hill:
     def fits(self, effects: Sequence[Effect]) -> list[CandidateFit]:
         (effect,) = effects
         centre, width = (effect.settings[name] for name in ("centre_rad", "width_rad"))
-        distance = (centre - BEST[0]) ** 2 + (width - BEST[1]) ** 2
+        centre_difference = centre - BEST[0]
+        width_difference = width - BEST[1]
+        distance = centre_difference**2 + width_difference**2
         fallen = np.array([SCALE / (1.0 + distance)])
-        return [CandidateFit(coefficients=np.array([1.0]), fallen=fallen)]
+        coefficients = np.array([1.0])
+        return [CandidateFit(coefficients=coefficients, fallen=fallen)]
 
 
 def _refined(centre_rad: float, width_rad: float) -> tuple[float, ...]:
     hill = cast(SearchProblem, _Hill())
-    effect = refine_together(hill, Bump(centre_rad, width_rad), axis=0)
+    bump = Bump(centre_rad, width_rad)
+    effect = refine_together(hill, bump, axis=0)
     return tuple(effect.settings.values())
 
 

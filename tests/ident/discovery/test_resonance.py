@@ -72,7 +72,8 @@ def _stepped(
     no windows.
     """
     steps = max(8, round(STEPS_HZ / rate_hz))
-    twist = torque[0] * compliance + half_gap * np.sign(torque[0])
+    torque_sign = np.sign(torque[0])
+    twist = torque[0] * compliance + half_gap * torque_sign
     rate = 0.0
     twists_rad = np.full(len(torque), twist)
     bends = np.zeros(len(torque))
@@ -81,7 +82,8 @@ def _stepped(
         twists_rad[k] = twist
         before = rate
         for part in range(steps):
-            pulled = torque[k] + (torque[k + 1] - torque[k]) * part / steps
+            torque_difference = torque[k + 1] - torque[k]
+            pulled = torque[k] + torque_difference * part / steps
             if twist > half_gap:
                 force = (twist - half_gap) / compliance + damping * rate
                 force = max(force, 0.0) if half_gap else force
@@ -109,18 +111,22 @@ def _on_a_spring(small: Evidence, truth: Truth, compliance: float, half_gap: flo
         run = fitted_signals(small.model, data, small.training, small.estimate)
         assert run.arm is not None
         through = (run.geared_torque_nm if half_gap else run.load_torque_nm)[AXIS]
-        twist, bend = _stepped(through, run.inertia(AXIS, AXIS), run.rate_hz, compliance, half_gap)
+        inertia = run.inertia(AXIS, AXIS)
+        twist, bend = _stepped(through, inertia, run.rate_hz, compliance, half_gap)
         lag = np.stack((twist, np.gradient(twist) * run.rate_hz, bend))
         states = np.stack((data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2))
         states[:, :, AXIS] -= lag
-        return np.asarray(run.arm.load_change(Motion(*states)))
+        motion = Motion(*states)
+        return np.asarray(run.arm.load_change(motion))
 
     return bent(small, truth, torque)
 
 
 def _found(start: Evidence) -> Evidence:
     families = tuple(family for family in EFFECTS if family[0].name in NEAR)
-    return find_effects(start, np.random.default_rng(0), GATES, families, geometry=())[-1].after
+    rng = np.random.default_rng(0)
+    effects = find_effects(start, rng, GATES, families, geometry=())
+    return effects[-1].after
 
 
 def test_one_effect_explains_a_resonance_in_the_band_and_none_joins(
@@ -168,11 +174,14 @@ def test_windows_hold_all_that_a_gap_does() -> None:
     compliances = np.array([2e-4, 1e-4])
     still = np.zeros_like(torque)
     link = DrivenLink(rate_hz, inertia, torque, still, still)
-    made = twists(link, Gears(gaps, compliances, RATIO)).acceleration_rad_s2
+    gears = Gears(gaps, compliances, RATIO)
+    made = twists(link, gears).acceleration_rad_s2
     for one, gap, compliance in zip(made, gaps, compliances, strict=True):
         whole = _stepped(torque, inertia, rate_hz, compliance, gap)[1][100:-100]
         left = one[100:-100] - whole
-        assert np.sqrt(np.mean(left**2)) < 0.1 * np.sqrt(np.mean(whole**2))
+        rms = np.sqrt(np.mean(left**2))
+        rms_whole = np.sqrt(np.mean(whole**2))
+        assert rms < 0.1 * rms_whole
 
 
 def test_no_resonance_is_proposed_where_the_residual_holds_none(small: Evidence) -> None:
@@ -192,11 +201,14 @@ def test_a_spring_passes_a_wave_as_its_transfer_function_says(
     """H = ω²/(ω² − w² + 2iζωw), at the resonance exactly, whatever the rate."""
     resonance = 2.0 * np.pi * share * rate_hz
     time = np.arange(round(60 + 40.0 / (ratio * share))) / rate_hz
+    compliance_rad_nm = 1.0 / (inertia * resonance**2)
+    torque_nm = np.sin(resonance * time)
+    inertia_kg_m2 = np.full(len(time), inertia)
     passed = spring_torque(
-        np.sin(resonance * time),
-        np.full(len(time), inertia),
+        torque_nm,
+        inertia_kg_m2,
         rate_hz,
-        1.0 / (inertia * resonance**2),
+        compliance_rad_nm,
         ratio,
     )
     settled = slice(len(time) // 2, None)
@@ -215,8 +227,11 @@ def test_a_stiff_gear_or_none_passes_the_torque_as_it_is() -> None:
 def test_the_first_order_is_the_limit_of_a_stiff_gear(small: Evidence) -> None:
     problem = search_problem_of(small)
     run = problem.runs[0]
-    run = replace(run, inertia_kg_m2=np.ones_like(run.inertia_kg_m2))
-    slow = replace(run, load_torque_nm=(1.0 - np.cos(run.time_s)) * np.ones((3, 1)))
+    inertia_kg_m2 = np.ones_like(run.inertia_kg_m2)
+    run = replace(run, inertia_kg_m2=inertia_kg_m2)
+    time_cosine = np.cos(run.time_s)
+    load_torque_nm = (1.0 - time_cosine) * np.ones((3, 1))
+    slow = replace(run, load_torque_nm=load_torque_nm)
     first = Elasticity().columns(slow, AXIS)[..., 100:-100]
     assert Elasticity(2e-6, 0.3).columns(slow, AXIS)[..., 100:-100] == pytest.approx(
         first, abs=0.01
@@ -233,9 +248,11 @@ def test_a_gap_is_refined_to_the_form_in_which_its_link_is_held_or_not(
 
     def torque(data: Dataset) -> FloatArray:
         run = fitted_signals(quick.model, data, quick.training, quick.estimate)
-        return planted.half_gap_rad * columns_at(planted, run, AXIS)[:, 0]
+        columns = columns_at(planted, run, AXIS)
+        return planted.half_gap_rad * columns[:, 0]
 
-    problem = search_problem_of(bent(quick, small_truth, torque))
+    evidence = bent(quick, small_truth, torque)
+    problem = search_problem_of(evidence)
     found = refined_gear(problem, gap, AXIS)
     assert isinstance(found, Backlash)
     assert found.held == held

@@ -43,9 +43,8 @@ def _rippling(small: Evidence, truth: Truth, axis: int, order: float, size_nm: f
     ratio = truth.model.drive_train.ratio[axis, axis]
 
     def torque(data: Dataset) -> FloatArray:
-        return acting_on(
-            axis, 3, size_nm * np.cos(order * ratio * data.position_rad[:, axis] - 0.8)
-        )
+        torque_nm = size_nm * np.cos(order * ratio * data.position_rad[:, axis] - 0.8)
+        return acting_on(axis, 3, torque_nm)
 
     return bent(small, truth, torque)
 
@@ -58,15 +57,18 @@ def test_an_order_between_the_whole_ones_is_named(
     small: Evidence, small_truth: Truth, axis: int, order: float
 ) -> None:
     start = _rippling(small, small_truth, axis, order, 4.0)
-    last = find_effects(start, np.random.default_rng(0), GATES, RIPPLES, geometry=())[-1].after
+    rng = np.random.default_rng(0)
+    effects = find_effects(start, rng, GATES, RIPPLES, geometry=())
+    last = effects[-1].after
     ((placed, effect),) = [(placed.axis, placed.effect) for placed in last.effects]
     assert isinstance(effect, Ripple)
     assert placed == axis
     # A line is one period over the range wide; it is found to a tenth of that.
-    range_rev = np.ptp(np.concatenate([data.position_rad[:, axis] for data in small.datasets])) / (
-        2.0 * np.pi
-    )
-    assert abs(effect.order - order) * 40.0 * range_rev < 0.1
+    position_rad = [data.position_rad[:, axis] for data in small.datasets]
+    stacked_position_rad = np.concatenate(position_rad)
+    range_rev = np.ptp(stacked_position_rad) / (2.0 * np.pi)
+    order_difference = abs(effect.order - order)
+    assert order_difference * 40.0 * range_rev < 0.1
     found = last.estimate.parameters[len(last.rows_without_effects.columns) :][:2]
     assert np.hypot(*found) == pytest.approx(4.0, rel=0.1)
 
@@ -105,9 +107,11 @@ def test_noise_proposes_no_order(small: Evidence) -> None:
     for _ in range(15):
         size = rng.uniform(0.2, 2.0, folds.linearisation.cluster_count)[folds.linearisation.cluster]
         noise = size * np.convolve(rng.normal(size=len(size)), (0.6, 1.0, 0.6), "same")
+        linearisation = replace(folds.linearisation, residual=noise)
+        changed_fold = replace(folds, linearisation=linearisation)
         drawn = replace(
             problem,
-            folds=replace(folds, linearisation=replace(folds.linearisation, residual=noise)),
+            folds=changed_fold,
         )
         alarms += bool(propose_orders(drawn, (), rng, GATES))
     assert alarms <= 1
@@ -116,12 +120,14 @@ def test_noise_proposes_no_order(small: Evidence) -> None:
 def test_an_order_in_the_model_or_next_to_one_is_not_proposed_again(
     small: Evidence, small_truth: Truth
 ) -> None:
-    problem = search_problem_of(_rippling(small, small_truth, 1, 2.6, 4.0))
+    evidence = _rippling(small, small_truth, 1, 2.6, 4.0)
+    problem = search_problem_of(evidence)
     rng = np.random.default_rng(0)
     (family,) = propose_orders(problem, (), rng, GATES)[1]
     nearest: Effect = min(family, key=lambda member: abs(member.settings["order"] - 2.6))
     assert nearest.settings["order"] == pytest.approx(2.6, abs=0.01)
-    assert propose_orders(problem, (PlacedEffect(nearest, 1),), rng, GATES) == {}
+    effects = (PlacedEffect(nearest, 1),)
+    assert propose_orders(problem, effects, rng, GATES) == {}
 
 
 def test_the_transform_is_the_sum_over_the_rows_of_each_move(small_truth: Truth) -> None:
@@ -134,14 +140,15 @@ def test_the_transform_is_the_sum_over_the_rows_of_each_move(small_truth: Truth)
     made = periodogram(problem, 1, 0)
     assert made is not None
     chosen = len(made.orders) // 10
-    columns = problem.torque(Ripple(float(made.orders[chosen])), 1)
+    order = float(made.orders[chosen])
+    columns = problem.torque(Ripple(order), 1)
     folds = problem.folds
+    changed_linearisation = replace(folds.linearisation, scatter=None)
+    to_motor = problem.model.drive_train.to_motor
     slow = (
         # Decorrelation of the runs is on the residual's side here; summed over moves it is the
         # same.
-        replace(folds.linearisation, scatter=None).whitened(
-            columns, problem.model.drive_train.to_motor
-        )
+        changed_linearisation.whitened(columns, to_motor)
         * folds.linearisation.decorrelated(folds.linearisation.residual)[:, None]
     )
     by_move = np.stack([np.bincount(folds.linearisation.cluster, part) for part in slow.T])
@@ -153,8 +160,11 @@ def test_the_transform_is_the_sum_over_the_rows_of_each_move(small_truth: Truth)
 
 def test_signs_leave_the_noise_as_it_is() -> None:
     rng = np.random.default_rng(1)
-    made = Periodogram(0, 0, 3.0, np.arange(5.0), rng.normal(size=(2, 40, 5)))
-    same = made.statistic(np.ones((1, 40)))
+    scores = rng.normal(size=(2, 40, 5))
+    orders = np.arange(5.0)
+    made = Periodogram(0, 0, 3.0, orders, scores)
+    signs = np.ones((1, 40))
+    same = made.statistic(signs)
     assert made.statistic(-np.ones((1, 40))) == pytest.approx(same)
     assert np.mean(made.statistic(rng.choice((-1.0, 1.0), (500, 40)))) == pytest.approx(
         2.0, rel=0.1

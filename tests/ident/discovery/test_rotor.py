@@ -88,7 +88,8 @@ def _with_load_friction(truth: Truth) -> Evidence:
         load_nm = np.einsum("jck,c->jk", truth.model.regressor(data.motion()), parameters * links)[
             AXIS
         ]
-        friction_nm = COEFFICIENT * np.abs(load_nm) * np.sign(data.velocity_rad_s[:, AXIS])
+        velocity_sign = np.sign(data.velocity_rad_s[:, AXIS])
+        friction_nm = COEFFICIENT * np.abs(load_nm) * velocity_sign
         return acting_on(AXIS, len(truth.gains), friction_nm)
 
     return bent(_clean(truth), truth, torque)
@@ -106,7 +107,9 @@ def heavy(heavy_truth: Truth) -> Evidence:
 
 @pytest.fixture(scope="module")
 def found(heavy: Evidence) -> Evidence:
-    return find_effects(heavy, np.random.default_rng(0), GATES)[-1].after
+    rng = np.random.default_rng(0)
+    effects = find_effects(heavy, rng, GATES)
+    return effects[-1].after
 
 
 def _loss(evidence: Evidence) -> tuple[FloatArray, FloatArray]:
@@ -126,16 +129,19 @@ def _assert_true(evidence: Evidence, truth: Truth, rotor_kg_m2: float) -> None:
     """Coefficient, rotor and gains are true within 3 σ, and σ is small."""
     effect = _own(evidence)
     values, deviations = (part[:2] for part in _loss(evidence))
-    assert abs(values[0] - COEFFICIENT) < 3.0 * deviations[0]
+    difference = abs(values[0] - COEFFICIENT)
+    assert difference < 3.0 * deviations[0]
     assert deviations[0] < 0.02 * COEFFICIENT
-    errors = (evidence.estimate.gains - truth.gains) / evidence.estimate.gains_std
+    gain_difference = evidence.estimate.gains - truth.gains
+    errors = gain_difference / evidence.estimate.gains_std
     assert np.max(np.abs(errors)) < 3.5
     if not rotor_kg_m2 and not effect.with_rotor:
         return  # moves that were left out are predicted no better without a rotor that is not there
     assert effect.with_rotor == 1
     inertia_std = deviations[1] / values[0]
     inertia_kg_m2 = effect.rotor_inertia_kg_m2 + values[1] / values[0]
-    assert abs(inertia_kg_m2 - rotor_kg_m2) < 3.0 * inertia_std
+    inertia_difference_kg_m2 = abs(inertia_kg_m2 - rotor_kg_m2)
+    assert inertia_difference_kg_m2 < 3.0 * inertia_std
     assert inertia_std < 0.2
 
 
@@ -145,20 +151,25 @@ def test_load_friction_beside_a_heavy_rotor_is_true(
     _assert_true(found, heavy_truth, ROTORS_KG_M2[AXIS])
     assert abs(_loss(found)[0][1]) < _loss(found)[1][1]
     # What it is for: with the rotor in the load the coefficient is wrong.
-    plain = with_effects(heavy, (PlacedEffect(LoadFriction(0), AXIS),))
+    effects = (PlacedEffect(LoadFriction(0), AXIS),)
+    plain = with_effects(heavy, effects)
     values, deviations = _loss(plain)
-    assert abs(values[0] - COEFFICIENT) > 5.0 * deviations[0]
+    difference = abs(values[0] - COEFFICIENT)
+    assert difference > 5.0 * deviations[0]
 
 
 def test_without_a_rotor_the_coefficient_is_true_as_well() -> None:
     truth = _truth((0.0, 0.0, 0.0))
-    after = find_effects(_with_load_friction(truth), np.random.default_rng(0), GATES)[-1].after
+    effects = find_effects(_with_load_friction(truth), np.random.default_rng(0), GATES)
+    after = effects[-1].after
     _assert_true(after, truth, 0.0)
 
 
 def test_deviations_hold_what_is_open_about_the_rotor(found: Evidence) -> None:
     effect = _own(found)
-    known = with_effects(found, (PlacedEffect(replace(effect, with_rotor=0), AXIS),))
+    changed_effect = replace(effect, with_rotor=0)
+    effects = (PlacedEffect(changed_effect, AXIS),)
+    known = with_effects(found, effects)
     assert _loss(found)[1][0] > _loss(known)[1][0]
 
 
@@ -169,7 +180,8 @@ def _predicted(calibration: Calibration, truth: Truth, data: Dataset) -> FloatAr
 def test_a_calibration_predicts_the_same_load_friction(found: Evidence, heavy_truth: Truth) -> None:
     calibration = calibrated(found)
     (accepted,) = calibration.effects
-    assert placed_effect(accepted, calibration)[0].effect == _own(found)
+    effect = placed_effect(accepted, calibration)[0].effect
+    assert effect == _own(found)
     data = found.datasets[1]
     names = {coefficient.name for coefficient in accepted.coefficients}
     declared = tuple(
@@ -180,15 +192,20 @@ def test_a_calibration_predicts_the_same_load_friction(found: Evidence, heavy_tr
     parameters = heavy_truth.parameters.copy()
     parameters[heavy_truth.model.flange] += list(PAYLOAD_TRUTH.values())
     load_nm = heavy_truth.model.torques(data.motion(), parameters)[0][AXIS]
-    expected_nm = COEFFICIENT * np.abs(load_nm) * np.sign(data.velocity_rad_s[:, AXIS])
-    assert np.linalg.norm(friction_nm - expected_nm) < 0.03 * np.linalg.norm(expected_nm)
+    velocity_sign = np.sign(data.velocity_rad_s[:, AXIS])
+    expected_nm = COEFFICIENT * np.abs(load_nm) * velocity_sign
+    friction_difference_norm_nm = np.linalg.norm(friction_nm - expected_nm)
+    expected_norm_nm = np.linalg.norm(expected_nm)
+    assert friction_difference_norm_nm < 0.03 * expected_norm_nm
 
 
 def test_a_calibration_of_an_earlier_version_has_no_rotor(heavy: Evidence) -> None:
-    calibration = calibrated(with_effects(heavy, (PlacedEffect(LoadFriction(0), AXIS),)))
+    effects = (PlacedEffect(LoadFriction(0), AXIS),)
+    calibration = calibrated(with_effects(heavy, effects))
     (accepted,) = calibration.effects
     earlier = replace(accepted, settings={"speed_exponent": 0.0})
-    assert placed_effect(earlier, calibration)[0].effect == LoadFriction(0)
+    effect = placed_effect(earlier, calibration)[0].effect
+    assert effect == LoadFriction(0)
     assert [one.name for one in accepted.coefficients] == [
         "load-friction coefficient 2 (speed_exponent 0)"
     ]
@@ -220,9 +237,8 @@ def test_the_bound_of_a_rotor_holds_for_a_redundant_drive() -> None:
     the bound is that rotor.
     """
     made = recorded(PLANAR, 7, seconds=12.0, noise_a=0.01)
-    problem = search_problem_of(
-        gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
-    )
+    evidence = gather(identify(made.model, made.runs, made.conditioning, keep_rows=True))
+    problem = search_problem_of(evidence)
     (run, _) = problem.runs
     (data, _) = problem.datasets
     followed = made.model.follow(data.motion())
@@ -230,17 +246,22 @@ def test_the_bound_of_a_rotor_holds_for_a_redundant_drive() -> None:
     projector = np.einsum("kmd,kdj->kmj", followed.to_motors, back)[:20]
     rotors_kg_m2 = np.array([0.3, 0.2, 0.4, 0.5])
     inertia_kg_m2 = np.einsum("kij,j,kjl->ilk", projector, rotors_kg_m2, projector)
-    alone = replace(problem, runs=(replace(run, inertia_kg_m2=inertia_kg_m2),))
-    assert np.min(inertia_kg_m2[0, 0]) < rotors_kg_m2[0]
+    runs = (replace(run, inertia_kg_m2=inertia_kg_m2),)
+    alone = replace(problem, runs=runs)
+    smallest_inertia_kg_m2 = np.min(inertia_kg_m2[0, 0])
+    assert smallest_inertia_kg_m2 < rotors_kg_m2[0]
     assert largest_inertia(alone, 0) >= rotors_kg_m2[0] - 1e-9
 
 
 def _declared(heavy: Evidence, effect: Effect, axis: int) -> Evidence:
-    return with_declared(heavy, [PlacedEffect(effect, axis)], np.random.default_rng(0))[-1].after
+    declared = [PlacedEffect(effect, axis)]
+    rng = np.random.default_rng(0)
+    return with_declared(heavy, declared, rng)[-1].after
 
 
 def test_a_declared_loss_leaves_the_rotor_out(heavy: Evidence, heavy_truth: Truth) -> None:
-    _assert_true(_declared(heavy, LoadFriction(0), AXIS), heavy_truth, ROTORS_KG_M2[AXIS])
+    evidence = _declared(heavy, LoadFriction(0), AXIS)
+    _assert_true(evidence, heavy_truth, ROTORS_KG_M2[AXIS])
 
 
 def test_a_declared_inertia_is_kept(heavy: Evidence) -> None:
@@ -248,14 +269,16 @@ def test_a_declared_inertia_is_kept(heavy: Evidence) -> None:
     after = _declared(heavy, given, AXIS)
     assert _own(after) == given
     values, deviations = _loss(after)
-    assert abs(values[0] - COEFFICIENT) < 3.0 * deviations[0]
+    difference = abs(values[0] - COEFFICIENT)
+    assert difference < 3.0 * deviations[0]
 
 
 def test_a_declared_inertia_that_is_a_parameter_of_its_own_is_refused(heavy: Evidence) -> None:
+    effect = Efficiency(1.0, 0.1)
+    declared = [PlacedEffect(effect, 2)]
+    rng = np.random.default_rng(0)
     with pytest.raises(EffectRefused, match="J3 is given a rotor"):
-        with_declared(
-            heavy, [PlacedEffect(Efficiency(1.0, 0.1), 2)], np.random.default_rng(0), axes=NAMES
-        )
+        with_declared(heavy, declared, rng, axes=NAMES)
 
 
 @pytest.mark.parametrize("name", [LoadFriction.name, Efficiency.name])
@@ -264,13 +287,15 @@ def test_no_rotor_has_a_negative_inertia(name: str, heavy: Evidence) -> None:
     and a rotor that is certainly negative is none.
     """
     dictionary = {family[0].name: family[0] for family in EFFECTS}
-    without = dictionary[name].with_settings({"with_rotor": 1, "rotor_inertia_kg_m2": 0.0})
+    settings = {"with_rotor": 1, "rotor_inertia_kg_m2": 0.0}
+    without = dictionary[name].with_settings(settings)
     beside = without.with_settings({"rotor_inertia_kg_m2": 0.2})
     assert without.coefficients[1].least == 0.0
     assert beside.coefficients[1].least == -np.inf
     problem = search_problem_of(heavy)
     deviations = np.array([0.01, 0.01])
-    certain = refined_rotor(problem, without, 0, np.array([0.1, -0.05]), deviations)
+    coefficients = np.array([0.1, -0.05])
+    certain = refined_rotor(problem, without, 0, coefficients, deviations)
     assert certain.settings["with_rotor"] == 0
     may_be_zero = refined_rotor(problem, without, 0, np.array([0.1, -0.015]), deviations)
     assert may_be_zero == without

@@ -27,7 +27,8 @@ def _with_torque(run: Run, axis: int, torque_nm: FloatArray) -> Run:
 
 
 def _speed(run: Run, axis: int) -> FloatArray:
-    return np.asarray(np.gradient(run.position_rad[:, axis]) * run.rate_hz)
+    position_rad_gradient = np.gradient(run.position_rad[:, axis])
+    return np.asarray(position_rad_gradient * run.rate_hz)
 
 
 def _identified(truth: Truth, runs: tuple[Run, ...]) -> Evidence:
@@ -49,9 +50,11 @@ def test_low_speed_friction_is_named_and_the_holdout_run_gets_better(
     runs = []
     for run in noisy_runs:
         v = _speed(run, 1)
-        runs.append(_with_torque(run, 1, 5.0 * np.sign(v) * np.exp(-((v / 0.35) ** 2))))
+        torque_nm = 5.0 * np.sign(v) * np.exp(-((v / 0.35) ** 2))
+        runs.append(_with_torque(run, 1, torque_nm))
     start = _identified(truth, tuple(runs))
-    steps = find_effects(start, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    steps = find_effects(start, rng)
     assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [
         ("stribeck", 1)
     ]
@@ -60,7 +63,8 @@ def test_low_speed_friction_is_named_and_the_holdout_run_gets_better(
     assert before is not None
     assert after is not None
     assert after.axes[1] < 0.95 * before.axes[1]
-    assert np.max(np.abs(steps[-1].after.estimate.gains / GAINS - 1.0)) < 0.02
+    gains = steps[-1].after.estimate.gains
+    assert np.max(np.abs(gains / GAINS - 1.0)) < 0.02
 
 
 def test_a_spring_is_distinguished_from_gravity(
@@ -77,5 +81,7 @@ def test_a_spring_is_distinguished_from_gravity(
     steps = find_effects(_identified(small_truth, runs), np.random.default_rng(0))
     accepted = [step.accepted for step in steps if step.accepted]
     assert [(finding.effect.name, finding.axis) for finding in accepted] == [("spring", 2)]
-    index = [column.name for column in steps[-1].after.training.columns].index("spring stiffness 3")
-    assert steps[-1].after.estimate.parameters[index] == pytest.approx(4.0, rel=0.1)
+    columns = steps[-1].after.training.columns
+    index = [column.name for column in columns].index("spring stiffness 3")
+    parameters = steps[-1].after.estimate.parameters
+    assert parameters[index] == pytest.approx(4.0, rel=0.1)

@@ -40,9 +40,11 @@ def _low_speed(data: Dataset, speed_rad_s: float = 0.17) -> FloatArray:
 def test_a_setting_between_two_of_the_dictionary_is_found(
     small: Evidence, small_truth: Truth
 ) -> None:
-    search_problem = search_problem_of(_needing(small, small_truth, _low_speed))
+    evidence = _needing(small, small_truth, _low_speed)
+    search_problem = search_problem_of(evidence)
     families = (EFFECTS[0],)
-    best = rank_effects(search_problem, np.random.default_rng(0), GATES, families)[0]
+    rng = np.random.default_rng(0)
+    best = rank_effects(search_problem, rng, GATES, families)[0]
     effect = refine_setting(search_problem, best.effect, best.axis, families)
     assert isinstance(effect, Stribeck)
     assert best.axis == 1
@@ -62,10 +64,12 @@ def test_an_effect_that_a_later_one_makes_idle_is_taken_out(
     small: Evidence, small_truth: Truth
 ) -> None:
     bare = _needing(small, small_truth, _low_speed)
-    start = with_effects(
-        bare, (PlacedEffect(AsymmetricViscous(), 1), PlacedEffect(AsymmetricViscous(), 2))
-    )
-    last = find_effects(start, np.random.default_rng(0), GATES)[-1].after
+    placed_effect = PlacedEffect(AsymmetricViscous(), 1)
+    effects = (placed_effect, PlacedEffect(AsymmetricViscous(), 2))
+    start = with_effects(bare, effects)
+    rng = np.random.default_rng(0)
+    last_effect = find_effects(start, rng, GATES)[-1]
+    last = last_effect.after
     assert [(placed.effect.name, placed.axis) for placed in last.effects] == [("stribeck", 1)]
 
 
@@ -73,19 +77,22 @@ def test_an_effect_that_is_still_needed_stays(small: Evidence, small_truth: Trut
     start = _needing(
         small, small_truth, lambda data: _low_speed(data) + 9.0 * data.position_rad[:, 1]
     )
-    last = find_effects(start, np.random.default_rng(0), GATES)[-1].after
-    assert {(placed.effect.name, placed.axis) for placed in last.effects} == {
-        ("stribeck", 1),
-        ("spring", 1),
-    }
+    rng = np.random.default_rng(0)
+    effects = find_effects(start, rng, GATES)
+    last = effects[-1].after
+    expected = {("stribeck", 1), ("spring", 1)}
+    assert {(placed.effect.name, placed.axis) for placed in last.effects} == expected
 
 
 def _finding(effect: Effect, fall: float, axis: int = 1, *, passed: bool = True) -> Finding:
+    coefficients = np.ones(len(effect.coefficients))
+    deviations = np.ones(len(effect.coefficients))
+    fold_errors = np.ones(8)
     return Finding(
         effect=effect,
         axis=axis,
-        coefficients=np.ones(len(effect.coefficients)),
-        deviations=np.ones(len(effect.coefficients)),
+        coefficients=coefficients,
+        deviations=deviations,
         probability=0.001,
         folds_better=1.0,
         explained=0.2,
@@ -94,7 +101,7 @@ def _finding(effect: Effect, fall: float, axis: int = 1, *, passed: bool = True)
         error_fall=0.2,
         held_out_fall=fall,
         passed=passed,
-        fold_errors=np.ones(8),
+        fold_errors=fold_errors,
     )
 
 
@@ -122,4 +129,5 @@ def test_of_two_that_explain_alike_the_simpler_is_chosen(
 
 def test_where_nothing_passed_nothing_is_chosen() -> None:
     assert choose_effect([]) is None
-    assert choose_effect([_finding(SPRING, 10.0, passed=False)]) is None
+    findings = [_finding(SPRING, 10.0, passed=False)]
+    assert choose_effect(findings) is None

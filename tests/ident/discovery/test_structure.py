@@ -40,7 +40,8 @@ def _needing(small: Evidence, truth: Truth, axis: int, torque: Torque) -> Eviden
 
 
 def _loop(start: Evidence, families: tuple[tuple[Effect, ...], ...] = EFFECTS) -> Sequence[Step]:
-    return find_effects(start, np.random.default_rng(0), GATES, families, geometry=())
+    rng = np.random.default_rng(0)
+    return find_effects(start, rng, GATES, families, geometry=())
 
 
 def _low_speed(axis: int) -> Torque:
@@ -96,7 +97,8 @@ def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
 ) -> None:
     monkeypatch.setattr(loop, "MAX_EFFECTS", 1)
     start = _needing(small, small_truth, case.axis, case.torque)
-    step = _loop(start, _without(*case.removed))[0]
+    families = _without(*case.removed)
+    step = _loop(start, families)[0]
     found = [step.accepted, *(aside.finding for aside in step.set_aside)]
     term = next(
         one for one in found if one and (one.effect.name, one.axis) == (case.name, case.axis)
@@ -106,7 +108,8 @@ def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
     before, after, clean = (training_error(e).axes[case.axis] ** 2 for e in (start, joined, small))
     assert before - after > 0.6 * (before - clean)
     # It bends a gain, or is in the model.
-    moved = np.abs(joined.estimate.gains - start.estimate.gains) > start.estimate.gains_std
+    gain_difference = joined.estimate.gains - start.estimate.gains
+    moved = np.abs(gain_difference) > start.estimate.gains_std
     assert moved.any() == (term is not step.accepted)
 
 
@@ -117,7 +120,8 @@ def test_a_name_that_is_right_wins_over_a_term_that_fits_anything(
     assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [
         ("stribeck", 1)
     ]
-    assert any(finding.passed for finding in steps[0].structures)  # it was asked, and had its say
+    structures = steps[0].structures
+    assert any(finding.passed for finding in structures)  # it was asked, and had its say
 
 
 @pytest.mark.parametrize(
@@ -133,7 +137,8 @@ def test_no_variable_is_lost_because_a_part_of_its_term_is_declared(
     search_problem = search_problem_of(small)
     limits = {Abscissa.VELOCITY: (0.0, 3.0), Abscissa.TIME: (0.0, 20.0)}.get(variable, (-1.0, 1.0))
     for at_rows in (False, True):
-        assert search_problem.test([(Smooth(variable, *limits, signed),)], 1, at_rows=at_rows)
+        families = [(Smooth(variable, *limits, signed),)]
+        assert search_problem.test(families, 1, at_rows=at_rows)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -151,9 +156,9 @@ def test_the_detection_limit_parts_what_is_found_from_what_is_not(
             small, small_truth, axis,
             lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[:, axis]),  # noqa: E501
         )  # fmt: skip
-        best = choose_effect(
-            rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, families)
-        )
+        rng = np.random.default_rng(0)
+        findings = rank_effects(search_problem_of(start), rng, GATES, families)
+        best = choose_effect(findings)
         return None if best is None else (best.effect.name, best.axis)
 
     assert found(3.0) == ("cogging", axis)

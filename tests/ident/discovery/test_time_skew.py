@@ -52,15 +52,19 @@ def test_least_squares_find_a_skew_in_the_loop_that_instruments_do_not_confirm(
 def test_a_planted_skew_is_confirmed_with_its_value_and_sign(
     small_truth: Truth, disturbed: tuple[Run, ...], planted_s: float
 ) -> None:
-    evidence = _fitted(small_truth, tuple(late(run, planted_s) for run in disturbed))
+    runs = tuple(late(run, planted_s) for run in disturbed)
+    evidence = _fitted(small_truth, runs)
     found = time_skew(evidence)
     assert found is not None
     assert found.confirmed
     assert found.seconds == pytest.approx(planted_s, abs=3.0 * found.std)
     assert 5.0 * found.std < abs(planted_s)
     # Once it is in the model, the value is that of the model, with the filter that it has there.
-    setting = TimeSkew(filter_s=0.5 * abs(planted_s), backwards=int(planted_s < 0.0))
-    accepted = time_skew(with_effects(evidence, (PlacedEffect(setting, 0),)))
+    filter_s = 0.5 * abs(planted_s)
+    backwards = int(planted_s < 0.0)
+    setting = TimeSkew(filter_s=filter_s, backwards=backwards)
+    effects = (PlacedEffect(setting, 0),)
+    accepted = time_skew(with_effects(evidence, effects))
     assert accepted is not None
     assert accepted.is_in_model
     assert accepted.seconds == pytest.approx(found.seconds, abs=0.5 * found.std)
@@ -70,4 +74,5 @@ def test_without_instruments_a_skew_is_not_known(
     small_truth: Truth, disturbed: tuple[Run, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evidence_module, "with_demand", lambda data, *_: data)
-    assert time_skew(_fitted(small_truth, disturbed)) is None
+    evidence = _fitted(small_truth, disturbed)
+    assert time_skew(evidence) is None

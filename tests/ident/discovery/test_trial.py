@@ -36,19 +36,27 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
     held = []
     for fold in range(count):
         out = problem.cluster % count == fold
-        without = e[~out] - j[~out] @ fitted_to(j[~out], e[~out])
+        target = e[~out]
+        without = e[~out] - j[~out] @ fitted_to(j[~out], target)
         fitted = fitted_to(both[~out], e[~out])
-        training.append(float(np.sum(without**2) - np.sum((e[~out] - both[~out] @ fitted) ** 2)))
+        difference = np.sum(without**2) - np.sum((e[~out] - both[~out] @ fitted) ** 2)
+        training.append(float(difference))
         held.append(by_motor(e - both @ fitted, out))
     moves = [problem.cluster == move for move in range(MOVES)]
+    fallen = np.array(by_motor(e, everything)) - np.array(by_motor(after, everything))
+    scatter = np.stack([left[rows].T @ after[rows] for rows in moves])
+    gram = np.stack([left[rows].T @ left[rows] for rows in moves])
+    score = left.T @ e
+    training_fall = np.array(training)
+    held_out = np.array(held)
     return CandidateTrial(
         coefficients=coefficients,
-        fallen=np.array(by_motor(e, everything)) - np.array(by_motor(after, everything)),
-        training_fall=np.array(training),
-        held_out=np.array(held),
-        score=left.T @ e,
-        scatter=np.stack([left[rows].T @ after[rows] for rows in moves]),
-        gram=np.stack([left[rows].T @ left[rows] for rows in moves]),
+        fallen=fallen,
+        training_fall=training_fall,
+        held_out=held_out,
+        score=score,
+        scatter=scatter,
+        gram=gram,
     )
 
 
@@ -97,7 +105,8 @@ def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
     folds = cut_into_folds(random_problem(rng))
     problem = folds.linearisation
     seen = rng.normal(size=(len(problem.motor), 1)) * (problem.cluster % 8 == 3)[:, None]
-    (trial,) = score_candidates(folds, seen, [slice(0, 1)])
+    candidates = [slice(0, 1)]
+    (trial,) = score_candidates(folds, seen, candidates)
     assert trial is not None
     expected = _written_out(problem, seen)  # of the least size, where the others do not say: zero
     assert trial.training_fall[3] == pytest.approx(0.0, abs=1e-9)
@@ -112,7 +121,8 @@ def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> N
     whole = rng.normal(size=len(problem.motor)) + 0.5 * problem.residual
     seen = rng.normal(size=len(problem.motor)) * (problem.cluster % 8 == 3)
     pair = np.stack((whole, seen), axis=1)
-    (trial,) = score_candidates(folds, pair, [slice(0, 2)])
+    candidates = [slice(0, 2)]
+    (trial,) = score_candidates(folds, pair, candidates)
     assert trial is not None
     assert trial.held_out == pytest.approx(_written_out(problem, pair).held_out, rel=1e-6)
 
@@ -121,21 +131,23 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
     rng = np.random.default_rng(4)
     folds = cut_into_folds(random_problem(rng))
     columns = rng.normal(size=(len(folds.linearisation.motor), 2))
-    (one,) = score_candidates(folds, columns, [slice(0, 2)])
+    candidates = [slice(0, 2)]
+    (one,) = score_candidates(folds, columns, candidates)
     (other,) = score_candidates(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])
     assert one is not None
     assert other is not None
+    coefficients = other.coefficients * np.array([1e5, 1e-4])
     _agree(replace(other, score=one.score, scatter=one.scatter, gram=one.gram,
-                   coefficients=other.coefficients * np.array([1e5, 1e-4])), one)  # fmt: skip
+                   coefficients=coefficients), one)  # fmt: skip
 
 
 @pytest.mark.parametrize("width", [1, 2, 3])
 def test_a_draws_statistic_is_that_of_its_moves_one_by_one(width: int) -> None:
     rng = np.random.default_rng(5)
     folds = cut_into_folds(random_problem(rng))
-    (trial,) = score_candidates(
-        folds, rng.normal(size=(len(folds.linearisation.motor), width)), [slice(0, width)]
-    )
+    columns = rng.normal(size=(len(folds.linearisation.motor), width))
+    candidates = [slice(0, width)]
+    (trial,) = score_candidates(folds, columns, candidates)
     assert trial is not None
     signs = rng.choice((-1.0, 1.0), size=(5, MOVES))
     expected = []
