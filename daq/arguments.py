@@ -1,6 +1,4 @@
-"""Checks of the arguments of public functions:
-one error that names the function, the argument and what it takes.
-"""
+"""Checks of the arguments of public functions: an error names function, argument, what it takes."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeGuard, TypeVar
 
 from daq.errors import UsageError
 
@@ -30,15 +28,17 @@ class ExpectedArgument:
 
 
 def _is_path(value: object) -> bool:
-    return isinstance(value, (str, os.PathLike)) and bool(os.fspath(value))
+    if not isinstance(value, (str, os.PathLike)):
+        return False
+    return bool(os.fspath(value))
+
+
+def _is_list(value: object) -> TypeGuard[Sequence[object]]:
+    return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
 def _is_list_of_paths(value: object) -> bool:
-    return (
-        isinstance(value, Sequence)
-        and not isinstance(value, (str, bytes))
-        and all(map(_is_path, value))
-    )
+    return _is_list(value) and all(map(_is_path, value))
 
 
 def _is_file_to_write(value: object) -> bool:
@@ -50,7 +50,9 @@ def _is_moment(value: object) -> bool:
 
 
 def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    if not isinstance(value, int) or isinstance(value, bool):
+        return False
+    return value >= 0
 
 
 def _is_number(value: object) -> bool:
@@ -62,11 +64,9 @@ def _is_text(value: object) -> bool:
 
 
 def _is_collection_of_texts(value: object) -> bool:
-    return (
-        isinstance(value, Collection)
-        and not isinstance(value, (str, bytes, Mapping))
-        and all(map(_is_text, value))
-    )
+    if not isinstance(value, Collection) or isinstance(value, (str, bytes, Mapping)):
+        return False
+    return all(map(_is_text, value))
 
 
 A_PATH = ExpectedArgument("the path of a file, as Path or text", _is_path)
@@ -87,11 +87,7 @@ A_PATH_OBJECT = ExpectedArgument(
     "a pathlib.Path", lambda value: isinstance(value, Path), 'write Path("...")'
 )
 A_NUMBER = ExpectedArgument("a number", _is_number)
-A_LIST = ExpectedArgument(
-    "a list",
-    lambda value: isinstance(value, Sequence) and not isinstance(value, (str, bytes)),
-    "write [value]",
-)
+A_LIST = ExpectedArgument("a list", _is_list, "write [value]")
 
 
 def of_kind(kind: type) -> ExpectedArgument:
@@ -103,29 +99,29 @@ def by_name(values: ExpectedArgument) -> ExpectedArgument:
     """Expect a mapping from names to values of one kind."""
 
     def is_met(value: object) -> bool:
-        return (
-            isinstance(value, Mapping)
-            and all(map(_is_text, value))
-            and all(map(values.is_met, value.values()))
-        )
+        if not isinstance(value, Mapping):
+            return False
+        return all(map(_is_text, value)) and all(map(values.is_met, value.values()))
 
     return ExpectedArgument(f"a mapping from a name to {values.described}", is_met)
 
 
 def with_methods(described: str, *names: str) -> ExpectedArgument:
     """Expect an object that has some methods, of whatever class."""
-    return ExpectedArgument(
-        described, lambda value: all(callable(getattr(value, name, None)) for name in names)
-    )
+
+    def is_met(value: object) -> bool:
+        return all(callable(getattr(value, name, None)) for name in names)
+
+    return ExpectedArgument(described, is_met)
 
 
 def optional(expected: ExpectedArgument) -> ExpectedArgument:
     """Expect the same, or None."""
-    return ExpectedArgument(
-        f"{expected.described}, or None",
-        lambda value: value is None or expected.is_met(value),
-        expected.hint,
-    )
+
+    def is_met(value: object) -> bool:
+        return value is None or expected.is_met(value)
+
+    return ExpectedArgument(f"{expected.described}, or None", is_met, expected.hint)
 
 
 def checks_arguments(
@@ -140,16 +136,18 @@ def checks_arguments(
 
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
         signature = inspect.signature(function)
+        function_name = function.__qualname__
 
         @wraps(function)
         def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            for name, value in signature.bind(*args, **kwargs).arguments.items():
-                if name in expected and not expected[name].is_met(value):
-                    taken = [one for one in signature.parameters if one not in {"cls", "self"}]
-                    call = f"call {function.__qualname__}({', '.join(taken)})"
-                    raise argument_refused(
-                        f"{name} of {function.__qualname__}", value, expected[name], call
-                    )
+            given = signature.bind(*args, **kwargs).arguments
+            for name, value in given.items():
+                if name not in expected or expected[name].is_met(value):
+                    continue
+                taken = [one for one in signature.parameters if one not in {"cls", "self"}]
+                call = f"call {function_name}({', '.join(taken)})"
+                label = f"{name} of {function_name}"
+                raise argument_refused(label, value, expected[name], call)
             return function(*args, **kwargs)
 
         return checked
@@ -189,9 +187,8 @@ def argument_refused(
         call: advice where the expectation has none.
     """
     shown = repr(value)[:SHOWN_CHARACTERS]
+    kind = type(value).__name__
+    remedy = expected.hint or call
     return UsageError(
-        label,
-        found=f"{shown} of type {type(value).__name__}",
-        expected=expected.described,
-        remedy=expected.hint or call,
+        label, found=f"{shown} of type {kind}", expected=expected.described, remedy=remedy
     )

@@ -1,5 +1,4 @@
-"""An error for the user: subject, found, expected and remedy, a line each,
-or one line of JSON under `--json`.
+"""An error for the user: subject, found, expected and remedy, a line each, or a line of JSON.
 
 The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found;
 `ADVICE` adds what the command line expects there, and a remedy, and `daq.advice` puts verbs in the
@@ -262,23 +261,24 @@ class ErrorParts:
     @classmethod
     def of(cls, error: Exception, verb: str = "") -> ErrorParts:
         """Take an error of `daq`, `drivers` or `ident` apart; `verb` is the one that raised it."""
-        notes = getattr(error, "__notes__", ())
-        labelled = {}
-        for note in notes:
+        kind = type(error)
+        labelled: dict[str, str] = {}
+        for note in getattr(error, "__notes__", ()):
             label, _, text = note.partition(": ")
             if label in NOTES:
                 labelled[label] = text
+        of_stop = driver.stop_notes(error)
         subject, found, expected, remedy = map(for_command_line, _parts(error, verb))
         return cls(
-            type(error).__name__,
-            subject,
-            found,
-            expected,
-            remedy,
-            int(exit_code(type(error)) or ExitCode.UNEXPECTED),
-            labelled,
-            tuple(note for note in driver.stop_notes(error) if note.startswith(driver.WHILE)),
-            may_have_power(error),
+            kind=kind.__name__,
+            error=subject,
+            found=found,
+            expected=expected,
+            do=remedy,
+            exit_code=int(exit_code(kind) or ExitCode.UNEXPECTED),
+            notes=labelled,
+            unconfirmed=tuple(note for note in of_stop if note.startswith(driver.WHILE)),
+            powered=may_have_power(error),
         )
 
     def document(self) -> ErrorReport:
@@ -307,21 +307,22 @@ class ErrorParts:
     def lines(self) -> Iterator[tuple[str, str, str]]:
         """Label, text and style of each line for a terminal."""
         yield "error", self.error, "bold red"
-        for label, text in (("found", self.found), ("expected", self.expected), ("do", self.do)):
+        evidence = {"found": self.found, "expected": self.expected, "do": self.do}
+        for label, text in evidence.items():
             if text != self.error:
                 yield label, text, "bold"
-        yield from ((label, text, "bold") for label, text in self.notes.items())
-        yield from (("note", text, "bold") for text in self.unconfirmed)
+        for label, text in self.notes.items():
+            yield label, text, "bold"
+        for text in self.unconfirmed:
+            yield "note", text, "bold"
         if self.powered:
             yield "AXES", NOT_STOPPED.format(self.powered), "bold red"
 
 
 def may_have_power(error: BaseException | None) -> str:
     """Name the axes that had power and are not confirmed without it; empty where there are none."""
-    notes = driver.stop_notes(error)
-    return ", ".join(
-        note.removeprefix(driver.POWERED) for note in notes if note.startswith(driver.POWERED)
-    )
+    of_power = [note for note in driver.stop_notes(error) if note.startswith(driver.POWERED)]
+    return ", ".join(note.removeprefix(driver.POWERED) for note in of_power)
 
 
 def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
@@ -341,9 +342,11 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
         known_advice = ADVICE_WITHIN["demo"]
     else:
         known_advice = ADVICE | ADVICE_WITHIN.get(verb, {})
-    advice = next(
-        (known_advice[kind] for kind in type(error).__mro__ if kind in known_advice), ("", "")
-    )
+    advice = ("", "")
+    for kind in type(error).__mro__:  # the nearest class first
+        if kind in known_advice:
+            advice = known_advice[kind]
+            break
     said = str(error)
     if verb == "demo":
         said = said.replace(RESET, "")
@@ -381,4 +384,5 @@ def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
             if console.is_terminal:
                 shown = break_lines(shown, max(console.width - INDENT, 1))
             indented = shown.replace("\n", "\n" + INDENT * " ")
-            console.print(Text(f"{label + ':':<{INDENT}}", style=style) + Text(indented))
+            padded_label = f"{label}:".ljust(INDENT)
+            console.print(Text(padded_label, style=style) + Text(indented))

@@ -373,18 +373,15 @@ def load_import(path: Path) -> ImportDescription:
         if own != axes and 1 not in {axes, own}:
             found = f"{own} columns"
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
-    timed = () if wanted.time is None else (wanted.time.column,)
-    named = [
-        c for columns in (*wanted.files().values(), timed) for c in columns if isinstance(c, str)
-    ]
+    columns: list[object] = []
+    for of_file in wanted.files().values():
+        columns += of_file
+    if wanted.time is not None:
+        columns.append(wanted.time.column)
+    named = [column for column in columns if isinstance(column, str)]
     if named and not wanted.table.header:
-        faults.append(
-            Fault(
-                ("table", "header"),
-                f"false, and column {named[0]!r} by name",
-                "column numbers from 1",
-            )
-        )
+        found = f"false, and column {named[0]!r} by name"
+        faults.append(Fault(("table", "header"), found, "column numbers from 1"))
     if faults:
         raise ConfigurationInconsistent(
             **fault_texts(document, faults), remedy="correct the import description"

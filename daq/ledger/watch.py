@@ -107,8 +107,9 @@ class Series:
 def watch(
     entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement]
 ) -> tuple[Series, ...]:
-    """Return one series an axis, in the order of the axes;
-    entries are of one cell, acknowledgements oldest first.
+    """Return one series an axis, in the order of the axes.
+
+    Entries are of one cell, acknowledgements oldest first.
     """
     if not entries:
         return ()
@@ -117,11 +118,16 @@ def watch(
     for axis, dispersion in dispersions_of(entries, tuple(axes)).items():
         known = _known(entries, axis)
         acknowledged = tuple(noted for noted in acknowledgements if noted.axis == axis)
-        starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
+        # A stretch begins with the first calibration since an acknowledgement.
+        starts: set[int] = set()
+        for noted in acknowledged:
+            starts.add(sum(entry.recorded < noted.since for entry, _ in known))
         stretches = []
         for began, ended in pairwise(sorted({0, *starts, len(known)})):
             gains = [gain for _, gain in known[began:ended]]
-            drift = cusum([g.value for g in gains], [g.std for g in gains], dispersion=dispersion)
+            values = [gain.value for gain in gains]
+            deviations = [gain.std for gain in gains]
+            drift = cusum(values, deviations, dispersion=dispersion)
             stretches.append(Stretch(began, drift))
         points = []
         for index, (entry, gain) in enumerate(known):
@@ -268,11 +274,10 @@ def questions(all_series: Sequence[Series]) -> tuple[str, ...]:
             found = [_MORE if rose[0] else _LESS]
         case Pattern.SEVERAL:
             found = [_SEVERAL]
-    configurations = {
-        point.entry.configuration_sha256 for s in all_series for point in s.points[s.began :]
-    }
-    changed = len(configurations) > 1
-    return (
-        *found,
-        *(["the cell's configuration changed in this time: what was changed?"] if changed else []),
-    )
+    configurations: set[str] = set()
+    for series in all_series:
+        points = series.points[series.began :]
+        configurations.update(point.entry.configuration_sha256 for point in points)
+    if len(configurations) > 1:
+        found.append("the cell's configuration changed in this time: what was changed?")
+    return tuple(found)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -343,11 +343,12 @@ def parse_markup(content: bytes, file: str) -> Markup:
         raise refused(file, error.found, expected, "correct the file") from error
     if encoding.lower() not in {"utf-8", "us-ascii", "ascii"}:
         raise refused(file, f"encoding {encoding!r}", "UTF-8", "save it as UTF-8")
-    (root,) = level = around.children
+    (root,) = around.children
     if root.name != "robot":
         raise refused(file, f"<{root.name}>", "a URDF, <robot> around all")
+    level = [root]
     for _ in range(MAX_DEPTH):
-        level = [child for element in level for child in element.children]
+        level = list(chain.from_iterable(element.children for element in level))
     if level:
         raise refused(file, f"more than {MAX_DEPTH} elements in each other", "a URDF")
     named: dict[str, dict[str, Element]] = {"link": {}, "joint": {}}

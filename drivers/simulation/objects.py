@@ -109,8 +109,10 @@ LOAD = int.from_bytes(b"load", "little")
 
 
 def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
+    """Objects of CiA 301 and CiA 402, and two of the manufacturer."""
     counts = axis.counts_per_revolution
     peak_per_mille = round(1000 * axis.peak_current_a / axis.rated_current_a)
+    gain_as_float = struct.pack("<f", axis.entered_gain_nm_per_a)
     i8, u8, i16, u16, i32, u32, text = Kind
     ro, rw, tpdo, rpdo = Access
     return (
@@ -139,13 +141,7 @@ def _cia402(axis: AxisSpec) -> tuple[Entry, ...]:
         # Manufacturer specific: the entered joint drive gain, for masters only.
         Entry(0x2003, 0, u8, ro, 2),
         Entry(0x2003, 1, i32, rw, round(1000 * axis.entered_gain_nm_per_a)),
-        Entry(
-            0x2003,
-            2,
-            u32,
-            rw,
-            int.from_bytes(struct.pack("<f", axis.entered_gain_nm_per_a), "little"),
-        ),
+        Entry(0x2003, 2, u32, rw, int.from_bytes(gain_as_float, "little")),
         Entry(0x2005, 0, i16),  # manufacturer specific: temperature of the motor [0.1 °C]
         Entry(0x6007, 0, i16, rw, 1, lowest=0, highest=3),
         Entry(0x603F, 0, u16, tpdo),
@@ -192,7 +188,9 @@ def find(dictionary: Dictionary, index: int, subindex: int) -> Entry:
     entry = dictionary.get((index, subindex))
     if entry is not None:
         return entry
-    raise SdoAbort(NO_SUBINDEX if any(known == index for known, _ in dictionary) else NO_OBJECT)
+    if any(known == index for known, _ in dictionary):
+        raise SdoAbort(NO_SUBINDEX)
+    raise SdoAbort(NO_OBJECT)
 
 
 _HEAD = struct.Struct("<BHB")
@@ -215,9 +213,7 @@ class SdoServer:
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes | None:
-        """Return the response to a request of 8 bytes,
-        or None where none is due (an abort of the client).
-        """
+        """Return the response to a request of 8 bytes; None to an abort of the client."""
         if len(request) < 8:
             return None
         command = request[0] >> 5
@@ -228,26 +224,31 @@ class SdoServer:
             self._upload = self._download = None
         if command == 4:
             return None
-        serve = (
-            self._continue_download,
-            self._start_download,
-            self._start_upload,
-            self._continue_upload,
-        )
+        serve = {
+            0: self._continue_download,
+            1: self._start_download,
+            2: self._start_upload,
+            3: self._continue_upload,
+        }
         try:
-            return (serve[command] if command < len(serve) else self._refuse)(request)
+            return serve.get(command, self._refuse)(request)
         except SdoAbort as abort:
             self._upload = self._download = None
-            return _HEAD.pack(0x80, *self._entry) + struct.pack("<I", abort.code)
+            return self._response(0x80, abort.code.to_bytes(4, "little"))
+
+    def _response(self, command: int, data: bytes) -> bytes:
+        """Command byte, index and subindex of the transfer, and four bytes of data."""
+        return _HEAD.pack(command, *self._entry) + data.ljust(4, b"\0")
 
     def _start_upload(self, _: bytes) -> bytes:
         data = self._read(*self._entry)
-        if len(data) <= 4:
-            unused = 4 - len(data)
-            return _HEAD.pack(0x43 | unused << 2, *self._entry) + data.ljust(4, b"\0")
+        size = len(data)
+        if size <= 4:
+            unused = 4 - size
+            return self._response(0x43 | unused << 2, data)
         self._upload = data
         self._toggle = 0
-        return _HEAD.pack(0x41, *self._entry) + struct.pack("<I", len(data))
+        return self._response(0x41, size.to_bytes(4, "little"))
 
     def _continue_upload(self, request: bytes) -> bytes:
         if self._upload is None:
@@ -272,7 +273,7 @@ class SdoServer:
         else:
             self._download = bytearray()
             self._toggle = 0
-        return _HEAD.pack(0x60, *self._entry) + bytes(4)
+        return self._response(0x60, b"")
 
     def _continue_download(self, request: bytes) -> bytes:
         if self._download is None:
@@ -374,11 +375,10 @@ def vendor(axis: AxisSpec) -> Vendor:
 
 
 def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
-    """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh),
-    which are in pdo.py.
-    """
+    """Return all entries of an amplifier but the PDO parameters (1400h-1BFFh) of pdo.py."""
     make = vendor(axis)
     entries = [entry for entry in _cia402(axis) if entry.index not in make.absent]
-    entries += [Entry(*current.key, current.kind, Access.TPDO) for current in make.currents]
+    for current in make.currents:
+        entries.append(Entry(*current.key, current.kind, Access.TPDO))
     entries += make.others
     return {(entry.index, entry.subindex): entry for entry in entries}

@@ -32,8 +32,11 @@ class GateRow:
     @property
     def text(self) -> str:
         """The condition in words: the first paragraph of each check's docstring."""
-        first_paragraphs = [(check.__doc__ or "").partition("\n\n")[0] for check in self.checks]
-        return " ".join(" ".join(first_paragraphs).split())
+        words: list[str] = []
+        for check in self.checks:
+            first_paragraph, *_ = (check.__doc__ or "").split("\n\n", 1)
+            words += first_paragraph.split()
+        return " ".join(words)
 
 
 GATES: tuple[GateRow, ...] = (
@@ -153,9 +156,9 @@ def check_gates(context: GateContext) -> tuple[Refusal, ...]:
         UsageError: the value of --base is no digest.
         ConfigurationInconsistent: a signer's public key is none.
     """
-    return tuple(
-        Refusal(row.gate, *finding)
-        for row in GATES
-        for check in row.checks
-        for finding in check(context)
-    )
+    refusals: list[Refusal] = []
+    for row in GATES:
+        for check in row.checks:
+            for finding in check(context):
+                refusals.append(Refusal(row.gate, *finding))
+    return tuple(refusals)
