@@ -26,41 +26,47 @@ KEYS = {axis: f"drives.{axis}.gain" for axis in AXES}
 
 def demo_calibration() -> Calibration:
     """Calibration of the demo cell, with the gains of the paper's Table 4 and σ of 0.4 %."""
+    sha256 = "a" * 64
+    source = Source("unloaded", sha256, "fit", recording=demo_recording())
+    sources = (
+        source,
+        Source("loaded", "b" * 64, "fit", False, "disc", 4.59, demo_recording(4.592)),
+        Source("held-out", "d" * 64, "holdout", False, "disc", 4.59, demo_recording(4.588)),
+    )
+    gains = tuple(
+        Gain(axis, value, 0.004 * abs(value), "Nm/A", nameplate)
+        for axis, value, nameplate in zip(AXES, IDENTIFIED, NAMEPLATE, strict=True)
+    )
+    coefficients = (Parameter("c", 0.12, 0.002, "1"),)
+    accepted_effect = AcceptedEffect(
+        "load-friction", "J3", {"power": 1.0}, coefficients, 6.1, 3.4, ()
+    )
+    effects = (accepted_effect,)
+    parameter = Parameter("ZZ1R", 1.25, 0.01, "kg m²")
+    parameters = (parameter, Parameter("off3", 0.0, 0.02, "Nm"))
+    axes = (3.1, 2.8, 3.4, 4.0, 5.5, 4.9)
+    relative_error_percent = RelativeError(axes, 3.2)
+    holdout_error_percent = RelativeError((3.2, 2.9, 3.5, 4.1, 5.6, 5.0), 3.3)
+    current_residual = (0.03, 0.05, 0.02, 0.02, 0.01, 0.01)
+    relative_error = RelativeError((4.2, 3.9, 4.5, 5.1, 6.6, 6.0), 4.3)
     return Calibration(
         cell="demo",
         method="ml",
-        gains=tuple(
-            Gain(axis, value, 0.004 * abs(value), "Nm/A", nameplate)
-            for axis, value, nameplate in zip(AXES, IDENTIFIED, NAMEPLATE, strict=True)
-        ),
-        parameters=(Parameter("ZZ1R", 1.25, 0.01, "kg m²"), Parameter("off3", 0.0, 0.02, "Nm")),
-        effects=(
-            AcceptedEffect(
-                "load-friction",
-                "J3",
-                {"power": 1.0},
-                (Parameter("c", 0.12, 0.002, "1"),),
-                6.1,
-                3.4,
-                (),
-            ),
-        ),
-        relative_error_percent=RelativeError((3.1, 2.8, 3.4, 4.0, 5.5, 4.9), 3.2),
-        holdout_error_percent=RelativeError((3.2, 2.9, 3.5, 4.1, 5.6, 5.0), 3.3),
+        gains=gains,
+        parameters=parameters,
+        effects=effects,
+        relative_error_percent=relative_error_percent,
+        holdout_error_percent=holdout_error_percent,
         condition=812.0,
         rows=14400,
         filter={"position_cutoff_hz": 40.0, "standstill_rad_s": [0.03] * 6},
-        sources=(
-            Source("unloaded", "a" * 64, "fit", recording=demo_recording()),
-            Source("loaded", "b" * 64, "fit", False, "disc", 4.59, demo_recording(4.592)),
-            Source("held-out", "d" * 64, "holdout", False, "disc", 4.59, demo_recording(4.588)),
-        ),
+        sources=sources,
         configuration_sha256="c" * 64,
         created="2025-01-02T03:04:05+00:00",
         software="drivegain 0.1.0",
-        nameplate_holdout_error_percent=RelativeError((4.2, 3.9, 4.5, 5.1, 6.6, 6.0), 4.3),
+        nameplate_holdout_error_percent=relative_error,
         recording_configuration_sha256=None,
-        current_residual=(0.03, 0.05, 0.02, 0.02, 0.01, 0.01),
+        current_residual=current_residual,
     )
 
 
@@ -79,7 +85,8 @@ def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Pat
         gains=tuple(replace(gain, value=gain.value * factor) for gain in calibration.gains),
     )
     path = cell_file.parent / f"calibration-{factor:g}.yaml"
-    save_calibration(replace(calibration, **changes), path)
+    changed_calibration = replace(calibration, **changes)
+    save_calibration(changed_calibration, path)
     return path
 
 
@@ -99,14 +106,13 @@ def recorded(calibration: Calibration, at: datetime) -> Calibration:
 def with_recordings(calibration: Calibration, **changes: object) -> Calibration:
     """The same calibration with changes in how every log was recorded."""
     reported = [(source, source.recording) for source in calibration.sources]
+    sources = tuple(
+        source if recording is None else replace(source, recording=replace(recording, **changes))  # type: ignore[arg-type]
+        for source, recording in reported
+    )
     return replace(
         calibration,
-        sources=tuple(
-            source
-            if recording is None
-            else replace(source, recording=replace(recording, **changes))  # type: ignore[arg-type]
-            for source, recording in reported
-        ),
+        sources=sources,
     )
 
 
@@ -119,18 +125,23 @@ def of_first_axes(calibration: Calibration, count: int) -> Calibration:
         return replace(error, axes=error.axes[:count])
 
     error = calibration.relative_error_percent
+    relative_error_percent = replace(error, axes=error.axes[:count])
+    holdout_error_percent = first(calibration.holdout_error_percent)
     cut = replace(
         calibration,
         gains=calibration.gains[:count],
-        relative_error_percent=replace(error, axes=error.axes[:count]),
-        holdout_error_percent=first(calibration.holdout_error_percent),
+        relative_error_percent=relative_error_percent,
+        holdout_error_percent=holdout_error_percent,
         nameplate_holdout_error_percent=first(calibration.nameplate_holdout_error_percent),
     )
+    serials = tuple(range(1001, 1001 + count))
+    saturated_percent = (0.0,) * count
+    missing = (0,) * count
     return with_recordings(
         cut,
-        serials=tuple(range(1001, 1001 + count)),
-        saturated_percent=(0.0,) * count,
-        missing=(0,) * count,
+        serials=serials,
+        saturated_percent=saturated_percent,
+        missing=missing,
     )
 
 

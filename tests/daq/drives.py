@@ -42,11 +42,16 @@ def demo_cell(folder: Path, *objects: GainObject) -> Cell:
     """The demo cell with its records in a folder, and the gains in these objects,
     or in 2003h:01 of all drives.
     """
-    cell = load_cell(CONFIGS / "cells" / "demo.yaml")
+    path = CONFIGS / "cells" / "demo.yaml"
+    cell = load_cell(path)
+    controller = Controller(objects=objects or (WHOLE,) * len(cell.axes))
+    store = folder / "demo.history.sqlite"
+    audit = folder / "demo.audit.jsonl"
+    history = HistoryPlace(store, audit)
     return replace(
         cell,
-        controller=Controller(objects=objects or (WHOLE,) * len(cell.axes)),
-        history=HistoryPlace(folder / "demo.history.sqlite", folder / "demo.audit.jsonl"),
+        controller=controller,
+        history=history,
     )
 
 
@@ -63,14 +68,16 @@ def simulated(
     address: BusAddress, *faults: FaultSpec, entered: tuple[float, ...] = NAMEPLATE
 ) -> Iterator[SimulatedCell]:
     """The demo cell, its drives with entered gains and faults."""
-    spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
+    path = CONFIGS / "simulation" / "clean.yaml"
+    spec = load_simulation(path)
     axes = tuple(
         replace(axis, entered_gain_nm_per_a=gain)
         for axis, gain in zip(spec.axes, entered, strict=True)
     )
     bus: can.BusABC = open_bus(address)
     try:
-        with SimulatedCell(replace(spec, axes=axes, faults=faults), bus) as cell:
+        changed_spec = replace(spec, axes=axes, faults=faults)
+        with SimulatedCell(changed_spec, bus) as cell:
             yield cell
     finally:
         bus.shutdown()
@@ -80,11 +87,14 @@ def network_of(
     cell: Cell, address: BusAddress, mapping: Mapping = Mapping.STORED
 ) -> CanopenNetwork:
     """To be entered; with short waits, and drives of which it is known that they save so."""
+    axes = tuple(with_mapping(axis, mapping) for axis in drive_axes(cell))
+    bounds = Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05)
+    policy = SdoPolicy(0.3, 3)
     return CanopenNetwork(
         address,
-        tuple(with_mapping(axis, mapping) for axis in drive_axes(cell)),
-        bounds=Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05),
-        policy=SdoPolicy(0.3, 3),
+        axes,
+        bounds=bounds,
+        policy=policy,
     )
 
 
@@ -92,7 +102,9 @@ def with_mapping(axis: Axis, mapping: Mapping) -> Axis:
     """An axis whose drive does that with mappings when it saves."""
     save = axis.profile.save
     assert save is not None
-    return replace(axis, profile=replace(axis.profile, save=replace(save, mapping=mapping)))
+    changed_save = replace(save, mapping=mapping)
+    profile = replace(axis.profile, save=changed_save)
+    return replace(axis, profile=profile)
 
 
 def entered_gain(node: Node, gain_object: GainObject = WHOLE) -> float:
@@ -148,19 +160,21 @@ def apply_in_drives(
     """As `drivegain apply --drives` does it, in Kim's name."""
     calibration = calibration or demo_calibration()
     assert cell.history is not None
+    opening = drives_on_the_bus(cell, saving)
+    request = Request(
+        calibration,
+        NOW,
+        policy=cell.apply,
+        accepts_changed_configuration=True,
+        base=base,
+        appliers=ACTOR.names,
+        file=Path("calibration.yaml"),
+        content=encode_calibration(calibration),
+    )
     apply_to(
-        drives_on_the_bus(cell, saving),
+        opening,
         cell,
-        Request(
-            calibration,
-            NOW,
-            policy=cell.apply,
-            accepts_changed_configuration=True,
-            base=base,
-            appliers=ACTOR.names,
-            file=Path("calibration.yaml"),
-            content=encode_calibration(calibration),
-        ),
+        request,
         actor=ACTOR,
         audit=cell.history.audit,
         undo="drivegain rollback --cell cells/demo.yaml --drives",

@@ -170,7 +170,8 @@ def why_not_here() -> str:
             "the numbers and registers of system calls are those of Linux on x86-64, not of "
             f"{platform.machine()}"
         )
-    if traced(lambda: 0, lambda _: True).code == NOT_PERMITTED:
+    code = traced(lambda: 0, lambda _: True).code
+    if code == NOT_PERMITTED:
         return "ptrace is not permitted here: no system call can be made to fail"
     return ""
 
@@ -312,7 +313,9 @@ class _Tracer:
         assert kind.path is not None
         if registers[kind.path] == 0:  # of the descriptor itself, as utimensat(2) has it
             return None
-        path = Path(_text(process / "mem", registers[kind.path]))
+        memory = process / "mem"
+        address = registers[kind.path]
+        path = Path(_text(memory, address))
         folder = process / "cwd"
         if kind.folder is not None:
             descriptor = ctypes.c_int(registers[kind.folder]).value

@@ -45,7 +45,8 @@ def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibr
         replace(one, sha256=hashlib.sha256(f"{one.name} of week {week}".encode()).hexdigest())
         for one in demo.sources
     )
-    return recorded(replace(demo, gains=gains, sources=logs, created=at.isoformat()), at)
+    calibration = replace(demo, gains=gains, sources=logs, created=at.isoformat())
+    return recorded(calibration, at)
 
 
 def digest_of(calibration: Calibration) -> str:
@@ -55,7 +56,8 @@ def digest_of(calibration: Calibration) -> str:
 
 def ledger_in(folder: Path) -> Ledger:
     """The ledger of the demo cell with its audit log in a folder."""
-    demo = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    demo = load_cell(path)
     return Ledger(demo, folder / "demo.audit.jsonl")
 
 

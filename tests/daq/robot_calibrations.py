@@ -64,7 +64,8 @@ def robot_of(name: str) -> CalibratedRobot:
     """The robot of a shipped cell, or that of a recording beside the checkout."""
     path = CHECKOUT / "configs/cells" / f"{name}.yaml"
     if name == "ur10":
-        data = Path(os.environ.get("DRIVEGAIN_DATA", CHECKOUT.parent / "shared/data"))
+        data_folder = CHECKOUT.parent / "shared/data"
+        data = Path(os.environ.get("DRIVEGAIN_DATA", data_folder))
         path = data / "ur10/ur10-cell.yaml"
         if not path.exists():
             pytest.skip(
@@ -76,9 +77,9 @@ def robot_of(name: str) -> CalibratedRobot:
 
 def apart(found: FloatArray, expected: FloatArray) -> float:
     """‖found − expected‖/‖expected‖ of the worst axis."""
-    return float(
-        (np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)).max()
-    )
+    difference_norm = np.linalg.norm(found - expected, axis=1)
+    expected_norm = np.linalg.norm(expected, axis=1)
+    return float((difference_norm / expected_norm).max())
 
 
 def calibrated_robot(cell_file: Path, seed: int = 4, coupling: float = 0.2) -> CalibratedRobot:
@@ -96,7 +97,8 @@ def calibrated_robot(cell_file: Path, seed: int = 4, coupling: float = 0.2) -> C
     states = random_states(model, cell_limits(cell))
     columns = model.regressor(states).transpose(0, 2, 1).reshape(-1, len(standard))
     names = tuple(column.name for column in model.columns)
-    base = base_parameters(np.asarray(np.linalg.qr(columns, mode="r")), names)
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    base = base_parameters(triangle, names)
     gains = tuple(
         Gain(axis.name, 1.03 * axis.nameplate_gain, 0.01, axis.gain_unit, axis.nameplate_gain)
         for axis in cell.axes
@@ -105,13 +107,15 @@ def calibrated_robot(cell_file: Path, seed: int = 4, coupling: float = 0.2) -> C
         Parameter(name, float(value), 0.01 * abs(float(value)) + 1e-3, "kg m²")
         for name, value in zip(base.names, base.grouping @ standard, strict=True)
     )
+    axes = (3.0,) * len(gains)
+    relative_error_percent = RelativeError(axes, 3.0)
     calibration = Calibration(
         cell=cell.name,
         method="ml",
         gains=gains,
         parameters=parameters,
         effects=(),
-        relative_error_percent=RelativeError((3.0,) * len(gains), 3.0),
+        relative_error_percent=relative_error_percent,
         holdout_error_percent=None,
         condition=800.0,
         rows=1000,
@@ -132,10 +136,13 @@ def _standard_of(cell: Cell, model: Model, seed: int, coupling: float) -> FloatA
     for columns, link in zip(model.link_columns, links, strict=True):
         # A tenth of the link's mass more, somewhere in it.
         more_kg = 0.1 * float(link[9])
-        more = Body(more_kg, rng.uniform(-0.1, 0.1, 3), 0.01 * more_kg * np.eye(3))
+        centre_m = rng.uniform(-0.1, 0.1, 3)
+        inertia_kg_m2 = 0.01 * more_kg * np.eye(3)
+        more = Body(more_kg, centre_m, inertia_kg_m2)
         standard[columns] = link + more.parameters
     # Inertias, dampers and dry friction that matter beside the links, each axis its own.
-    least = np.abs(model.regressor(random_states(model, cell_limits(cell)))).max(axis=2)
+    motion = random_states(model, cell_limits(cell))
+    least = np.abs(model.regressor(motion)).max(axis=2)
     largest_nm = (least @ np.abs(standard)).max()
     count = model.robot.axis_count
     speeds = cell_limits(cell)[2:]
@@ -145,7 +152,8 @@ def _standard_of(cell: Cell, model: Model, seed: int, coupling: float) -> FloatA
         (model.dry_friction_columns, np.full(count, 0.02 * largest_nm)),
     ):
         standard[column] = size * rng.uniform(0.5, 1.0, count)
-    offsets = JOINT_COLUMNS * np.array(model.robot.axis_joints) + JOINT_COLUMNS - 1
+    axis_joints = np.array(model.robot.axis_joints)
+    offsets = JOINT_COLUMNS * axis_joints + JOINT_COLUMNS - 1
     standard[offsets] = 0.02 * largest_nm * rng.uniform(-1.0, 1.0, count)
     first = JOINT_COLUMNS * model.robot.joint_count
     for number, motor in enumerate(model.drive_train.coupled):
@@ -153,5 +161,6 @@ def _standard_of(cell: Cell, model: Model, seed: int, coupling: float) -> FloatA
         for place, columns in enumerate(
             (model.rotor_columns, model.viscous_friction_columns, model.dry_friction_columns)
         ):
-            standard[first + 3 * number + place] = coupling * float(standard[columns][turned].min())
+            smallest_standard = float(standard[columns][turned].min())
+            standard[first + 3 * number + place] = coupling * smallest_standard
     return standard

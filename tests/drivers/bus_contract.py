@@ -56,7 +56,8 @@ class BusContract:
 
     def test_no_end_hears_itself(self, ends: Ends) -> None:
         first, second, _ = ends
-        first.send(can.Message(arbitration_id=1, is_extended_id=False))
+        message = can.Message(arbitration_id=1, is_extended_id=False)
+        first.send(message)
         second.send(can.Message(arbitration_id=2, is_extended_id=False))
         heard = first.recv(WAIT_S)
         assert heard is not None
@@ -76,9 +77,8 @@ class BusContract:
             send_burst(sender, burst[start : start + 100])
         for end in others:
             received = [end.recv(WAIT_S) for _ in burst]
-            assert [bytes(frame.data) for frame in received if frame] == [
-                bytes(frame.data) for frame in burst
-            ]
+            expected = [bytes(frame.data) for frame in burst]
+            assert [bytes(frame.data) for frame in received if frame] == expected
 
     def test_shutdown_twice_is_harmless(self, ends: Ends) -> None:
         ends[2].shutdown()

@@ -41,7 +41,8 @@ MOVE = Move((3000, -2000), (100_000, 80_000), (1_000_000, 800_000))
 
 def shipped(name: str) -> DriveProfile:
     """Return a shipped drive profile."""
-    path = shipped_configurations() / "drives" / f"{name}.yaml"
+    drives_folder = shipped_configurations() / "drives"
+    path = drives_folder / f"{name}.yaml"
     return drive_from_text(path.read_bytes(), path.name)
 
 
@@ -83,7 +84,8 @@ class ForeignNode(ScriptedNode):
         return [number for number in range(8) if base + number in self.local.object_dictionary]
 
     def has(self, index: int, sub: int) -> bool:
-        return self.local.object_dictionary.get_variable(index, sub) is not None
+        variable = self.local.object_dictionary.get_variable(index, sub)
+        return variable is not None
 
     def _variable(self, index: int, sub: int) -> ODVariable:
         variable = self.local.object_dictionary.get_variable(index, sub)
@@ -144,9 +146,11 @@ class ForeignNode(ScriptedNode):
             if not cob >> 31 and kind == 1 and (mapped := self._mapped(0x1800, number)):
                 self._refresh()
                 data = b"".join(self.value(i, s).to_bytes(n, "little") for i, s, n in mapped)
-                answers.append(
-                    can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data)
+                arbitration_id = cob & 0x7FF
+                message = can.Message(
+                    arbitration_id=arbitration_id, is_extended_id=False, data=data
                 )
+                answers.append(message)
         for number in self.numbers(0x1400):
             cob = self.value(0x1400 + number, 1)
             pdo = self._pending.pop(cob & 0x7FF, None)
@@ -172,13 +176,16 @@ def foreign_cell(
     if not sheet.is_file():
         pytest.skip(f"no data sheet at {sheet}: set DRIVEGAIN_DATA to the folder that holds eds/")
     clock = FakeClock()
-    bus = ScriptedBus(tuple(ForeignNode(n + 1, sheet, **how) for n in range(axes)), clock)
+    nodes = tuple(ForeignNode(n + 1, sheet, **how) for n in range(axes))
+    bus = ScriptedBus(nodes, clock)
+    bounds = Bounds(0.1, 0.1, 0.1, 0.1)
+    policy = SdoPolicy(0.02, 2)
     network = CanopenNetwork(
         ADDRESS,
         tuple(Axis(f"J{n + 1}", n + 1, profile) for n in range(axes)),
         heartbeat_ms=20,
-        bounds=Bounds(0.1, 0.1, 0.1, 0.1),
-        policy=SdoPolicy(0.02, 2),
+        bounds=bounds,
+        policy=policy,
         clock=clock,
         opener=lambda address: bus,
         profiles=profiles,

@@ -14,7 +14,8 @@ WAIT_S = 30.0
 @contextmanager
 def raw_client(hub: Hub) -> Iterator[socket.socket]:
     """Open a connection in raw mode."""
-    with socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
+    port = hub.address().port
+    with socket.create_connection((HOST, port), timeout=WAIT_S) as client:
         client.sendall(b"< open can0 >< rawmode >")
         heard = b""
         while heard != b"< hi >< ok >< ok >":

@@ -205,9 +205,11 @@ class ScriptedNode:
                     (self.value(i, s) & (1 << 8 * n) - 1).to_bytes(n, "little")
                     for i, s, n in self._mapped(0x1800, number)
                 )
-                answers.append(
-                    can.Message(arbitration_id=cob & 0x7FF, is_extended_id=False, data=data)
+                arbitration_id = cob & 0x7FF
+                message = can.Message(
+                    arbitration_id=arbitration_id, is_extended_id=False, data=data
                 )
+                answers.append(message)
         self._apply_pdos(cycle)
         self._move()
         return answers
@@ -287,7 +289,8 @@ class ScriptedNode:
 
     def emcy(self, code: int) -> can.Message:
         data = struct.pack("<HB5x", code, 1)
-        return can.Message(arbitration_id=0x80 + self.node_id, is_extended_id=False, data=data)
+        arbitration_id = 0x80 + self.node_id
+        return can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=data)
 
 
 class ScriptedBus(can.BusABC):
@@ -341,11 +344,11 @@ class ScriptedBus(can.BusABC):
             elif cob == 0x600 + node.node_id and node.nmt != 4:
                 reply = node.sdo(data)
                 if reply is not None:
-                    self._answer(
-                        can.Message(
-                            arbitration_id=0x580 + node.node_id, is_extended_id=False, data=reply
-                        )
+                    arbitration_id = 0x580 + node.node_id
+                    message = can.Message(
+                        arbitration_id=arbitration_id, is_extended_id=False, data=reply
                     )
+                    self._answer(message)
             elif 0x200 <= cob < 0x600 and cob & 0x7F == node.node_id:
                 node.receive_pdo(cob, data)
         self._beat()
@@ -356,11 +359,11 @@ class ScriptedBus(can.BusABC):
             if node.beats and period_ms and self.clock.now_ns >= node.next_beat_ns:
                 node.next_beat_ns = self.clock.now_ns + period_ms * 1_000_000
                 data = bytes((node.nmt,))
-                self._answer(
-                    can.Message(
-                        arbitration_id=0x700 + node.node_id, is_extended_id=False, data=data
-                    )
+                arbitration_id = 0x700 + node.node_id
+                message = can.Message(
+                    arbitration_id=arbitration_id, is_extended_id=False, data=data
                 )
+                self._answer(message)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if self.broken:
@@ -382,13 +385,16 @@ class ScriptedBus(can.BusABC):
 def cell(axes: int = 2) -> tuple[CanopenNetwork, ScriptedBus]:
     """A network of so many axes, not yet entered, and the bus that it will open."""
     clock = FakeClock()
-    bus = ScriptedBus(tuple(ScriptedNode(n + 1) for n in range(axes)), clock)
+    nodes = tuple(ScriptedNode(n + 1) for n in range(axes))
+    bus = ScriptedBus(nodes, clock)
+    bounds = Bounds(0.1, 0.1, 0.1, 0.1)
+    policy = SdoPolicy(0.02, 2)
     network = CanopenNetwork(
         ADDRESS,
         tuple(Axis(f"J{n + 1}", n + 1, PROFILE, Identity(0x29A, 0x40200, 7)) for n in range(axes)),
         heartbeat_ms=20,
-        bounds=Bounds(0.1, 0.1, 0.1, 0.1),
-        policy=SdoPolicy(0.02, 2),
+        bounds=bounds,
+        policy=policy,
         clock=clock,
         opener=lambda address: bus,
     )
@@ -419,4 +425,6 @@ def lose_first_answer(bus: ScriptedBus, *, repeats: bool) -> None:
 
 def permission(axes: int = 2, span: int = 100_000) -> MotionPermission:
     """For axes that may go from -span to +span."""
-    return MotionPermission("the test", (AxisLimits(-span, span, 1e6, 1e7),) * axes)
+    axis_limits = AxisLimits(-span, span, 1e6, 1e7)
+    limits = (axis_limits,) * axes
+    return MotionPermission("the test", limits)

@@ -29,7 +29,8 @@ def _chain(name: str, joints: tuple[tuple[str, str, str, str], ...]) -> Arm:
             f'value="{4.0 - 0.4 * index}"/><inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" '
             'iyz="0.003" izz="0.02"/></inertial></link>'
         )
-    return Arm(name, "".join([*text, "</robot>"]))
+    urdf = "".join([*text, "</robot>"])
+    return Arm(name, urdf)
 
 
 SEVEN_AXES = _chain(

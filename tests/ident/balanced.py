@@ -39,11 +39,13 @@ MIDDLE_RAD = np.array([0.0, -1.26, 0.3, 0.0, 0.0, 0.0])
 
 def heavy_model() -> Model:
     """Six axes with the geometry and drive train of the shipped cell."""
-    document = yaml.safe_load((CONFIGS / "cells/kr270.yaml").read_text(encoding="utf-8"))
+    text = (CONFIGS / "cells/kr270.yaml").read_text(encoding="utf-8")
+    document = yaml.safe_load(text)
     urdf = _urdf(CONFIGS / "robots/kr270.urdf")
+    ratio = np.array(document["drive_train"]["ratio"], dtype=np.float64)
     return Model(
         robot_from_urdf(urdf),
-        DriveTrain(np.array(document["drive_train"]["ratio"], dtype=np.float64)),
+        DriveTrain(ratio),
     )
 
 
@@ -57,10 +59,12 @@ def _balance(q: FloatArray, free_m: float) -> FloatArray:
     """
 
     def energy(angle: FloatArray) -> FloatArray:
-        lever = np.array([np.cos(angle - TOWARDS_RAD), np.sin(angle - TOWARDS_RAD)]) * LEVER_M
-        return np.asarray(
-            0.5 * STIFFNESS_N_M * (np.hypot(lever[0] - FOOT_M, lever[1]) - free_m) ** 2
-        )
+        cosine = np.cos(angle - TOWARDS_RAD)
+        sine = np.sin(angle - TOWARDS_RAD)
+        lever = np.array([cosine, sine]) * LEVER_M
+        lever_difference = lever[0] - FOOT_M
+        difference = np.hypot(lever_difference, lever[1]) - free_m
+        return np.asarray(0.5 * STIFFNESS_N_M * difference**2)
 
     return (energy(q + 1e-5) - energy(q - 1e-5)) / 2e-5
 
@@ -74,12 +78,14 @@ def heavy_runs(balanced: bool, free_m: float = FREE_M) -> tuple[Run, ...]:
     """
     model = heavy_model()
     rng = np.random.default_rng(1)
-    links, _ = nominal_links(model.robot, _urdf(CONFIGS / "simulation/kr270-plant.urdf"))
+    urdf = _urdf(CONFIGS / "simulation/kr270-plant.urdf")
+    links, _ = nominal_links(model.robot, urdf)
     parameters = np.zeros(len(model.columns))
     own = parameters[: 14 * 6].reshape(6, 14)
     own[:, :10], own[:, 10:13] = links, FRICTION
+    centre_m_outer = np.outer(CENTRE_M, CENTRE_M)
     inertia = np.diag([17.0, 14.0, 15.0]) + MASS_KG * (
-        CENTRE_M @ CENTRE_M * np.eye(3) - np.outer(CENTRE_M, CENTRE_M)
+        CENTRE_M @ CENTRE_M * np.eye(3) - centre_m_outer
     )
     body = np.concatenate((inertia[np.triu_indices(3)], MASS_KG * CENTRE_M, [MASS_KG]))
     runs = []
@@ -89,7 +95,8 @@ def heavy_runs(balanced: bool, free_m: float = FREE_M) -> tuple[Run, ...]:
         else:
             payload = None
         q = MIDDLE_RAD + positions(rng, 12.0, RATE_HZ, REACH_RAD)
-        run = Run(f"run-{number}", np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), payload)
+        time_s = np.arange(len(q)) / RATE_HZ
+        run = Run(f"run-{number}", time_s, q, np.zeros_like(q), payload)
         data = differentiate(run, model.drive_train, CONDITIONING)
         total = parameters.copy()
         total[model.flange] += body if payload else 0.0
@@ -104,5 +111,6 @@ def heavy_runs(balanced: bool, free_m: float = FREE_M) -> tuple[Run, ...]:
         stays = np.exp(-1.0 / (RATE_HZ * 0.005))
         for k in range(1, len(noise)):
             noise[k] = stays * noise[k - 1] + np.sqrt(1.0 - stays**2) * noise[k]
-        runs.append(Run(run.name, run.time_s, q, current + noise, payload))
+        current_a = current + noise
+        runs.append(Run(run.name, run.time_s, q, current_a, payload))
     return tuple(runs)

@@ -37,7 +37,8 @@ class Made:
 
 def _body(rng: np.random.Generator, mass: float) -> FloatArray:
     centre = rng.uniform(-0.05, 0.05, 3)
-    inertia = mass * (np.eye(3) * (0.06**2 + centre @ centre) - np.outer(centre, centre))
+    centre_outer = np.outer(centre, centre)
+    inertia = mass * (np.eye(3) * (0.06**2 + centre @ centre) - centre_outer)
     return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
 
 
@@ -48,13 +49,16 @@ def axis_positions(
     in a share of all.
     """
     robot = mechanism.robot
-    home = mechanism.model.assembly.position_rad[list(robot.axis_joints)]
+    position_rad = mechanism.model.assembly.position_rad
+    home = position_rad[list(robot.axis_joints)]
     if mechanism is not PLANAR:
         reach = np.full(robot.axis_count, 0.6 if mechanism is FIVE_BAR else 0.06)
         return home + share * positions(rng, seconds, RATE_HZ, reach)
-    pose = share * positions(rng, seconds, RATE_HZ, np.array([0.08, 0.08, 0.4]))
+    limits = np.array([0.08, 0.08, 0.4])
+    pose = share * positions(rng, seconds, RATE_HZ, limits)
     motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
-    return np.asarray(motors + 2.0 * np.pi * np.round((home - motors[0]) / (2.0 * np.pi)))
+    home_difference = home - motors[0]
+    return np.asarray(motors + 2.0 * np.pi * np.round(home_difference / (2.0 * np.pi)))
 
 
 def preload_of(
@@ -91,26 +95,29 @@ def recorded(
     rng = np.random.default_rng(0)
     standard = np.zeros(len(model.columns))
     for columns in model.link_columns:
-        standard[columns] = _body(rng, rng.uniform(0.3, 1.5))
+        mass = rng.uniform(0.3, 1.5)
+        standard[columns] = _body(rng, mass)
     for joint in model.robot.axis_joints:
         standard[14 * joint + 10 : 14 * joint + 14] = 0.02, 0.3, 0.4, 0.05
     payload = _body(rng, 2.0)
-    conditioning = Conditioning(standstill_rad_s=(0.02,) * model.robot.axis_count)
+    standstill_rad_s = (0.02,) * model.robot.axis_count
+    conditioning = Conditioning(standstill_rad_s=standstill_rad_s)
     rng = np.random.default_rng(seed)
     runs = []
     for mounted in (None, MOUNTED):
         drawn = axis_positions(mechanism, rng, seconds, share)
         q = drawn[::AVERAGED]
         time_s = np.asarray(np.arange(len(q)) * (AVERAGED / RATE_HZ), dtype=np.float64)
-        run = Run("loaded" if mounted else "bare", time_s, q, np.zeros_like(q), mounted)
+        current_a = np.zeros_like(q)
+        run = Run("loaded" if mounted else "bare", time_s, q, current_a, mounted)
         data = differentiate(run, model.drive_train, conditioning)
         whole = standard.copy()
         if mounted is not None:
             whole[model.flange] += payload
         torque = np.einsum("mck,c->km", model.regressor(data.motion()), whole)
-        torque = torque + preload_of(
-            model, model.follow(data.motion()).to_motors, data.time_s, preload_nm
-        )
+        to_motors = model.follow(data.motion()).to_motors
+        preload = preload_of(model, to_motors, data.time_s, preload_nm)
+        torque = torque + preload
         noise = noise_a * rng.standard_normal(drawn.shape)
         current = np.add.reduceat(noise, np.arange(0, len(noise), AVERAGED)) / AVERAGED
         current[1:-1] += torque / mechanism.gains

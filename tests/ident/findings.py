@@ -10,11 +10,14 @@ from ident.effects.effect import Effect
 
 def passed_finding(effect: Effect, axis: int, value: float, std: float) -> Finding:
     """A finding of one coefficient that has passed every gate."""
+    coefficients = np.array([value])
+    deviations = np.array([std])
+    fold_errors = np.ones(8)
     return Finding(
         effect=effect,
         axis=axis,
-        coefficients=np.array([value]),
-        deviations=np.array([std]),
+        coefficients=coefficients,
+        deviations=deviations,
         probability=0.001,
         folds_better=1.0,
         explained=0.5,
@@ -23,5 +26,5 @@ def passed_finding(effect: Effect, axis: int, value: float, std: float) -> Findi
         error_fall=0.2,
         held_out_fall=9.0,
         passed=True,
-        fold_errors=np.ones(8),
+        fold_errors=fold_errors,
     )

@@ -53,10 +53,13 @@ def record_in_loop(
     )
     off = signal.lfilter(moved[0].ravel(), moved[1], disturbance, axis=0)
     q = asked.position_rad + off
+    position_cutoff_hz = 0.3 * rate_hz
+    conditioning = Conditioning(position_cutoff_hz=position_cutoff_hz)
+    run = replace(asked, position_rad=q)
     data = differentiate(
-        replace(asked, position_rad=q),
+        run,
         truth.model.drive_train,
-        Conditioning(position_cutoff_hz=0.3 * rate_hz),
+        conditioning,
     )
     parameters = truth.parameters.copy()
     if payload is not None:
@@ -66,7 +69,8 @@ def record_in_loop(
         + disturbance[1:-1].T
     )
     current = np.zeros_like(q)
-    current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T
+    to_motor = truth.model.drive_train.to_motor
+    current[1:-1] = ((to_motor @ torque) / truth.gains[:, None]).T
     samples = len(q) // AVERAGED * AVERAGED
     q, current = (one[:samples].reshape(-1, AVERAGED, count).mean(axis=1) for one in (q, current))
     return replace(asked, time_s=asked.time_s[:samples:AVERAGED], position_rad=q, current_a=current)

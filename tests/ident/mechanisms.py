@@ -56,7 +56,8 @@ class Mechanism:
     @property
     def model(self) -> Model:
         """With a reduction of its own for each motor."""
-        return Model(self.robot, DriveTrain(np.diag(10.0 + 5.0 * np.arange(len(self.motors)))))
+        ratio = np.diag(10.0 + 5.0 * np.arange(len(self.motors)))
+        return Model(self.robot, DriveTrain(ratio))
 
 
 class _Urdf:
@@ -105,20 +106,25 @@ BASE_M = 0.25
 def _five_bar() -> Mechanism:
     urdf = _Urdf("five-bar")
     for side, at in (("left", -0.5 * BASE_M), ("right", 0.5 * BASE_M)):
-        crank = urdf.joint(f"{side}-crank", "revolute", "base", f"{at} 0 0", "0 0 1")
+        xyz = f"{at} 0 0"
+        crank = urdf.joint(f"{side}-crank", "revolute", "base", xyz, "0 0 1")
         rod = urdf.joint(f"{side}-rod", "revolute", crank, f"{CRANK_M} 0 0", "0 0 1")
         urdf.frame(f"{side}-tip", rod, f"{ROD_M} 0 0")
     assembly = {"left-crank": 2.1, "left-rod": -1.28, "right-crank": 1.05, "right-rod": 1.28}
+    link_pair = LinkPair("tip", "left-tip", "right-tip", ("x", "y"))
+    closures = (link_pair,)
+    gains = np.array([20.0, -15.0])
+    gravity_m_s2 = (0.0, -9.81, 0.0)
     return Mechanism(
         name="five-bar",
         urdf=urdf.text,
         motors=("left-crank", "right-crank"),
-        closures=(LinkPair("tip", "left-tip", "right-tip", ("x", "y")),),
+        closures=closures,
         platform="left-rod",
         mobility=2,
-        gains=np.array([20.0, -15.0]),
+        gains=gains,
         assembly_rad=assembly,
-        gravity_m_s2=(0.0, -9.81, 0.0),
+        gravity_m_s2=gravity_m_s2,
     )
 
 
@@ -134,8 +140,10 @@ def leg_angles(pose: FloatArray, leg: int) -> tuple[FloatArray, FloatArray]:
     """
     x, y, side = LEGS[leg]
     end = -HALF_M if leg < 2 else HALF_M
-    dx = pose[:, 0] + end * np.cos(pose[:, 2]) - x
-    dy = pose[:, 1] + end * np.sin(pose[:, 2]) - y
+    pose_cosine = np.cos(pose[:, 2])
+    dx = pose[:, 0] + end * pose_cosine - x
+    pose_sine = np.sin(pose[:, 2])
+    dy = pose[:, 1] + end * pose_sine - y
     apart = np.hypot(dx, dy)
     first = np.arctan2(dy, dx) + side * np.arccos(0.5 * apart / LEG_M)
     elbow = np.arctan2(dy - LEG_M * np.sin(first), dx - LEG_M * np.cos(first)) - first
@@ -147,7 +155,8 @@ def _planar() -> Mechanism:
     home = np.zeros((1, 3))
     assembly: dict[str, float] = {}
     for leg, (x, y, _) in enumerate(LEGS):
-        crank = urdf.joint(f"motor-{leg}", "revolute", "base", f"{x} {y} 0", "0 0 1")
+        xyz = f"{x} {y} 0"
+        crank = urdf.joint(f"motor-{leg}", "revolute", "base", xyz, "0 0 1")
         rod = urdf.joint(f"elbow-{leg}", "revolute", crank, f"{LEG_M} 0 0", "0 0 1")
         first, elbow = (float(angle[0]) for angle in leg_angles(home, leg))
         assembly |= {crank: first, rod: elbow}
@@ -157,16 +166,19 @@ def _planar() -> Mechanism:
         else:
             urdf.frame(f"tip-{leg}", rod, f"{LEG_M} 0 0")
             urdf.frame(f"corner-{leg}", "platform", f"{0.0 if leg == 1 else 2.0 * HALF_M} 0 0")
+    closures = tuple(
+        LinkPair(f"corner {n}", f"corner-{n}", f"tip-{n}", ("x", "y")) for n in (1, 2, 3)
+    )
+    motors = tuple(f"motor-{leg}" for leg in range(4))
+    gains = np.array([2.0, -1.5, 1.8, 2.2])
     return Mechanism(
         name="planar",
         urdf=urdf.text,
-        motors=tuple(f"motor-{leg}" for leg in range(4)),
-        closures=tuple(
-            LinkPair(f"corner {n}", f"corner-{n}", f"tip-{n}", ("x", "y")) for n in (1, 2, 3)
-        ),
+        motors=motors,
+        closures=closures,
         platform="platform",
         mobility=3,
-        gains=np.array([2.0, -1.5, 1.8, 2.2]),
+        gains=gains,
         assembly_rad=assembly,
     )
 
@@ -184,12 +196,14 @@ def _three_legs() -> Mechanism:
         "-1.5707963267948966 -1.5707963267948966 0",
     )
     for leg, rpy in enumerate(turns):
-        axes = np.roll(np.eye(3), leg, axis=1)[0]
+        shifted_identity = np.roll(np.eye(3), leg, axis=1)
+        axes = shifted_identity[0]
+        xyz = " ".join(map(str, -SLIDE_M * axes))
         slide = urdf.joint(
             f"slide-{leg}",
             "prismatic",
             "base",
-            " ".join(map(str, -SLIDE_M * axes)),
+            xyz,
             "1 0 0",
             rpy=rpy,
         )
@@ -214,15 +228,18 @@ def _three_legs() -> Mechanism:
         for n in range(3)
     ]
     closures += [LinkPair(f"platform {n}", f"seat-{n}", f"centre-{n}", rigid) for n in (1, 2)]
+    motors = tuple(f"slide-{leg}" for leg in range(3))
+    gravity_m_s2 = (-4.0, -5.0, -7.4)
+    gains = np.array([150.0, -140.0, 160.0])
     return Mechanism(
         name="three-legs",
         urdf=urdf.text,
-        motors=tuple(f"slide-{leg}" for leg in range(3)),
+        motors=motors,
         closures=tuple(closures),
         platform="hand-0",
         mobility=3,
-        gains=np.array([150.0, -140.0, 160.0]),
-        gravity_m_s2=(-4.0, -5.0, -7.4),
+        gains=gains,
+        gravity_m_s2=gravity_m_s2,
     )
 
 

@@ -25,7 +25,8 @@ def turned(angle_rad: float) -> FloatArray:
     """The payload after a turn about the flange's axis, shape (10,)."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec((0.0, 0.0, angle_rad)).as_matrix()
-    return link_parameters(turn @ pseudo_inertia(BODY) @ turn.T)
+    pseudo = turn @ pseudo_inertia(BODY) @ turn.T
+    return link_parameters(pseudo)
 
 
 def small_recordings(

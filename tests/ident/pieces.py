@@ -30,8 +30,10 @@ def noisy_pieces(
 def with_noise(run: Run, rng: np.random.Generator, share: float = NOISE) -> Run:
     """The same run with correlated noise of its currents."""
     current = run.current_a
-    size: FloatArray = share * np.sqrt(np.mean(current**2, axis=0))
-    return replace(run, current_a=current + size * coloured(rng, current.shape))
+    rms_current = np.sqrt(np.mean(current**2, axis=0))
+    size: FloatArray = share * rms_current
+    current_a = current + size * coloured(rng, current.shape)
+    return replace(run, current_a=current_a)
 
 
 def first_samples(run: Run, count: int) -> Run:

@@ -65,8 +65,10 @@ def tx40_truth(seed: int = 0) -> Truth:
         (0.05, 1.1, 2.6),
         (0.01, 0.25, 0.6),
     )
-    model = Model(robot_from_urdf(TX40.urdf), DriveTrain(RATIO))
-    parameters = _parameters(model, masses, friction, np.random.default_rng(seed))
+    robot = robot_from_urdf(TX40.urdf)
+    model = Model(robot, DriveTrain(RATIO))
+    rng = np.random.default_rng(seed)
+    parameters = _parameters(model, masses, friction, rng)
     parameters[-3:] = (0.0104, 0.47, 1.7)
     return Truth(model, parameters, GAINS)
 
@@ -77,17 +79,22 @@ def three_axes_truth() -> Truth:
     Its rotors are light: what is seen of Ia2 is regrouped with the inertia of the links, which
     elasticity and backlash speak of, and would make them look smaller than they are.
     """
-    model = Model(robot_from_urdf(THREE_AXES.urdf), DriveTrain(np.diag([40.0, 50.0, -45.0])))
+    ratio = np.diag([40.0, 50.0, -45.0])
+    robot = robot_from_urdf(THREE_AXES.urdf)
+    model = Model(robot, DriveTrain(ratio))
     friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (0.02, 1.6, 6.3))
-    parameters = _parameters(model, (10.0, 5.0, 3.0), friction, np.random.default_rng(2))
-    return Truth(model, parameters, np.array([33.9, 32.4, -24.2]))
+    rng = np.random.default_rng(2)
+    masses = (10.0, 5.0, 3.0)
+    parameters = _parameters(model, masses, friction, rng)
+    gains = np.array([33.9, 32.4, -24.2])
+    return Truth(model, parameters, gains)
 
 
 def gantry_truth() -> Truth:
     """Three linear axes with a wrist of two, the arm in an upright gravity."""
-    model = Model(
-        robot_from_urdf(GANTRY.urdf), DriveTrain(np.diag([120.0, 120.0, 150.0, 40.0, 50.0]))
-    )
+    ratio = np.diag([120.0, 120.0, 150.0, 40.0, 50.0])
+    robot = robot_from_urdf(GANTRY.urdf)
+    model = Model(robot, DriveTrain(ratio))
     friction = (
         (8.0, 20.0, 15.0),
         (6.0, 15.0, 12.0),
@@ -95,18 +102,26 @@ def gantry_truth() -> Truth:
         (0.03, 1.0, 2.0),
         (0.02, 0.8, 1.5),
     )
-    parameters = _parameters(model, (15.0, 12.0, 8.0, 4.0, 2.0), friction, np.random.default_rng(3))
+    masses = (15.0, 12.0, 8.0, 4.0, 2.0)
+    rng = np.random.default_rng(3)
+    parameters = _parameters(model, masses, friction, rng)
     offset_n = [20.0, -15.0, 10.0]
     parameters[[13, 27, 41]] = offset_n
-    return Truth(model, parameters, np.array([60.0, 55.0, 70.0, 8.0, 6.0]))
+    gains = np.array([60.0, 55.0, 70.0, 8.0, 6.0])
+    return Truth(model, parameters, gains)
 
 
 def polar_truth() -> Truth:
     """A turntable, a joint that lifts the arm, a slide along it, and a wrist."""
-    model = Model(robot_from_urdf(POLAR.urdf), DriveTrain(np.diag([40.0, 50.0, 120.0, 40.0])))
+    ratio = np.diag([40.0, 50.0, 120.0, 40.0])
+    robot = robot_from_urdf(POLAR.urdf)
+    model = Model(robot, DriveTrain(ratio))
     friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (3.0, 20.0, 15.0), (0.02, 1.6, 4.0))
-    parameters = _parameters(model, (12.0, 8.0, 5.0, 3.0), friction, np.random.default_rng(2))
-    return Truth(model, parameters, np.array([33.0, 32.0, 60.0, 15.0]))
+    masses = (12.0, 8.0, 5.0, 3.0)
+    rng = np.random.default_rng(2)
+    parameters = _parameters(model, masses, friction, rng)
+    gains = np.array([33.0, 32.0, 60.0, 15.0])
+    return Truth(model, parameters, gains)
 
 
 def _parameters(
@@ -119,7 +134,8 @@ def _parameters(
     parameters = np.zeros(len(model.columns))
     for joint, (mass, drive) in enumerate(zip(masses, friction, strict=True)):
         centre = rng.uniform(-0.1, 0.1, 3)
-        inertia = mass * (np.eye(3) * (0.05**2 + centre @ centre) - np.outer(centre, centre))
+        centre_outer = np.outer(centre, centre)
+        inertia = mass * (np.eye(3) * (0.05**2 + centre @ centre) - centre_outer)
         parameters[14 * joint : 14 * joint + 6] = inertia[np.triu_indices(3)]
         parameters[14 * joint + 6 : 14 * joint + 9] = mass * centre
         parameters[14 * joint + 9] = mass
@@ -134,13 +150,15 @@ def positions(
     """Point-to-point moves with smooth ramps and no dwell, shape (k, n)."""
     count = round(seconds * rate_hz)
     knots = rng.uniform(-1.0, 1.0, (round(seconds / 1.1) + 2, len(limits))) * limits
-    stairs = np.repeat(knots, round(1.1 * rate_hz), axis=0)[:count]
+    repeated_knots = np.repeat(knots, round(1.1 * rate_hz), axis=0)
+    stairs = repeated_knots[:count]
     window = np.hanning(round(0.9 * rate_hz))
+    repeated_stairs = np.repeat(stairs[-1:], len(window), axis=0)
     padded = np.concatenate(
         (
             np.repeat(stairs[:1], len(window), axis=0),
             stairs,
-            np.repeat(stairs[-1:], len(window), axis=0),
+            repeated_stairs,
         )
     )
     return np.asarray(
@@ -184,19 +202,21 @@ def record(
     drawn = bend(positions(rng, seconds, drawn_hz, limits))
     q = drawn[::averaged]
     time = np.arange(len(q)) / rate_hz
-    bare = Run(name, time, q, np.zeros_like(q))
+    current_a = np.zeros_like(q)
+    bare = Run(name, time, q, current_a)
     # The recorded positions are band-limited far below this cut-off, so these derivatives are the
     # motion's own.
-    data = differentiate(
-        bare, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * rate_hz)
-    )
+    position_cutoff_hz = 0.3 * rate_hz
+    conditioning = Conditioning(position_cutoff_hz=position_cutoff_hz)
+    data = differentiate(bare, truth.model.drive_train, conditioning)
     columns = truth.model.regressor(data.motion())
     parameters = truth.parameters.copy()
     if payload is not None:
         parameters[truth.model.flange] += [PAYLOAD_TRUTH[p] for p in LINK_PARAMETERS]
     torque = np.einsum("jck,c->jk", columns, parameters)
     current = np.zeros_like(q)
-    current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T
+    to_motor = truth.model.drive_train.to_motor
+    current[1:-1] = ((to_motor @ torque) / truth.gains[:, None]).T
     noise = noise_a * rng.standard_normal(drawn.shape)
     current += np.add.reduceat(noise, np.arange(0, len(noise), averaged)) / averaged
     return Run(name, time, q, current, payload)
@@ -204,7 +224,8 @@ def record(
 
 def gathered(truth: Truth, runs: tuple[Run, ...], holdout: tuple[Run, ...] = ()) -> Evidence:
     """Identified by ``ml``, with its rows."""
-    conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * len(truth.gains))
+    standstill_rad_s = (0.03,) * len(truth.gains)
+    conditioning = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
     return gather(identify(truth.model, runs, conditioning, holdout=holdout), runs, holdout)
 
 
@@ -218,20 +239,21 @@ def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArra
         torque_nm: of all joints along a run, shape (n, k).
     """
     rows = [decimate_rows(data, clean.conditioning, torque_nm(data)) for data in clean.datasets]
+    stacked_rows = np.concatenate(rows, axis=1)
+    to_motor = truth.model.drive_train.to_motor
+    added_a = to_motor @ stacked_rows / truth.gains[:, None]
     return with_current(
         clean,
-        truth.model.drive_train.to_motor @ np.concatenate(rows, axis=1) / truth.gains[:, None],
+        added_a,
     )
 
 
 def with_current(clean: Evidence, added_a: FloatArray) -> Evidence:
     """The same with more current on the decimated rows, shape (n, r), fitted again."""
-    training = replace(
-        clean.rows_without_effects, current=clean.rows_without_effects.current + added_a
-    )
-    return replace(
-        clean, rows_without_effects=training, training=training, estimate=ml(training.system())
-    )
+    current = clean.rows_without_effects.current + added_a
+    training = replace(clean.rows_without_effects, current=current)
+    estimate = ml(training.system())
+    return replace(clean, rows_without_effects=training, training=training, estimate=estimate)
 
 
 def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
@@ -255,7 +277,9 @@ def training_error(evidence: Evidence) -> RelativeError:
     """Error on the rows of the fit [%]."""
     estimate = evidence.estimate
     rows = evidence.training
-    return relative_error(rows.torque(estimate.gains), estimate.predicted_torque(rows), rows.use)
+    measured_nm = rows.torque(estimate.gains)
+    predicted_nm = estimate.predicted_torque(rows)
+    return relative_error(measured_nm, predicted_nm, rows.use)
 
 
 def calibrated(evidence: Evidence) -> Calibration:
@@ -272,10 +296,12 @@ def calibrated(evidence: Evidence) -> Calibration:
     for placed in evidence.effects:
         names = {column.name for column in placed.columns}
         coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
-        setting = {name: float(value) for name, value in placed.effect.settings.items()}
-        effects.append(
-            AcceptedEffect(placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0)
+        settings = placed.effect.settings.items()
+        setting = {name: float(value) for name, value in settings}
+        accepted_effect = AcceptedEffect(
+            placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0
         )
+        effects.append(accepted_effect)
     whole = a_calibration(estimate.gains, parameters, estimate.gains_std)
     references = []
     for one in mass_responses(evidence.identification.system, estimate):
@@ -284,12 +310,13 @@ def calibrated(evidence: Evidence) -> Calibration:
         references.append(
             PayloadMass.of(one.payload, one.mass_kg, gain_per_kg, whole.gains, parameters_per_kg)
         )
+    covariance_factor = factor_of(estimate.covariance)
     return replace(
         whole,
         payload_mass=tuple(references),
         effects=tuple(effects),
         session_began_s=session_began_s(evidence.fit_runs),
-        covariance_factor=factor_of(estimate.covariance),
+        covariance_factor=covariance_factor,
     )
 
 
@@ -298,6 +325,8 @@ def a_calibration(
 ) -> Calibration:
     """A calibration of these gains and parameters, exact unless deviations are given."""
     std = np.zeros(len(gains)) if gains_std is None else gains_std
+    axes = (0.0,) * len(gains)
+    relative_error_percent = RelativeError(axes, 0.0)
     return Calibration(
         cell="test",
         method="ml",
@@ -307,7 +336,7 @@ def a_calibration(
         ),
         parameters=parameters,
         effects=(),
-        relative_error_percent=RelativeError((0.0,) * len(gains), 0.0),
+        relative_error_percent=relative_error_percent,
         holdout_error_percent=None,
         condition=1.0,
         rows=1,

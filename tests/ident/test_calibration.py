@@ -27,7 +27,8 @@ DELAY_S = 0.008
 @pytest.fixture(scope="module")
 def late(small_runs: tuple[ident.Run, ...]) -> tuple[ident.Run, ...]:
     """Recordings whose currents were sampled eight milliseconds after their positions."""
-    samples = round(DELAY_S * small_runs[0].rate_hz)
+    rate_hz = small_runs[0].rate_hz
+    samples = round(DELAY_S * rate_hz)
     return tuple(
         replace(
             run,
@@ -48,7 +49,8 @@ def searched(
     found = ident.identify(small_truth.model, late[:3], Conditioning(), holdout=late[3:])
     families = ((TimeSkew(),), (Coupling(2, 1), Coupling(3, 1)))
     evidence = ident.gather(found, late[:3], late[3:])
-    return found, ident.find_effects(evidence, np.random.default_rng(0), families=families)
+    rng = np.random.default_rng(0)
+    return found, ident.find_effects(evidence, rng, families=families)
 
 
 def test_what_is_left_of_the_currents_is_that_of_the_held_out_rows(
@@ -57,7 +59,8 @@ def test_what_is_left_of_the_currents_is_that_of_the_held_out_rows(
     found, steps = searched
     held = steps[-1].after.holdout
     assert held is not None
-    left = np.sqrt(error_on(held, steps[-1].after.estimate).left / held.motor_use.sum(axis=1))
+    estimate = steps[-1].after.estimate
+    left = np.sqrt(error_on(held, estimate).left / held.motor_use.sum(axis=1))
     calibration = ident.calibration_of(found, AXES, NAMEPLATE, steps=steps)
     assert calibration.current_residual == pytest.approx(left, rel=1e-5)
 
@@ -69,15 +72,17 @@ def test_a_skew_found_on_all_axes_is_predicted(
     calibration = ident.calibration_of(found, AXES, NAMEPLATE, steps=steps)
     (skew,) = calibration.effects
     assert (skew.name, skew.axis) == ("time-skew", ALL_AXES)
-    assert skew.coefficients[0].value == pytest.approx(DELAY_S, rel=0.1)
+    coefficient = skew.coefficients[0].value
+    assert coefficient == pytest.approx(DELAY_S, rel=0.1)
     assert skew.error_after_percent < 0.97 * skew.error_before_percent
-    assert calibration.gains[1].value == pytest.approx(steps[-1].after.estimate.gains[1])
+    estimate = steps[-1].after.estimate
+    gain = calibration.gains[1].value
+    assert gain == pytest.approx(estimate.gains[1])
     data = ident.differentiate(late[3], found.model.drive_train, found.conditioning)
 
     def left(of: ident.Calibration) -> float:
-        rest = np.where(
-            data.moving, ident.predict_current(of, found.model, data) - data.current_a, 0.0
-        )
+        difference = ident.predict_current(of, found.model, data) - data.current_a
+        rest = np.where(data.moving, difference, 0.0)
         return float(np.linalg.norm(decimate_rows(data, found.conditioning, rest.T)))
 
     without = ident.calibration_of(found, AXES, NAMEPLATE)
@@ -90,9 +95,8 @@ def test_errors_without_a_held_out_run_are_those_of_left_out_moves(
 ) -> None:
     found, steps = searched
     blind = tuple(replace(step, after=replace(step.after, holdout=None)) for step in steps)
-    (skew,) = ident.calibration_of(
-        replace(found, holdout=None), AXES, NAMEPLATE, steps=blind
-    ).effects
+    calibration = ident.calibration_of(replace(found, holdout=None), AXES, NAMEPLATE, steps=blind)
+    (skew,) = calibration.effects
     assert steps[0].accepted is not None
     assert skew.error_before_percent == steps[0].accepted.error_before_percent
 
@@ -101,8 +105,9 @@ def test_an_identification_with_effects_needs_the_turns_of_the_search(
     searched: tuple[ident.Identification, tuple[ident.Step, ...]],
 ) -> None:
     _, steps = searched
+    after = steps[-1].after
     with pytest.raises(ident.ModelError, match=r"'time-skew time 1'.*steps=find_effects"):
-        ident.calibration_of(steps[-1].after.identification, AXES, NAMEPLATE)
+        ident.calibration_of(after.identification, AXES, NAMEPLATE)
 
 
 def test_only_an_effect_on_all_motors_is_on_all_axes(
@@ -110,8 +115,10 @@ def test_only_an_effect_on_all_motors_is_on_all_axes(
 ) -> None:
     found, steps = searched
     calibration = ident.calibration_of(found, AXES, NAMEPLATE, steps=steps)
-    placed, _ = placed_effect(calibration.effects[0], calibration)
-    assert placed in steps[-1].after.effects
+    accepted = calibration.effects[0]
+    placed, _ = placed_effect(accepted, calibration)
+    last_step = steps[-1]
+    assert placed in last_step.after.effects
     spring = replace(calibration.effects[0], name="spring")
     with pytest.raises(
         ident.EffectRefused, match="'spring' acts on axis 'all axes'; there are J1, J2, J3"

@@ -34,9 +34,8 @@ CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 3)
 def calibration(small_truth: Truth) -> Calibration:
     """Exact: what is left is the noise alone."""
     columns = zip(small_truth.model.columns, small_truth.parameters, strict=True)
-    return a_calibration(
-        small_truth.gains, tuple(Parameter(one.name, float(v), 0.0, one.unit) for one, v in columns)
-    )
+    parameters = tuple(Parameter(one.name, float(v), 0.0, one.unit) for one, v in columns)
+    return a_calibration(small_truth.gains, parameters)
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +45,12 @@ def runs(small_truth: Truth) -> tuple[Run, ...]:
     out = []
     for name in ("first", "second", "watched"):
         run = record(small_truth, name, rng, seconds=40.0, rate_hz=RATE_HZ)
-        speed = np.abs(np.gradient(run.position_rad[:, 0])) * RATE_HZ
+        position_rad_gradient = np.gradient(run.position_rad[:, 0])
+        speed = np.abs(position_rad_gradient) * RATE_HZ
         noise = 0.1 * coloured(rng, run.current_a.shape)
         noise[:, 0] *= 0.2 + speed
-        out.append(replace(run, current_a=run.current_a + noise))
+        current_a = run.current_a + noise
+        out.append(replace(run, current_a=current_a))
     return tuple(out)
 
 
@@ -71,10 +72,10 @@ def test_a_push_is_found_where_and_when_it_was(
         band = None
     quiet = external_torque(calibration, model, runs[2], CONDITIONING, band)
     assert quiet.contacts == ()
-    torque_nm = -3.0 * float(np.median(quiet.threshold_nm[PUSHED]))
-    found = external_torque(
-        calibration, model, _pushed(small_truth, runs[2], torque_nm), CONDITIONING, band
-    )
+    median_threshold_nm = np.median(quiet.threshold_nm[PUSHED])
+    torque_nm = -3.0 * float(median_threshold_nm)
+    run = _pushed(small_truth, runs[2], torque_nm)
+    found = external_torque(calibration, model, run, CONDITIONING, band)
     (contact,) = found.contacts
     assert contact.axis == PUSHED
     assert contact.start_s == pytest.approx(START_S, abs=0.1)
@@ -89,9 +90,11 @@ def test_the_band_holds_its_share_and_follows_what_drives_the_residual(
 ) -> None:
     band = prediction_band(calibration, small_truth.model, runs[:2], CONDITIONING)
     watched = external_torque(calibration, small_truth.model, runs[2], CONDITIONING, band)
-    inside = np.abs(watched.torque_nm) <= watched.band_nm
+    absolute_torque_nm = np.abs(watched.torque_nm)
+    inside = absolute_torque_nm <= watched.band_nm
     for joint, use in enumerate(watched.use):
-        assert inside[joint, use].mean() == pytest.approx(PREDICTED_SHARE, abs=0.03)
+        mean_inside = inside[joint, use].mean()
+        assert mean_inside == pytest.approx(PREDICTED_SHARE, abs=0.03)
     constant, _, speed, _ = band.scale[0]
     assert constant == pytest.approx(0.2 * speed, rel=0.6)  # as 0.2 + |q̇| was planted
     assert band.correlation_s == pytest.approx(np.full(3, 0.05), abs=0.03)
@@ -114,7 +117,8 @@ def test_the_level_is_crossed_less_often_than_allowed(kind: str) -> None:
     level = alarm_level(seen, time_s, 0.1, 1.0, 120.0)
     assert level is not None
     beyond = np.flatnonzero(later > level)
-    assert np.count_nonzero(np.diff(beyond, prepend=-100) > 5) <= 5
+    beyond_steps = np.diff(beyond, prepend=-100)
+    assert np.count_nonzero(beyond_steps > 5) <= 5
     assert level < 3.0 * np.sort(later)[-20]
     often = alarm_level(seen, time_s, 0.1, 60.0, 120.0)
     assert often is not None
@@ -142,7 +146,9 @@ def test_a_heavy_tail_has_fewer_alarms_than_allowed_on_average() -> None:
 def test_too_little_quiet_motion_gives_no_threshold(
     small_truth: Truth, calibration: Calibration, runs: tuple[Run, ...]
 ) -> None:
-    assert alarm_level(np.ones(50), np.arange(50.0), 1.0, 1.0, 50.0) is None
+    ratio = np.ones(50)
+    time_s = np.arange(50.0)
+    assert alarm_level(ratio, time_s, 1.0, 1.0, 50.0) is None
     end = round(2.5 * RATE_HZ)
     arrays = ("time_s", "position_rad", "current_a")
     short = replace(runs[0], **{name: getattr(runs[0], name)[:end] for name in arrays})
@@ -151,6 +157,7 @@ def test_too_little_quiet_motion_gives_no_threshold(
     assert found.contacts == ()
     with pytest.raises(DataUnfit, match="no quiet run"):
         prediction_band(calibration, small_truth.model, [], CONDITIONING)
-    still = replace(short, position_rad=np.zeros_like(short.position_rad))
+    position_rad = np.zeros_like(short.position_rad)
+    still = replace(short, position_rad=position_rad)
     with pytest.raises(DataUnfit, match="did the robot move"):
         external_torque(calibration, small_truth.model, still, CONDITIONING)

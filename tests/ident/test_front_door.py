@@ -56,9 +56,9 @@ def test_from_arrays_to_gains_in_ten_lines(
 ) -> None:
     lines = [line[4:] for line in (ident.__doc__ or "").splitlines() if line.startswith("    ")]
     assert len(lines) <= 10
-    model = ident.Model(
-        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
-    )
+    robot = ident.robot_from_urdf(example.URDF)
+    drive_train = ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    model = ident.Model(robot, drive_train)
     bare, loaded = (
         example.record(model, "x", payload, seed)
         for seed, payload in enumerate((None, example.DISC))
@@ -73,19 +73,21 @@ def test_from_arrays_to_gains_in_ten_lines(
     exec("\n".join(lines), given)  # noqa: S102 - the documented lines themselves are what is tested
     found = given["found"]
     assert isinstance(found, ident.Identification)
-    error = np.abs(found.estimate.gains - example.TRUE_GAINS_NM_A)
+    gain_difference = found.estimate.gains - example.TRUE_GAINS_NM_A
+    error = np.abs(gain_difference)
     assert np.all(error < 4.0 * found.estimate.gains_std)
-    assert capsys.readouterr().out.count("[") == 2
+    printed = capsys.readouterr().out
+    assert printed.count("[") == 2
 
 
 def test_the_example_finds_the_gains(
     example: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = example.main()
-    assert np.all(
-        np.abs(found.estimate.gains - example.TRUE_GAINS_NM_A) < 4.0 * found.estimate.gains_std
-    )
-    assert capsys.readouterr().out.count("±") == 3
+    gain_difference = np.abs(found.estimate.gains - example.TRUE_GAINS_NM_A)
+    assert np.all(gain_difference < 4.0 * found.estimate.gains_std)
+    printed = capsys.readouterr().out
+    assert printed.count("±") == 3
 
 
 def test_the_calibration_predicts_a_run_that_the_fit_has_not_seen(example: SimpleNamespace) -> None:
@@ -94,12 +96,15 @@ def test_the_calibration_predicts_a_run_that_the_fit_has_not_seen(example: Simpl
     run = example.record(found.model, "another", example.DISC, 9)
     data = ident.differentiate(run, found.model.drive_train, found.conditioning)
     predicted = ident.predict_current(calibration, found.model, data)
-    rest = (predicted - data.current_a)[data.moving.all(axis=1)]
+    predicted_difference = predicted - data.current_a
+    rest = predicted_difference[data.moving.all(axis=1)]
     assert predicted.shape == data.current_a.shape == (len(run.time_s) - 2, 3)
     # The noise of the recording is 0.05 A; filtering the positions changes the direction of dry
     # friction for a moment.
-    assert np.all(np.sqrt(np.mean(rest**2, axis=0)) < 0.08)
-    assert np.all(np.sqrt(np.mean(data.current_a**2, axis=0)) > 0.3)
+    rms_rest = np.sqrt(np.mean(rest**2, axis=0))
+    assert np.all(rms_rest < 0.08)
+    rms_current_a = np.sqrt(np.mean(data.current_a**2, axis=0))
+    assert np.all(rms_current_a > 0.3)
 
 
 def test_a_calibration_needs_one_name_an_axis(example: SimpleNamespace) -> None:
@@ -175,9 +180,8 @@ def test_another_payload_on_a_known_mounting_is_not_predicted(example: SimpleNam
     with pytest.raises(ident.DataUnfit, match="found payload 'box' on mounting 'flange'"):
         ident.prediction_band(calibration, found.model, [box_run])
     # Weighing ignores what a run says of its payload.
-    assert ident.weigh(calibration, found.model, [box_run]).mass_kg == pytest.approx(
-        disc_kg, rel=0.1
-    )
+    mass_kg = ident.weigh(calibration, found.model, [box_run]).mass_kg
+    assert mass_kg == pytest.approx(disc_kg, rel=0.1)
 
 
 def test_two_payloads_keep_their_own_mountings(example: SimpleNamespace) -> None:
@@ -185,7 +189,8 @@ def test_two_payloads_keep_their_own_mountings(example: SimpleNamespace) -> None
     found = example.main()
     calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
     elsewhere = ident.Source("earlier", "", "fit", payload="box", mass_kg=2.0, mounting="elbow")
-    both = replace(calibration, sources=(*calibration.sources, elsewhere))
+    sources = (*calibration.sources, elsewhere)
+    both = replace(calibration, sources=sources)
     box = ident.Payload("box", mounting="flange", known={"m": 2.0})
     motion = ident.planned(_slow_motion(), 100.0, box)
     with pytest.raises(ident.DataUnfit, match="expected payload 'disc', of which"):
@@ -222,7 +227,9 @@ def test_a_planned_motion_holds_numbers_of_one_shape() -> None:
 def test_lists_are_as_good_as_arrays(example: SimpleNamespace) -> None:
     found = example.main()
     calibration = ident.calibration_of(found, ["J1", "J2", "J3"], list(example.NAMEPLATE_NM_A))
-    model = ident.Model(found.model.robot, ident.DriveTrain(np.diag(example.GEAR_RATIOS).tolist()))
+    gear_matrix = np.diag(example.GEAR_RATIOS)
+    drive_train = ident.DriveTrain(gear_matrix.tolist())
+    model = ident.Model(found.model.robot, drive_train)
     run = example.record(found.model, "lists", example.DISC, 3)
     lists = ident.Run(
         "lists",
@@ -265,9 +272,10 @@ class Frame:
 def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(
     example: SimpleNamespace,
 ) -> None:
-    model = ident.Model(
-        ident.robot_from_urdf(example.URDF), ident.DriveTrain(Frame(np.diag(example.GEAR_RATIOS)))
-    )
+    robot = ident.robot_from_urdf(example.URDF)
+    gear_matrix = np.diag(example.GEAR_RATIOS)
+    drive_train = ident.DriveTrain(Frame(gear_matrix))
+    model = ident.Model(robot, drive_train)
     runs = [
         example.record(model, "bare", None, 1),
         example.record(model, "loaded", example.DISC, 2),
@@ -289,10 +297,12 @@ def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(
     assert np.array_equal(found.estimate.gains_std, same.estimate.gains_std)
     nameplate = Frame(np.array(example.NAMEPLATE_NM_A))
     fixed = ident.identify(model, frames, fixed_gains=nameplate)
-    assert fixed.estimate.gains.tolist() == list(example.NAMEPLATE_NM_A)
+    gains = fixed.estimate.gains.tolist()
+    assert gains == list(example.NAMEPLATE_NM_A)
     axes = ("J1", "J2", "J3")
     calibration = ident.calibration_of(same, axes, nameplate)
-    assert [gain.nameplate for gain in calibration.gains] == list(example.NAMEPLATE_NM_A)
+    nameplates = [gain.nameplate for gain in calibration.gains]
+    assert nameplates == list(example.NAMEPLATE_NM_A)
     assert ident.diagnose(same, axes, nameplate) == ident.diagnose(
         found, axes, list(example.NAMEPLATE_NM_A)
     )
@@ -301,8 +311,10 @@ def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(
         Frame(motion.position_rad), motion.velocity_rad_s.tolist(), motion.acceleration_rad_s2
     )
     assert np.array_equal(model.regressor(motion), model.regressor(framed))
-    torque_nm = ident.measured_torque(calibration, model, Frame(runs[0].current_a))
-    assert np.array_equal(torque_nm, ident.measured_torque(calibration, model, runs[0].current_a))
+    frame = Frame(runs[0].current_a)
+    torque_nm = ident.measured_torque(calibration, model, frame)
+    current_a = runs[0].current_a
+    assert np.array_equal(torque_nm, ident.measured_torque(calibration, model, current_a))
 
 
 def test_the_parameters_that_a_type_checker_sees_are_those_of_the_class() -> None:
@@ -310,14 +322,16 @@ def test_the_parameters_that_a_type_checker_sees_are_those_of_the_class() -> Non
     at run time by the fields.
     """
     for kind in (ident.Run, ident.Motion, ident.DriveTrain):
-        tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+        text = textwrap.dedent(inspect.getsource(kind))
+        tree = ast.parse(text)
         functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
         (checked,) = (node for node in functions if node.name == "__init__")
         names = [argument.arg for argument in checked.args.args]
         own = inspect.signature(kind).parameters
         assert names == ["self", *own]
         defaults = [ast.literal_eval(one) for one in checked.args.defaults]
-        assert defaults == [one.default for one in own.values() if one.default is not one.empty]
+        expected = [one.default for one in own.values() if one.default is not one.empty]
+        assert defaults == expected
 
 
 def test_filters_need_not_be_given(example: SimpleNamespace) -> None:
@@ -339,7 +353,8 @@ def test_filters_need_not_be_given(example: SimpleNamespace) -> None:
     of_slow = ident.identify(found.model, iter(slow))
     assert of_slow.conditioning.position_cutoff_hz == pytest.approx(16.0)
     assert of_slow.conditioning.decimation_cutoff_hz == pytest.approx(8.0)
-    error = np.abs(of_slow.estimate.gains - example.TRUE_GAINS_NM_A)
+    gain_difference = of_slow.estimate.gains - example.TRUE_GAINS_NM_A
+    error = np.abs(gain_difference)
     assert np.all(error < 4.0 * of_slow.estimate.gains_std)
 
 
@@ -363,24 +378,26 @@ def test_a_calibration_brings_its_filters(example: SimpleNamespace) -> None:
     external = ident.external_torque(calibration, model, runs[1], band=quiet)
     same = ident.external_torque(calibration, model, runs[1], given, quiet)
     assert np.array_equal(external.torque_nm, same.torque_nm)
+    changed_calibration = replace(calibration, filter={})
     with pytest.raises(
         ident.ModelError,
         match=r"the filter of the calibration: found nothing; "
         r".*give `conditioning`",
     ):
-        ident.weigh(replace(calibration, filter={}), model, runs[1:])
+        ident.weigh(changed_calibration, model, runs[1:])
 
 
 def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(
     example: SimpleNamespace,
 ) -> None:
     found = example.main()
+    drive_train = ident.DriveTrain(np.diag([100.0, 100.0]))
     with pytest.raises(
         ident.ModelError,
         match=r"drive train has shape \(2, 2\), "
         r"expected \(3, 3\)",
     ):
-        ident.Model(found.model.robot, ident.DriveTrain(np.diag([100.0, 100.0])))
+        ident.Model(found.model.robot, drive_train)
     run = example.record(found.model, "run", None, 3)
     turned = ident.Run("turned", run.time_s, run.position_rad.T, run.current_a)
     with pytest.raises(
@@ -389,8 +406,9 @@ def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(
         r".*transpose it\?",
     ):
         ident.identify(found.model, [turned], found.conditioning)
+    fixed_gains = np.ones(2)
     with pytest.raises(ident.ModelError, match=r"fixed_gains has shape \(2,\); expected \(3,\)"):
-        ident.identify(found.model, [run], found.conditioning, fixed_gains=np.ones(2))
+        ident.identify(found.model, [run], found.conditioning, fixed_gains=fixed_gains)
     calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
     motion = _slow_motion()
     across = ident.Motion(
@@ -401,16 +419,17 @@ def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(
 
 
 def _columns(run: ident.Run, scale: list[float]) -> ident.Run:
-    return replace(run, position_rad=np.asarray(run.position_rad) * scale)
+    position_rad = np.asarray(run.position_rad) * scale
+    return replace(run, position_rad=position_rad)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_one_axis_in_degrees_is_refused_by_the_limits_of_its_joint(
     example: SimpleNamespace, axis: int
 ) -> None:
-    model = ident.Model(
-        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
-    )
+    robot = ident.robot_from_urdf(example.URDF)
+    drive_train = ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    model = ident.Model(robot, drive_train)
     scale = [1.0, 1.0, 1.0]
     scale[axis] = 180.0 / np.pi
     runs = [
@@ -431,15 +450,16 @@ def test_an_axis_without_limits_is_not_guessed_to_be_in_degrees(example: SimpleN
     assert urdf != example.URDF
     robot = ident.robot_from_urdf(urdf)
     assert [joint.travel for joint in robot.joints] == [None, None, None]
-    assert [joint.travel for joint in ident.robot_from_urdf(example.URDF).joints] == [6.0, 6.0, 6.0]
+    joints = ident.robot_from_urdf(example.URDF).joints
+    assert [joint.travel for joint in joints] == [6.0, 6.0, 6.0]
 
 
 def test_exchanged_currents_name_the_function_that_tests_their_order(
     example: SimpleNamespace,
 ) -> None:
-    model = ident.Model(
-        ident.robot_from_urdf(example.URDF), ident.DriveTrain(np.diag(example.GEAR_RATIOS))
-    )
+    robot = ident.robot_from_urdf(example.URDF)
+    drive_train = ident.DriveTrain(np.diag(example.GEAR_RATIOS))
+    model = ident.Model(robot, drive_train)
     bare = example.record(model, "bare", None, 1)
     loaded = example.record(model, "loaded", example.DISC, 2)
     for order in ([1, 0, 2], [2, 1, 0]):
@@ -465,7 +485,8 @@ def test_held_out_runs_judge_the_effects_of_a_library_user(example: SimpleNamesp
     def with_friction(run: ident.Run, friction_nm: float) -> ident.Run:
         """Dry friction of J2 that changes with its position."""
         current_a = np.array(run.current_a)
-        angle_rad = np.asarray(run.position_rad)[:, 1]
+        position_rad = np.asarray(run.position_rad)
+        angle_rad = position_rad[:, 1]
         direction = np.sign(np.gradient(angle_rad))
         gain_nm_a = example.TRUE_GAINS_NM_A[1]
         current_a[:, 1] += friction_nm * direction * np.cos(angle_rad) / gain_nm_a
@@ -473,15 +494,19 @@ def test_held_out_runs_judge_the_effects_of_a_library_user(example: SimpleNamesp
 
     fitted = [with_friction(run, 3.0) for run in runs]
     held_out = example.record(model, "held out", example.DISC, 3)
-    again = ident.identify(model, fitted, axes=["J1", "J2", "J3"])
+    axes = ["J1", "J2", "J3"]
+    again = ident.identify(model, fitted, axes=axes)
     name = "position-friction"
     for friction_nm, written in ((3.0, {name}), (0.0, set())):
         unseen = with_friction(held_out, friction_nm)
         evidence = ident.gather(again, fitted, holdout=[unseen])
-        steps = ident.find_effects(evidence, np.random.default_rng(0))
-        assert {placed.effect.name for placed in steps[-1].after.effects} == {name}
+        rng = np.random.default_rng(0)
+        steps = ident.find_effects(evidence, rng)
+        effects = steps[-1].after.effects
+        assert {placed.effect.name for placed in effects} == {name}
         judged = ident.accept_on_holdout(evidence, steps)
-        assert {one.placed.effect.name for one in judged[-1].verdicts} == {name}
+        verdicts = judged[-1].verdicts
+        assert {one.placed.effect.name for one in verdicts} == {name}
         calibration = ident.calibration_of(
             again, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A, steps=judged
         )

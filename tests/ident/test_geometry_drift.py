@@ -37,10 +37,11 @@ NOISE_A = 0.05
 
 @cache
 def _new_run() -> Run:
+    rng = np.random.default_rng(77)
     return record(
         tx40_truth(),
         "new",
-        np.random.default_rng(77),
+        rng,
         seconds=30.0,
         rate_hz=500.0,
         averaged=2,
@@ -69,7 +70,8 @@ def _fitted_runs() -> tuple[Run, ...]:
 @cache
 def _fitted() -> tuple[Evidence, Calibration]:
     evidence = gathered(tx40_truth(), _fitted_runs())
-    return evidence, calibration_of(evidence.identification, AXES, (1.0,) * 6)
+    nameplate = (1.0,) * 6
+    return evidence, calibration_of(evidence.identification, AXES, nameplate)
 
 
 def _drift(
@@ -93,7 +95,8 @@ def _drift(
 def test_a_lost_zero_is_named_with_its_size(axis: int) -> None:
     position = _new_run().position_rad.copy()
     position[:, axis] += np.radians(3.0)
-    found = _drift(replace(_new_run(), position_rad=position), tx40_truth().model)
+    run = replace(_new_run(), position_rad=position)
+    found = _drift(run, tx40_truth().model)
     assert found is not None
     assert (found.placed.effect.name, found.placed.axis) == ("zero-offset", axis)
     assert np.degrees(found.values[0]) == pytest.approx(-3.0, abs=0.5)
@@ -108,14 +111,18 @@ def _offset(run: Run, axis: int, degrees: float) -> Run:
 def test_of_two_zeros_that_explain_the_error_the_one_that_explains_more_is_named() -> None:
     """Both explain more than what the error is larger than in a fit that left much."""
     _, calibration = _fitted()
-    errors = RelativeError((2.5,) * 6, 2.5)
+    axes = (2.5,) * 6
+    errors = RelativeError(axes, 2.5)
+    run = _offset(_new_run(), 2, 3.0)
+    known = replace(calibration, relative_error_percent=errors)
     found = _drift(
-        _offset(_new_run(), 2, 3.0),
+        run,
         tx40_truth().model,
-        replace(calibration, relative_error_percent=errors),
+        known,
     )
     assert found is not None
-    assert found.placed == PlacedEffect(ZeroOffset(), 2)
+    expected = PlacedEffect(ZeroOffset(), 2)
+    assert found.placed == expected
 
 
 def test_a_zero_that_is_suspected_needs_not_explain_most_of_the_error() -> None:
@@ -124,7 +131,8 @@ def test_a_zero_that_is_suspected_needs_not_explain_most_of_the_error() -> None:
     slow = np.repeat(rng.standard_normal((len(run.time_s) // 50 + 1, 6)), 50, axis=0)[
         : len(run.time_s)
     ]
-    disturbed = replace(run, current_a=run.current_a + 0.03 * slow)
+    current_a = run.current_a + 0.03 * slow
+    disturbed = replace(run, current_a=current_a)
     model = tx40_truth().model
     assert _drift(disturbed, model) is None
     suspected = (PlacedEffect(ZeroOffset(), 1),)
@@ -137,7 +145,8 @@ def test_a_zero_that_is_suspected_needs_not_explain_most_of_the_error() -> None:
 
 def test_a_moved_base_is_named() -> None:
     truth = tx40_truth().model
-    turned = rotation_by(np.array([0.0, np.radians(4.0), 0.0])) @ truth.robot.gravity_m_s2
+    vector_rad = np.array([0.0, np.radians(4.0), 0.0])
+    turned = rotation_by(vector_rad) @ truth.robot.gravity_m_s2
     found = _drift(_new_run(), Model(replace(truth.robot, gravity_m_s2=turned), truth.drive_train))
     assert found is not None
     assert found.placed.effect.name == "gravity-direction"
@@ -151,15 +160,20 @@ def test_a_base_that_moved_after_gravity_was_corrected_is_named_with_its_size() 
     truth = tx40_truth()
 
     def tilted(degrees: float) -> Model:
-        turned = (
-            rotation_by(np.array([0.0, np.radians(degrees), 0.0])) @ truth.model.robot.gravity_m_s2
-        )
-        return Model(replace(truth.model.robot, gravity_m_s2=turned), truth.model.drive_train)
+        vector_rad = np.array([0.0, np.radians(degrees), 0.0])
+        gravity_m_s2 = truth.model.robot.gravity_m_s2
+        turned = rotation_by(vector_rad) @ gravity_m_s2
+        robot = replace(truth.model.robot, gravity_m_s2=turned)
+        return Model(robot, truth.model.drive_train)
 
     runs = _fitted_runs()
-    start = gathered(replace(truth, model=tilted(5.0)), runs)
-    steps = with_declared(start, (PlacedEffect(GravityDirection(), 0),), np.random.default_rng(0))
-    calibration = calibration_of(start.identification, AXES, (1.0,) * 6, steps=steps)
+    changed_truth = replace(truth, model=tilted(5.0))
+    start = gathered(changed_truth, runs)
+    declared = (PlacedEffect(GravityDirection(), 0),)
+    rng = np.random.default_rng(0)
+    steps = with_declared(start, declared, rng)
+    nameplate = (1.0,) * 6
+    calibration = calibration_of(start.identification, AXES, nameplate, steps=steps)
     assert _drift(_new_run(), tilted(5.0), calibration) is None
     # The description now says 9°, of which 5° are corrected: 4° are new.
     found = _drift(_new_run(), tilted(9.0), calibration)
@@ -175,7 +189,8 @@ def test_nothing_is_named_where_friction_or_a_gain_has_changed() -> None:
     current = run.current_a.copy()
     current[:, 1] += 4.0 * np.sign(np.gradient(run.position_rad[:, 1])) / truth.gains[1]
     current[:, 2] *= 1.2
-    assert _drift(replace(run, current_a=current), truth.model) is None
+    changed_run = replace(run, current_a=current)
+    assert _drift(changed_run, truth.model) is None
 
 
 @pytest.mark.parametrize("run", [0, 1], ids=["bare", "loaded"])

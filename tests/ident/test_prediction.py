@@ -59,7 +59,10 @@ def _largest_difference(identification: Evidence) -> float:
         decimate_rows(data, CONDITIONING, predict_torque(calibration, identification.model, data).T)
         for data in identification.datasets
     ]
-    return float(np.max(np.abs(np.concatenate(rows, axis=1) - expected)) / np.max(np.abs(expected)))
+    stacked_rows = np.concatenate(rows, axis=1)
+    stacked_row_difference = np.abs(stacked_rows - expected)
+    largest_absolute_expected = np.max(np.abs(expected))
+    return float(np.max(stacked_row_difference) / largest_absolute_expected)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +91,8 @@ def test_so_does_that_of_effects(identified: Evidence, effects: tuple[PlacedEffe
     after = with_effects(identified, effects)
     assert _largest_difference(after) < 1e-9
     without = replace(calibrated(after), effects=())
-    with pytest.raises(ModelError, match=effects[0].effect.name):
+    effect = effects[0].effect
+    with pytest.raises(ModelError, match=effect.name):
         standard_parameters(without, identified.model)
 
 
@@ -105,31 +109,32 @@ def test_an_effect_has_no_torque_far_beyond_what_the_fit_has_seen(identified: Ev
         after.training.effects[:, 0]
         * after.estimate.parameters[own_unknowns(after.estimate, (placed,))]
     )
-    assert largest_nm == pytest.approx(
-        np.max(np.abs(rows), axis=1, where=after.training.use, initial=0.0), rel=1e-3
-    )
-    bounded = replace(whole, effects=(replace(whole.effects[0], largest_torque=largest_nm),))
+    largest_absolute_row = np.max(np.abs(rows), axis=1, where=after.training.use, initial=0.0)
+    assert largest_nm == pytest.approx(largest_absolute_row, rel=1e-3)
+    changed_effect = replace(whole.effects[0], largest_torque=largest_nm)
+    effects = (changed_effect,)
+    bounded = replace(whole, effects=effects)
     data = identified.datasets[0]
-    fast = replace(data, velocity_rad_s=2.0 * data.velocity_rad_s)
+    velocity_rad_s = 2.0 * data.velocity_rad_s
+    fast = replace(data, velocity_rad_s=velocity_rad_s)
     model = identified.model
     for motion, is_limited in ((data, False), (fast, True)):
         free = predict_torque(whole, model, motion)
         limited = predict_torque(bounded, model, motion)
         assert np.allclose(free, limited) != is_limited
-    without = predict_torque(
-        replace(whole, effects=(_without_torque(whole.effects[0]),)), model, fast
-    )
-    assert np.max(np.abs(limited - without)) == pytest.approx(
-        EXTRAPOLATED * max(largest_nm), rel=1e-6
-    )
+    effect = whole.effects[0]
+    calibration = replace(whole, effects=(_without_torque(effect),))
+    without = predict_torque(calibration, model, fast)
+    limited_difference = np.abs(limited - without)
+    largest_limited_difference = np.max(limited_difference)
+    assert largest_limited_difference == pytest.approx(EXTRAPOLATED * max(largest_nm), rel=1e-6)
     assert _largest_torque(after, PlacedEffect(Lag(), 1)) is None
 
 
 def _without_torque(effect: AcceptedEffect) -> AcceptedEffect:
     """The same effect with coefficients of zero."""
-    return replace(
-        effect, coefficients=tuple(replace(one, value=0.0) for one in effect.coefficients)
-    )
+    coefficients = tuple(replace(one, value=0.0) for one in effect.coefficients)
+    return replace(effect, coefficients=coefficients)
 
 
 def test_what_fades_over_a_session_counts_from_its_first_run(
@@ -139,12 +144,15 @@ def test_what_fades_over_a_session_counts_from_its_first_run(
         replace(run, started_s=1.7e9 + 60.0 * number) for number, run in enumerate(noisy_runs[:2])
     )
     found = identify(truth.model, runs, CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
-    after = with_effects(gather(found, runs), (PlacedEffect(WarmUp(40.0, 1), 1),))
+    effect = WarmUp(40.0, 1)
+    effects = (PlacedEffect(effect, 1),)
+    after = with_effects(gather(found, runs), effects)
     assert _largest_difference(after) < 1e-9
 
 
 def test_a_motion_that_no_one_recorded_needs_the_same_current(identified: Evidence) -> None:
-    after = with_effects(identified, (PlacedEffect(Spring(), 2), PlacedEffect(LoadFriction(0), 1)))
+    effects = (PlacedEffect(Spring(), 2), PlacedEffect(LoadFriction(0), 1))
+    after = with_effects(identified, effects)
     calibration = calibrated(after)
     data = after.datasets[1]
     asked = planned(data.motion(), data.rate_hz, data.payload)
@@ -158,7 +166,8 @@ def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Evid
     """The fit built its columns with the estimate before the last,
     so the two agree only as the iteration does.
     """
-    after = with_effects(identified, (PlacedEffect(LoadFriction(0), 1),))
+    effects = (PlacedEffect(LoadFriction(0), 1),)
+    after = with_effects(identified, effects)
     assert _largest_difference(after) < 1e-4
 
 
@@ -171,7 +180,8 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
     identified: Evidence, truth: Truth, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    motion = _random_motion(identified.datasets[0], rng)
+    like = identified.datasets[0]
+    motion = _random_motion(like, rng)
     standard = rng.normal(size=len(truth.model.columns))
     base = identified.rows_without_effects.base
     named = tuple(
@@ -180,15 +190,18 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
     )
     columns = truth.model.regressor(motion.motion())
     expected = np.einsum("jck,c->kj", columns, standard)
-    found = predict_torque(a_calibration(GAINS, named), truth.model, motion)
-    assert found == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))
+    calibration = a_calibration(GAINS, named)
+    found = predict_torque(calibration, truth.model, motion)
+    largest_absolute_expected = np.max(np.abs(expected))
+    assert found == pytest.approx(expected, abs=1e-6 * largest_absolute_expected)
 
 
 def _random_motion(like: Dataset, rng: np.random.Generator) -> Dataset:
     position, velocity, acceleration = rng.normal(size=(3, 50, 6))
+    time_s = np.arange(50.0)
     return replace(
         like,
-        time_s=np.arange(50.0),
+        time_s=time_s,
         position_rad=position,
         velocity_rad_s=velocity,
         acceleration_rad_s2=acceleration,
@@ -217,13 +230,13 @@ def test_the_true_parameters_predict_the_recorded_current(
         predicted = decimate_rows(
             data, CONDITIONING, predict_current(calibration, truth.model, data).T
         )[use]
-        assert np.linalg.norm(predicted - recorded) < 2e-3 * np.linalg.norm(recorded)
-        torque = measured_torque(
-            calibration, truth.model, predict_current(calibration, truth.model, data)
-        )
-        assert_allclose(
-            torque, predict_torque(calibration, truth.model, data), rtol=1e-9, atol=1e-9
-        )
+        predicted_difference_norm = np.linalg.norm(predicted - recorded)
+        recorded_norm = np.linalg.norm(recorded)
+        assert predicted_difference_norm < 2e-3 * recorded_norm
+        current_a = predict_current(calibration, truth.model, data)
+        torque = measured_torque(calibration, truth.model, current_a)
+        expected = predict_torque(calibration, truth.model, data)
+        assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -250,15 +263,16 @@ def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(
     calibration = calibrated(identified)
     data = identified.datasets[1]
     full = dict.fromkeys(PAYLOAD_TRUTH, 0.0) | {"m": 1e-9}  # a speck
-    weightless = predict_torque(
-        calibration, identified.model, replace(data, payload=Payload("x", "x", full))
-    )
+    payload = Payload("x", "x", full)
+    weightless = predict_torque(calibration, identified.model, replace(data, payload=payload))
     bare = predict_torque(calibration, identified.model, replace(data, payload=None))
     assert weightless == pytest.approx(bare, abs=1e-6)
+    known = {**full, "m": 1.0}
     heavy = predict_torque(
-        calibration, identified.model, replace(data, payload=Payload("x", "x", {**full, "m": 1.0}))
+        calibration, identified.model, replace(data, payload=Payload("x", "x", known))
     )
-    assert np.max(np.abs(heavy - bare)) > 5.0  # a kilogram at the flange of an arm of half a metre
+    heavy_difference = np.abs(heavy - bare)
+    assert np.max(heavy_difference) > 5.0  # a kilogram at the flange of an arm of half a metre
 
 
 STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
@@ -339,8 +353,9 @@ def test_an_effect_that_does_not_exist_is_refused(
 def test_settings_that_no_effect_has_are_refused(
     identified: Evidence, name: str, settings: dict[str, float], words: str
 ) -> None:
+    accepted = AcceptedEffect(name, "J3", settings, (), 1.0, 1.0)
     with pytest.raises(EffectRefused, match=words):
-        placed_effect(AcceptedEffect(name, "J3", settings, (), 1.0, 1.0), calibrated(identified))
+        placed_effect(accepted, calibrated(identified))
 
 
 @pytest.mark.parametrize(
@@ -357,9 +372,8 @@ def test_an_effect_of_an_earlier_version_is_that_of_first_order(
     identified: Evidence, effect: Effect, coefficient: str
 ) -> None:
     axis = ALL_AXES if effect.side is GearSide.ALL_MOTORS else "J3"
-    earlier = AcceptedEffect(
-        effect.name, axis, {}, (Parameter(coefficient, 2e-4, 1e-5, ""),), 1.0, 1.0
-    )
+    coefficients = (Parameter(coefficient, 2e-4, 1e-5, ""),)
+    earlier = AcceptedEffect(effect.name, axis, {}, coefficients, 1.0, 1.0)
     placed, values = placed_effect(earlier, calibrated(identified))
     assert (placed.effect, values.tolist()) == (effect, [2e-4])
 
@@ -377,14 +391,16 @@ def _with_longer_links(model: Model, times: float) -> Model:
     joints = [
         replace(joint, translation_m=times * joint.translation_m) for joint in model.robot.joints
     ]
-    return Model(replace(model.robot, joints=tuple(joints)), model.drive_train)
+    robot = replace(model.robot, joints=tuple(joints))
+    return Model(robot, model.drive_train)
 
 
 def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:
     calibration = calibrated(identified)
     data = identified.datasets[0]
+    changed_calibration = replace(calibration, gains=calibration.gains[:5])
     with pytest.raises(ModelError, match="5 gains, the model 6 joints"):
-        predict_torque(replace(calibration, gains=calibration.gains[:5]), identified.model, data)
+        predict_torque(changed_calibration, identified.model, data)
     other = _with_longer_links(identified.model, 1.2)
     with pytest.raises(
         ModelError,
@@ -394,8 +410,8 @@ def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None
         predict_current(calibration, other, data)
     measured_again = _with_longer_links(identified.model, 1.002)
     predict_current(calibration, measured_again, data)
-    seventh = replace(
-        calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, ""))
-    )
+    parameter = Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, "")
+    parameters = (*calibration.parameters, parameter)
+    seventh = replace(calibration, parameters=parameters)
     with pytest.raises(ModelError, match="'Izz7"):
         predict_torque(seventh, identified.model, data)

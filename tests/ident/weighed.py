@@ -53,20 +53,26 @@ def weighed_cell(
         mass_factor: of the mass that the calibration takes as known, against the true one.
     """
     rng = np.random.default_rng(seed)
-    conditioning = Conditioning(standstill_rad_s=(0.03,) * len(truth.gains))
-    entered = replace(MOUNTED, known={"m": mass_factor * MOUNTED.known["m"]})
+    standstill_rad_s = (0.03,) * len(truth.gains)
+    conditioning = Conditioning(standstill_rad_s=standstill_rad_s)
+    known = {"m": mass_factor * MOUNTED.known["m"]}
+    entered = replace(MOUNTED, known=known)
     runs = []
     for index in range(4):
         run = noisy_run(truth, f"run{index}", rng, DISC if index % 2 else None, seconds)
-        runs.append(replace(run, payload=entered if index % 2 else None))
+        changed_run = replace(run, payload=entered if index % 2 else None)
+        runs.append(changed_run)
     evidence = gather(identify(truth.model, runs, conditioning), runs)
-    calibration = calibrated(with_effects(evidence, (PlacedEffect(LoadFriction(0), AXIS),)))
+    effects = (PlacedEffect(LoadFriction(0), AXIS),)
+    calibration = calibrated(with_effects(evidence, effects))
     body = a_body(rng)
+    loaded = noisy_run(truth, "unknown", rng, body, seconds)
+    bare = noisy_run(truth, "empty", rng, None, seconds)
     return WeighedCell(
         calibration,
         conditioning,
-        noisy_run(truth, "unknown", rng, body, seconds),
-        noisy_run(truth, "empty", rng, None, seconds),
+        loaded,
+        bare,
         body,
     )
 
@@ -74,9 +80,10 @@ def weighed_cell(
 def a_body(rng: np.random.Generator) -> FloatArray:
     """One to six kilograms within a decimetre of the flange."""
     mass = rng.uniform(1.0, 6.0)
-    return Body(
-        mass, rng.uniform(-0.1, 0.1, 3), mass * np.diag(rng.uniform(0.002, 0.004, 3))
-    ).parameters
+    centre_m = rng.uniform(-0.1, 0.1, 3)
+    diagonal = np.diag(rng.uniform(0.002, 0.004, 3))
+    inertia_kg_m2 = mass * diagonal
+    return Body(mass, centre_m, inertia_kg_m2).parameters
 
 
 def noisy_run(
@@ -87,18 +94,22 @@ def noisy_run(
     """
     mounted = truth.parameters.copy()
     mounted[truth.model.flange] += 0.0 if body is None else body
-    run = record(replace(truth, parameters=mounted), name, rng, seconds=seconds, rate_hz=RATE_HZ)
-    data = differentiate(
-        run, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * RATE_HZ)
-    )
+    changed_truth = replace(truth, parameters=mounted)
+    run = record(changed_truth, name, rng, seconds=seconds, rate_hz=RATE_HZ)
+    position_cutoff_hz = 0.3 * RATE_HZ
+    conditioning = Conditioning(position_cutoff_hz=position_cutoff_hz)
+    data = differentiate(run, truth.model.drive_train, conditioning)
     load = truth.model.torques(data.motion(), mounted)[0][AXIS]
-    torque = COEFFICIENT * np.abs(load) * np.sign(data.velocity_rad_s[:, AXIS])
+    velocity_sign = np.sign(data.velocity_rad_s[:, AXIS])
+    torque = COEFFICIENT * np.abs(load) * velocity_sign
     current = run.current_a.copy()
     current[1:-1] += np.outer(torque, truth.model.drive_train.to_motor[:, AXIS] / truth.gains)
+    current_a = current + coloured(rng, current.shape) * NOISE * np.sqrt(
+        np.mean(current**2, axis=0)
+    )
     return replace(
         run,
-        current_a=current
-        + coloured(rng, current.shape) * NOISE * np.sqrt(np.mean(current**2, axis=0)),
+        current_a=current_a,
     )
 
 

@@ -75,18 +75,21 @@ def bench(tmp_path: Path) -> Bench:
     controllers = tmp_path / "controllers"
     cells.mkdir()
     controllers.mkdir()
-    text = (
-        (CONFIGS / "cells" / "demo.yaml").read_text().replace("../robots", str(CONFIGS / "robots"))
-    )
+    demo_path = CONFIGS / "cells" / "demo.yaml"
+    text = demo_path.read_text().replace("../robots", str(CONFIGS / "robots"))
     cell = cells / "cell.yaml"
     cell.write_text(text)
     shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controllers / "demo.yaml")
     calibration = recorded(demo_calibration(), datetime.now(UTC))
+    configuration_sha256 = load_cell(cell).digest
+    changed_calibration = replace(calibration, configuration_sha256=configuration_sha256)
     save_calibration(
-        replace(calibration, configuration_sha256=load_cell(cell).digest),
+        changed_calibration,
         tmp_path / "calibration.yaml",
     )
-    return Bench(cell, controllers / "demo.yaml", tmp_path / "calibration.yaml")
+    controller = controllers / "demo.yaml"
+    calibration_path = tmp_path / "calibration.yaml"
+    return Bench(cell, controller, calibration_path)
 
 
 @pytest.mark.parametrize(
@@ -169,14 +172,19 @@ def test_the_command_shows_writes_and_rolls_back(
         bench.apply("--yes", "--max-change-percent", "10", "--json") == ExitCode.CALIBRATION_REFUSED
     )
     outcome = capsys.readouterr()
-    assert {refusal["gate"] for refusal in json.loads(outcome.out)["refusals"]} == {"change"}
+    refusals = json.loads(outcome.out)["refusals"]
+    gates = {refusal["gate"] for refusal in refusals}
+    assert gates == {"change"}
     assert "J4" in outcome.err
     assert bench.controller.read_bytes() == before
     assert bench.actions() == [AuditAction.REFUSED] * 2
 
     assert bench.apply("--yes", "--base", dry["base_sha256"], "--by", "Ada") == ExitCode.OK
-    undo = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("To undo: drivegain "))
-    assert undo == ["rollback", str(bench.cell)]
+    lines = capsys.readouterr().out.splitlines()
+    last_line = lines[-1]
+    undo = shlex.split(last_line.removeprefix("To undo: drivegain "))
+    expected = ["rollback", str(bench.cell)]
+    assert undo == expected
     assert b"-9.2100" in bench.controller.read_bytes()
 
     assert bench.apply("--yes") == ExitCode.OK
@@ -191,22 +199,20 @@ def test_the_command_shows_writes_and_rolls_back(
     back = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
     assert read(bench.audit)[2].who == f"Ada (login {login()})"
-    assert [event.target for event in history_of(bench.cell).events] == [str(bench.controller)] * 2
+    events = history_of(bench.cell).events
+    targets = [event.target for event in events]
+    assert targets == [str(bench.controller)] * 2
 
 
 def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
     before = bench.controller.read_bytes()
     assert bench.apply("--yes") == ExitCode.OK
     begun, applied, entered = read(bench.audit)
-    assert (
-        entered.details["document"]
-        == encode_calibration(decode_calibration(bench.calibration.read_bytes(), "")).decode()
-    )
-    assert (begun.action, begun.who, begun.subject) == (
-        AuditAction.APPLY_BEGUN,
-        login(),
-        str(bench.controller),
-    )
+    content = bench.calibration.read_bytes()
+    calibration = decode_calibration(content, "")
+    assert entered.details["document"] == encode_calibration(calibration).decode()
+    expected = (AuditAction.APPLY_BEGUN, login(), str(bench.controller))
+    assert (begun.action, begun.who, begun.subject) == expected
     assert applied.details == {"begun": begun.number}
     digests = demo_calibration().sources
     logs = begun.details["logs"]
@@ -240,10 +246,11 @@ def test_another_configuration_is_refused_until_someone_says_so(
 def test_the_mass_may_be_entered_at_the_write_back(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    once = with_recordings(recorded(demo_calibration(), datetime.now(UTC)), entered_kg=None)
-    save_calibration(
-        replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration
-    )
+    calibration = recorded(demo_calibration(), datetime.now(UTC))
+    once = with_recordings(calibration, entered_kg=None)
+    configuration_sha256 = load_cell(bench.cell).digest
+    changed_once = replace(once, configuration_sha256=configuration_sha256)
+    save_calibration(changed_once, bench.calibration)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--payload-mass disc=KG" in capsys.readouterr().err
     assert bench.apply("--yes", "--payload-mass", "disc=4.61") == ExitCode.CALIBRATION_REFUSED
@@ -275,7 +282,8 @@ def test_options_may_be_tighter_than_the_cell_and_not_wider(
 def test_the_cell_s_policy_is_the_bound(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {max_change_percent: 15}}\n")
     assert bench.apply("--configuration-changed", "--json") == ExitCode.CALIBRATION_REFUSED
-    refusals = json.loads(capsys.readouterr().out)["refusals"]
+    printed = capsys.readouterr().out
+    refusals = json.loads(printed)["refusals"]
     assert [(one["gate"], one["subject"]) for one in refusals] == [("change", "J4")]
 
 
@@ -293,7 +301,8 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
     audit = tmp_path / "elsewhere.jsonl"
     assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
     assert "No audit log has this rollback" not in capsys.readouterr().out
-    assert [entry.action for entry in read(audit)] == [
+    actions = [entry.action for entry in read(audit)]
+    assert actions == [
         AuditAction.ROLLBACK_BEGUN,
         AuditAction.ROLLED_BACK,
     ]
@@ -308,7 +317,8 @@ def test_without_room_for_the_audit_nothing_is_written(
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "the cell's audit, a regular file" in capsys.readouterr().err
     assert bench.controller.read_bytes() == before
-    assert not list(bench.controller.parent.glob("*.bak"))
+    files = bench.controller.parent.glob("*.bak")
+    assert not list(files)
 
 
 def test_no_one_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Path) -> None:
@@ -356,13 +366,17 @@ def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(
     other = bench.cell.with_name("other.yaml")
     text = bench.cell.read_text()
     bench.cell.write_text(text + shared % "one")
-    other.write_text(text.replace("name: demo", "name: other") + shared % "two")
+    changed_text = text.replace("name: demo", "name: other")
+    other.write_text(changed_text + shared % "two")
     for file, factor in ((bench.cell, 1.0), (other, 1.01)):
         declared = load_cell(file)
         made = recorded(demo_calibration(), datetime.now(UTC))
         gains = tuple(replace(gain, value=gain.value * factor) for gain in made.gains)
+        calibration = replace(
+            made, cell=declared.name, configuration_sha256=declared.digest, gains=gains
+        )
         save_calibration(
-            replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains),
+            calibration,
             bench.calibration,
         )
         base = () if factor == 1.0 else ("--base", sha256(bench.controller.read_bytes()))
@@ -382,7 +396,8 @@ def test_a_dry_run_says_that_the_history_cannot_be_read(
 ) -> None:
     bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
     assert bench.apply() == ExitCode.OK
-    assert "the history cannot be read" in caplog.text + capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert "the history cannot be read" in caplog.text + error_output
 
 
 @pytest.mark.parametrize("name", ["A\udcff", "A\x1b[31m", "A\u202e"])
@@ -402,7 +417,8 @@ def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
         patch.setattr("daq.writeback.target.enter_calibration", killed)
         assert bench.apply("--yes") == ExitCode.INTERRUPTED
     assert b"-9.2100" in bench.controller.read_bytes()
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "has the new content, complete; the history lacks this write" in said
     assert "nothing was written" not in said
     for _ in range(2):
@@ -410,7 +426,8 @@ def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
         assert "these gains already" in capsys.readouterr().out
         history = history_of(bench.cell)
         assert history.in_force(str(bench.controller)) == history.entries[0].digest
-        assert [event.audit for event in history.events] == [read(bench.audit)[1].sha256]
+        expected = [read(bench.audit)[1].sha256]
+        assert [event.audit for event in history.events] == expected
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
@@ -429,7 +446,8 @@ def test_a_history_that_is_none_does_not_make_a_write_undone(
 ) -> None:
     bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
     assert bench.apply("--yes") == ExitCode.OK
-    assert "the history may lack this write" in caplog.text + capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert "the history may lack this write" in caplog.text + error_output
     assert b"-9.2100" in bench.controller.read_bytes()
 
 
@@ -440,8 +458,10 @@ def _change(axis: str, current_gain: float, new: float, std: float) -> GainChang
 def significant(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> set[str]:
     """Axes whose change is marked as more than noise in the table that the operator reads."""
     shown = io.StringIO()
-    Console(file=shown, width=120).print(change_table(changes, known))
-    return {line.split()[0] for line in shown.getvalue().splitlines() if " * " in line}
+    console = Console(file=shown, width=120)
+    console.print(change_table(changes, known))
+    lines = shown.getvalue().splitlines()
+    return {line.split()[0] for line in lines if " * " in line}
 
 
 def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
@@ -453,7 +473,8 @@ def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the current gain is as uncertain.
     middle = _change("J4", 10.0, 10.25, 0.07)
     assert significant((middle,)) == {"J4"}
-    assert significant((middle,), Spread({"J4": 0.07})) == set()
+    known = Spread({"J4": 0.07})
+    assert significant((middle,), known) == set()
 
 
 def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
@@ -462,18 +483,20 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     def fourth() -> dict[str, object]:
         capsys.readouterr()
         assert bench.apply("--json") == ExitCode.OK
-        found: dict[str, object] = json.loads(capsys.readouterr().out)["changes"][3]
+        document = json.loads(capsys.readouterr().out)
+        found: dict[str, object] = document["changes"][3]
         return found
 
     # Entered by hand: exact
     assert fourth()["change_sigmas"] == pytest.approx(-2.31 / (DISPERSION * 0.03684))
     assert bench.apply("--yes") == ExitCode.OK
-    known = decode_calibration(bench.calibration.read_bytes(), "")
+    content = bench.calibration.read_bytes()
+    known = decode_calibration(content, "")
     gain = known.gains[3]
     moved = replace(gain, value=gain.value * 1.015)
-    save_calibration(
-        replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration
-    )
+    gains = (*known.gains[:3], moved, *known.gains[4:])
+    changed_known = replace(known, gains=gains)
+    save_calibration(changed_known, bench.calibration)
     found = fourth()
     assert found["change_sigmas"] == pytest.approx(
         0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01
@@ -485,9 +508,8 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     assert "No gain has changed by more than noise: the largest change is J4 +1.5 % (" in shown
     assert "Nothing needs to be written." in shown
     far = replace(gain, value=gain.value * 1.1)
-    save_calibration(
-        replace(known, gains=(*known.gains[:3], far, *known.gains[4:])), bench.calibration
-    )
+    calibration = replace(known, gains=(*known.gains[:3], far, *known.gains[4:]))
+    save_calibration(calibration, bench.calibration)
     assert bench.apply() == ExitCode.OK
     assert "Nothing needs to be written" not in capsys.readouterr().out
 
@@ -505,19 +527,23 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     assert bench.apply() == ExitCode.OK
     base = _shown_base(capsys.readouterr().out)
     assert bench.apply("--json") == ExitCode.OK
-    assert json.loads(capsys.readouterr().out)["base"] == base
+    document = json.loads(capsys.readouterr().out)
+    assert document["base"] == base
     # Another calibration under the same name.
     known = decode_calibration(fitted, "")
-    moved = replace(known.gains[3], value=known.gains[3].value * 1.01)
-    save_calibration(
-        replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration
-    )
+    gain = known.gains[3].value
+    moved = replace(known.gains[3], value=gain * 1.01)
+    gains = (*known.gains[:3], moved, *known.gains[4:])
+    calibration = replace(known, gains=gains)
+    save_calibration(calibration, bench.calibration)
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
+    error_output = capsys.readouterr().err
     assert ("the keys or the factors have changed since the dry run") in " ".join(
-        capsys.readouterr().err.split()
+        error_output.split()
     )
     assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
-    assert _shown_base(capsys.readouterr().out) != base
+    shown = capsys.readouterr().out
+    assert _shown_base(shown) != base
     bench.calibration.write_bytes(fitted)
     # Other keys in the cell: the gains of J1 and J2 exchanged.
     cell = bench.cell.read_text()
@@ -534,22 +560,26 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
     assert "as --base says" in " ".join(capsys.readouterr().err.split())
     bench.controller.write_bytes(before)
-    assert not list(bench.controller.parent.glob("*.bak"))
+    files = bench.controller.parent.glob("*.bak")
+    assert not list(files)
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
     (backup,) = bench.controller.parent.glob("*.bak")
     assert f".{base}.bak" in backup.name
     # Asked for once more, what it wants is there already.
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
-    for wrong in ("abc", base[:-1], base.replace("-", "_"), "x" * 64):
+    changed_base = base.replace("-", "_")
+    for wrong in ("abc", base[:-1], changed_base, "x" * 64):
         assert bench.apply("--yes", "--base", wrong) == ExitCode.USAGE
 
 
 def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    known = decode_calibration(bench.calibration.read_bytes(), "")
+    content = bench.calibration.read_bytes()
+    known = decode_calibration(content, "")
     digest = hashlib.sha256(bench.controller.read_bytes()).hexdigest()
-    save_calibration(with_recordings(known, controller_sha256=digest), bench.calibration)
+    calibration = with_recordings(known, controller_sha256=digest)
+    save_calibration(calibration, bench.calibration)
     bench.controller.write_bytes(bench.controller.read_bytes() + b"# seen by K.\n")
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--base" not in capsys.readouterr().out
@@ -562,7 +592,8 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
     # The file is another one than at the recording, by this very write.
     assert bench.apply("--yes") == ExitCode.OK
     assert "these gains already" in capsys.readouterr().out
-    assert bench.actions()[-1] is AuditAction.NOTHING_TO_DO
+    last_action = bench.actions()[-1]
+    assert last_action is AuditAction.NOTHING_TO_DO
     assert bench.apply() == ExitCode.OK
     assert bench.actions().count(AuditAction.NOTHING_TO_DO) == 1
     assert (
@@ -588,7 +619,8 @@ def test_no_other_file_becomes_an_audit(
     before = [path.read_bytes() for path in paths]
     strict = ["--max-change-percent", "1"] if refused else []
     assert bench.apply("--yes", "--configuration-changed", *strict) != ExitCode.OK
-    assert [path.read_bytes() for path in paths] == before
+    contents = [path.read_bytes() for path in paths]
+    assert contents == before
     assert not store.exists()
     if not refused:
         assert "audit" in capsys.readouterr().err
@@ -618,7 +650,8 @@ def test_whatever_the_history_does_a_write_is_not_called_undone(
 
     monkeypatch.setattr("daq.writeback.target.enter_calibration", broken)
     assert bench.apply("--yes") == ExitCode.OK
-    assert "the history may lack this write" in caplog.text + capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert "the history may lack this write" in caplog.text + error_output
     assert b"-9.2100" in bench.controller.read_bytes()
 
 
@@ -637,7 +670,8 @@ def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -
     capsys.readouterr()
     for code in (bench.apply(), bench.apply("--yes"), bench.rollback()):
         assert code == ExitCode.CALIBRATION_REFUSED
-    output = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    output = " ".join(error_output.split())
     assert output.count(found) == 3
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.CALIBRATION_REFUSED
     assert found in " ".join(capsys.readouterr().err.split())
@@ -647,7 +681,8 @@ def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -
 def test_a_link_of_the_cell_file_into_a_folder_that_everybody_may_write_is_refused(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _linked(bench, tmp_path / "open" / "gains.yaml")
+    target = tmp_path / "open" / "gains.yaml"
+    _linked(bench, target)
     assert bench.apply("--yes") == ExitCode.OK
     (tmp_path / "open").chmod(0o777)
     _all_refused(bench, "everybody may write", capsys)
@@ -705,7 +740,9 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     assert bench.controller.is_symlink()
     assert target.read_bytes() == before
     assert {entry.subject for entry in read(bench.audit)} == {str(target), "history of demo"}
-    assert {event.target for event in history_of(bench.cell).events} == {str(target)}
+    events = history_of(bench.cell).events
+    targets = {event.target for event in events}
+    assert targets == {str(target)}
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
 
 
@@ -855,7 +892,8 @@ def test_an_option_of_the_drives_is_not_ignored_without_them(
     before = bench.controller.read_bytes()
     codes = {bench.apply("--yes", option), bench.rollback(option), bench.apply(option)}
     assert codes == {ExitCode.USAGE}
-    assert capsys.readouterr().err.count(f"error:    {option}\n") == 3
+    error_output = capsys.readouterr().err
+    assert error_output.count(f"error:    {option}\n") == 3
     assert bench.controller.read_bytes() == before
 
 
@@ -886,7 +924,8 @@ def test_something_else_in_place_of_the_lock_is_named(
     made(lock)
     before = bench.controller.read_bytes()
     assert bench.apply("--yes") == ExitCode.UNEXPECTED
-    assert f"error:    {lock}\n" in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert f"error:    {lock}\n" in error_output
     assert bench.controller.read_bytes() == before
 
 
@@ -895,7 +934,8 @@ def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixt
     bench.cell.write_text(f"{bench.cell.read_text()}history: {{audit: {json.dumps(str(audit))}}}\n")
     before = bench.controller.read_bytes()
     assert bench.apply("--yes", "--configuration-changed") == ExitCode.UNEXPECTED
-    assert f"error:    {audit}\n" in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert f"error:    {audit}\n" in error_output
     assert bench.controller.read_bytes() == before
 
 
@@ -921,7 +961,8 @@ def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) ->
         assert (done.returncode, done.stderr) == (ExitCode.OK, b"")
         shown.append(done.stdout.decode("ascii"))
     assert "-9.210 \\u00b1 0.037" in shown[0]
-    assert json.loads(shown[1])["file"] == str(file)
+    document = json.loads(shown[1])
+    assert document["file"] == str(file)
 
 
 def test_an_audit_is_compared_with_every_other_file_of_the_command(tmp_path: Path) -> None:

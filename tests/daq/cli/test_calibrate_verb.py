@@ -26,7 +26,8 @@ LOOK = QuickLook("block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33
 def looks(tmp_path: Path) -> Looks:
     """While the second block is recorded."""
     story = Story(io.StringIO(), Form.TEXT, lambda: datetime(2026, 1, 5, tzinfo=UTC))
-    return Looks(Feed(tmp_path / "cell.yaml"), story, block=LOOK.block)
+    feed = Feed(tmp_path / "cell.yaml")
+    return Looks(feed, story, block=LOOK.block)
 
 
 def test_a_look_is_printed_where_the_errors_go_now(
@@ -34,8 +35,12 @@ def test_a_look_is_printed_where_the_errors_go_now(
 ) -> None:
     """A progress bar replaces the stream while it is shown."""
     looks.show(LOOK)
-    looks.show(replace(LOOK, move=4))
-    looks.show(replace(LOOK, move=5, gains=[replace(LOOK.gains[0], std_percent=0.1)]))
+    look = replace(LOOK, move=4)
+    looks.show(look)
+    changed_gain = replace(LOOK.gains[0], std_percent=0.1)
+    gains = [changed_gain]
+    changed_look = replace(LOOK, move=5, gains=gains)
+    looks.show(changed_look)
     said = capsys.readouterr().err.splitlines()
     assert [line.split(",")[1] for line in said] == [" move 3 of 9", " move 4 of 9", " move 5 of 9"]
     assert looks.remark == "moves, J1 ± 0.10 % (target 0.5 %)"
@@ -56,20 +61,23 @@ def test_what_is_missing_is_printed_once_in_a_block(
 ) -> None:
     waiting = replace(LOOK, gains=[], missing="no payload")
     for move in (1, 2, 3):
-        looks.show(replace(waiting, move=move))
+        look = replace(waiting, move=move)
+        looks.show(look)
     assert capsys.readouterr().err == "No gains yet: no payload.\n"
 
 
 def test_a_check_that_fails_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     refused = BusError("virtual:127.0.0.1:29536", "Connection refused")
     refused.__cause__ = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+    check_line = CheckLine("disk, interlock, drives", "", refused)
+    lines = (CheckLine("cell file", "6 axes"), check_line)
     with pytest.raises(typer.Exit) as ended:
-        show_check(
-            (CheckLine("cell file", "6 axes"), CheckLine("disk, interlock, drives", "", refused))
-        )
+        show_check(lines)
     assert ended.value.exit_code == ExitCode.CONFIGURATION
-    first, failed, *parts = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr().out
+    first, failed, *parts = printed.splitlines()
     assert first == "✓ cell file: 6 axes"
     assert failed == "✗ disk, interlock, drives"
-    assert [line.split(":")[0].strip() for line in parts] == ["error", "found", "expected", "do"]
+    expected = ["error", "found", "expected", "do"]
+    assert [line.split(":")[0].strip() for line in parts] == expected
     assert "drivegain simulate demo" in parts[-1]

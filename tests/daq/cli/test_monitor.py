@@ -145,7 +145,8 @@ def _answers(at_ns: int, cycle: int, silent: int | None = None) -> list[tuple[in
     for node in range(1, 7):
         if node != silent:
             data = struct.pack("<ihH", 1000 * node + cycle, -node, 0x1237)
-            frames.append((at_ns + 1000 * node, _frame(0x180 + node, data)))
+            identifier = 0x180 + node
+            frames.append((at_ns + 1000 * node, _frame(identifier, data)))
     return frames
 
 
@@ -161,13 +162,14 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(
     reading = monitor.watch(5.005)
     assert bus.sent == []
     assert reading.source is ReadingSource.OVERHEARD
-    assert [axis.position_counts for axis in reading.axes] == [
-        1000 * node + 499 for node in range(1, 7)
-    ]
+    expected = [1000 * node + 499 for node in range(1, 7)]
+    position_counts = [axis.position_counts for axis in reading.axes]
+    assert position_counts == expected
     assert [axis.current_raw for axis in reading.axes] == [-1, -2, -3, -4, -5, -6]
     assert [axis.lost for axis in reading.axes] == [0, 0, 2, 0, 0, 0]
     assert reading.sync_hz == pytest.approx(100, rel=0.01)
-    assert reading.axes[0].rate_hz == pytest.approx(100, rel=0.01)
+    rate_hz = reading.axes[0].rate_hz
+    assert rate_hz == pytest.approx(100, rel=0.01)
     assert reading.axes[2].rate_hz == pytest.approx(498 / 5.005, rel=1e-6)
     # SYNC and six answers in 10 ms, by the count that a recording is refused with.
     profiles = [axis.profile for axis in CELL.axes if axis.profile is not None]
@@ -182,15 +184,16 @@ def test_each_overheard_cycle_is_a_sample_and_a_gap_is_counted(bus: QuietBus) ->
     monitor.period_ns = 10_000_000
     start = bus.clock.now_ns
     for cycle in (*range(20), *range(25, 40)):  # five SYNCs that this program missed
-        frames = _answers(
-            start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle == 30 else None
-        )
+        at_ns = start + (cycle + 1) * 10_000_000
+        frames = _answers(at_ns, cycle, silent=3 if cycle == 30 else None)
         frames[0][1].timestamp = 1.7e9 + 0.01 * cycle
         bus.coming += frames
     monitor.watch(0.5)
     # The last may still be answered
-    assert [sample.cycle for sample in samples] == [*range(20), *range(25, 39)]
-    assert [sample.cycle for sample in samples if sample.missing] == [30]
+    expected = [*range(20), *range(25, 39)]
+    assert [sample.cycle for sample in samples] == expected
+    cycles = [sample.cycle for sample in samples if sample.missing]
+    assert cycles == [30]
     assert samples[25].missing == 0b100
     for sample in samples:
         position = [1000 * node + sample.cycle for node in range(1, 7)]
@@ -204,9 +207,9 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
     monitor.watch(QUIET_S - 0.01)
     assert bus.sent == []
     reading = monitor.watch(9.5 * ABANDONED_S)
-    assert {message.arbitration_id for message in bus.sent} == {
-        0x600 + node for node in range(1, 7)
-    }
+    expected = {0x600 + node for node in range(1, 7)}
+    arbitration_ids = {message.arbitration_id for message in bus.sent}
+    assert arbitration_ids == expected
     assert {message.data[0] for message in bus.sent} == {0x40}
     assert reading.source is ReadingSource.ASKED
     assert all(
@@ -229,7 +232,8 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.Monk
         nonlocal answered
         answered += 1
         reply = bytes((0x43, *msg.data[1:4])) + bytes(4)
-        bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        identifier = msg.arbitration_id - 0x80
+        bus.coming.append((bus.clock.now_ns, _frame(identifier, reply)))
 
     monkeypatch.setattr(bus, "send", answer)
     reading = monitor.watch(5.0)
@@ -246,7 +250,8 @@ def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) 
     monitor.watch(QUIET_S + 0.1)
     asked = len(bus.sent)
     bus.coming.append((bus.clock.now_ns, _frame(identifier, bytes(8))))
-    assert monitor.watch(QUIET_S - 0.01).source is ReadingSource.OVERHEARD
+    source = monitor.watch(QUIET_S - 0.01).source
+    assert source is ReadingSource.OVERHEARD
     assert len(bus.sent) <= asked + 6  # those that left before it spoke
     asked = len(bus.sent)
     monitor.watch(0.1)
@@ -268,12 +273,15 @@ def test_nothing_is_sent_once_a_recorder_has_the_bus(bus: QuietBus) -> None:
 def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
     monitor = _monitor(bus)
     monitor.watch(QUIET_S + 0.01)
-    other = bytes((0x43, 0x75, 0x60, 0)) + struct.pack("<I", 2000)
+    packed = struct.pack("<I", 2000)
+    other = bytes((0x43, 0x75, 0x60, 0)) + packed
     bus.coming.append((bus.clock.now_ns, _frame(0x581, other)))
-    assert monitor.watch(0.05).axes[0].position_counts is None
+    axes = monitor.watch(0.05).axes
+    assert axes[0].position_counts is None
     mine = bytes((0x43, 0x64, 0x60, 0)) + struct.pack("<i", -7)
     bus.coming.append((bus.clock.now_ns, _frame(0x581, mine)))
-    assert monitor.watch(0.05).axes[0].position_counts == -7
+    position_counts = monitor.watch(0.05).axes[0].position_counts
+    assert position_counts == -7
 
 
 @settings(deadline=None)
@@ -281,34 +289,39 @@ def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
 def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(
     joints: list[float], unknown: int
 ) -> None:
-    motor = CELL.ratio @ (np.array(joints) - [axis.zero_offset_rad for axis in CELL.axes])
+    zero_offset_rad = [axis.zero_offset_rad for axis in CELL.axes]
+    difference = np.array(joints) - zero_offset_rad
+    motor = CELL.ratio @ difference
     counts: list[int | None] = [round(turn * 65536 / (2 * np.pi)) for turn in motor]
     reading = _reading(counts)
     assert joint_positions(CELL, reading) == pytest.approx(joints, abs=1e-5)
     counts[unknown] = None
     shown = joint_positions(CELL, _reading(counts))
     # Motor 6 turns with joints 5 and 6: without motor 5 neither of the two is known (paper eq. 24).
-    assert {number for number, value in enumerate(shown) if value is None} == (
-        {4, 5} if unknown == 4 else {unknown}
-    )
+    numbers = {number for number, value in enumerate(shown) if value is None}
+    assert numbers == ({4, 5} if unknown == 4 else {unknown})
 
 
 def _reading(counts: list[int | None]) -> CellReading:
     axes = tuple(AxisReading(count, 5, 0x237, 5, 10.0, 0) for count in counts)
-    return CellReading(ReadingSource.ASKED, 0.5, axes, 0.0, ((0,) * 9,), ())
+    frames = ((0,) * 9,)
+    return CellReading(ReadingSource.ASKED, 0.5, axes, 0.0, frames, ())
 
 
 def test_what_is_not_known_is_shown_as_that() -> None:
     out = io.StringIO()
     dead = AxisReading(None, None, None, None, 0.0, 3, heard=False)
     reading = _reading([0] * 6)
-    reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
+    axes = (*reading.axes[:5], dead)
+    frames = ((0,) * 9,)
+    reading = CellReading(reading.source, 0.5, axes, 0.0, frames, ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
     ampere = (0.002, None, None, None, None, None)
-    report = monitor_report(
-        CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,))
-    )
-    Console(file=out, width=100).print(monitor_view(report))
+    position = joint_positions(CELL, reading)
+    watched = WatchedCell(reading, position, ampere, (event,))
+    report = monitor_report(CELL, watched)
+    console = Console(file=out, width=100)
+    console.print(monitor_view(report))
     text = out.getvalue()
     assert "+0.010 A" in text
     assert "+5 raw" in text
@@ -317,8 +330,10 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     assert "no power" not in text
     off = tuple(replace(axis, statusword=0x250) for axis in reading.axes[:5])
     without = replace(reading, axes=(*off, dead))
-    report = monitor_report(CELL, WatchedCell(without, joint_positions(CELL, without), ampere, ()))
-    assert report.axes[0].current_a == pytest.approx(0.01)  # the document has what the drive says
+    watched_cell = WatchedCell(without, joint_positions(CELL, without), ampere, ())
+    report = monitor_report(CELL, watched_cell)
+    current_a = report.axes[0].current_a
+    assert current_a == pytest.approx(0.01)  # the document has what the drive says
     out = io.StringIO()
     Console(file=out, width=100).print(monitor_view(report))
     assert out.getvalue().count("no power") == 5
@@ -346,7 +361,8 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(
     bus = open_bus(ADDRESS)
     witness = open_bus(ADDRESS)
     try:
-        simulated = SimulatedCell(load_simulation(shipped_simulation("clean")), bus)
+        spec = load_simulation(shipped_simulation("clean"))
+        simulated = SimulatedCell(spec, bus)
         with simulated:
             assert main(["monitor", str(cell), "--json", "--interval", "0.5"]) == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
@@ -410,12 +426,13 @@ def test_a_node_that_aborts_is_not_called_silent(
     assert (refusing["silent"], refusing["rate_hz"], refusing["state"]) == (False, 0.0, None)
     assert refusing["position"] == pytest.approx(90.0, abs=1e-2)
     assert refusing["current_a"] is not None
-    assert refusing["refused"] == [{"object": "6041h:00", "abort_code": 0x06020000}]
+    expected = [{"object": "6041h:00", "abort_code": 0x06020000}]
+    assert refusing["refused"] == expected
     assert refusing["remark"].startswith("answers with abort 0x06020000 for 6041h:00")
-    assert ("J3 answers with abort 0x06020000 for 6041h:00") in _view(
-        MonitorReport.model_validate(document)
-    )
-    assert document["axes"][1]["refused"] == []
+    report = MonitorReport.model_validate(document)
+    assert ("J3 answers with abort 0x06020000 for 6041h:00") in _view(report)
+    refused = document["axes"][1]["refused"]
+    assert refused == []
 
 
 @pytest.mark.parametrize(
@@ -430,11 +447,15 @@ def test_a_refused_object_is_no_value_and_forgotten_when_it_is_given(
 ) -> None:
     answers = [answer]
     _answering(bus, monkeypatch, lambda data: answers[0] if data[1:3] == b"\x41\x60" else None)
-    watch = _watch(bus, tmp_path / "cell.yaml")
+    cell_file = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_file)
     watch.listen(QUIET_S)
-    report = monitor_report(CELL, watch.read(0.5))
-    assert [axis.remark for axis in report.axes] == [remark] * 6
-    assert {(axis.statusword, axis.rate_hz, axis.lost) for axis in report.axes} == {(None, 0.0, 0)}
+    watched = watch.read(0.5)
+    report = monitor_report(CELL, watched)
+    remarks = [axis.remark for axis in report.axes]
+    assert remarks == [remark] * 6
+    expected = {(None, 0.0, 0)}
+    assert {(axis.statusword, axis.rate_hz, axis.lost) for axis in report.axes} == expected
     answers[0] = bytes.fromhex("4b41600050020000")
     report = monitor_report(CELL, watch.read(0.5))
     assert {(axis.remark, axis.statusword) for axis in report.axes} == {("", 0x250)}
@@ -445,16 +466,19 @@ def test_a_node_that_answers_after_400_ms_is_called_slow(
     bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _answering(bus, monkeypatch, lambda _: None, slow={1: 400_000_000})
-    watch = _watch(bus, tmp_path / "cell.yaml")
+    cell_file = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_file)
     watch.listen(QUIET_S)
     reports = [monitor_report(CELL, watch.read(0.5)) for _ in range(10)]
     slow = [report.axes[0] for report in reports]
-    assert {axis.remark for axis in slow} == {"answers after 400 ms"}
+    remarks = {axis.remark for axis in slow}
+    assert remarks == {"answers after 400 ms"}
     assert 0.5 * sum(axis.rate_hz for axis in slow) >= 3  # in 5 s; a reading has three objects
     assert {(axis.silent, axis.lost) for axis in slow} == {(False, 0)}
     assert slow[-1].position_counts == 0
     assert {report.axes[1].remark for report in reports} == {""}
-    assert "J1 answers after 400 ms" in _view(reports[-1])
+    last_report = reports[-1]
+    assert "J1 answers after 400 ms" in _view(last_report)
 
 
 def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
@@ -474,7 +498,9 @@ def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
         for node in simulated.nodes:
             node.write(0x1017, 0, bytes(2))  # no heartbeat
         assert main(["monitor", str(cell), "--json", "--interval", "0.1"]) == ExitCode.OK
-    assert json.loads(capsys.readouterr().out)["axes"][0]["remark"].startswith("answers after ")
+    printed = capsys.readouterr().out
+    axes = json.loads(printed)["axes"]
+    assert axes[0]["remark"].startswith("answers after ")
 
 
 @pytest.mark.parametrize("identifier", [0x081, 0x181, 0x701])
@@ -482,7 +508,9 @@ def test_a_node_that_only_sends_by_itself_is_not_silent(bus: QuietBus, identifie
     monitor = _monitor(bus)
     monitor.watch(QUIET_S)
     bus.coming.append((bus.clock.now_ns + 200_000_000, _frame(identifier, b"\x05")))
-    assert [axis.heard for axis in monitor.watch(1.5).axes] == [True, *[False] * 5]
+    axes = monitor.watch(1.5).axes
+    expected = [True, *[False] * 5]
+    assert [axis.heard for axis in axes] == expected
     assert not any(axis.heard for axis in monitor.watch(0.5).axes)  # longer ago than ABANDONED_S
 
 
@@ -500,7 +528,8 @@ def _answering(
         data = bytes(msg.data)
         reply = own(data) or bytes((0x43, *data[1:4])) + bytes(4)
         at_ns = bus.clock.now_ns + (slow or {}).get(msg.arbitration_id & 0x7F, 0)
-        bus.coming.append((at_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        identifier = msg.arbitration_id - 0x80
+        bus.coming.append((at_ns, _frame(identifier, reply)))
         bus.coming.sort(key=lambda one: one[0])
 
     monkeypatch.setattr(bus, "send", answer)
@@ -508,7 +537,8 @@ def _answering(
 
 def _view(report: MonitorReport) -> str:
     out = io.StringIO()
-    Console(file=out, width=200).print(monitor_view(report))
+    console = Console(file=out, width=200)
+    console.print(monitor_view(report))
     return out.getvalue()
 
 
@@ -517,16 +547,21 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     with bus_lock(CELL, tmp_path):
         assert bus_taken(CELL, tmp_path)
     assert not bus_taken(CELL, tmp_path)
-    assert not bus_taken(CELL, tmp_path, tmp_path / "no list of locks")
+    locks = tmp_path / "no list of locks"
+    assert not bus_taken(CELL, tmp_path, locks)
     axis = AxisReading(0, 1, 0x1208, None, 1.0, 0)
-    reading = CellReading(ReadingSource.OVERHEARD, 1.0, (axis,) * 6, 100.0, ((0,) * 9,), ())
+    frames = ((0,) * 9,)
+    axes = (axis,) * 6
+    reading = CellReading(ReadingSource.OVERHEARD, 1.0, axes, 100.0, frames, ())
     said = []
     for recorder in (False, True):
         out = io.StringIO()
-        report = monitor_report(
-            CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder)
-        )
-        Console(file=out, width=200).print(monitor_view(report))
+        position = (None,) * 6
+        ampere = (None,) * 6
+        watched = WatchedCell(reading, position, ampere, (), recorder=recorder)
+        report = monitor_report(CELL, watched)
+        console = Console(file=out, width=200)
+        console.print(monitor_view(report))
         said.append(out.getvalue())
     assert "another master" in said[0]
     assert "drivegain's recorder" in said[1]
@@ -551,7 +586,8 @@ def test_a_recorder_that_comes_while_the_axes_are_queried_hears_no_further_reque
 
     _answering(bus, monkeypatch, note)
     monkeypatch.setattr("daq.workflow.monitor.bus_taken", lambda _cell: bool(scaled))
-    watch = _watch(bus, tmp_path / "cell.yaml")
+    cell_file = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_file)
     watch.listen(2.0)
     watch.read(0.5)
     assert len(scaled) == 1  # of the first axis; the five others are not asked
@@ -567,18 +603,21 @@ def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
     calibration = predicting_calibration()
     model = model_of(CELL)
     time_s = np.arange(round(seconds * PREDICTED_HZ)) / PREDICTED_HZ
-    omega: FloatArray = 2.0 * np.pi * np.linspace(0.5, 1.0, 6)
+    grid = np.linspace(0.5, 1.0, 6)
+    omega: FloatArray = 2.0 * np.pi * grid
     phase = omega * time_s[:, None]
-    motion = Motion(
-        0.5 * np.sin(phase), 0.5 * omega * np.cos(phase), -0.5 * omega**2 * np.sin(phase)
-    )
+    acceleration_rad_s2 = -0.5 * omega**2 * np.sin(phase)
+    velocity_rad_s = 0.5 * omega * np.cos(phase)
+    position_rad = 0.5 * np.sin(phase)
+    motion = Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
     current = predict_current(calibration, model, planned(motion, PREDICTED_HZ, None))
     current[:, 3] *= factor
     run = replace(facts(CELL, Path("run.mcap")), rate_hz=PREDICTED_HZ)
     # Fine enough that an acceleration shows no count; 16 bits hold the currents.
-    run = replace(
-        run, rad_per_count=[1e-7] * 6, current_per_unit=(np.abs(current).max(axis=0) / 3e4).tolist()
-    )
+    largest_absolute_current = np.abs(current).max(axis=0)
+    current_per_unit = (largest_absolute_current / 3e4).tolist()
+    rad_per_count = [1e-7] * 6
+    run = replace(run, rad_per_count=rad_per_count, current_per_unit=current_per_unit)
     counts = np.rint(motion.position_rad / 1e-7).astype(int)
     raw = np.rint(current / run.current_per_unit).astype(int)
     start = bus.clock.now_ns
@@ -587,7 +626,8 @@ def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
         bus.coming.append((at_ns, _frame(0x80)))
         for node in range(1, 7):
             data = struct.pack("<ihH", counts[cycle, node - 1], raw[cycle, node - 1], 0x1237)
-            bus.coming.append((at_ns + 1000 * node, _frame(0x180 + node, data)))
+            identifier = 0x180 + node
+            bus.coming.append((at_ns + 1000 * node, _frame(identifier, data)))
     return run
 
 
@@ -599,11 +639,13 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     run = _moving(bus, 6.0, factor)
     monkeypatch.setattr("daq.workflow.monitor.bus_taken", lambda _cell: True)
     monkeypatch.setattr("daq.workflow.monitor.facts_of_recorder", lambda *_: run)
-    watch = _watch(bus, tmp_path / "cell.yaml", calibration)
+    cell_file = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_file, calibration)
     watch.listen(2.0)
     report = [monitor_report(CELL, watch.read(0.5)) for _ in range(7)][-1]
     assert report.recorder
-    assert report.prediction == PredictionState(payload=None, remark="")
+    expected = PredictionState(payload=None, remark="")
+    assert report.prediction == expected
     predictions = [axis.prediction for axis in report.axes if axis.prediction is not None]
     assert [found.conspicuous for found in predictions] == [
         False,
@@ -622,17 +664,21 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
                 found.predicted * (factor if wrong else 1.0), abs=0.01
             )
     out = io.StringIO()
-    Console(file=out, width=80, force_terminal=True, color_system="standard").print(
-        monitor_view(report)
-    )
-    coloured = [line for line in out.getvalue().splitlines() if "33m" in line]
+    console = Console(file=out, width=80, force_terminal=True, color_system="standard")
+    console.print(monitor_view(report))
+    lines = out.getvalue().splitlines()
+    coloured = [line for line in lines if "33m" in line]
     assert [line.split("J")[1][0] for line in coloured] == (["4"] if factor > 1.0 else [])
     off = report.axes[0].model_copy(update={"enabled": False})
-    _, without = prediction_view(report.model_copy(update={"axes": [off, *report.axes[1:]]}))
+    update = {"axes": [off, *report.axes[1:]]}
+    _, without = prediction_view(report.model_copy(update=update))
     assert isinstance(without, Table)
-    assert next(str(cell) for cell in without.columns[1].cells) == "no power"
+    cells = without.columns[1].cells
+    shown_cell = next(str(cell) for cell in cells)
+    assert shown_cell == "no power"
     bus.coming.clear()
-    report = monitor_report(CELL, watch.read(0.5))
+    watched = watch.read(0.5)
+    report = monitor_report(CELL, watched)
     assert report.prediction is not None
     assert report.prediction.remark == "no prediction: there is no SYNC"
     assert not any(axis.silent for axis in report.axes)  # they were not asked
@@ -648,14 +694,17 @@ def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(
     _moving(bus, 4.0, 1.0)
     bus.clock.now_ns -= 300_000_000  # it begins within the first reading
     assert CELL.sync is not None
-    timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
-    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), cell=timed)
+    sync = replace(CELL.sync, pacing=PacingMode.TIMED)
+    timed = replace(CELL, sync=sync)
+    cell_file = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_file, predicting_calibration(), cell=timed)
     watch.listen(0.5)
     assert watch._facts is None
     reports = [monitor_report(CELL, watch.read(0.5)) for _ in range(6)]
     assert watch._facts is not None
     assert watch._facts.rate_hz == pytest.approx(PREDICTED_HZ, rel=0.01)
-    predictions = [axis.prediction for axis in reports[-1].axes if axis.prediction is not None]
+    axes = reports[-1].axes
+    predictions = [axis.prediction for axis in axes if axis.prediction is not None]
     assert len(predictions) == 6
     assert all(found.measured is None and found.residual_rms is None for found in predictions)
 
@@ -672,38 +721,41 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         else:
             value = 0
         reply = bytes((0x43, *msg.data[1:4])) + value.to_bytes(4, "little")
-        bus.coming.append((bus.clock.now_ns, _frame(msg.arbitration_id - 0x80, reply)))
+        identifier = msg.arbitration_id - 0x80
+        bus.coming.append((bus.clock.now_ns, _frame(identifier, reply)))
 
     monkeypatch.setattr(bus, "send", answer)
-    feed = Feed(tmp_path / "cell.yaml", stop=None)
-    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
+    cell_file = tmp_path / "cell.yaml"
+    feed = Feed(cell_file, stop=None)
+    cell_path = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_path, predicting_calibration(), feed)
     watch.listen(QUIET_S)
-    report = monitor_report(CELL, watch.read(0.5))
+    watched = watch.read(0.5)
+    report = monitor_report(CELL, watched)
     assert report.source == "asked"
     assert report.prediction is not None
     assert "10 positions a second are too few" in report.prediction.remark
-    assert [axis.prediction for axis in report.axes] == [None] * 6
-    assert [axis.fault is not None for axis in report.axes] == [
-        False,
-        False,
-        True,
-        False,
-        False,
-        False,
-    ]
+    predictions = [axis.prediction for axis in report.axes]
+    assert predictions == [None] * 6
+    expected = [False, False, True, False, False, False]
+    assert [axis.fault is not None for axis in report.axes] == expected
     fault = report.axes[2].fault
     assert fault is not None and fault.model_dump() == asdict(explain_error_code(0x7305))
     out = io.StringIO()
-    Console(file=out, width=200).print(monitor_view(report))
+    console = Console(file=out, width=200)
+    console.print(monitor_view(report))
     assert (
         "J3 is in fault: 7305h incremental sensor 1 fault; check the plugs and cables of encoder"
     ) in out.getvalue()
     # A console gets it too, however late it comes.
     assert [(event["axis"], event["code"]) for event in feed._events] == [(2, 0x7305)]
-    bus.coming.append((bus.clock.now_ns, _frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
+    packed = struct.pack("<HB5x", 0x3210, 1)
+    bus.coming.append((bus.clock.now_ns, _frame(0x82, packed)))
     for node in range(1, 7):  # other events do not displace it
-        bus.coming.append((bus.clock.now_ns, _frame(0x700 + node, b"\x05")))
-    (notice,) = (one for one in monitor_report(CELL, watch.read(0.5)).notices if one.alarm)
+        node_identifier = 0x700 + node
+        bus.coming.append((bus.clock.now_ns, _frame(node_identifier, b"\x05")))
+    notices = monitor_report(CELL, watch.read(0.5)).notices
+    (notice,) = (one for one in notices if one.alarm)
     assert notice.model_dump() == asdict(notice_of(EventKind.EMCY, 0x3210, "J2", notice.text))
     assert notice.text.startswith("EMCY 3210h") and notice.remedy == for_command_line(
         remedy_of(0x3210)
@@ -713,12 +765,17 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
 def test_each_reading_publishes_the_load_of_the_buses(
     bus: QuietBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    feed = Feed(tmp_path / "cell.yaml", stop=None)
+    cell_file = tmp_path / "cell.yaml"
+    feed = Feed(cell_file, stop=None)
     loads = list[dict[str, float]]()
     monkeypatch.setattr(feed, "measured", loads.append)
-    watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), feed)
+    cell_path = tmp_path / "cell.yaml"
+    watch = _watch(bus, cell_path, predicting_calibration(), feed)
     watch.listen(QUIET_S)
     for _ in range(2):
         watch.read(1.1)
-    assert [list(load) for load in loads] == [[one.name for one in CELL.buses]] * 2
-    assert all(0.0 < load < 0.06 for one in loads for load in one.values())
+    expected = [[one.name for one in CELL.buses]] * 2
+    assert [list(load) for load in loads] == expected
+    for one in loads:
+        for load in one.values():
+            assert 0.0 < load < 0.06

@@ -108,16 +108,17 @@ def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, 
     mapped = {profile.position, profile.current, STATUSWORD, *COMMAND, *MOTION_PROFILE} - {
         PROFILE_DECELERATION
     }
-    lacks_deceleration = sheet.get_variable(PROFILE_DECELERATION.index, 0) is None
+    variable = sheet.get_variable(PROFILE_DECELERATION.index, 0)
+    lacks_deceleration = variable is None
     if not lacks_deceleration:
         mapped.add(PROFILE_DECELERATION)
         read.append(PROFILE_DECELERATION)
-    faults = [
-        fault
-        for entry in dict.fromkeys(read)
-        for fault in _faults(entry, sheet, mapped=entry in mapped)
-    ]
-    numbers = {way: [n for n in range(4) if way.value[0] + n in sheet] for way in Direction}
+    faults = []
+    for entry in dict.fromkeys(read):
+        faults.extend(_faults(entry, sheet, mapped=entry in mapped))
+    numbers = {}
+    for way in Direction:
+        numbers[way] = [n for n in range(4) if way.value[0] + n in sheet]
     try:
         wanted_pdos(
             Axis("any", 1, profile), numbers, MOTION_PROFILE[2:] if lacks_deceleration else ()

@@ -52,16 +52,17 @@ def variables(draw: st.DrawFn, name: str) -> Variable:
     default: int | None = draw(st.integers(least, most - 127))
     if not of_node:
         default = draw(st.one_of(st.none(), st.just(default)))
-    return Variable(
-        name, data_type, draw(st.sampled_from(ACCESS)), draw(st.booleans()), default, of_node
-    )
+    access = draw(st.sampled_from(ACCESS))
+    mappable = draw(st.booleans())
+    return Variable(name, data_type, access, mappable, default, of_node)
 
 
 @st.composite
 def entries(draw: st.DrawFn, index: int) -> Entry:
     """One object of any type."""
     name = f"Object {index:X}"
-    object_type = draw(st.sampled_from((7, 8, 9)))
+    sampled = st.sampled_from((7, 8, 9))
+    object_type = draw(sampled)
     if object_type == 7:
         return Entry(name, 7, {0: draw(variables(name))})
     count = Variable("Number of entries", 0x05, "ro", mappable=False, default=9)
@@ -108,9 +109,8 @@ def sheets(draw: st.DrawFn, dictionary: dict[int, Entry]) -> str:
     lines = ["[FileInfo]", "EDSVersion=4.0", "[DeviceInfo]", "VendorName=; none"]
     for sections in draw(st.permutations(objects)):
         for section in sections:
-            lines += draw(
-                st.sampled_from(([], [""], ["; a comment with [brackets] = and $NODEID"]))
-            )
+            sampled = st.sampled_from(([], [""], ["; a comment with [brackets] = and $NODEID"]))
+            lines += draw(sampled)
             lines += section
     return draw(st.sampled_from(LINE_ENDS)).join([*lines, ""])
 
@@ -119,14 +119,17 @@ def number(draw: st.DrawFn, value: int) -> str:
     """One spelling of a number: decimal, hexadecimal or, with a leading 0, octal."""
     if value < 0:
         return str(value)
-    return draw(st.sampled_from((str(value), f"0x{value:x}", f"0X{value:04X}", f"0{value:o}")))
+    sampled = st.sampled_from((str(value), f"0x{value:x}", f"0X{value:04X}", f"0{value:o}"))
+    return draw(sampled)
 
 
 def _sections(draw: st.DrawFn, index: int, entry: Entry) -> list[list[str]]:
-    head = draw(st.sampled_from((f"[{index:04X}]", f"[{index:04x}]")))
+    sampled = st.sampled_from((f"[{index:04X}]", f"[{index:04x}]"))
+    head = draw(sampled)
     if entry.object_type == 7:
         type_lines = draw(st.sampled_from(([], [f"ObjectType={number(draw, 7)}"])))
-        return [[head, *_fields(draw, entry.variables[0]), *type_lines]]
+        first_variable = entry.variables[0]
+        return [[head, *_fields(draw, first_variable), *type_lines]]
     lines = [head, f"ParameterName={entry.name}", f"ObjectType={number(draw, entry.object_type)}"]
     if entry.compact:
         element = next(iter(entry.variables.values()))
@@ -157,7 +160,6 @@ def _fields(draw: st.DrawFn, variable: Variable) -> list[str]:
         return lines
     value = number(draw, variable.default)
     if variable.of_node:
-        value = draw(
-            st.sampled_from((f"$NODEID+{value}", f"{value}+$NODEID", f"$NodeID + {value}"))
-        )
+        sampled = st.sampled_from((f"$NODEID+{value}", f"{value}+$NODEID", f"$NodeID + {value}"))
+        value = draw(sampled)
     return [*lines, f"DefaultValue={value}"]

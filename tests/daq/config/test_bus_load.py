@@ -86,8 +86,10 @@ def _answers_of_a_moving_arm(cycles: int, size: int) -> Iterator[int]:
             phase = 2 * pi * cycle / 1000.0 / (1.3 + 0.4 * axis) + axis
             position = round(65536 * (10 + 5 * axis) * sin(phase)) * (-1) ** axis
             current = round(600 * cos(phase) + 37 * sin(0.9 * cycle + axis))
-            data = struct.pack("<ihH", position, current, 0x1237)[:size]
-            bits += _bits_on_the_wire(0x181 + axis, data)
+            packed = struct.pack("<ihH", position, current, 0x1237)
+            data = packed[:size]
+            identifier = 0x181 + axis
+            bits += _bits_on_the_wire(identifier, data)
         yield bits
 
 
@@ -130,13 +132,16 @@ def test_the_shortest_period_is_just_allowed(axes: int, bitrate: int, longer_us:
     used = [PROFILE] * axes
     shortest = shortest_period_us(used, bitrate)
     assert shortest is not None
-    assert bus_load(used, bitrate, shortest + longer_us).allowed
-    assert not bus_load(used, bitrate, shortest - 1).allowed
+    period_us = shortest + longer_us
+    assert bus_load(used, bitrate, period_us).allowed
+    allowed = bus_load(used, bitrate, shortest - 1).allowed
+    assert not allowed
 
 
 @given(st.integers(1, 11), st.integers(500, 20_000))
 def test_more_axes_and_shorter_periods_load_a_bus_more(axes: int, period_us: int) -> None:
-    load = bus_load([PROFILE] * axes, BITRATE, period_us)
+    profiles = [PROFILE] * axes
+    load = bus_load(profiles, BITRATE, period_us)
     more = bus_load([PROFILE] * (axes + 1), BITRATE, period_us)
     faster = bus_load([PROFILE] * axes, BITRATE, 400)
     for other in (more, faster):
@@ -147,7 +152,8 @@ def test_more_axes_and_shorter_periods_load_a_bus_more(axes: int, period_us: int
 
 @given(st.integers(1, 10), st.integers(1, 10), st.integers(500, 5000))
 def test_two_buses_share_what_one_would_carry(left: int, right: int, period_us: int) -> None:
-    one = bus_load([PROFILE] * (left + right), BITRATE, period_us)
+    profiles = [PROFILE] * (left + right)
+    one = bus_load(profiles, BITRATE, period_us)
     two = [bus_load([PROFILE] * axes, BITRATE, period_us) for axes in (left, right)]
     # Only SYNC and the recorder's heartbeat are there twice.
     twice = usual_bits(0) / period_us + usual_bits(1) * 10 / BITRATE
@@ -156,16 +162,19 @@ def test_two_buses_share_what_one_would_carry(left: int, right: int, period_us: 
 
 @given(st.integers(10_000, 30_000), st.integers(1, 32))
 def test_a_bus_that_heartbeats_fill_has_no_period(bitrate: int, axes: int) -> None:
-    shortest = shortest_period_us([PROFILE] * axes, bitrate)
+    profiles = [PROFILE] * axes
+    shortest = shortest_period_us(profiles, bitrate)
     assume(shortest is None)
-    assert not bus_load([PROFILE] * axes, bitrate, 1_000_000).allowed
+    allowed = bus_load([PROFILE] * axes, bitrate, 1_000_000).allowed
+    assert not allowed
 
 
 def test_a_current_of_32_bits_takes_a_second_frame() -> None:
+    object_entry = ObjectEntry(0x30D0, 0, 32, signed=True)
     wide = DriveProfile(
         **{
             **{name: getattr(PROFILE, name) for name in PROFILE.__dataclass_fields__},
-            "current": ObjectEntry(0x30D0, 0, 32, signed=True),
+            "current": object_entry,
         }
     )
     assert split_answers(wide)
@@ -178,13 +187,18 @@ def test_a_current_of_32_bits_takes_a_second_frame() -> None:
 
 def test_a_move_sends_no_more_than_is_counted() -> None:
     network, bus = cell(2)
+    velocity_counts_s = (20_000,) * 2
+    acceleration_counts_s2 = (100_000,) * 2
+    move = Move((0, 0), velocity_counts_s, acceleration_counts_s2)
+    target_counts = (1000, -1000)
     moves = (
-        Move((1000, -1000), (20_000, 20_000), (100_000, 100_000)),
-        Move((0, 0), (20_000,) * 2, (100_000,) * 2),
+        Move(target_counts, (20_000, 20_000), (100_000, 100_000)),
+        move,
     )
     with network:
         network.prepare()
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, clock=bus.clock))
+        pacing = LockstepSync(PERIOD_NS, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         for _ in execute(network, stream, (), permission()):
             pass
         bus.sent.clear()
@@ -211,7 +225,8 @@ def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of(
         "% at worst",
     )
     assert load_warnings(CELL) == ()
-    files = bundle(shipped_configurations() / "cells/demo.yaml")
+    path = shipped_configurations() / "cells/demo.yaml"
+    files = bundle(path)
     text = files["cell.yaml"].decode()
     timed = text.replace("pacing: lockstep", "pacing: timed")
     (warning,) = load_warnings(cell_from_bundle({**files, "cell.yaml": timed.encode()}))
@@ -230,14 +245,16 @@ def test_torque_and_temperature_are_read_only_where_a_period_has_room_for_an_sdo
     a request and its answer take up to 27 % of such a period.
     """
     assert CELL.sync is not None
-    timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
+    sync = replace(CELL.sync, pacing=PacingMode.TIMED)
+    timed = replace(CELL, sync=sync)
     assert not polling_fits(timed)
     (warning,) = polling_warnings(timed)
     assert "sync.period_us of 1200 has room" in warning
     slower = replace(timed, sync=Sync(1200))
     assert polling_fits(slower)
     assert polling_warnings(slower) == ()
-    assert not polling_fits(replace(slower, sync=Sync(1100)))
+    changed_slower = replace(slower, sync=Sync(1100))
+    assert not polling_fits(changed_slower)
     # A simulated cell waits for its frames.
     assert CELL.sync.pacing is PacingMode.LOCKSTEP
     assert polling_fits(CELL)

@@ -40,35 +40,44 @@ def configurations(tmp_path: Path) -> Path:
 def _spoil(path: Path, old: str, new: str) -> Path:
     text = path.read_text(encoding="utf-8")
     assert old in text
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    changed_text = text.replace(old, new, 1)
+    path.write_text(changed_text, encoding="utf-8")
     return path
 
 
 def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
-    assert load_cell(str(checkout / "configs/cells/demo.yaml")).digest == cell.digest
+    path = str(checkout / "configs/cells/demo.yaml")
+    assert load_cell(path).digest == cell.digest
     assert cell.name == "demo"
-    assert cell.axis_names == ("J1", "J2", "J3", "J4", "J5", "J6")
+    expected = ("J1", "J2", "J3", "J4", "J5", "J6")
+    assert cell.axis_names == expected
     np.testing.assert_array_equal(cell.ratio[5], [0, 0, 0, 0, 32, 32])
-    assert cell.axes[4].limits.position == (radians(-115), radians(128))
-    assert cell.axes[3].nameplate_gain == -11.52
+    position = cell.axes[4].limits.position
+    assert position == (radians(-115), radians(128))
+    nameplate_gain = cell.axes[3].nameplate_gain
+    assert nameplate_gain == -11.52
     assert cell.axes[0].gain_unit == "Nm/A"
-    assert cell.payloads[0].payload.known == {"m": 4.59}
+    known = cell.payloads[0].payload.known
+    assert known == {"m": 4.59}
     assert cell.sync is not None
     assert cell.sync.pacing is PacingMode.LOCKSTEP
     assert cell.controller_path == checkout / "configs/controllers/demo.yaml"
     profile = cell.axes[0].profile
     assert profile is not None
-    assert profile.current == ObjectEntry(0x6074, 0, 16, signed=True)
+    object_entry = ObjectEntry(0x6074, 0, 16, signed=True)
+    assert profile.current == object_entry
     assert (profile.amplitude, profile.tap) == (Amplitude.RMS, TapPoint.REFERENCE)
-    assert [axis.node_id for axis in drive_axes(cell)] == [1, 2, 3, 4, 5, 6]
+    node_ids = [axis.node_id for axis in drive_axes(cell)]
+    assert node_ids == [1, 2, 3, 4, 5, 6]
     assert bus_address(cell).interface == "virtual"
 
 
 def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/tx40.yaml")
     assert cell.buses == ()
-    assert cell.axes[1].zero_offset_rad == radians(-90)
+    expected = radians(-90)
+    assert cell.axes[1].zero_offset_rad == expected
     assert cell.axes[0].gain_unit == "Nm/Nm(motor, a priori)"
     with pytest.raises(ConfigurationInconsistent, match="no bus"):
         bus_address(cell)
@@ -97,9 +106,10 @@ def test_limits_in_rad_are_recognised_without_limits_in_the_urdf(configurations:
     """
     urdf = configurations / "robots/tx40.urdf"
     path = configurations / "cells/demo.yaml"
-    urdf.write_text(
-        re.sub(r"<limit [^>]*>", "", urdf.read_text()).replace('"revolute"', '"continuous"')
+    changed_text = re.sub(r"<limit [^>]*>", "", urdf.read_text()).replace(
+        '"revolute"', '"continuous"'
     )
+    urdf.write_text(changed_text)
     load_cell(path)
     text = path.read_text()
     in_rad = re.sub(r"position_deg: \[[^]]*\]", "position_deg: [-3.1, 3.1]", text)
@@ -114,18 +124,18 @@ def test_a_log_with_an_implausible_cell_can_be_read(configurations: Path) -> Non
     """Earlier versions recorded with it, and the copy in a log cannot be corrected."""
     path = configurations / "cells/demo.yaml"
     files = bundle(path)
-    heavy = {**files, "cell.yaml": files["cell.yaml"].replace(b"mass_kg: 4.59", b"mass_kg: 4590")}
-    assert cell_from_bundle(heavy).payloads[0].mass_kg == 4590.0
+    changed_cell_yaml = files["cell.yaml"].replace(b"mass_kg: 4.59", b"mass_kg: 4590")
+    heavy = {**files, "cell.yaml": changed_cell_yaml}
+    first_payload = cell_from_bundle(heavy).payloads[0]
+    assert first_payload.mass_kg == 4590.0
     for old, new in (
         (b"mass_kg: 4.59", b"mass_kg: 4.59\n    centre_m: [-20, 30, 50]"),
         (b"velocity_deg_s: 200", b"velocity_deg_s: 1.0e15"),
         (b"payloads:", b"effects: [{name: sprung, axis: J1}]\npayloads:"),
     ):
         assert old in files["cell.yaml"]
-        assert (
-            cell_from_bundle({**files, "cell.yaml": files["cell.yaml"].replace(old, new, 1)}).name
-            == "demo"
-        )
+        cell = cell_from_bundle({**files, "cell.yaml": files["cell.yaml"].replace(old, new, 1)})
+        assert cell.name == "demo"
 
 
 def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(
@@ -140,10 +150,12 @@ def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(
     (cells / "cell.yaml").write_text(text)
     profile = (configs / "drives/generic-cia402.yaml").read_text()
     (drives / "generic-cia402.yaml").write_text(profile)
-    assert not [name for name in bundle(cells / "cell.yaml") if name.endswith(".eds")]
+    path = cells / "cell.yaml"
+    assert not [name for name in bundle(path) if name.endswith(".eds")]
     (drives / "generic-cia402.yaml").write_text(profile + "eds: maker.eds\n")
     (drives / "maker.eds").write_bytes(b"[FileInfo]\n")
-    assert bundle(cells / "cell.yaml")["drives/generic-cia402.eds"] == b"[FileInfo]\n"
+    cell_path = cells / "cell.yaml"
+    assert bundle(cell_path)["drives/generic-cia402.eds"] == b"[FileInfo]\n"
     (drives / "maker.eds").unlink()
     with pytest.raises(ConfigurationMissing, match=r"maker\.eds"):
         bundle(cells / "cell.yaml")
@@ -166,7 +178,8 @@ def test_a_bundle_is_the_same_cell_without_its_files(checkout: Path) -> None:
 def test_the_digest_follows_every_file(configurations: Path) -> None:
     path = configurations / "cells/demo.yaml"
     before = load_cell(path).digest
-    _spoil(configurations / "drives/generic-cia402.yaml", "amplitude: rms", "amplitude: peak")
+    generic_cia402_path = configurations / "drives/generic-cia402.yaml"
+    _spoil(generic_cia402_path, "amplitude: rms", "amplitude: peak")
     assert load_cell(path).digest != before
 
 
@@ -318,14 +331,16 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
 def test_a_cell_that_contradicts_itself_is_refused(
     configurations: Path, old: str, new: str, message: str
 ) -> None:
-    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    demo_path = configurations / "cells/demo.yaml"
+    path = _spoil(demo_path, old, new)
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(path)
 
 
 def test_axes_in_another_order_than_their_joints_are_refused(configurations: Path) -> None:
     urdf = configurations / "robots/tx40.urdf"
-    text = urdf.read_text().replace('"J1"', '"J0"').replace('"J2"', '"J1"').replace('"J0"', '"J2"')
+    changed_text = urdf.read_text().replace('"J1"', '"J0"')
+    text = changed_text.replace('"J2"', '"J1"').replace('"J0"', '"J2"')
     urdf.write_text(text)
     with pytest.raises(
         ConfigurationInconsistent,
@@ -347,7 +362,8 @@ def test_an_empty_urdf_is_no_robot(configurations: Path) -> None:
 
 @pytest.mark.parametrize("lead", ["5.0e-324", "1.0e300"])
 def test_a_lead_that_no_screw_has_is_refused(configurations: Path, lead: str) -> None:
-    path = _spoil(configurations / "cells/gantry.yaml", "lead_mm: 20.0", f"lead_mm: {lead}")
+    gantry_path = configurations / "cells/gantry.yaml"
+    path = _spoil(gantry_path, "lead_mm: 20.0", f"lead_mm: {lead}")
     with pytest.raises(SchemaMismatch, match=r"0\.01 to 10000 mm in size"):
         load_cell(path)
 
@@ -359,9 +375,8 @@ def test_a_lead_that_no_screw_has_is_refused(configurations: Path, lead: str) ->
 def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
     configurations: Path, interface: str, pacing: str
 ) -> None:
-    path = _spoil(
-        configurations / "cells/demo.yaml", "interface: virtual", f"interface: {interface}"
-    )
+    demo_path = configurations / "cells/demo.yaml"
+    path = _spoil(demo_path, "interface: virtual", f"interface: {interface}")
     cell = load_cell(_spoil(path, "pacing: lockstep", f"pacing: {pacing}"))
     assert cell.sync is not None
     assert cell.sync.pacing is PacingMode(pacing)
@@ -387,7 +402,8 @@ def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
     ],
 )
 def test_a_misspelt_cell_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
-    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    demo_path = configurations / "cells/demo.yaml"
+    path = _spoil(demo_path, old, new)
     with pytest.raises(SchemaMismatch, match=message):
         load_cell(path)
 
@@ -400,7 +416,8 @@ def test_a_misspelt_cell_is_refused(configurations: Path, old: str, new: str, me
     ],
 )
 def test_a_missing_file_is_named(configurations: Path, old: str, new: str, message: str) -> None:
-    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    demo_path = configurations / "cells/demo.yaml"
+    path = _spoil(demo_path, old, new)
     with pytest.raises(ConfigurationMissing, match=message):
         load_cell(path)
     with pytest.raises(ConfigurationMissing, match="nowhere"):
@@ -431,18 +448,22 @@ def test_a_cell_file_copied_without_its_robot_says_which_file_to_copy(
     ],
 )
 def test_a_wrong_drive_profile_is_refused(old: str, new: str) -> None:
-    text = (shipped_configurations() / "drives/generic-cia402.yaml").read_text(encoding="utf-8")
-    assert drive_from_text(text.encode(), "x").saturation_bit == 11
+    generic_cia402_path = shipped_configurations() / "drives/generic-cia402.yaml"
+    text = generic_cia402_path.read_text(encoding="utf-8")
+    drive = drive_from_text(text.encode(), "x")
+    assert drive.saturation_bit == 11
+    changed_content = text.replace(old, new, 1).encode()
     with pytest.raises(ConfigurationError):
-        drive_from_text(text.replace(old, new, 1).encode(), "x")
+        drive_from_text(changed_content, "x")
 
 
 @pytest.fixture
 def two_buses(configurations: Path) -> Path:
     """The demo cell on two."""
     path = configurations / "cells/demo.yaml"
+    text = path.read_text(encoding="utf-8")
     path.write_text(
-        on_two_buses(path.read_text(encoding="utf-8"), "socketcan", "can0", "can1"),
+        on_two_buses(text, "socketcan", "can0", "can1"),
         encoding="utf-8",
     )
     return _spoil(path, "pacing: lockstep", "pacing: timed")
@@ -450,11 +471,13 @@ def two_buses(configurations: Path) -> Path:
 
 def test_a_cell_may_have_several_buses(two_buses: Path) -> None:
     cell = load_cell(two_buses)
-    assert [axis.bus for axis in cell.axes] == ["left"] * 3 + ["right"] * 3
+    expected = ["left"] * 3 + ["right"] * 3
+    assert [axis.bus for axis in cell.axes] == expected
     address = cell_address(cell)
     assert isinstance(address, SplitAddress)
     assert str(address) == "left (socketcan:can0) + right (socketcan:can1)"
-    assert [sorted(part.node_ids) for part in bus_parts(cell)] == [list(LEFT), list(RIGHT)]
+    sorted_node_ids = [sorted(part.node_ids) for part in bus_parts(cell)]
+    assert sorted_node_ids == [list(LEFT), list(RIGHT)]
     with pytest.raises(ConfigurationInconsistent, match="2 buses; expected one"):
         bus_address(cell)
 
@@ -554,8 +577,9 @@ def test_a_misspelt_bus_of_several_is_refused_with_its_place(
 def test_a_misspelt_single_bus_is_refused_with_its_place(
     configurations: Path, old: str, new: str, message: str
 ) -> None:
+    path = configurations / "cells/demo.yaml"
     with pytest.raises(SchemaMismatch, match=message):
-        load_cell(_spoil(configurations / "cells/demo.yaml", old, new))
+        load_cell(_spoil(path, old, new))
 
 
 @pytest.mark.parametrize("store", ["demo.yaml", "../controllers/demo.yaml", "../cells/other.yaml"])
@@ -563,7 +587,8 @@ def test_a_history_that_would_replace_another_file_is_refused(
     configurations: Path, store: str
 ) -> None:
     cell = configurations / "cells" / "demo.yaml"
-    (configurations / "cells" / "other.yaml").hardlink_to(cell)
+    other_path = configurations / "cells" / "other.yaml"
+    other_path.hardlink_to(cell)
     with cell.open("a", encoding="utf-8") as stream:
         stream.write(f"\nhistory: {{store: {store}}}\n")
     with pytest.raises(ConfigurationInconsistent, match="a file of the history's own"):
@@ -583,18 +608,23 @@ GRIPPER = """
 @pytest.fixture
 def with_gripper(configurations: Path) -> Path:
     """The cell of the TX-40 with a gripper of two joints in its URDF, not yet held."""
-    _spoil(configurations / "robots/tx40.urdf", "</robot>", GRIPPER)
+    path = configurations / "robots/tx40.urdf"
+    _spoil(path, "</robot>", GRIPPER)
     return configurations / "cells/tx40.yaml"
 
 
 def test_joints_that_are_no_axes_are_held(with_gripper: Path) -> None:
-    bare = model_of(load_cell(shipped_configurations() / "cells/tx40.yaml")).robot
+    path = shipped_configurations() / "cells/tx40.yaml"
+    bare = model_of(load_cell(path)).robot
     cell = load_cell(_spoil(with_gripper, "\naxes:", "\nhold: {swivel: 30, slide: 0.02}\naxes:"))
     robot = model_of(cell).robot
-    assert [joint.name for joint in robot.joints] == [joint.name for joint in bare.joints]
-    flange = read_urdf((shipped_configurations() / "robots/tx40.urdf").read_text())
+    expected = [joint.name for joint in bare.joints]
+    assert [joint.name for joint in robot.joints] == expected
+    urdf = (shipped_configurations() / "robots/tx40.urdf").read_text()
+    flange = read_urdf(urdf)
     carrying = read_urdf(cell.urdf)
-    assert carrying.bodies[-1].mass_kg == pytest.approx(flange.bodies[-1].mass_kg + 0.3)
+    last_body = carrying.bodies[-1]
+    assert last_body.mass_kg == pytest.approx(flange.bodies[-1].mass_kg + 0.3)
     assert '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.5235987755982988 0.0" />' in cell.urdf
     assert '<origin xyz="0.0 0.02 0.0"' in cell.urdf
     logged = cell_from_bundle(bundle(with_gripper))
@@ -621,8 +651,9 @@ def test_joints_that_are_no_axes_are_held(with_gripper: Path) -> None:
     ],
 )
 def test_a_joint_is_an_axis_or_held(with_gripper: Path, hold: str, message: str) -> None:
+    path = _spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:")
     with pytest.raises(ConfigurationInconsistent, match=message):
-        load_cell(_spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:"))
+        load_cell(path)
 
 
 FOLLOWER = """
@@ -634,13 +665,13 @@ FOLLOWER = """
 
 
 def test_a_joint_that_mimics_an_axis_follows_it(configurations: Path) -> None:
-    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    path = configurations / "robots/tx40.urdf"
+    _spoil(path, "</robot>", FOLLOWER)
     cell = load_cell(configurations / "cells/tx40.yaml")
     model = model_of(cell)
     assert cell.place_names == cell.axis_names
-    assert [joint.name for joint in model.robot.places] == [
-        joint.name for joint in model.robot.axes
-    ]
+    expected = [joint.name for joint in model.robot.axes]
+    assert [joint.name for joint in model.robot.places] == expected
     assert joint_names(cell) == ("J1", "J2", "J3", "J4", "J5", "J6")
     (coupling,) = model.robot.couplings
     assert model.robot.joints[coupling.follower].name == "rod"
@@ -649,10 +680,12 @@ def test_a_joint_that_mimics_an_axis_follows_it(configurations: Path) -> None:
 
 
 def test_a_body_on_a_joint_that_follows_may_be_named(configurations: Path) -> None:
-    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
+    path = configurations / "robots/tx40.urdf"
+    _spoil(path, "</robot>", FOLLOWER)
     capsule = "{name: rod, link: rod, from_m: [0, 0, 0], to_m: [0, 0, 0.1], radius_m: 0.02}"
     declared = f"\nclearance: {{capsules: [{capsule}]}}\naxes:"
-    cell = load_cell(_spoil(configurations / "cells/tx40.yaml", "\naxes:", declared))
+    tx40_path = configurations / "cells/tx40.yaml"
+    cell = load_cell(_spoil(tx40_path, "\naxes:", declared))
     assert cell.clearance is not None
     (body,) = cell.clearance.capsules
     assert body.name == "rod"
@@ -661,8 +694,10 @@ def test_a_body_on_a_joint_that_follows_may_be_named(configurations: Path) -> No
 
 @pytest.mark.parametrize("logged", [False, True], ids=["a file", "a log"])
 def test_a_joint_that_follows_an_axis_cannot_be_held(configurations: Path, logged: bool) -> None:
-    _spoil(configurations / "robots/tx40.urdf", "</robot>", FOLLOWER)
-    cell = _spoil(configurations / "cells/tx40.yaml", "\naxes:", "\nhold: {rod: 0.0}\naxes:")
+    path = configurations / "robots/tx40.urdf"
+    _spoil(path, "</robot>", FOLLOWER)
+    tx40_path = configurations / "cells/tx40.yaml"
+    cell = _spoil(tx40_path, "\naxes:", "\nhold: {rod: 0.0}\naxes:")
     with pytest.raises(
         ConfigurationInconsistent,
         match=r"joint '?rod'? mimics .*J5.* "
@@ -696,7 +731,8 @@ def test_a_joint_that_follows_no_axis_is_held_with_its_leader(
 ) -> None:
     slide = '<axis xyz="0 1 0"/><limit lower="0"'
     urdf = with_gripper.parent.parent / "robots/tx40.urdf"
-    urdf.write_text(urdf.read_text().replace(slide, mimic + slide))
+    changed_text = urdf.read_text().replace(slide, mimic + slide)
+    urdf.write_text(changed_text)
     with pytest.raises(ConfigurationInconsistent, match=advice):
         load_cell(with_gripper)
     follows = "swivel" in mimic
@@ -704,7 +740,8 @@ def test_a_joint_that_follows_no_axis_is_held_with_its_leader(
         hold = "hold: {swivel: 0.5}"
     else:
         hold = "hold: {swivel: 0.5, slide: 0.0}"
-    cell = load_cell(_spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:"))
+    path = _spoil(with_gripper, "\naxes:", f"\n{hold}\naxes:")
+    cell = load_cell(path)
     assert model_of(cell).robot.joint_count == 6
 
 
@@ -713,7 +750,8 @@ def test_a_base_that_floats_is_held_to_be_an_arm(configurations: Path) -> None:
         '<link name="w"/><joint name="f" type="floating"><parent link="w"/><child '
         'link="base"/></joint></robot>'
     )
-    _spoil(configurations / "robots/tx40.urdf", "</robot>", world)
+    path = configurations / "robots/tx40.urdf"
+    _spoil(path, "</robot>", world)
     cell = configurations / "cells/tx40.yaml"
     with pytest.raises(
         ConfigurationInconsistent,
@@ -721,10 +759,8 @@ def test_a_base_that_floats_is_held_to_be_an_arm(configurations: Path) -> None:
         r"\{JOINT: POSITION\}`",
     ):
         load_cell(cell)
-    assert (
-        model_of(load_cell(_spoil(cell, "\naxes:", "\nhold: {f: 0.0}\naxes:"))).robot.joint_count
-        == 6
-    )
+    model = model_of(load_cell(_spoil(cell, "\naxes:", "\nhold: {f: 0.0}\naxes:")))
+    assert model.robot.joint_count == 6
 
 
 @pytest.mark.parametrize("text", ["<robot name='arm'>\n<link name='a'>", "no XML " * 2000])
@@ -734,7 +770,8 @@ def test_a_urdf_that_cannot_be_read_is_named_with_its_line_and_not_repeated(
     folder = tmp_path / "configs"
     shutil.copytree(checkout / "configs", folder)
     cell = folder / "cells/demo.yaml"
-    name = parse_yaml(cell.read_bytes(), "cell").tree["robot"]["urdf"]
+    yaml = parse_yaml(cell.read_bytes(), "cell")
+    name = yaml.tree["robot"]["urdf"]
     (cell.parent / name).write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationInconsistent) as caught:
         load_cell(cell)

@@ -157,7 +157,8 @@ def test_a_bad_description_is_refused_by_name(
 ) -> None:
     with pytest.raises(ConfigurationInconsistent) as refusal:
         _cell(tmp_path, (old, new))
-    assert str(refusal.value) == f"{tmp_path}/cell.yaml:{message}; correct the cell file"
+    expected = f"{tmp_path}/cell.yaml:{message}; correct the cell file"
+    assert str(refusal.value) == expected
 
 
 def test_a_coupled_drive_train_of_a_redundant_robot_is_refused(tmp_path: Path) -> None:
@@ -170,7 +171,8 @@ def test_a_coupled_drive_train_of_a_redundant_robot_is_refused(tmp_path: Path) -
         "the cell file"
     )
     # Two motors, two degrees of freedom
-    assert _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio[1, 0] == 10.0
+    ratio = _cell(tmp_path, ("- [0, -50]", "- [10, -50]")).ratio
+    assert ratio[1, 0] == 10.0
 
 
 def test_motors_in_another_order_than_their_axes_are_refused(tmp_path: Path) -> None:
@@ -245,7 +247,8 @@ def test_the_payload_of_a_serial_robot_may_hang_on_any_link_that_moves(tmp_path:
     text = path.read_text(encoding="utf-8")
     last = load_cell(path)
     assert model_of(last).robot.carrier == 5
-    path.write_text(text.replace("robot:\n", "robot:\n  platform: link3\n", 1), encoding="utf-8")
+    changed_text = text.replace("robot:\n", "robot:\n  platform: link3\n", 1)
+    path.write_text(changed_text, encoding="utf-8")
     cell = load_cell(path)
     model = model_of(cell)
     assert model.robot.carrier == 2
@@ -266,17 +269,20 @@ def test_the_payload_of_a_serial_robot_may_hang_on_any_link_that_moves(tmp_path:
 
 def test_places_of_a_cell_are_those_of_its_robot() -> None:
     for name in ("five-bar", "dualv", "orthoglide", "demo"):
-        cell = load_cell(CHECKOUT / f"configs/cells/{name}.yaml")
+        path = CHECKOUT / f"configs/cells/{name}.yaml"
+        cell = load_cell(path)
         robot = robot_of(cell)
         assert cell.place_names[len(cell.axes) :] == robot.undriven_names
         assert len(cell.place_units) == len(robot.places)
-    assert load_cell(CHECKOUT / "configs/cells/five-bar.yaml").place_units[3] is DEGREE
+    five_bar_path = CHECKOUT / "configs/cells/five-bar.yaml"
+    assert load_cell(five_bar_path).place_units[3] is DEGREE
 
 
 def test_an_effect_is_declared_on_the_pivot_that_a_loop_is_cut_at(tmp_path: Path) -> None:
     declared = "effects:\n  - {name: passive-friction, axis: pivot tip}\nconditioning:"
     cell = _cell(tmp_path, ("conditioning:", declared))
-    assert cell.effects == (DeclaredEffect("passive-friction", 4, {}),)
+    expected = (DeclaredEffect("passive-friction", 4, {}),)
+    assert cell.effects == expected
     (placed,) = declared_effects(cell)
     assert placed.name_among(cell.place_names) == "passive-friction on pivot tip"
     assert cell.place_units[placed.axis] is DEGREE
@@ -285,7 +291,8 @@ def test_an_effect_is_declared_on_the_pivot_that_a_loop_is_cut_at(tmp_path: Path
 def test_an_effect_is_declared_on_a_joint_without_a_motor(tmp_path: Path) -> None:
     declared = "effects:\n  - {name: passive-friction, axis: elbow-2}\nconditioning:"
     cell = _cell(tmp_path, ("conditioning:", declared))
-    assert cell.effects == (DeclaredEffect("passive-friction", 3, {}),)
+    expected = (DeclaredEffect("passive-friction", 3, {}),)
+    assert cell.effects == expected
     (placed,) = declared_effects(cell)
     assert placed.name_among(cell.place_names) == "passive-friction on elbow-2"
     wrong = declared.replace("elbow-2", "elbow-3")
@@ -298,8 +305,9 @@ def test_an_effect_is_declared_on_a_joint_without_a_motor(tmp_path: Path) -> Non
         r"effects\[0\]\.axis: found a place that this effect cannot have; expected a joint "
         r".* without a motor"
     )
+    changed_declared = declared.replace("elbow-2", "crank-2")
     with pytest.raises(ConfigurationInconsistent, match=message):
-        _cell(tmp_path, ("conditioning:", declared.replace("elbow-2", "crank-2")))
+        _cell(tmp_path, ("conditioning:", changed_declared))
 
 
 def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None:
@@ -320,7 +328,8 @@ def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None
     )
     start = f'{head}<joint name="plate-mount" type="fixed">{head_of_link}<link name="plate">'
     rest = rest.partition("</link>")[2]
-    bare = read_urdf(f"{start}</link>{rest}").bodies[1]
+    bodies = read_urdf(f"{start}</link>{rest}").bodies
+    bare = bodies[1]
     loaded = read_urdf(f"{start}{body}{rest}").bodies[1]
     (tmp_path / "robot.urdf").write_text(f"{start}</link>{rest}", encoding="utf-8")
     listed = f"    centre_m: {list(centre)}\n    inertia_kg_m2: {list(inertia)}\n"

@@ -21,11 +21,8 @@ OBJECTS = "[" + ", ".join(["{index: 0x2003, subindex: 1, type: i32, factor: 1000
 
 
 def _cell(folder: Path, controller: str) -> Cell:
-    text = (
-        (CONFIGS / "cells" / "demo.yaml")
-        .read_text(encoding="utf-8")
-        .replace("../robots", str(CONFIGS / "robots"))
-    )
+    demo_path = CONFIGS / "cells" / "demo.yaml"
+    text = demo_path.read_text(encoding="utf-8").replace("../robots", str(CONFIGS / "robots"))
     (folder / "cell.yaml").write_text(
         text[: text.index("\ncontroller:")] + f"\ncontroller: {controller}\n"
     )
@@ -33,10 +30,12 @@ def _cell(folder: Path, controller: str) -> Cell:
 
 
 def test_keys_may_have_a_factor_and_the_file_a_format(tmp_path: Path) -> None:
-    cell = _cell(tmp_path, f"{{file: robot.cfg, format: xml, gains: {KEYS}}}")
+    controller = f"{{file: robot.cfg, format: xml, gains: {KEYS}}}"
+    cell = _cell(tmp_path, controller)
     assert cell.controller is not None
     assert (cell.controller.file, cell.controller.format) == ("robot.cfg", ControllerFormat.XML)
-    assert cell.controller.keys == ("a", "b", "c", "d", "e", "f")
+    expected = ("a", "b", "c", "d", "e", "f")
+    assert cell.controller.keys == expected
     assert (cell.controller.factors, cell.controller.objects) == (
         (1.0, 1000.0, -1.0, 1.0, 1.0, 1.0),
         (),
@@ -46,12 +45,15 @@ def test_keys_may_have_a_factor_and_the_file_a_format(tmp_path: Path) -> None:
 
 def test_objects_alone_and_beside_a_file(tmp_path: Path) -> None:
     reported = GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1000.0)
-    alone = _cell(tmp_path, f"{{objects: {OBJECTS}}}")
-    assert alone.controller == Controller(objects=(reported,) * 6)
+    controller = f"{{objects: {OBJECTS}}}"
+    alone = _cell(tmp_path, controller)
+    objects = (reported,) * 6
+    assert alone.controller == Controller(objects=objects)
     assert alone.controller_path is None
     beside = _cell(tmp_path, f"{{file: robot.json, gains: [a, b, c, d, e, f], objects: {OBJECTS}}}")
     assert beside.controller is not None
-    assert (beside.controller.objects, beside.controller.file) == ((reported,) * 6, "robot.json")
+    expected = ((reported,) * 6, "robot.json")
+    assert (beside.controller.objects, beside.controller.file) == expected
 
 
 @pytest.mark.parametrize(
@@ -84,11 +86,8 @@ def test_what_fits_no_cell_is_refused_with_its_place(
 
 
 def test_a_cell_without_a_bus_has_no_objects(tmp_path: Path) -> None:
-    text = (
-        (CONFIGS / "cells" / "tx40.yaml")
-        .read_text(encoding="utf-8")
-        .replace("../robots", str(CONFIGS / "robots"))
-    )
+    tx40_path = CONFIGS / "cells" / "tx40.yaml"
+    text = tx40_path.read_text(encoding="utf-8").replace("../robots", str(CONFIGS / "robots"))
     (tmp_path / "cell.yaml").write_text(text + f"\ncontroller: {{objects: {OBJECTS}}}\n")
     with pytest.raises(ConfigurationError, match="objects of drives that no bus leads to"):
         load_cell(tmp_path / "cell.yaml")
@@ -112,8 +111,10 @@ def test_a_parameter_holds_the_nearest_number_or_refuses(kind: ParameterKind, va
     assert 0 <= word < 1 << kind.bits
     held = parameter.value(word)
     if kind is ParameterKind.F32:
-        assert struct.pack("<f", value) == struct.pack("<I", word)
-        assert abs(held - value) <= 6e-8 * abs(value) + 1e-45
+        packed = struct.pack("<f", value)
+        assert packed == struct.pack("<I", word)
+        difference = abs(held - value)
+        assert difference <= 6e-8 * abs(value) + 1e-45
     else:
         assert held == round(value)
     assert parameter.word(held) == word

@@ -52,22 +52,22 @@ def files(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Files:
     (folder / "residual.json").write_text(residual)
     record = '{"format": "drivegain drive record 1", "cell": "demo", "drives": []}'
     (folder / "record.json").write_text(record)
-    write(folder / "run.mcap", demo_content(checkout), samples([[0] * 6] * 5))
-    return Files(
-        {
-            DocumentKind.CELL: CONFIGS / "cells/demo.yaml",
-            DocumentKind.PLAN: folder / "plan.yaml",
-            DocumentKind.CALIBRATION: folder / "calibration.yaml",
-            DocumentKind.RESIDUAL: folder / "residual.json",
-            DocumentKind.DRIVE_PROFILE: CONFIGS / "drives/generic-cia402.yaml",
-            DocumentKind.DRIVE_RECORD: folder / "record.json",
-            DocumentKind.IMPORT: CONFIGS / "imports/tx40.yaml",
-            DocumentKind.SIMULATION: CONFIGS / "simulation/clean.yaml",
-            DocumentKind.SCENARIO: CONFIGS / "simulation/faults-example.yaml",
-            DocumentKind.LOG: folder / "run.mcap",
-            DocumentKind.URDF: CONFIGS / "robots/tx40.urdf",
-        }
-    )
+    path = folder / "run.mcap"
+    write(path, demo_content(checkout), samples([[0] * 6] * 5))
+    by_kind = {
+        DocumentKind.CELL: CONFIGS / "cells/demo.yaml",
+        DocumentKind.PLAN: folder / "plan.yaml",
+        DocumentKind.CALIBRATION: folder / "calibration.yaml",
+        DocumentKind.RESIDUAL: folder / "residual.json",
+        DocumentKind.DRIVE_PROFILE: CONFIGS / "drives/generic-cia402.yaml",
+        DocumentKind.DRIVE_RECORD: folder / "record.json",
+        DocumentKind.IMPORT: CONFIGS / "imports/tx40.yaml",
+        DocumentKind.SIMULATION: CONFIGS / "simulation/clean.yaml",
+        DocumentKind.SCENARIO: CONFIGS / "simulation/faults-example.yaml",
+        DocumentKind.LOG: folder / "run.mcap",
+        DocumentKind.URDF: CONFIGS / "robots/tx40.urdf",
+    }
+    return Files(by_kind)
 
 
 READERS: dict[DocumentKind, Callable[[Path], Any]] = {
@@ -119,7 +119,8 @@ def test_what_is_no_document_of_ours_has_no_kind(tmp_path: Path) -> None:
         DocumentKind
     )
     assert kind_of_file(tmp_path) is None
-    assert kind_of_file(tmp_path / "missing.yaml") is None
+    path = tmp_path / "missing.yaml"
+    assert kind_of_file(path) is None
     for text in (
         b"drives: {J1: {gain: 1.0}}",
         b"- 1\n- 2",
@@ -129,8 +130,10 @@ def test_what_is_no_document_of_ours_has_no_kind(tmp_path: Path) -> None:
         b"format: [1]",
     ):
         (tmp_path / "file").write_bytes(text)
-        assert kind_of_file(tmp_path / "file") is None
+        file_folder = tmp_path / "file"
+        assert kind_of_file(file_folder) is None
     assert (
         kind_of_head(b'\xef\xbb\xbf<?xml version="1.0"?>\n<robot name="arm">') is DocumentKind.URDF
     )
-    assert kind_of_tree(parse_yaml(b"format: drivegain-plan", "plan").tree) is DocumentKind.PLAN
+    tree = parse_yaml(b"format: drivegain-plan", "plan").tree
+    assert kind_of_tree(tree) is DocumentKind.PLAN

@@ -57,7 +57,8 @@ def text_of(name: str, peak_a: float = PEAK_A) -> str:
 
 
 def profile_of(name: str) -> DriveProfile:
-    return drive_from_text(text_of(name).encode(), f"{name}.yaml")
+    text = text_of(name).encode()
+    return drive_from_text(text, f"{name}.yaml")
 
 
 def sheet(shared_data: Path, name: str) -> ObjectDictionary:
@@ -72,10 +73,18 @@ def sheet(shared_data: Path, name: str) -> ObjectDictionary:
 
 
 def test_every_make_of_the_issue_has_a_profile() -> None:
-    assert set(NAMES) == {
-        "generic-cia402", "maxon-epos4", "elmo-gold", "nanotec", "copley", "technosoft-ipos", "beckhoff-ax2000",  # noqa: E501
-        "beckhoff-el72x1", "schunk-pilz-prbt",
-    }  # fmt: skip
+    expected = {
+        "generic-cia402",
+        "maxon-epos4",
+        "elmo-gold",
+        "nanotec",
+        "copley",
+        "technosoft-ipos",
+        "beckhoff-ax2000",
+        "beckhoff-el72x1",
+        "schunk-pilz-prbt",
+    }
+    assert set(NAMES) == expected  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -83,10 +92,18 @@ def test_a_shipped_profile_is_whole_and_every_fact_has_a_source(name: str) -> No
     profile = profile_of(name)
     assert profile.name == name
     slow = {name for name in ("torque", "temperature") if getattr(profile, name) is not None}
-    assert {fact.about for fact in profile.facts} == slow | {
-        "position", "current", "current_scale", "amplitude", "tap", "saturation_bit", "update_period_us", "rated",  # noqa: E501
+    expected = slow | {
+        "position",
+        "current",
+        "current_scale",
+        "amplitude",
+        "tap",
+        "saturation_bit",
+        "update_period_us",
+        "rated",
         "save",
-    }  # fmt: skip
+    }
+    assert {fact.about for fact in profile.facts} == expected  # fmt: skip
     assert profile.save_semantics
     # A fact with a data sheet as its basis is one that the tests below look up.
     assert (name in SHEETS) is any(fact.basis is FactBasis.EDS for fact in profile.facts)
@@ -186,8 +203,9 @@ def test_a_peak_current_that_no_one_entered_is_named_with_its_line() -> None:
 def test_what_is_not_a_profile_is_refused_with_its_line(old: str, new: str, message: str) -> None:
     text = text_of("maxon-epos4")
     assert old in text
+    changed_content = text.replace(old, new, 1).encode()
     with pytest.raises(SchemaMismatch, match=message):
-        drive_from_text(text.replace(old, new, 1).encode(), "x")
+        drive_from_text(changed_content, "x")
 
 
 @given(
@@ -213,7 +231,8 @@ source: a test
 """
     wanted = SCALE_KEYS[form]
     if keys == wanted or (form is ScaleForm.PRODUCT and keys == {"factor"}):
-        assert drive_from_text(text.encode(), "x").current_scale.form is form
+        drive = drive_from_text(text.encode(), "x")
+        assert drive.current_scale.form is form
     else:
         with pytest.raises(SchemaMismatch, match="current_scale"):
             drive_from_text(text.encode(), "x")
@@ -237,12 +256,14 @@ source: any
 """
     scale = drive_from_text(old, "old").current_scale
     now = profile_of("generic-cia402").current_scale
-    assert (scale.factor, scale.objects) == (now.factor, now.objects)
+    expected = (now.factor, now.objects)
+    assert (scale.factor, scale.objects) == expected
 
 
 def test_a_profile_may_name_the_data_sheet_beside_it_and_no_other_place() -> None:
     text = text_of("maxon-epos4")
-    assert drive_from_text(f"{text}eds: epos4.eds\n".encode(), "x").name == "maxon-epos4"
+    drive = drive_from_text(f"{text}eds: epos4.eds\n".encode(), "x")
+    assert drive.name == "maxon-epos4"
     with pytest.raises(SchemaMismatch, match="eds"):
         drive_from_text(f"{text}eds: ../../secret\n".encode(), "x")
 
@@ -280,11 +301,13 @@ def test_a_wrong_width_or_an_object_that_cannot_be_mapped_is_reported(
 ) -> None:
     reported = sheet(shared_data, file)
     profile = profile_of(name)
-    wide = replace(profile, current=replace(profile.current, bits=32))
+    current = replace(profile.current, bits=32)
+    wide = replace(profile, current=current)
     assert disagreements(wide, reported) == (
         "6074h:00 (torque_demand): i16 in the data sheet, i32 in the profile",
     )
-    rated = replace(profile, current=profile.current_scale.objects[0])
+    first_object = profile.current_scale.objects[0]
+    rated = replace(profile, current=first_object)
     assert disagreements(rated, reported) == (
         "6075h:00 (motor_rated_current): not mappable according to the data sheet",
     )
@@ -322,9 +345,8 @@ def test_a_data_sheet_is_read_with_its_empty_fields() -> None:
     read = data_sheet(SHEET.encode(), "x")
     assert set(read) == {0x6064, 0x1008, 0x1018}
     agreed = profile_of("elmo-gold")
-    profile = replace(
-        agreed, current=agreed.position, current_scale=replace(agreed.current_scale, objects=())
-    )
+    current_scale = replace(agreed.current_scale, objects=())
+    profile = replace(agreed, current=agreed.position, current_scale=current_scale)
     profile = replace(profile, rated=None, torque=None, save=None)
     # All that the sheet lacks is what every recording needs.
     needed = (
@@ -344,7 +366,8 @@ def test_a_data_sheet_is_read_with_its_empty_fields() -> None:
     assert disagreements(profile, read) == absent
     name = ObjectEntry(0x1008, 0, 32, signed=False)
     vendor = ObjectEntry(0x1018, 1, 32, signed=False)
-    assert disagreements(replace(profile, position=name, current=vendor), read)[:4] == (
+    changed_profile = replace(profile, position=name, current=vendor)
+    assert disagreements(changed_profile, read)[:4] == (
         "1008h:00 (name): no integer in the data sheet, u32 in the profile",
         "1008h:00 (name): not mappable according to the data sheet",
         "1018h:01 (vendor): not readable according to the data sheet",
@@ -432,9 +455,8 @@ def recorded(
         .read_text()
         .replace("../robots", str(checkout / "configs/robots"))
     )
-    text = text.replace("period_us: 1000", "period_us: 2000").replace(
-        "channel: demo", f"channel: {folder.name}"
-    )
+    changed_text = text.replace("period_us: 1000", "period_us: 2000")
+    text = changed_text.replace("channel: demo", f"channel: {folder.name}")
     for peak_a in (8, 6):
         # The simulated amplifier reports the temperature of its motor.
         found = "{index: 0x22A3, subindex: 1, type: u16, kelvin_per_unit: 1.0}"
@@ -461,13 +483,15 @@ def recorded(
 
     def witnessed(self: AmplifierSet) -> None:
         report(self)
-        seen.append((self.reported_a.copy(), np.array(self.loops["current_a"])))
+        current_a = np.array(self.loops["current_a"])
+        seen.append((self.reported_a.copy(), current_a))
 
     patch.setattr(AmplifierSet, "report", witnessed)
     bus = open_bus(bus_address(cell))
     try:
         with SimulatedCell(spec, bus):
-            moves = load_plan(folder / "plan.yaml", cell)
+            plan_path = folder / "plan.yaml"
+            moves = load_plan(plan_path, cell)
             out = folder / "a.mcap"
             request = RecordingRequest(
                 cell_file,
@@ -520,9 +544,11 @@ def test_a_run_is_in_ampere_whatever_the_drive_counts_in(
     else:
         truth = reported.reference_a
     measured = reported.run.current_a
-    half_step = 0.5001 * np.array(STEP_A[dialect])
+    step_a = np.array(STEP_A[dialect])
+    half_step = 0.5001 * step_a
     # The arm moves: a dead channel would pass every bound
-    assert np.abs(measured).max(axis=0).min() > 0.2
+    largest_absolute_measured = np.abs(measured).max(axis=0)
+    assert largest_absolute_measured.min() > 0.2
     starts = range(len(truth) - len(measured) + 1)
     fits = [
         k for k in starts if (np.abs(truth[k : k + len(measured)] - measured) <= half_step).all()
@@ -539,25 +565,30 @@ def test_an_actual_current_is_said_to_be_one(
     reported = recorded(checkout, tmp_path, monkeypatch, Dialect.IPOS)
     capsys.readouterr()
     assert main(["info", str(reported.log), "--json"]) == ExitCode.OK
-    shown = json.loads(capsys.readouterr().out)["current"]
-    drive = read_log(reported.log).head.readback.axes[0].drive
+    printed = capsys.readouterr().out
+    shown = json.loads(printed)["current"]
+    readback = read_log(reported.log).head.readback
+    drive = readback.axes[0].drive
     assert (drive["tap"], drive["signal"]) == ("actual", "ACTUAL current 6077h:00")
-    assert [axis.gain_unit for axis in reported.cell.axes] == ["Nm/A(actual)"] * 6
-    assert shown == dict.fromkeys(
+    gain_units = [axis.gain_unit for axis in reported.cell.axes]
+    assert gain_units == ["Nm/A(actual)"] * 6
+    expected = dict.fromkeys(
         reported.cell.axis_names, "ACTUAL current 6077h:00, amplitude unstated"
     )
+    assert shown == expected
     spec = load_simulation(checkout / "configs/simulation/clean.yaml")
     bus = open_bus(bus_address(reported.cell))
     try:
-        with SimulatedCell(
-            replace(spec, axes=tuple(replace(a, dialect=Dialect.IPOS) for a in spec.axes)), bus
-        ):
+        axes = tuple(replace(a, dialect=Dialect.IPOS) for a in spec.axes)
+        changed_spec = replace(spec, axes=axes)
+        with SimulatedCell(changed_spec, bus):
             assert main(["scan", str(reported.cell_file)]) == ExitCode.OK
             assert (
                 "J1, J2, J3, J4, J5, J6: ACTUAL current, not the reference"
             ) in capsys.readouterr().out
             assert main(["scan", str(reported.cell_file), "--json"]) == ExitCode.OK
-            assert json.loads(capsys.readouterr().out)["current"] == shown
+            document = json.loads(capsys.readouterr().out)
+            assert document["current"] == shown
     finally:
         bus.shutdown()
 

@@ -16,7 +16,8 @@ from tests.daq.logs import demo_content, samples, write
 
 @pytest.fixture
 def log(checkout: Path, tmp_path: Path) -> Path:
-    return write(tmp_path / "bare.mcap", demo_content(checkout), samples([[0] * 6] * 20))
+    path = tmp_path / "bare.mcap"
+    return write(path, demo_content(checkout), samples([[0] * 6] * 20))
 
 
 def test_the_files_are_those_of_the_log_with_the_same_digest(
@@ -24,11 +25,14 @@ def test_the_files_are_those_of_the_log_with_the_same_digest(
 ) -> None:
     folder = tmp_path / "new" / "cell"
     assert main(["info", str(log), "--extract-cell", str(folder)]) == ExitCode.OK
-    assert capsys.readouterr().out.splitlines()[-1] == f"Written: {folder}/cells/demo.yaml"
+    lines = capsys.readouterr().out.splitlines()
+    last_line = lines[-1]
+    assert last_line == f"Written: {folder}/cells/demo.yaml"
     found = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
     assert found == ["cells/demo.yaml", "drives/generic-cia402.yaml", "robots/tx40.urdf"]
     own = load_cell(checkout / "configs/cells/demo.yaml")
-    assert load_cell(folder / "cells/demo.yaml").digest == own.digest
+    demo_path = folder / "cells/demo.yaml"
+    assert load_cell(demo_path).digest == own.digest
     assert main(["info", str(log), "--extract-cell", str(folder)]) == ExitCode.USAGE
     assert "something in it" in capsys.readouterr().err
 
@@ -55,7 +59,8 @@ def test_each_file_is_where_the_cell_file_looks_for_it(
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(content)
     own = load_cell(checkout / "configs/cells/demo.yaml")
-    assert differing_sections(load_cell(tmp_path / place), own) == ()
+    cell = load_cell(tmp_path / place)
+    assert differing_sections(cell, own) == ()
 
 
 def test_a_file_outside_of_the_folder_is_refused(checkout: Path) -> None:

@@ -17,7 +17,8 @@ def test_an_odd_sheet_gives_the_dictionary_that_it_was_written_from(data: st.Dat
     dictionary: dict[int, Entry] = data.draw(dictionaries())
     text = data.draw(sheets(dictionary))
     node_id = data.draw(NODE_IDS)
-    found = data_sheet(text.encode("latin-1"), "odd.eds", node_id)
+    encoded_text = text.encode("latin-1")
+    found = data_sheet(encoded_text, "odd.eds", node_id)
     assert {index for index in found if index >= 0x1000} == set(dictionary)
     for index, entry in dictionary.items():
         for subindex, expected in entry.variables.items():

@@ -13,7 +13,9 @@ from daq.config.cell_file import load_cell
 @pytest.fixture(scope="session")
 def cell(checkout: Path) -> Cell:
     """The demo cell."""
-    return load_cell(checkout / "configs" / "cells" / "demo.yaml")
+    cells_folder = checkout / "configs" / "cells"
+    path = cells_folder / "demo.yaml"
+    return load_cell(path)
 
 
 @pytest.fixture

@@ -33,7 +33,9 @@ def facts(cell: Cell, log: Path | None) -> RunFacts:
     milliampere.
     """
     count = len(cell.axes)
-    identity = [[float(row == column) for column in range(count)] for row in range(count)]
+    identity = []
+    for row in range(count):
+        identity.append([float(row == column) for column in range(count)])
     scales = [1e-3] * count, [1e-3] * count, identity, [0.0] * count
     loads = {} if log is None else {"can0": 0.4}
     return RunFacts(
@@ -43,7 +45,8 @@ def facts(cell: Cell, log: Path | None) -> RunFacts:
 
 def predicting_calibration() -> Calibration:
     """A calibration of the demo cell with every filter and without effects."""
-    filters = Conditioning(standstill_rad_s=(0.03,) * 6).document()
+    standstill_rad_s = (0.03,) * 6
+    filters = Conditioning(standstill_rad_s=standstill_rad_s).document()
     # Without dry friction, whose sign depends on the last digit of a speed near zero.
     each = {"Ia": 1.0, "fv": 3.0, "off": 0.5}
     parameters = tuple(
@@ -51,7 +54,8 @@ def predicting_calibration() -> Calibration:
         for name, value in each.items()
         for axis in range(1, 7)
     )
-    gravity = Parameter("mx2", 2.0, 0.1, "kg m"), Parameter("my3", -1.0, 0.1, "kg m")
+    parameter = Parameter("my3", -1.0, 0.1, "kg m")
+    gravity = Parameter("mx2", 2.0, 0.1, "kg m"), parameter
     left = (0.01,) * 6  # of currents of some tenths of an ampere
     found = demo_calibration()
     return replace(
@@ -70,7 +74,8 @@ class Recording:
 
     def statistics(self) -> RunStatistics:
         """Statistics of the log that there would be."""
-        return RunStatistics(self.samples, 0, (0,) * self.axes, valid=True)
+        missing = (0,) * self.axes
+        return RunStatistics(self.samples, 0, missing, valid=True)
 
     def run(self, count: int) -> None:
         """Publish so many samples; positions and currents are the number of the cycle and of the
@@ -81,9 +86,10 @@ class Recording:
             self.samples += 1
             position = tuple(cycle + axis for axis in range(self.axes))
             current = tuple(-cycle - axis for axis in range(self.axes))
-            self.feed.sample(
-                Sample(cycle, cycle * 2_000_000, position, current, (0x237,) * self.axes)
-            )
+            statusword = (0x237,) * self.axes
+            time_ns = cycle * 2_000_000
+            sample = Sample(cycle, time_ns, position, current, statusword)
+            self.feed.sample(sample)
 
 
 class Arrivals(deque[socket.socket]):
@@ -151,7 +157,8 @@ class Served:
         self.live = WatchedLive(cell_file, cell)
         self.listener = listen(0)
         self.port = self.listener.getsockname()[1]
-        page = Page(cell, self.live, Results(cell_file, cell, report=report))
+        results = Results(cell_file, cell, report=report)
+        page = Page(cell, self.live, results)
         self.server = server_of(page, TOKEN, self.port)
         self.thread = threading.Thread(
             target=lambda: asyncio.run(self.server.serve(sockets=[self.listener]))

@@ -48,7 +48,8 @@ class Case:
 def cases(draw: st.DrawFn) -> Case:
     newline = draw(st.sampled_from(["\n", "\r\n"]))
     axes = draw(st.lists(_words, min_size=1, max_size=4, unique=True))
-    step = " " * draw(st.sampled_from([1, 2, 4]))
+    sampled = st.sampled_from([1, 2, 4])
+    step = " " * draw(sampled)
     head = draw(
         st.sampled_from(
             ["", "\ufeff", "# a human's file", "---", "%YAML 1.1\n---", "title: 'déjà 漢 😀 vu'"]
@@ -59,7 +60,8 @@ def cases(draw: st.DrawFn) -> Case:
         for _ in range(2)
     ]
     if around[1]:
-        around[1] = around[1].replace("&d", "&e").replace("*d", "*e").replace(": ", "_2: ", 1)
+        changed_around = around[1].replace("&d", "&e")
+        around[1] = changed_around.replace("*d", "*e").replace(": ", "_2: ", 1)
     else:
         around[1] = ""
     pieces = [head + (newline if head.strip("\ufeff") else "") + around[0] + f"drives:{newline}"]

@@ -23,19 +23,19 @@ from tests.daq.jobs.rig import Rig, make_plan
 @pytest.fixture(scope="session")
 def short_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A few moves."""
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    return make_plan(
-        cell, tmp_path_factory.mktemp("plan") / "short.yaml", seed=3, duration_s=6.0, moves=2
-    )
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
+    short_path = tmp_path_factory.mktemp("plan") / "short.yaml"
+    return make_plan(cell, short_path, seed=3, duration_s=6.0, moves=2)
 
 
 @pytest.fixture(scope="session")
 def one_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A single move."""
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    return make_plan(
-        cell, tmp_path_factory.mktemp("plan") / "one.yaml", seed=3, duration_s=6.0, moves=1
-    )
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
+    one_path = tmp_path_factory.mktemp("plan") / "one.yaml"
+    return make_plan(cell, one_path, seed=3, duration_s=6.0, moves=1)
 
 
 @pytest.fixture(scope="session", name="whole_job")
@@ -76,7 +76,8 @@ def _outlooks_once() -> Iterator[None]:
     def outlook_once(fitted: Fit, experiment: Experiment, std_percent: FloatArray) -> Outlook:
         question = id(fitted), pickle.dumps((experiment, std_percent))
         if question not in known:
-            known[question] = fitted, outlook_of(fitted, experiment, std_percent)
+            outlook = outlook_of(fitted, experiment, std_percent)
+            known[question] = fitted, outlook
         return known[question][1]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -55,7 +55,8 @@ class Made:
             further["require_released"]()  # before they get power
             # Logs of another day are other logs; the fit that would read them knows its result
             # already.
-            out.write_bytes(self.logs[out.stem].read_bytes() + str(rig.clock.at).encode())
+            content = self.logs[out.stem].read_bytes()
+            out.write_bytes(content + str(rig.clock.at).encode())
             return replace(self.recorded[out.stem], path=out)
 
         def in_this_cell(_fit: Fit, created: datetime) -> Calibration:
@@ -111,8 +112,10 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
     Args:
         folder: of the cell; empty, the plan goes beside it.
     """
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
-    plan_file = make_plan(cell, folder.parent / "plan.yaml", seed=11, duration_s=6.0, moves=4)
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
+    plan_path = folder.parent / "plan.yaml"
+    plan_file = make_plan(cell, plan_path, seed=11, duration_s=6.0, moves=4)
     rig = make_rig(folder, plan_file)
     kept: dict[str, Any] = {}
     recorded: dict[str, Recorded] = {}
@@ -140,7 +143,7 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
         rig.job()
         assert powerless(cell_there)
     logs = {name: rig.session.folder / f"{name}.mcap" for name in recorded}
-    return rig, Made(
+    made = Made(
         plan_file,
         logs,
         recorded,
@@ -149,3 +152,4 @@ def whole_job(folder: Path) -> tuple[Rig, Made]:
         kept["account"],
         kept["calibration"],
     )
+    return rig, made

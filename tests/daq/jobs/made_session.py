@@ -52,7 +52,8 @@ class MadeSession(Made):
             calibration: Calibration, logs: Sequence[Path], cell: Cell
         ) -> tuple[Validation, ...]:
             own = [gain.value for gain in self.calibration.gains]
-            is_new = [gain.value for gain in calibration.gains] == own
+            gains = [gain.value for gain in calibration.gains]
+            is_new = gains == own
             return (self.after if is_new else self.before,)
 
         return replace(
@@ -67,8 +68,9 @@ class MadeSession(Made):
 
 def settings_of(rig: Rig, **changed: Any) -> GuidedSettings:
     """Settings of the session that was made."""
+    folder = rig.cells / "demo.sessions"
     settings = GuidedSettings(
-        rig.cells / "demo.sessions",
+        folder,
         "disc",
         target_percent=TARGET_PERCENT,
         block_s=BLOCK_S,
@@ -81,7 +83,8 @@ def given_answers(rig: Rig, **changed: Any) -> GivenAnswers:
     """An operator who mounts what is asked for, and writes."""
 
     def put(payload: str | None) -> None:
-        (rig.cells / "mounted").write_text(f"{payload or 'none'}\n")
+        mounted_folder = rig.cells / "mounted"
+        mounted_folder.write_text(f"{payload or 'none'}\n")
 
     return replace(GivenAnswers(WHO, {"disc": MASS_KG}, put, "the test"), **changed)
 
@@ -95,10 +98,11 @@ def run_session(rig: Rig, operator: Operator | None = None, **changed: Any) -> C
         changed: settings.
     """
     journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
+    settings = settings_of(rig, **changed)
     return calibrate(
         rig.cell_file,
         rig.cell,
-        settings_of(rig, **changed),
+        settings,
         operator or given_answers(rig),
         rig.tools,
         journal,
@@ -108,7 +112,8 @@ def run_session(rig: Rig, operator: Operator | None = None, **changed: Any) -> C
 
 def session_rig(folder: Path, **section: Any) -> Rig:
     """A rig for guided sessions."""
-    rig = make_rig(folder, folder / "no-plan.yaml", **section)
+    plan_file = folder / "no-plan.yaml"
+    rig = make_rig(folder, plan_file, **section)
     rig.kind = "sessions"
     (rig.cells / "mounted").write_text("none\n")
     return rig
@@ -158,14 +163,20 @@ def whole_session(folder: Path) -> tuple[Rig, MadeSession]:
         assert powerless(cell_there)
     recorded = {found.path.stem: found for found in made["record"]}
     before, after = (found for (found,) in made["validate"])
+    logs = {name: found.path for name, found in recorded.items()}
+    fitted = made["fit"][-1]
+    closed = made["close_loop"][-1]
+    changed = made["account"][-1]
+    calibration = made["calibration"][-1]
+    plan_file = folder / "no-plan.yaml"
     session = MadeSession(
-        plan_file=folder / "no-plan.yaml",
-        logs={name: found.path for name, found in recorded.items()},
+        plan_file=plan_file,
+        logs=logs,
         recorded=recorded,
-        fitted=made["fit"][-1],
-        closed=made["close_loop"][-1],
-        changed=made["account"][-1],
-        calibration=made["calibration"][-1],
+        fitted=fitted,
+        closed=closed,
+        changed=changed,
+        calibration=calibration,
         plans=plans,
         before=before,
         after=after,

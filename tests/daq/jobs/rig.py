@@ -59,9 +59,8 @@ def _cell(path: Path, _content: bytes) -> Cell:
 
 @cache
 def _truth(payload: str | None) -> CellSpec:
-    return _with_period(
-        load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload)
-    )
+    path = shipped_configurations() / "simulation" / "demo.yaml"
+    return _with_period(load_simulation(path, payload))
 
 
 def _with_period(truth: CellSpec) -> CellSpec:
@@ -72,9 +71,8 @@ def _with_period(truth: CellSpec) -> CellSpec:
     axes = (
         replace(axis, current_noise_a=axis.current_noise_a / slower**0.5) for axis in truth.axes
     )
-    return replace(
-        truth, sync_period_us=PERIOD_US, substeps=round(slower * truth.substeps), axes=tuple(axes)
-    )
+    substeps = round(slower * truth.substeps)
+    return replace(truth, sync_period_us=PERIOD_US, substeps=substeps, axes=tuple(axes))
 
 
 class TestClock:
@@ -121,7 +119,8 @@ class Rig:
 
     @property
     def cell(self) -> Cell:
-        return _cell(self.cell_file, self.cell_file.read_bytes())
+        content = self.cell_file.read_bytes()
+        return _cell(self.cell_file, content)
 
     @property
     def controller(self) -> Path:
@@ -134,7 +133,8 @@ class Rig:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        return sessions(self.cells / f"demo.{self.kind}", "demo")
+        folder = self.cells / f"demo.{self.kind}"
+        return sessions(folder, "demo")
 
     @property
     def session(self) -> Session:
@@ -151,7 +151,8 @@ class Rig:
     @property
     def events(self) -> list[dict[str, Any]]:
         """The journal."""
-        return [json.loads(line) for line in self.said.getvalue().splitlines()]
+        lines = self.said.getvalue().splitlines()
+        return [json.loads(line) for line in lines]
 
     @property
     def backups(self) -> list[Path]:
@@ -185,7 +186,8 @@ def make_rig(
     for part in ("controllers", "robots"):
         shutil.copytree(shipped / part, folder / part)
     (folder / "cells").mkdir()
-    document = yaml.safe_load((shipped / "cells" / "demo.yaml").read_text(encoding="utf-8"))
+    demo_path = shipped / "cells" / "demo.yaml"
+    document = yaml.safe_load(demo_path.read_text(encoding="utf-8"))
     document["bus"]["channel"] = f"recalibration {folder.parent.name} {folder.name}"
     document["sync"]["period_us"] = PERIOD_US
     document["policy"] = policy or {
@@ -202,12 +204,14 @@ def make_rig(
         **section,
     }
     # As JSON, which is YAML without aliases.
-    (folder / "cells" / "demo.yaml").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    text = json.dumps(document, indent=1)
+    (folder / "cells" / "demo.yaml").write_text(text, encoding="utf-8")
     (folder / "cells" / "closed").touch()
     clock = TestClock()
+    clocks = Clocks(wall_ns=lambda: int(clock.at.timestamp()) * 10**9)
     tools = Tools(
         save_report=save_report,
-        record=partial(record, clocks=Clocks(wall_ns=lambda: int(clock.at.timestamp()) * 10**9)),
+        record=partial(record, clocks=clocks),
         free=lambda _: 10**12,
         now=clock,
         monotonic_s=lambda: clock().timestamp(),
@@ -224,11 +228,13 @@ def serving(
     spec: CellSpec | None = None,
 ) -> Iterator[SimulatedCell]:
     """The simulated cell of a rig, powered on, with what its mount command has mounted."""
-    mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
+    path = rig.cells / "mounted"
+    mounted = MountedFile(path, _truth, lambda error: None)
     truth = replace(
         mounted.at_power_on() if spec is None else _with_period(spec), faults=faults, seed=seed
     )
-    truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
+    axes = tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes)
+    truth = replace(truth, axes=axes)
     bus = open_bus(bus_address(rig.cell))
     try:
         with SimulatedCell(truth, bus, mounted=mounted) as cell:
@@ -255,5 +261,6 @@ def make_plan(
         largest_condition=1e6,
         largest_std_percent=100.0,
     )
-    save_plan(replace(made, moves=made.moves[:moves]), path)
+    changed_made = replace(made, moves=made.moves[:moves])
+    save_plan(changed_made, path)
     return path

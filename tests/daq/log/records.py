@@ -26,21 +26,25 @@ from daq.log.message import (
 
 def raw_record(opcode: int, body: bytes, length: int | None = None) -> bytes:
     """Opcode, length and body; another length than the body's if given."""
-    return struct.pack("<BQ", opcode, len(body) if length is None else length) + body
+    packed = struct.pack("<BQ", opcode, len(body) if length is None else length)
+    return packed + body
 
 
 def cdr_text(text: str) -> bytes:
     """Length and characters."""
-    return struct.pack("<I", len(text.encode())) + text.encode()
+    packed = struct.pack("<I", len(text.encode()))
+    return packed + text.encode()
 
 
 def finished_file(path: Path, records: list[bytes]) -> Path:
     """A file of these records, with both checksums."""
     data = MAGIC + b"".join(records)
-    data += raw_record(Opcode.DATA_END, struct.pack("<I", zlib.crc32(data)))
-    footer = raw_record(Opcode.FOOTER, struct.pack("<QQ", 0, 0))[:9].replace(
-        b"\x10", b"\x14", 1
-    ) + struct.pack("<QQ", 0, 0)
+    body = struct.pack("<I", zlib.crc32(data))
+    data += raw_record(Opcode.DATA_END, body)
+    packed = struct.pack("<QQ", 0, 0)
+    footer = raw_record(Opcode.FOOTER, packed)[:9].replace(b"\x10", b"\x14", 1) + struct.pack(
+        "<QQ", 0, 0
+    )
     path.write_bytes(data + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC)
     return path
 
@@ -48,18 +52,14 @@ def finished_file(path: Path, records: list[bytes]) -> Path:
 def metadata_record(name: str, entries: dict[str, str]) -> bytes:
     """A metadata record."""
     pairs = b"".join(cdr_text(key) + cdr_text(value) for key, value in entries.items())
-    return raw_record(Opcode.METADATA, cdr_text(name) + struct.pack("<I", len(pairs)) + pairs)
+    body = cdr_text(name) + struct.pack("<I", len(pairs)) + pairs
+    return raw_record(Opcode.METADATA, body)
 
 
 def attachment_record(name: str, data: bytes) -> bytes:
     """An attachment with its checksum."""
-    body = (
-        struct.pack("<QQ", 0, 0)
-        + cdr_text(name)
-        + cdr_text("")
-        + struct.pack("<Q", len(data))
-        + data
-    )
+    packed = struct.pack("<QQ", 0, 0)
+    body = packed + cdr_text(name) + cdr_text("") + struct.pack("<Q", len(data)) + data
     return raw_record(Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body)))
 
 
@@ -72,17 +72,14 @@ def chunk_record(data: bytes, size: int | None = None, compression: str = "zstd"
     head = struct.pack(
         "<QQQI", 0, 0, len(data) if size is None else size, zlib.crc32(data)
     ) + cdr_text(compression)
-    return raw_record(Opcode.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+    body = head + struct.pack("<Q", len(packed)) + packed
+    return raw_record(Opcode.CHUNK, body)
 
 
 def definitions(topic: str, schema: str, number: int) -> bytes:
     """Schema and channel of a topic."""
-    described = (
-        struct.pack("<H", number)
-        + cdr_text(schema)
-        + cdr_text("ros2msg")
-        + cdr_text(DEFINITIONS[schema])
-    )
+    packed = struct.pack("<H", number)
+    described = packed + cdr_text(schema) + cdr_text("ros2msg") + cdr_text(DEFINITIONS[schema])
     channel = (
         struct.pack("<HH", number, number)
         + cdr_text(topic)

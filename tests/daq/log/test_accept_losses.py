@@ -29,7 +29,8 @@ MASKED = (
 
 @given(st.lists(st.tuples(st.integers(1, 10**9), st.sampled_from(MASKED)), min_size=1, max_size=6))
 def test_counted_losses_may_be_accepted(losses: list[tuple[int, str]]) -> None:
-    assert reports_only_losses(", ".join(f"{count} {kind}" for count, kind in losses))
+    reason = ", ".join(f"{count} {kind}" for count, kind in losses)
+    assert reports_only_losses(reason)
 
 
 @pytest.mark.parametrize(
@@ -52,16 +53,14 @@ def test_a_lossy_log_is_refused_until_it_is_accepted_and_is_then_partial(
     checkout: Path, tmp_path: Path
 ) -> None:
     rows = samples([[k, k, k, k, k, k] for k in range(40)])
-    path = write(
-        tmp_path / "lossy.mcap", demo_content(checkout), rows, verdict=(False, "3 missing answers")
-    )
+    lossy_path = tmp_path / "lossy.mcap"
+    path = write(lossy_path, demo_content(checkout), rows, verdict=(False, "3 missing answers"))
     with pytest.raises(RunInvalid, match="--accept-losses"):
         load_run(path)
     run, _ = load_run(path, lossy=LossyLogs.ACCEPTED)
     assert run.partial
-    doubled = write(
-        tmp_path / "doubled.mcap", demo_content(checkout), rows, verdict=(False, "3 answers twice")
-    )
+    doubled_path = tmp_path / "doubled.mcap"
+    doubled = write(doubled_path, demo_content(checkout), rows, verdict=(False, "3 answers twice"))
     with pytest.raises(RunInvalid):
         load_run(doubled, lossy=LossyLogs.ACCEPTED)
 
@@ -73,8 +72,9 @@ def test_the_recorder_counts_them_by_these_names() -> None:
     reason = stream_losses(counted)
     assert reason
     assert reports_only_losses(reason)
-    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == {
-        loss.value for loss in Loss if loss.masked
-    }
-    assert {loss.value for loss in Loss if loss.masked} == set(MASKED)
-    assert not reports_only_losses(stream_losses(StreamStatistics(missing=1, skipped_periods=1)))
+    expected = {loss.value for loss in Loss if loss.masked}
+    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == expected
+    losses = {loss.value for loss in Loss if loss.masked}
+    assert losses == set(MASKED)
+    statistics = StreamStatistics(missing=1, skipped_periods=1)
+    assert not reports_only_losses(stream_losses(statistics))

@@ -53,12 +53,14 @@ COLUMNS = tuple(f"{field}.{joint}" for field in ("position", "effort") for joint
 def message(row: int, joints: Sequence[int] = range(6), **changes: Any) -> dict[str, Any]:
     """A joint state of some joints in a row of the recording, with some fields replaced."""
     seconds, nanoseconds = divmod(START_NS + row * STEP_NS, 10**9)
+    positions = [float(POSITION[row, joint]) for joint in joints]
+    efforts = [float(EFFORT[row, joint]) for joint in joints]
     return {
         "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"},
         "name": [JOINTS[joint] for joint in joints],
-        "position": [float(POSITION[row, joint]) for joint in joints],
+        "position": positions,
         "velocity": [],
-        "effort": [float(EFFORT[row, joint]) for joint in joints],
+        "effort": efforts,
         **changes,
     }
 
@@ -70,7 +72,8 @@ def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **opti
     with path.open("wb") as stream, Ros2Writer(stream, **options) as writer:
         schema = writer.register_msgdef(JOINTS_SCHEMA, DEFINITIONS[JOINTS_SCHEMA])
         for number, (topic, content) in enumerate(messages):
-            writer.write_message(topic, schema, content, log_time=START_NS + 500_000 * number)
+            log_time = START_NS + 500_000 * number
+            writer.write_message(topic, schema, content, log_time=log_time)
     return path
 
 
@@ -95,7 +98,8 @@ def whole() -> list[tuple[str, dict[str, Any]]]:
 
 def assert_whole(table: Table) -> None:
     """The table is the recording, to the last bit."""
-    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT)))
+    expected = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(table.values, expected)
     assert table.stamps is not None
     assert table.stamps.first_ns == START_NS
     np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
@@ -103,9 +107,9 @@ def assert_whole(table: Table) -> None:
 
 @pytest.mark.parametrize("compression", CompressionType)
 def test_a_bag_is_read_as_it_was_written(compression: CompressionType, tmp_path: Path) -> None:
-    assert_whole(
-        read(write_bag(tmp_path / "run.mcap", whole(), compression=compression, chunk_size=4000))
-    )
+    run_path = tmp_path / "run.mcap"
+    path = write_bag(run_path, whole(), compression=compression, chunk_size=4000)
+    assert_whole(read(path))
 
 
 def _repack(source: Path, target: Path, **options: Any) -> Path:
@@ -132,8 +136,11 @@ def _repack(source: Path, target: Path, **options: Any) -> Path:
     ids=lambda options: next(iter(options)),
 )
 def test_chunks_and_checksums_are_optional(options: dict[str, Any], tmp_path: Path) -> None:
-    plain = write_bag(tmp_path / "plain.mcap", whole())
-    assert_whole(read(_repack(plain, tmp_path / "run.mcap", **options)))
+    path = tmp_path / "plain.mcap"
+    plain = write_bag(path, whole())
+    target = tmp_path / "run.mcap"
+    table = read(_repack(plain, target, **options))
+    assert_whole(table)
 
 
 def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
@@ -143,32 +150,39 @@ def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
     The bag begins after the arm's message of its first stamp, and ends before the wrist's of its
     last one.
     """
-    parts = [
-        ("/joint_states", part)
-        for row in range(ROWS)
+    parts = []
+    for row in range(ROWS):
+        joints = (2, 0, 1)
         for part in (
-            message(row, (2, 0, 1)),
+            message(row, joints),
             message(row, (), name=["finger"]),
             message(row, (5, 3, 4)),
-        )
-    ]
-    table = read(write_bag(tmp_path / "run.mcap", parts))
+        ):
+            parts.append(("/joint_states", part))
+    path = tmp_path / "run.mcap"
+    table = read(write_bag(path, parts))
     assert_whole(table)
     assert table.remarks == ()
-    cut = read(write_bag(tmp_path / "cut.mcap", parts[1:-1]))
-    np.testing.assert_array_equal(cut.values, np.hstack((POSITION, EFFORT))[1:-1])
+    cut_path = tmp_path / "cut.mcap"
+    cut = read(write_bag(cut_path, parts[1:-1]))
+    stacked_position = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(cut.values, stacked_position[1:-1])
     assert cut.remarks == ("left out, as joints are missing at the ends of the bag: 2 stamps",)
+    messages = [*parts[:32], *parts[33:]]
+    gap_path = tmp_path / "gap.mcap"
     with pytest.raises(
         TableUnfit,
         match=r"found no position.J4, .* at 1700000000.163456.*; "
         r"expected all joints in",
     ):
-        read(write_bag(tmp_path / "gap.mcap", [*parts[:32], *parts[33:]]))
+        read(write_bag(gap_path, messages))
 
 
 def _unmeasured(row: int) -> dict[str, Any]:
     """A message of a broadcaster whose hardware has not answered: it sends NaN."""
-    return message(row, effort=[float("nan")] * 6, position=[float("nan")] * 6)
+    effort = [float("nan")] * 6
+    position = [float("nan")] * 6
+    return message(row, effort=effort, position=position)
 
 
 def test_messages_before_the_first_reading_are_left_out(tmp_path: Path) -> None:
@@ -176,26 +190,33 @@ def test_messages_before_the_first_reading_are_left_out(tmp_path: Path) -> None:
         ("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row))
         for row in range(ROWS)
     ]
-    table = read(write_bag(tmp_path / "run.mcap", parts))
-    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[3:-1])
+    path = tmp_path / "run.mcap"
+    table = read(write_bag(path, parts))
+    stacked_position = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(table.values, stacked_position[3:-1])
     assert table.stamps is not None
-    assert table.stamps.first_ns == START_NS + 3 * STEP_NS
+    expected = START_NS + 3 * STEP_NS
+    assert table.stamps.first_ns == expected
     assert table.remarks == ("left out, as values are nan at the ends of the bag: 4 stamps",)
     assert table.place(0, "position.J1") == f"{tmp_path}/run.mcap, row 4, column position.J1"
 
 
 def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> None:
     parts = whole()
-    parts[50] = ("/joint_states", message(50, effort=[0.5, float("nan"), 0.5, 0.5, 0.5, 0.5]))
-    bag = write_bag(tmp_path / "run.mcap", parts)
+    effort = [0.5, float("nan"), 0.5, 0.5, 0.5, 0.5]
+    parts[50] = ("/joint_states", message(50, effort=effort))
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, parts)
     with pytest.raises(
         TableUnfit,
         match=r"found nan for effort\.J2 at 1700000000\.323456\d+ s; "
         r".*by `keep`",
     ):
         read(bag)
-    table = read(bag, keep=KeptPart(to_row=50))
-    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[:50])
+    keep = KeptPart(to_row=50)
+    table = read(bag, keep=keep)
+    stacked_position = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(table.values, stacked_position[:50])
 
 
 @pytest.mark.parametrize(
@@ -207,10 +228,14 @@ def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> No
     ],
 )
 def test_a_part_of_a_bag_is_kept(part: KeptPart, rows: slice, tmp_path: Path) -> None:
-    table = read(write_bag(tmp_path / "run.mcap", whole()), keep=part)
-    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[rows])
+    run_path = tmp_path / "run.mcap"
+    path = write_bag(run_path, whole())
+    table = read(path, keep=part)
+    stacked_position = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(table.values, stacked_position[rows])
     assert table.stamps is not None
-    assert table.stamps.first_ns == START_NS + rows.start * STEP_NS
+    expected = START_NS + rows.start * STEP_NS
+    assert table.stamps.first_ns == expected
     assert table.first_row == rows.start
 
 
@@ -218,7 +243,8 @@ def _other_publisher(row: int, **changes: Any) -> dict[str, Any]:
     """A second node with the same joints, halfway between two messages of the first one."""
     seconds, nanoseconds = divmod(START_NS + row * STEP_NS + STEP_NS // 2, 10**9)
     header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
-    return message(row, header=header, position=[0.0] * 6, effort=[], **changes)
+    position = [0.0] * 6
+    return message(row, header=header, position=position, effort=[], **changes)
 
 
 def _with_another(frame: str = "base", **changes: Any) -> list[tuple[str, dict[str, Any]]]:
@@ -250,7 +276,8 @@ def _with_another(frame: str = "base", **changes: Any) -> list[tuple[str, dict[s
 def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
     parts: list[tuple[str, dict[str, Any]]], other: str, tmp_path: Path
 ) -> None:
-    bag = write_bag(tmp_path / "run.mcap", parts)
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, parts)
     with pytest.raises(
         TableUnfit, match="found 2 publishers of the same joints on one topic"
     ) as caught:
@@ -260,7 +287,8 @@ def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
     assert "`publisher: 1`" in caught.value.remedy
     table = read(bag, publisher=1)
     assert_whole(table)
-    assert table.remarks == (f"left out, of another publisher: {other}",)
+    expected = (f"left out, of another publisher: {other}",)
+    assert table.remarks == expected
     with pytest.raises(
         TableUnfit,
         match=r"found publisher 3, and those of the topic are "
@@ -270,7 +298,8 @@ def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
 
 
 def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "run.mcap", _with_another())
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, _with_another())
     with pytest.raises(TableUnfit, match="found messages with 6 names and 0 values of effort"):
         read(bag, publisher=2)
 
@@ -281,9 +310,10 @@ def _of_sections(position: dict[str, Any], current: dict[str, Any]) -> dict[str,
     moved = PositionColumns(
         file="run.mcap", columns=columns, unit=PositionUnit.RAD, side=Side.JOINT, **position
     )
+    current_columns = CurrentColumns(file="run.mcap", columns=COLUMNS[6:], unit="A", **current)
     return {
         "position": moved,
-        "current": CurrentColumns(file="run.mcap", columns=COLUMNS[6:], unit="A", **current),
+        "current": current_columns,
     }
 
 
@@ -311,27 +341,35 @@ def test_positions_and_efforts_of_different_messages_are_joined_by_their_stamps(
     topic: str, position: dict[str, Any], current: dict[str, Any], tmp_path: Path
 ) -> None:
     sections = _of_sections(position, current)
-    bag = write_bag(tmp_path / "run.mcap", _apart(topic))
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, _apart(topic))
     assert_whole(read(bag, **sections))
     # Beginning and end are those of the shorter one.
-    bag = write_bag(tmp_path / "run.mcap", _apart(topic, effort_rows=range(10, ROWS - 20)))
+    messages = _apart(topic, effort_rows=range(10, ROWS - 20))
+    run_path = tmp_path / "run.mcap"
+    bag = write_bag(run_path, messages)
     table = read(bag, **sections)
-    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT))[10:-20])
+    stacked_position = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(table.values, stacked_position[10:-20])
     assert table.stamps is not None
-    assert table.stamps.first_ns == START_NS + 10 * STEP_NS
+    expected = START_NS + 10 * STEP_NS
+    assert table.stamps.first_ns == expected
     assert any(
         "left out, as other columns have none there: 30 stamps of /joint_states" in one
         or "30 stamps of the topic (publisher 1)" in one
         for one in table.remarks
     )
-    part = read(bag, keep=KeptPart(from_row=3, to_row=52), **sections)
+    keep = KeptPart(from_row=3, to_row=52)
+    part = read(bag, keep=keep, **sections)
     np.testing.assert_array_equal(part.values, table.values[2:52])
     assert part.first_row == 2
 
 
 def test_messages_that_cannot_be_joined_are_named_with_their_rates(tmp_path: Path) -> None:
     sections = _of_sections({"topic": "/joint_states"}, {"topic": "/efforts"})
-    bag = write_bag(tmp_path / "run.mcap", _apart("/efforts", effort_rows=range(0, ROWS, 2)))
+    messages = _apart("/efforts", effort_rows=range(0, ROWS, 2))
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, messages)
     with pytest.raises(TableUnfit) as caught:
         read(bag, **sections)
     rates = (
@@ -356,7 +394,8 @@ def test_positions_and_efforts_in_separate_messages_have_a_way(
     for row in range(ROWS):
         parts.append(("/joint_states", message(row, effort=[])))
         parts.append(("/joint_states", message(row, position=[])))
-    bag = write_bag(tmp_path / "run.mcap", parts)
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, parts)
     with pytest.raises(TableUnfit, match="write each field to a CSV file") as caught:
         read(bag, publisher=publisher)
     assert (
@@ -383,7 +422,9 @@ def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
 def test_two_publishers_with_nothing_but_other_stamps_are_refused(
     every: int, later_ns: int, tmp_path: Path
 ) -> None:
-    bag = write_bag(tmp_path / "run.mcap", _alike(every, later_ns))
+    path = tmp_path / "run.mcap"
+    messages = _alike(every, later_ns)
+    bag = write_bag(path, messages)
     with pytest.raises(TableUnfit, match="stamps of two publishers") as caught:
         read(bag)
     assert f"{ROWS} messages each 0.004 s" in caught.value.found
@@ -393,34 +434,36 @@ def test_two_publishers_with_nothing_but_other_stamps_are_refused(
     first = read(bag, rhythm=1)
     assert_whole(first)
     second = read(bag, rhythm=2)
-    np.testing.assert_array_equal(second.values, np.hstack((POSITION, EFFORT))[::every])
+    stacked_position = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(second.values, stacked_position[::every])
     assert second.stamps is not None
     assert second.stamps.first_ns == START_NS + later_ns
 
 
 def test_a_rhythm_is_chosen_only_where_each_message_has_one(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "run.mcap", whole())
     with pytest.raises(
         TableUnfit,
         match=r"found `rhythm: 2`, and no two even rows of stamps; .* "
         r"leave `rhythm` out",
     ):
-        read(write_bag(tmp_path / "run.mcap", whole()), rhythm=2)
+        read(path, rhythm=2)
     lost = [one for number, one in enumerate(_alike(1, 1_300_000)) if number != 2 * ROWS - 21]
+    run_path = tmp_path / "run.mcap"
     with pytest.raises(
         TableUnfit,
         match=r"found `rhythm: 1`, and (stamps of two publishers with "
         r"steps|no two even)",
     ):
-        read(write_bag(tmp_path / "run.mcap", lost), rhythm=1)
+        read(write_bag(run_path, lost), rhythm=1)
 
 
 def _write_channels(
     path: Path, parts: Iterable[tuple[int, dict[str, Any]]], nodes: Sequence[str] = ("", "")
 ) -> Path:
     """A bag in which two channels have one topic, with the names of their nodes."""
-    source = write_bag(
-        path.with_suffix(".source"), [(f"/{number}", content) for number, content in parts]
-    )
+    messages = [(f"/{number}", content) for number, content in parts]
+    source = write_bag(path.with_suffix(".source"), messages)
     with source.open("rb") as read_from, path.open("wb") as stream:
         writer = Writer(stream)
         writer.start("ros2")
@@ -428,7 +471,8 @@ def _write_channels(
         for schema, channel, content in make_reader(read_from).iter_messages():
             assert schema is not None
             if channel.topic not in channels:
-                node = nodes[int(channel.topic[1:])]
+                topic = int(channel.topic[1:])
+                node = nodes[topic]
                 metadata = {"callerid": node} if node else {}
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.topic] = writer.register_channel(
@@ -459,8 +503,10 @@ def test_publishers_with_a_channel_each_are_named_and_chosen(
     parts = []
     for row in range(ROWS):
         parts.append((0, message(row)))
-        parts.append((1, message(row, position=[0.0] * 6)))
-    bag = _write_channels(tmp_path / "run.mcap", parts, nodes)
+        position = [0.0] * 6
+        parts.append((1, message(row, position=position)))
+    path = tmp_path / "run.mcap"
+    bag = _write_channels(path, parts, nodes)
     with pytest.raises(TableUnfit, match=named):
         read(bag)
     assert_whole(read(bag, publisher=1))
@@ -470,7 +516,9 @@ def test_publishers_with_a_channel_each_are_named_and_chosen(
 def test_channels_after_each_other_are_one_publisher(tmp_path: Path) -> None:
     """A recorder that is set up anew in one file gives the topic another channel."""
     parts = [(int(row >= ROWS // 2), message(row)) for row in range(ROWS)]
-    assert_whole(read(_write_channels(tmp_path / "run.mcap", parts)))
+    run_path = tmp_path / "run.mcap"
+    path = _write_channels(run_path, parts)
+    assert_whole(read(path))
 
 
 @pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])
@@ -486,7 +534,9 @@ def test_uneven_stamps_of_one_publisher_are_not_two(jitter: float) -> None:
 
 def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:
     """The resampling decides what duplicates mean."""
-    bag = write_bag(tmp_path / "run.mcap", [whole()[0], *whole()])
+    messages = [whole()[0], *whole()]
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, messages)
     assert len(read(bag).values) == ROWS + 1
 
 
@@ -494,23 +544,23 @@ def test_joints_that_are_never_stamped_together_are_refused(tmp_path: Path) -> N
     parts = [
         ("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))) for row in range(ROWS)
     ]
+    path = tmp_path / "run.mcap"
     with pytest.raises(
         TableUnfit,
         match=r"found no position.J1, position.J2.*same stamp.*record a "
         r"topic that has all",
     ):
-        read(write_bag(tmp_path / "run.mcap", parts))
+        read(write_bag(path, parts))
 
 
 def test_without_stamps_the_time_of_recording_is_used(tmp_path: Path) -> None:
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    table = read(
-        write_bag(
-            tmp_path / "run.mcap", [(topic, {**one, "header": header}) for topic, one in whole()]
-        )
-    )
+    messages = [(topic, {**one, "header": header}) for topic, one in whole()]
+    path = tmp_path / "run.mcap"
+    table = read(write_bag(path, messages))
     assert table.stamps is not None
-    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 5e-4, atol=1e-12)
+    expected = np.arange(ROWS) * 5e-4
+    np.testing.assert_allclose(table.stamps.time_s, expected, atol=1e-12)
     assert table.remarks == ("200 messages without a stamp: the time of the recording is used",)
 
 
@@ -527,11 +577,14 @@ def _simulated(row: int, joints: Sequence[int] = range(6)) -> dict[str, Any]:
 def test_a_clock_that_starts_at_0_keeps_its_first_stamp(
     parts: tuple[Sequence[int], ...], tmp_path: Path
 ) -> None:
-    messages = [
-        ("/joint_states", _simulated(row, joints)) for row in range(ROWS) for joints in parts
-    ]
-    table = read(write_bag(tmp_path / "run.mcap", messages))
-    np.testing.assert_array_equal(table.values, np.hstack((POSITION, EFFORT)))
+    messages = []
+    for row in range(ROWS):
+        for joints in parts:
+            messages.append(("/joint_states", _simulated(row, joints)))
+    path = tmp_path / "run.mcap"
+    table = read(write_bag(path, messages))
+    expected = np.hstack((POSITION, EFFORT))
+    np.testing.assert_array_equal(table.values, expected)
     assert table.stamps is not None
     assert table.stamps.first_ns == 0
     np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
@@ -543,7 +596,9 @@ def test_a_message_without_stamp_among_times_of_day_has_the_time_of_its_recordin
 ) -> None:
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     (topic, first), *others = whole()
-    table = read(write_bag(tmp_path / "run.mcap", [(topic, {**first, "header": header}), *others]))
+    messages = [(topic, {**first, "header": header}), *others]
+    path = tmp_path / "run.mcap"
+    table = read(write_bag(path, messages))
     assert_whole(table)
     assert table.remarks == ("1 message without a stamp: the time of the recording is used",)
 
@@ -552,7 +607,8 @@ def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
     folder.mkdir()
     for number in range(11):
-        write_bag(folder / f"bag_{number}.mcap", whole()[number * 20 : (number + 1) * 20])
+        path = folder / f"bag_{number}.mcap"
+        write_bag(path, whole()[number * 20 : (number + 1) * 20])
     assert_whole(read(folder))
 
 
@@ -560,7 +616,8 @@ def _in_parts(folder: Path, listed: str) -> Path:
     """A bag of three files, with the metadata that its recorder writes."""
     folder.mkdir()
     for number in range(3):
-        write_bag(folder / f"bag_{number}.mcap", whole()[number * 80 : (number + 1) * 80])
+        path = folder / f"bag_{number}.mcap"
+        write_bag(path, whole()[number * 80 : (number + 1) * 80])
     metadata = (
         f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  "
         "topics: []\n"
@@ -577,7 +634,8 @@ LISTED = "".join(f"  - bag_{number}.mcap\n" for number in range(3))
 )
 def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None:
     """Without its last part it would end early, and nothing else shows it."""
-    folder = _in_parts(tmp_path / "bag", listed)
+    bag_folder = tmp_path / "bag"
+    folder = _in_parts(bag_folder, listed)
     assert_whole(read(folder))
     (folder / "bag_2.mcap").rename(folder / "renamed_2.mcap")
     assert_whole(read(folder))
@@ -592,7 +650,9 @@ def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None
 
 def test_a_topic_is_chosen(tmp_path: Path) -> None:
     others = [("/desired", {**one, "position": [9.0] * 6}) for _, one in whole()]
-    bag = write_bag(tmp_path / "run.mcap", [*others, *whole()])
+    messages = [*others, *whole()]
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, messages)
     with pytest.raises(
         TableUnfit,
         match=r"found joint states on 2 topics, /desired, "
@@ -636,7 +696,9 @@ def test_a_topic_is_chosen(tmp_path: Path) -> None:
 def test_what_a_bag_lacks_is_named(
     columns: tuple[str, ...], changes: dict[str, Any], error: str | None, tmp_path: Path
 ) -> None:
-    bag = write_bag(tmp_path / "run.mcap", [("/joint_states", message(0, **changes))])
+    messages = [("/joint_states", message(0, **changes))]
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, messages)
     if error is None:
         assert read(bag, columns).values.tolist() == [[1.0]]
         return
@@ -656,7 +718,8 @@ def _document(checkout: Path) -> dict[str, object]:
 
 
 def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Path) -> None:
-    write_bag(tmp_path / "run.mcap", whole())
+    path = tmp_path / "run.mcap"
+    write_bag(path, whole())
     description = tmp_path / "run.yaml"
     document = _document(checkout)
     description.write_text(json.dumps(document))
@@ -678,7 +741,8 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     assert main(["import", str(description), "--data", str(tmp_path), "--out", str(again)]) == 0
     assert again.read_bytes() == out.read_bytes()
     time = {"file": "run.mcap", "column": "stamp", "unit": "s"}
-    description.write_text(json.dumps({**document, "time": time}))
+    text = json.dumps({**document, "time": time})
+    description.write_text(text)
     assert (
         main(
             ["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]
@@ -691,7 +755,8 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     "columns", [list(JOINTS), ["effort"], [f"position.{name}" for name in JOINTS]]
 )
 def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[str]) -> None:
-    write_bag(tmp_path / "run.mcap", whole()[:1])
+    path = tmp_path / "run.mcap"
+    write_bag(path, whole()[:1])
     description = tmp_path / "run.yaml"
     out = tmp_path / "log.mcap"
     document = {**_document(checkout), "temperature": {"file": "run.mcap", "columns": columns}}
@@ -706,9 +771,10 @@ def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[
 def test_torques_of_a_bag_come_from_another_field_than_the_currents(
     checkout: Path, tmp_path: Path
 ) -> None:
+    messages = [(topic, {**one, "velocity": one["effort"]}) for topic, one in whole()]
     write_bag(
         tmp_path / "run.mcap",
-        [(topic, {**one, "velocity": one["effort"]}) for topic, one in whole()],
+        messages,
     )
     description = tmp_path / "run.yaml"
     out = tmp_path / "log.mcap"
@@ -721,7 +787,8 @@ def test_torques_of_a_bag_come_from_another_field_than_the_currents(
         [f"K{k}" for k in range(6)],
     ):
         torque = {"file": "run.mcap", "columns": columns, "side": "joint"}
-        description.write_text(json.dumps({**_document(checkout), "torque": torque}))
+        text = json.dumps({**_document(checkout), "torque": torque})
+        description.write_text(text)
         with pytest.raises(
             ConfigurationInconsistent,
             match=r"found effort of run\.mcap, which "
@@ -735,25 +802,29 @@ def test_torques_of_a_bag_come_from_another_field_than_the_currents(
 
 
 def test_a_healthy_bag_is_called_a_bag(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    bag = write_bag(tmp_path / "run.mcap", whole())
-    sums = _repack(bag, tmp_path / "sums.mcap", enable_data_crcs=True)
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, whole())
+    target = tmp_path / "sums.mcap"
+    sums = _repack(bag, target, enable_data_crcs=True)
     for words in (
         ["info", bag],
         ["info", sums],
         ["salvage", bag, "--out", tmp_path / "saved.mcap"],
     ):
         assert main([str(word) for word in words]) == 4
-        said = " ".join(capfd.readouterr().err.split())
+        error_output = capfd.readouterr().err
+        said = " ".join(error_output.split())
         assert "joint states of J1, J2, J3, J4, J5, J6 on /joint_states" in said
         assert "damaged" not in said
         assert "drivegain import" in said
         assert "the joints as `columns`" in said
+    text_path = tmp_path / "text.mcap"
     with pytest.raises(
         LogForeign,
         match=r"with /chatter; .*reads bags with "
         r"sensor_msgs/msg/JointState",
     ):
-        read_log(_of_text(tmp_path / "text.mcap"))
+        read_log(_of_text(text_path))
     with pytest.raises(
         TableUnfit,
         match="found topics /chatter; expected a topic of type sensor_msgs/msg/JointState",
@@ -772,7 +843,8 @@ def _of_text(path: Path) -> Path:
 def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], size: int
 ) -> None:
-    bag = write_bag(tmp_path / "run.mcap", whole())
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, whole())
     bag.write_bytes(bag.read_bytes()[:size])
     for words in (["info", bag], ["fit", bag], ["salvage", bag, "--out", tmp_path / "saved.mcap"]):
         assert main([str(word) for word in words]) == 4
@@ -782,7 +854,8 @@ def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
 
 
 def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "run.mcap", whole(), chunk_size=4000)
+    path = tmp_path / "run.mcap"
+    bag = write_bag(path, whole(), chunk_size=4000)
     bag.write_bytes(bag.read_bytes()[:-2000])
     with pytest.raises(LogTruncated, match=r"expected a finished bag; .*mcap recover"):
         read(bag)
@@ -806,16 +879,17 @@ def test_a_damaged_bag_is_refused_or_the_same(
     except DataError as error:
         assert str(path) in str(error)
     else:
-        expected = {row.tobytes() for row in np.hstack((POSITION, EFFORT))}
-        assert {row.tobytes() for row in table.values} <= expected
+        stacked_position = np.hstack((POSITION, EFFORT))
+        expected = {row.tobytes() for row in stacked_position}
+        tobytes = {row.tobytes() for row in table.values}
+        assert tobytes <= expected
 
 
 @pytest.fixture(scope="module")
 def bag_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A bag of some chunks."""
-    return write_bag(
-        tmp_path_factory.mktemp("bag") / "run.mcap", whole()[:60], chunk_size=4000
-    ).read_bytes()
+    path = tmp_path_factory.mktemp("bag") / "run.mcap"
+    return write_bag(path, whole()[:60], chunk_size=4000).read_bytes()
 
 
 @settings(deadline=None, max_examples=200, derandomize=True)
@@ -825,25 +899,25 @@ def test_any_bytes_are_a_joint_state_or_refused(data: bytes, order: int) -> None
         state = joint_state_from_cdr(bytes((0, order, 0, 0)) + data)
     except ValueError:
         return
-    assert max(len(state.names), len(state.position), len(state.effort)) <= len(data)
+    largest_name_count = max(len(state.names), len(state.position), len(state.effort))
+    assert largest_name_count <= len(data)
 
 
 def test_a_message_of_the_other_byte_order_is_read() -> None:
     names = b"".join(struct.pack(">I", 3) + name.encode() + b"\0" + b"\0" for name in ("J1", "J2"))
+    packed = struct.pack(">iII", 5, 6, 1)
     big = (
-        b"\0\0\0\0" + struct.pack(">iII", 5, 6, 1) + b"\0\0\0\0" + struct.pack(">I", 2) + names
+        b"\0\0\0\0" + packed + b"\0\0\0\0" + struct.pack(">I", 2) + names
         + struct.pack(">I2d", 2, 1.5, -2.5) + struct.pack(">II", 0, 0)
     )  # fmt: skip
     state = joint_state_from_cdr(big)
-    assert (state.stamp_ns, state.names, state.position, state.effort) == (
-        5_000_000_006,
-        ("J1", "J2"),
-        (1.5, -2.5),
-        (),
-    )
+    expected = (5_000_000_006, ("J1", "J2"), (1.5, -2.5), ())
+    assert (state.stamp_ns, state.names, state.position, state.effort) == expected
 
 
 def test_a_joint_twice_in_one_message_is_refused(tmp_path: Path) -> None:
     twice = message(0, name=["J1", "J1", *JOINTS[2:]])
+    path = tmp_path / "run.mcap"
+    messages = [("/joint_states", twice)]
     with pytest.raises(TableUnfit, match="joint J1 twice"):
-        read(write_bag(tmp_path / "run.mcap", [("/joint_states", twice)]))
+        read(write_bag(path, messages))

@@ -77,7 +77,8 @@ def test_every_kind_of_bag_has_the_same_numbers(
     storage: StoragePlugin, packed: CompressionMode, tmp_path: Path
 ) -> None:
     """As a folder and as its one file, whatever they are called."""
-    folder = record(tmp_path / "bag", storage, packed).rename(tmp_path / "run #1 50%?")
+    bag_folder = tmp_path / "bag"
+    folder = record(bag_folder, storage, packed).rename(tmp_path / "run #1 50%?")
     assert_whole(read(folder))
     (file,) = [file for file in folder.iterdir() if file.name != "metadata.yaml"]
     assert_whole(read(file))
@@ -87,7 +88,8 @@ def test_every_kind_of_bag_has_the_same_numbers(
 
 
 def test_a_file_that_a_player_has_unpacked_is_read_once(tmp_path: Path) -> None:
-    folder = record(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
+    bag_folder = tmp_path / "bag"
+    folder = record(bag_folder, StoragePlugin.SQLITE3, CompressionMode.FILE)
     packed = folder / "bag.db3.zstd"
     with packed.open("rb") as stream, (folder / "bag.db3").open("wb") as unpacked:
         zstandard.ZstdDecompressor().copy_stream(stream, unpacked)
@@ -98,7 +100,8 @@ def test_a_file_that_a_player_has_unpacked_is_read_once(tmp_path: Path) -> None:
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short bag in SQLite."""
     folder = tmp_path_factory.mktemp("bags")
-    return record(folder / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE, rows=60) / "bag.db3"
+    bag_folder = folder / "bag"
+    return record(bag_folder, StoragePlugin.SQLITE3, CompressionMode.NONE, rows=60) / "bag.db3"
 
 
 COMPUTED = """
@@ -247,7 +250,8 @@ def test_no_room_for_what_a_file_unfolds_to_is_an_error(
     checkout: Path,
 ) -> None:
     """As on a full disk."""
-    folder = record(tmp_path / "bag", StoragePlugin.MCAP, CompressionMode.FILE)
+    bag_folder = tmp_path / "bag"
+    folder = record(bag_folder, StoragePlugin.MCAP, CompressionMode.FILE)
     description = tmp_path / "run.yaml"
     description.write_text(
         f"name: run\ncell: {checkout / 'configs/cells/demo.yaml'}\n"
@@ -270,6 +274,7 @@ def test_no_room_for_what_a_file_unfolds_to_is_an_error(
     (full / "bag").symlink_to("/dev/full")
     monkeypatch.setattr("daq.log.bag_file.TemporaryDirectory", lambda: nullcontext(str(full)))
     assert main(words) == ExitCode.UNEXPECTED
-    said = " ".join(capfd.readouterr().err.split())
+    error_output = capfd.readouterr().err
+    said = " ".join(error_output.split())
     assert "no space left on device" in said
     assert "TMPDIR" in said

@@ -50,7 +50,8 @@ def record(checkout: Path, tmp_path: Path) -> Recorder:
         payload = DISC if options.get("loaded") else None
         assert isinstance(events, tuple)
         assert isinstance(verdict, tuple)
-        return write(tmp_path / "a.mcap", demo_content(checkout, payload), rows, events, verdict)
+        path = tmp_path / "a.mcap"
+        return write(path, demo_content(checkout, payload), rows, events, verdict)
 
     return _record
 
@@ -65,19 +66,25 @@ def test_joint_positions_are_those_of_the_drive_train(counts: list[int]) -> None
 
 
 def test_motor_six_also_turns_with_joint_five() -> None:
-    turn_of_motor_6 = DEMO_SCALING.joint_position(np.array([0, 0, 0, 0, 0, 65536]))
-    np.testing.assert_allclose(turn_of_motor_6, [0, 0, 0, 0, 0, 2 * pi / 32], atol=1e-12)
+    counts = np.array([0, 0, 0, 0, 0, 65536])
+    turn_of_motor_6 = DEMO_SCALING.joint_position(counts)
+    expected = [0, 0, 0, 0, 0, 2 * pi / 32]
+    np.testing.assert_allclose(turn_of_motor_6, expected, atol=1e-12)
     turn_of_motor_5 = DEMO_SCALING.joint_position(np.array([0, 0, 0, 0, 65536, 0]))
     np.testing.assert_allclose(turn_of_motor_5, [0, 0, 0, 0, 2 * pi / 45, -2 * pi / 45], atol=1e-12)
 
 
 def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
+    time_ns = START_NS + 20_000_000
+    cell_event = CellEvent(time_ns, None, EventKind.MOVE_START, 4, "")
+    start_ns_time_ns = START_NS + 50_000_000
     events = (
-        CellEvent(START_NS + 20_000_000, None, EventKind.MOVE_START, 4, ""),
-        CellEvent(START_NS + 50_000_000, None, EventKind.MOVE_END, 4, ""),
+        cell_event,
+        CellEvent(start_ns_time_ns, None, EventKind.MOVE_END, 4, ""),
         CellEvent(START_NS + 60_000_000, None, EventKind.MOVE_START, 5, ""),
     )
-    path = record(samples([[1000 * k] * 6 for k in range(100)]), events=events, loaded=True)
+    rows = [[1000 * k] * 6 for k in range(100)]
+    path = record(samples(rows), events=events, loaded=True)
     run, cell = load_run(path)
     # A name is as good as a path
     assert np.array_equal(load_run(str(path))[0].position_rad, run.position_rad)
@@ -85,7 +92,8 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
     assert run.payload == DISC
     assert run.rate_hz == pytest.approx(1000.0)
     assert run.time_s[0] == 0.0
-    np.testing.assert_allclose(run.current_a[3], [-6.0] * 6)
+    expected = [-6.0] * 6
+    np.testing.assert_allclose(run.current_a[3], expected)
     np.testing.assert_allclose(
         run.position_rad[1, :4], 1000 * 2 * pi / 65536 / np.array([32, 32, 45, -48])
     )
@@ -101,9 +109,12 @@ def test_the_channels_of_a_log_are_judged_once(
 ) -> None:
     counts = np.round(20_000.0 * np.sin(np.arange(2_500) / 80.0)).astype(int)
     counts[300] += 2_000  # a glitch
-    run, _ = load_run(record(samples([[count] * 6 for count in counts.tolist()])))
+    rows = [[count] * 6 for count in counts.tolist()]
+    path = record(samples(rows))
+    run, _ = load_run(path)
     train = DriveTrain(CELL.ratio)
-    again = differentiate(replace(run, judged_channels=None), train, CELL.conditioning)
+    changed_run = replace(run, judged_channels=None)
+    again = differentiate(changed_run, train, CELL.conditioning)
     with monkeypatch.context() as patch:
         patch.setattr(dataset, "find_faults", _judged_again)
         once = differentiate(run, train, CELL.conditioning)
@@ -117,7 +128,8 @@ def test_the_channels_of_a_log_are_judged_once(
     without_glitch = run.position_rad.copy()
     without_glitch[300] = without_glitch[[299, 301]].mean(axis=0)
     other = replace(run, position_rad=without_glitch)
-    assert differentiate(other, train, CELL.conditioning).faults == ()
+    faults = differentiate(other, train, CELL.conditioning).faults
+    assert faults == ()
 
 
 def _judged_again(*_: object) -> None:
@@ -126,16 +138,15 @@ def _judged_again(*_: object) -> None:
 
 def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder) -> None:
     """And what is printed of the payload is what was used."""
-    log = record(samples([[1000 * k] * 6 for k in range(100)]), loaded=True)
-    heavier = replace(
-        CELL, payloads=tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads)
-    )
+    rows = [[1000 * k] * 6 for k in range(100)]
+    log = record(samples(rows), loaded=True)
+    payloads = tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads)
+    heavier = replace(CELL, payloads=payloads)
     run, _ = load_run(log, heavier)
     assert run.payload is not None
     assert run.payload.known == {"m": 5.049}
-    other = replace(
-        CELL, payloads=tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads)
-    )
+    changed_payloads = tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads)
+    other = replace(CELL, payloads=changed_payloads)
     with pytest.raises(
         LogsDiffer, match="payload disc on flange-a, which the given description does not have"
     ):
@@ -143,16 +154,26 @@ def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder)
 
 
 def test_no_moves_recorded_is_none(record: Recorder) -> None:
-    assert load_run(record(samples([[0] * 6] * 3)))[0].move is None
+    rows = [[0] * 6] * 3
+    checkout = samples(rows)
+    run = load_run(record(checkout))
+    assert run[0].move is None
 
 
 def test_missing_and_saturated_samples_are_masked(record: Recorder) -> None:
     rows = samples([[0] * 6] * 20)
-    rows[3] = Sample(13, rows[3].time_ns, (0,) * 6, (0,) * 6, (0x1237,) * 6, missing=0b100100)
-    rows[7] = Sample(17, rows[7].time_ns, (0,) * 6, (0,) * 6, (0x1A37,) + (0x1237,) * 5)
+    position_counts = (0,) * 6
+    current_raw = (0,) * 6
+    rows[3] = Sample(
+        13, rows[3].time_ns, position_counts, current_raw, (0x1237,) * 6, missing=0b100100
+    )
+    statusword = (0x1A37,) + (0x1237,) * 5
+    time_ns = rows[7].time_ns
+    rows[7] = Sample(17, time_ns, (0,) * 6, (0,) * 6, statusword)
     valid = load_run(record(rows))[0].valid
     assert valid is not None
-    assert np.argwhere(~valid).tolist() == [[3, 2], [3, 5], [7, 0]]
+    expected = [[3, 2], [3, 5], [7, 0]]
+    assert np.argwhere(~valid).tolist() == expected
 
 
 def test_a_run_at_the_limit_is_refused(record: Recorder) -> None:
@@ -163,8 +184,9 @@ def test_a_run_at_the_limit_is_refused(record: Recorder) -> None:
 
 def test_a_gap_is_refused(record: Recorder) -> None:
     rows = samples([[0] * 6] * 20)
+    checkout = rows[:5] + rows[6:]
     with pytest.raises(CyclesLost, match="cycle 16 after 14 "):
-        load_run(record(rows[:5] + rows[6:]))
+        load_run(record(checkout))
 
 
 def test_a_clock_that_disagrees_is_refused(record: Recorder) -> None:
@@ -176,19 +198,24 @@ def test_a_clock_that_disagrees_is_refused(record: Recorder) -> None:
 def test_one_late_sync_is_refused(record: Recorder) -> None:
     """The mean rate of such a run is right, and its derivatives are not."""
     rows = samples([[0] * 6] * 400)
-    late = replace(rows[7], time_ns=rows[7].time_ns + 510_000)
+    time_ns = rows[7].time_ns + 510_000
+    late = replace(rows[7], time_ns=time_ns)
+    checkout = [*rows[:7], late, *rows[8:]]
     with pytest.raises(
         ClockImplausible,
         match=r"cycle 18 0\.49 ms after cycle 17, its most uneven step; "
         r"expected 1 ms",
     ):
-        load_run(record([*rows[:7], late, *rows[8:]]))
+        load_run(record(checkout))
 
 
 def test_a_sync_within_half_of_its_period_is_taken(record: Recorder) -> None:
     rows = samples([[0] * 6] * 400)
-    early = replace(rows[7], time_ns=rows[7].time_ns - 490_000)
-    assert load_run(record([*rows[:7], early, *rows[8:]]))[0].rate_hz == 1000.0
+    time_ns = rows[7].time_ns - 490_000
+    early = replace(rows[7], time_ns=time_ns)
+    checkout = [*rows[:7], early, *rows[8:]]
+    run = load_run(record(checkout))
+    assert run[0].rate_hz == 1000.0
 
 
 @given(
@@ -200,58 +227,63 @@ def test_a_sync_within_half_of_its_period_is_taken(record: Recorder) -> None:
 def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: list[int]) -> None:
     way = np.cumsum([start, *steps], dtype=np.int64)
     counter = ((way + 2**31) % 2**32 - 2**31).astype(np.int32)
-    np.testing.assert_array_equal(
-        unwrapped(np.stack((counter, np.full_like(counter, 7)), axis=1))[:, 0], way
-    )
+    counts = np.stack((counter, np.full_like(counter, 7)), axis=1)
+    np.testing.assert_array_equal(unwrapped(counts)[:, 0], way)
 
 
 def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
     """With an offset that puts the end of the counter in the middle of the joint's range."""
     end_rad = 2**31 / 65536 * 2 * pi / 32
-    axes = (replace(CELL.axes[0], zero_offset_rad=-end_rad), *CELL.axes[1:])
+    changed_axis = replace(CELL.axes[0], zero_offset_rad=-end_rad)
+    axes = (changed_axis, *CELL.axes[1:])
     counts = [2**31 - 3 + k - (2**32 if k >= 3 else 0) for k in range(6)]
     rows = [
         replace(row, current_raw=(0,) * 6)
         for row in samples([[count, 0, 0, 0, 0, 0] for count in counts])
     ]
     run, _ = load_run(record(rows), replace(CELL, axes=axes))
-    np.testing.assert_allclose(
-        run.position_rad[:, 0], np.arange(-3, 3) * 2 * pi / 65536 / 32, atol=1e-9
-    )
+    expected = np.arange(-3, 3) * 2 * pi / 65536 / 32
+    np.testing.assert_allclose(run.position_rad[:, 0], expected, atol=1e-9)
 
 
 def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
     start = demo_content(checkout)
     top = 2**31 - 1
     quantum = 0.01 / top
-    readback = Readback(
-        tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes)
-    )
+    axes = tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes)
+    readback = Readback(axes)
     rows = [
         Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6)
         for k, sign in enumerate((1, -1))
     ]
-    run, _ = load_run(write(tmp_path / "i.mcap", replace(start, readback=readback), rows))
-    np.testing.assert_allclose(run.position_rad[:, 0], [0.01 / 32, -0.01 / 32])
+    i_path = tmp_path / "i.mcap"
+    path = write(i_path, replace(start, readback=readback), rows)
+    run, _ = load_run(path)
+    expected = [0.01 / 32, -0.01 / 32]
+    np.testing.assert_allclose(run.position_rad[:, 0], expected)
 
 
 def test_an_invalid_run_is_refused(record: Recorder) -> None:
+    rows = [[0] * 6] * 20
+    path = record(samples(rows), verdict=(False, "heartbeat of node 3 lost"))
     with pytest.raises(RunInvalid, match="heartbeat of node 3"):
-        load_run(record(samples([[0] * 6] * 20), verdict=(False, "heartbeat of node 3 lost")))
+        load_run(path)
 
 
 def test_positions_outside_the_limits_are_refused(record: Recorder) -> None:
     turned = round(65536 * 32 * 0.8)
+    rows = [[0] * 6, [turned, 0, 0, 0, 0, 0]]
     with pytest.raises(
         PositionImplausible,
         match=r"axis J1: found joint positions from 0 to 288 deg; .*the zero "
         r"is wrong.*units",
     ):
-        load_run(record(samples([[0] * 6, [turned, 0, 0, 0, 0, 0]])))
+        load_run(record(samples(rows)))
 
 
 def test_a_log_of_another_cell_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "b.mcap", content(2), samples([[0, 0]] * 3))
+    b_path = tmp_path / "b.mcap"
+    path = write(b_path, content(2), samples([[0, 0]] * 3))
     with pytest.raises(LogsDiffer, match="a log of cell 'x'; expected one of cell 'demo'"):
         load_run(path, CELL)
     with pytest.raises(LogIncomplete, match="a readback of J1, J2; expected one of J1, J2, J3"):
@@ -259,13 +291,10 @@ def test_a_log_of_another_cell_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_readback_of_drives_keeps_their_answers() -> None:
-    readback = readback_of_drives(
-        ("J1", "J2"), (0.1, 0.2), {"J2": {"serial": 2}, "J1": {"serial": 1}}
-    )
-    assert [(a.name, a.current_per_unit, a.drive) for a in readback.axes] == [
-        ("J1", 0.1, {"serial": 1}),
-        ("J2", 0.2, {"serial": 2}),
-    ]
+    answers = {"J2": {"serial": 2}, "J1": {"serial": 1}}
+    readback = readback_of_drives(("J1", "J2"), (0.1, 0.2), answers)
+    expected = [("J1", 0.1, {"serial": 1}), ("J2", 0.2, {"serial": 2})]
+    assert [(a.name, a.current_per_unit, a.drive) for a in readback.axes] == expected
 
 
 def bouncing(count: int = 3000, size: bool = True) -> list[Sample]:
@@ -290,7 +319,8 @@ def test_a_current_without_its_sign_is_refused_by_axis(record: Recorder) -> None
 
 
 def test_a_current_with_its_sign_is_taken(record: Recorder) -> None:
-    run, _ = load_run(record(bouncing(size=False)))
+    path = record(bouncing(size=False))
+    run, _ = load_run(path)
     assert len(run.time_s) == 3000
 
 
@@ -301,9 +331,11 @@ def test_a_temperature_that_no_motor_has_is_left_out() -> None:
     for axis, values in celsius.items():
         for second, value in enumerate(values):
             at_ns = START_NS + second * 10**9
-            readings.append(SlowReading(at_ns, axis, Quantity.TEMPERATURE, value))
+            slow_reading = SlowReading(at_ns, axis, Quantity.TEMPERATURE, value)
+            readings.append(slow_reading)
     time_ns = START_NS + np.array([0, 1, 2], dtype=np.int64) * 10**9
-    samples_of_log = SimpleNamespace(time_ns=time_ns, position_counts=np.zeros((3, 3)))
+    position_counts = np.zeros((3, 3))
+    samples_of_log = SimpleNamespace(time_ns=time_ns, position_counts=position_counts)
     log: Any = SimpleNamespace(readings=readings, samples=samples_of_log)
     nothing = [np.nan] * 3
     expected = np.column_stack([[30.0, 31.0, 32.0], nothing, nothing])

@@ -62,12 +62,15 @@ def _read(
     moved = None
     if velocity is not None:
         moved = VelocityColumns(file="run.csv", columns=("v",), unit=velocity, side=Side.JOINT)
+    position = PositionColumns(file="run.csv", columns=columns[:1], unit=unit, side=Side.JOINT)
+    current = CurrentColumns(file="run.csv", columns=columns[1:], unit="A", factor=factor)
+    table = CsvLayout(**layout)
     wanted = ImportDescription(
         name="run",
         cell="cell.yaml",
-        table=CsvLayout(**layout),
-        position=PositionColumns(file="run.csv", columns=columns[:1], unit=unit, side=Side.JOINT),
-        current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A", factor=factor),
+        table=table,
+        position=position,
+        current=current,
         velocity=moved,
         time=timed,
         rate_hz=None if time is not None else 100.0,
@@ -82,10 +85,12 @@ def _read(
 def test_a_line_of_units_below_the_header_is_no_row(tmp_path: Path, units: str) -> None:
     if units.endswith(","):
         units += "Arms"
-    table = _read(tmp_path, ["t,q,i", units, *ROWS])
+    lines = ["t,q,i", units, *ROWS]
+    table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
     assert table.place(0, "q") == f"{tmp_path}/run.csv:3, column q"
-    assert table.remarks == (f"run.csv: line 2 was taken for the units of the columns: {units!r}",)
+    expected = (f"run.csv: line 2 was taken for the units of the columns: {units!r}",)
+    assert table.remarks == expected
 
 
 @pytest.mark.parametrize(
@@ -110,8 +115,9 @@ def test_a_line_of_units_below_the_header_is_no_row(tmp_path: Path, units: str) 
 def test_units_that_contradict_the_description_are_refused(
     tmp_path: Path, units: str, changes: dict[str, Any], found: str, expected: str
 ) -> None:
+    lines = ["t,q,i", units, *ROWS]
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column ") as caught:
-        _read(tmp_path, ["t,q,i", units, *ROWS], **changes)
+        _read(tmp_path, lines, **changes)
     assert found in caught.value.found
     assert expected in caught.value.expected
 
@@ -124,14 +130,16 @@ def test_a_unit_in_the_name_of_a_column_is_compared_too(
     tmp_path: Path, names: str, column: str
 ) -> None:
     stamps, position, current = names.split(",")
+    lines = [names, *ROWS]
     with pytest.raises(TableUnfit, match=r"run\.csv:1") as caught:
-        _read(tmp_path, [names, *ROWS], columns=(position, current), stamps=stamps)
+        _read(tmp_path, lines, columns=(position, current), stamps=stamps)
     assert column in caught.value.subject
     assert "in the name of the column" in caught.value.found
 
 
 def test_a_line_of_units_is_known_by_that_of_the_time_alone(tmp_path: Path) -> None:
-    table = _read(tmp_path, ["t,q,i", "s,rounds,bits", *ROWS])
+    lines = ["t,q,i", "s,rounds,bits", *ROWS]
+    table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
     assert table.remarks == (
         "run.csv: line 2 was taken for the units of the columns: 's,rounds,bits'",
@@ -146,12 +154,13 @@ def test_a_line_of_units_is_known_by_that_of_the_time_alone(tmp_path: Path) -> N
 
 def test_a_unit_in_a_name_must_be_that_of_the_line_of_units(tmp_path: Path) -> None:
     columns = ("q [deg]", "i [A]")
+    lines = ["t,q [deg],i [A]", "s,rad,A", *ROWS]
     with pytest.raises(
         TableUnfit,
         match=r"run\.csv:2, column q \[deg\]: .* 'rad' .* and 'deg' in the name "
         r".* one unit",
     ):
-        _read(tmp_path, ["t,q [deg],i [A]", "s,rad,A", *ROWS], columns=columns)
+        _read(tmp_path, lines, columns=columns)
     # Letters that may be no unit, and units that say the same.
     columns = ("q [A]", "i [Arms]")
     assert (
@@ -170,10 +179,11 @@ def test_lines_count_as_an_editor_counts_them(tmp_path: Path) -> None:
 
 
 def test_a_header_of_numbers_is_named_by_its_line_where_units_follow(tmp_path: Path) -> None:
+    lines = ["exported by X", "3,7,4", "s,rad,A", *ROWS]
     with pytest.raises(TableUnfit, match=r"run\.csv:2: found a header of numbers, 3, 7, 4"):
         _read(
             tmp_path,
-            ["exported by X", "3,7,4", "s,rad,A", *ROWS],
+            lines,
             stamps="3",
             columns=("7", "4"),
             skip_rows=1,
@@ -183,25 +193,29 @@ def test_a_header_of_numbers_is_named_by_its_line_where_units_follow(tmp_path: P
 @pytest.mark.parametrize("unit", ["deg/s", "rpm", "mm/s"])
 def test_velocities_in_another_unit_are_refused(tmp_path: Path, unit: str) -> None:
     rows = [f"{row},0.5" for row in ROWS]
+    lines = ["t,q,i,v", f"s,rad,A,{unit}", *rows]
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column v") as caught:
-        _read(tmp_path, ["t,q,i,v", f"s,rad,A,{unit}", *rows], velocity=VelocityUnit.RAD)
+        _read(tmp_path, lines, velocity=VelocityUnit.RAD)
     assert "'rad/s', the unit of `velocity`" in caught.value.expected
 
 
 def test_letters_in_a_name_that_may_be_no_unit_say_nothing(tmp_path: Path) -> None:
     names = ("q [A]", "i [N]")
-    assert len(_read(tmp_path, ["t,q [A],i [N]", *ROWS], columns=names).values) == COUNT
+    lines = ["t,q [A],i [N]", *ROWS]
+    assert len(_read(tmp_path, lines, columns=names).values) == COUNT
 
 
 @pytest.mark.parametrize(
     ("units", "factor"), [("s,rad,Nm", 0.5), ("s,rad,%", 0.12), ("s,rad,A", 1.414)]
 )
 def test_a_factor_may_convert_another_quantity(tmp_path: Path, units: str, factor: float) -> None:
-    assert len(_read(tmp_path, ["t,q,i", units, *ROWS], factor=factor).values) == COUNT
+    lines = ["t,q,i", units, *ROWS]
+    assert len(_read(tmp_path, lines, factor=factor).values) == COUNT
 
 
 def test_a_unit_that_is_not_known_says_nothing(tmp_path: Path) -> None:
-    assert len(_read(tmp_path, ["t,q,i", "s,turns,A", *ROWS]).values) == COUNT
+    lines = ["t,q,i", "s,turns,A", *ROWS]
+    assert len(_read(tmp_path, lines).values) == COUNT
 
 
 def test_a_row_that_is_commented_out_is_missing_at_a_rate(tmp_path: Path) -> None:
@@ -225,25 +239,31 @@ def test_a_column_that_is_no_time_names_those_that_grow(tmp_path: Path) -> None:
 
 
 def test_a_factor_explains_another_unit_of_the_current(tmp_path: Path) -> None:
-    assert len(_read(tmp_path, ["t,q,i", "s,rad,mA", *ROWS], factor=0.001).values) == COUNT
+    lines = ["t,q,i", "s,rad,mA", *ROWS]
+    assert len(_read(tmp_path, lines, factor=0.001).values) == COUNT
     assert len(_read(tmp_path, ["t,q,i", "s,mm,A", *ROWS], unit=PositionUnit.DEG).values) == COUNT
 
 
 @pytest.mark.parametrize("line", ["Time,Position,Current", "nan,nan,nan", "s,n/a,A", "-,-,-"])
 def test_a_line_of_other_words_is_refused_with_the_setting(tmp_path: Path, line: str) -> None:
+    lines = ["t,q,i", line, *ROWS]
     with pytest.raises(TableUnfit, match=r"run\.csv:2"):
-        _read(tmp_path, ["t,q,i", line, *ROWS])
-    kept = _read(tmp_path, ["t,q,i", line, *ROWS], keep=KeptPart(from_row=2))
+        _read(tmp_path, lines)
+    keep = KeptPart(from_row=2)
+    kept = _read(tmp_path, ["t,q,i", line, *ROWS], keep=keep)
     np.testing.assert_array_equal(kept.values, READ)
 
 
 def test_the_advice_for_a_second_header_is_the_setting_that_reads_it(tmp_path: Path) -> None:
+    lines = ["t,q,i", "Time,Position,Current", *ROWS]
     with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 2\}`"):
-        _read(tmp_path, ["t,q,i", "Time,Position,Current", *ROWS])
+        _read(tmp_path, lines)
     again = ["t,q,i", *ROWS[:5], "Time,Position,Current", *ROWS[5:]]
+    keep = KeptPart(from_row=6)
     with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 7\}`"):
-        _read(tmp_path, again, keep=KeptPart(from_row=6))
-    rest = _read(tmp_path, again, keep=KeptPart(from_row=7))
+        _read(tmp_path, again, keep=keep)
+    kept_part = KeptPart(from_row=7)
+    rest = _read(tmp_path, again, keep=kept_part)
     np.testing.assert_array_equal(rest.values, READ[5:])
 
 
@@ -261,13 +281,15 @@ def test_comments_before_and_after_the_rows_are_left_out(tmp_path: Path, sign: s
     ]
     table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
-    assert table.remarks == (f"run.csv: left out after the rows: 1 line, '{sign} {COUNT} samples'",)
+    expected = (f"run.csv: left out after the rows: 1 line, '{sign} {COUNT} samples'",)
+    assert table.remarks == expected
 
 
 @pytest.mark.parametrize("header", ["# t,q,i", "% t,q,i", "#t,q,i"])
 @pytest.mark.parametrize("comments", [[], ["# a note, about i"]])
 def test_a_header_may_begin_as_a_comment(tmp_path: Path, header: str, comments: list[str]) -> None:
-    np.testing.assert_array_equal(_read(tmp_path, [*comments, header, *ROWS]).values, READ)
+    lines = [*comments, header, *ROWS]
+    np.testing.assert_array_equal(_read(tmp_path, lines).values, READ)
     np.testing.assert_array_equal(
         _read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values, READ
     )
@@ -278,7 +300,8 @@ def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> No
     np.testing.assert_array_equal(_read(tmp_path, lines, columns=("#q", "i")).values, READ)
     lines = ["#q,t,i", *ROWS]
     table = _read(tmp_path, lines, columns=("#q", "i"), time=None)
-    np.testing.assert_array_equal(table.values[:, 0], np.round(VALUES[:, 0], 6))
+    expected = np.round(VALUES[:, 0], 6)
+    np.testing.assert_array_equal(table.values[:, 0], expected)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +324,8 @@ def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, 
         _read(tmp_path, lines)
     assert "delimiter" not in caught.value.remedy
     assert f"`keep: {{to_row: {place}}}`" in caught.value.remedy
-    before = _read(tmp_path, lines, keep=KeptPart(to_row=place))
+    keep = KeptPart(to_row=place)
+    before = _read(tmp_path, lines, keep=keep)
     np.testing.assert_array_equal(before.values, READ[:place])
     word, _, _ = line.partition(" ")
     sign = word[:4] if word.isalpha() else word
@@ -336,7 +360,8 @@ def test_line_ends_that_were_doubled_make_no_rows(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("line", ["sep=,", '"sep=,"', "SEP=,"])
 def test_the_line_that_names_the_delimiter_is_no_header(tmp_path: Path, line: str) -> None:
-    np.testing.assert_array_equal(_read(tmp_path, [line, "t,q,i", *ROWS]).values, READ)
+    lines = [line, "t,q,i", *ROWS]
+    np.testing.assert_array_equal(_read(tmp_path, lines).values, READ)
 
 
 def test_another_delimiter_than_the_files_own_is_refused(tmp_path: Path) -> None:
@@ -347,7 +372,8 @@ def test_another_delimiter_than_the_files_own_is_refused(tmp_path: Path) -> None
 
 
 def test_the_minus_sign_of_typography_is_read(tmp_path: Path) -> None:
-    table = _read(tmp_path, ["t,q,i", *(row.replace("-", "\u2212") for row in ROWS)])
+    lines = ["t,q,i", *(row.replace("-", "\u2212") for row in ROWS)]
+    table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
     assert table.remarks == ("run.csv: the minus sign U+2212 was read as -",)
 
@@ -358,9 +384,8 @@ def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(
     lines = ["t,q,i", *ROWS, "0.12,0.3"]
     with pytest.raises(TableUnfit, match=rf"the file ends early.*`keep: \{{to_row: {COUNT}\}}`"):
         _read(tmp_path, lines, end="")
-    np.testing.assert_array_equal(
-        _read(tmp_path, lines, end="", keep=KeptPart(to_row=COUNT)).values, READ
-    )
+    keep = KeptPart(to_row=COUNT)
+    np.testing.assert_array_equal(_read(tmp_path, lines, end="", keep=keep).values, READ)
 
 
 def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
@@ -375,7 +400,8 @@ def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
         _read(tmp_path, lines)
     assert f"{{to_row: {COUNT}}}" in caught.value.remedy
     assert f"{{from_row: {COUNT + 2}}}" in caught.value.remedy
-    for part in (KeptPart(to_row=COUNT), KeptPart(from_row=COUNT + 2)):
+    from_row = COUNT + 2
+    for part in (KeptPart(to_row=COUNT), KeptPart(from_row=from_row)):
         np.testing.assert_array_equal(_read(tmp_path, lines, keep=part).values, READ)
 
 
@@ -383,8 +409,9 @@ def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Pa
     """Which of the two is right only the file's owner knows:
     advice to keep one of them would exchange columns.
     """
+    lines = ["t,i,q", "t,q,i", *ROWS]
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column .*a second header") as caught:
-        _read(tmp_path, ["t,i,q", "t,q,i", *ROWS])
+        _read(tmp_path, lines)
     assert "`keep" not in caught.value.remedy
 
 
@@ -403,11 +430,13 @@ def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
     with pytest.raises(TableUnfit, match=rf"`keep: \{{{setting}\}}`"):
         _read(tmp_path, ["t,q,i", *rows])
     if first == 0:
-        part = KeptPart(from_row=last + 2)
+        from_row = last + 2
+        part = KeptPart(from_row=from_row)
     else:
         part = KeptPart(to_row=first)
     kept = READ[last + 1 :] if first == 0 else READ[:first]
-    np.testing.assert_array_equal(_read(tmp_path, ["t,q,i", *rows], keep=part).values, kept)
+    lines = ["t,q,i", *rows]
+    np.testing.assert_array_equal(_read(tmp_path, lines, keep=part).values, kept)
 
 
 @pytest.mark.parametrize(
@@ -416,11 +445,15 @@ def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
 def test_times_are_kept(
     tmp_path: Path, from_s: float | None, to_s: float | None, rows: slice
 ) -> None:
-    table = _read(tmp_path, ["t,q,i", *ROWS], keep=KeptPart(from_s=from_s, to_s=to_s))
+    keep = KeptPart(from_s=from_s, to_s=to_s)
+    lines = ["t,q,i", *ROWS]
+    table = _read(tmp_path, lines, keep=keep)
     np.testing.assert_array_equal(table.values, READ[rows])
     assert table.stamps is not None
-    assert table.stamps.first_ns == round(1e9 * VALUES[rows][0, 0])
-    assert table.stamps.time_s[-1] == pytest.approx(VALUES[rows][-1, 0] - VALUES[rows][0, 0])
+    expected = round(1e9 * VALUES[rows][0, 0])
+    assert table.stamps.first_ns == expected
+    value_difference = VALUES[rows][-1, 0] - VALUES[rows][0, 0]
+    assert table.stamps.time_s[-1] == pytest.approx(value_difference)
 
 
 PIECES = (
@@ -472,9 +505,10 @@ def test_any_lines_are_read_or_refused(
 
 @pytest.mark.parametrize("part", [KeptPart(from_row=100), KeptPart(from_s=5.0)])
 def test_a_part_with_nothing_in_it_is_refused(tmp_path: Path, part: KeptPart) -> None:
+    lines = ["t,q,i", *ROWS]
     with pytest.raises(
         TableUnfit,
         match=rf"found {COUNT} rows.*none of them in "
         r"`keep`.*correct `keep`",
     ):
-        _read(tmp_path, ["t,q,i", *ROWS], keep=part)
+        _read(tmp_path, lines, keep=part)

@@ -37,14 +37,17 @@ def _read(
 ) -> Table:
     path = tmp_path / "run.csv"
     path.write_bytes(data)
+    position = PositionColumns(
+        file="run.csv", columns=columns[:1], unit=PositionUnit.DEG, side=Side.JOINT
+    )
+    current = CurrentColumns(file="run.csv", columns=columns[1:], unit="A")
+    table = CsvLayout(**layout)
     wanted = ImportDescription(
         name="run",
         cell="cell.yaml",
-        table=CsvLayout(**layout),
-        position=PositionColumns(
-            file="run.csv", columns=columns[:1], unit=PositionUnit.DEG, side=Side.JOINT
-        ),
-        current=CurrentColumns(file="run.csv", columns=columns[1:], unit="A"),
+        table=table,
+        position=position,
+        current=current,
     )
     return read_csv(
         path,
@@ -71,9 +74,8 @@ def _text(*rows: str, header: str = "Winkel [°],Strom [µA]") -> str:
 def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> None:
     table = _read(tmp_path, bom + _text(*ROWS).encode(encoding), ("Winkel [°]", "Strom [µA]"))
     assert np.array_equal(table.values, VALUES)
-    assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == [
-        True
-    ] * bool(remark)
+    expected = [True] * bool(remark)
+    assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == expected
 
 
 @pytest.mark.parametrize(
@@ -142,7 +144,8 @@ def test_decimals_of_one_width_are_no_groups(
     tmp_path_factory: pytest.TempPathFactory, values: list[int]
 ) -> None:
     data = _text(*(f"0.5;{value / 1000:.3f}" for value in values), header="q;i").encode()
-    read = _read(tmp_path_factory.mktemp("csv"), data, ("i",), delimiter=";").values[:, 0]
+    tmp_path = tmp_path_factory.mktemp("csv")
+    read = _read(tmp_path, data, ("i",), delimiter=";").values[:, 0]
     assert np.array_equal(read, np.array(values) / 1000)
 
 
@@ -227,7 +230,8 @@ def test_stamps_since_1970_are_exact_in_every_unit(tmp_path: Path, unit: TimeUni
     stamps = _stamped(tmp_path, unit, texts).stamps
     assert stamps is not None
     assert stamps.first_ns == START_NS
-    assert stamps.time_s.tolist() == [STEP_NS * index * 1e-9 for index in range(4)]
+    expected = [STEP_NS * index * 1e-9 for index in range(4)]
+    assert stamps.time_s.tolist() == expected
 
 
 def test_dates_with_a_zone(tmp_path: Path) -> None:
@@ -247,8 +251,9 @@ def test_dates_with_a_zone(tmp_path: Path) -> None:
     "text", ["2026-03-01T07:00:00.1", "2026-13-01T07:00:00Z", "7:00", "1772348400.1"]
 )
 def test_a_date_without_a_zone_is_refused(tmp_path: Path, text: str) -> None:
+    stamps = [text] * 3
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1") as caught:
-        _stamped(tmp_path, TimeUnit.ISO_8601, [text] * 3)
+        _stamped(tmp_path, TimeUnit.ISO_8601, stamps)
     assert "add the zone" in caught.value.remedy
 
 
@@ -261,8 +266,9 @@ def test_stamps_since_some_start_are_those_of_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("last", [TimeUnit.SECOND, TimeUnit.NANOSECOND])
 def test_stamps_that_no_log_holds_are_refused(tmp_path: Path, last: TimeUnit) -> None:
+    stamps = ["1", "1e308", "3"]
     with pytest.raises(TableUnfit, match=r"run\.csv:3, column 1"):
-        _stamped(tmp_path, last, ["1", "1e308", "3"])
+        _stamped(tmp_path, last, stamps)
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column 1"):
         _stamped(tmp_path, TimeUnit.ISO_8601, ["9999-01-01T00:00:00Z"] * 2)
 
@@ -322,9 +328,8 @@ def test_times_of_day_are_stamps_since_midnight(
 
 
 def test_times_of_day_go_on_over_midnight(tmp_path: Path) -> None:
-    table = _stamped(
-        tmp_path, TimeUnit.CLOCK, ["23:59:59.98", "23:59:59.99", "00:00:00.00", "00:00:00.01"]
-    )
+    stamps = ["23:59:59.98", "23:59:59.99", "00:00:00.00", "00:00:00.01"]
+    table = _stamped(tmp_path, TimeUnit.CLOCK, stamps)
     assert table.stamps is not None
     assert table.stamps.time_s == pytest.approx([0.0, 0.01, 0.02, 0.03], abs=1e-9)
     assert "times of day that pass midnight" in table.remarks[0]
@@ -339,7 +344,8 @@ def test_dates_that_go_back_a_day_do_not_pass_midnight(tmp_path: Path) -> None:
     ]
     table = _stamped(tmp_path, TimeUnit.CLOCK, texts)
     assert table.stamps is not None
-    assert np.diff(table.stamps.time_s).min() < -86_000.0
+    time_steps_s = np.diff(table.stamps.time_s)
+    assert time_steps_s.min() < -86_000.0
     assert table.remarks == ()
 
 
@@ -347,20 +353,22 @@ def test_dates_that_go_back_a_day_do_not_pass_midnight(tmp_path: Path) -> None:
     "text", ["8:59 AM", "24:00:00", "08:59", "2026-02-30 08:00:00", "08:60:00", "5.0"]
 )
 def test_what_is_no_time_of_day_is_refused(tmp_path: Path, text: str) -> None:
+    stamps = [text] * 3
     with pytest.raises(
         TableUnfit,
         match=r"run\.csv:2, column 1: .*expected a time of day "
         r"of 24 hours",
     ):
-        _stamped(tmp_path, TimeUnit.CLOCK, [text] * 3)
+        _stamped(tmp_path, TimeUnit.CLOCK, stamps)
 
 
 @pytest.mark.parametrize(
     "text", ["08:59:00.000", "2026-03-01 08:59:00.000", "2026-03-01T08:59:00.000Z"]
 )
 def test_a_time_of_day_where_a_number_is_expected_names_the_unit(tmp_path: Path, text: str) -> None:
+    stamps = [text] * 3
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column t.*`unit: clock`.*`unit: iso8601`"):
-        _stamped(tmp_path, TimeUnit.SECOND, [text] * 3)
+        _stamped(tmp_path, TimeUnit.SECOND, stamps)
 
 
 @pytest.mark.parametrize(
@@ -382,7 +390,8 @@ def test_a_counter_of_time_that_wraps_goes_on(
     half = 2 ** (bits - 1) if signed else 0
     counts = [(2**bits - 3 * step + step * row - 1) % 2**bits - half for row in range(8)]
     assert min(np.diff(counts)) < 0
-    table = _stamped(tmp_path, unit, [str(count) for count in counts])
+    stamps = [str(count) for count in counts]
+    table = _stamped(tmp_path, unit, stamps)
     assert table.stamps is not None
     assert table.stamps.time_s == pytest.approx(step * unit.seconds * np.arange(8.0), abs=1e-9)
     assert f"a counter of {bits} bits in {unit.value} that wraps" in table.remarks[0]

@@ -38,7 +38,8 @@ def log(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Path:
         CellEvent(START_NS + at * 1_000_000, None, EventKind.MOVE_START, number, "")
         for number, at in ((0, 5), (1, 5000))
     ]
-    return write(tmp_path_factory.mktemp("log") / "bare.mcap", demo_content(checkout), rows, moves)
+    path = tmp_path_factory.mktemp("log") / "bare.mcap"
+    return write(path, demo_content(checkout), rows, moves)
 
 
 def _table(path: Path) -> dict[str, list[str]]:
@@ -59,7 +60,8 @@ def test_csv_has_the_numbers_that_a_fit_gets(
     said = json.loads(capsys.readouterr().out)
     table = _table(out)
     run, _ = load_run(log)
-    assert (said["rows"], said["columns"], said["valid"]) == (ROWS, list(table), True)
+    expected = (ROWS, list(table), True)
+    assert (said["rows"], said["columns"], said["valid"]) == expected
     assert list(table)[:4] == ["cycle", "time_ns", "time_s", "move"]
     assert list(table)[4:10] == [
         f"J1.{name}"
@@ -74,14 +76,17 @@ def test_csv_has_the_numbers_that_a_fit_gets(
     ]
     # repr gives back the very numbers.
     for index in range(6):
-        assert (_numbers(table[f"J{index + 1}.position_rad"]) == run.position_rad[:, index]).all()
+        column = table[f"J{index + 1}.position_rad"]
+        assert (_numbers(column) == run.position_rad[:, index]).all()
         assert (_numbers(table[f"J{index + 1}.current_A"]) == run.current_a[:, index]).all()
     assert run.move is not None
     assert (_numbers(table["move"]) == run.move).all()
-    assert [row for row, text in enumerate(table["J3.answered"]) if text == "0"] == [7]
+    rows = [row for row, text in enumerate(table["J3.answered"]) if text == "0"]
+    assert rows == [7]
     assert set(table["J2.answered"]) == {"1"}
     assert [int(text) for text in table["time_ns"][:2]] == [START_NS, START_NS + 1_000_000]
-    assert set(table["J6.statusword"]) == {str(0x1237)}
+    j6_statusword = set(table["J6.statusword"])
+    assert j6_statusword == {str(0x1237)}
     assert list(tmp_path.iterdir()) == [out]
 
 
@@ -93,9 +98,12 @@ def test_a_counter_that_wraps_goes_on_from_block_to_block(tmp_path: Path, checko
         Sample(10 + k, START_NS + k * 1_000_000, tuple(row), (0,) * 6, (0,) * 6, 0)
         for k, row in enumerate(rows)
     ]
-    log = write(tmp_path / "wrapping.mcap", demo_content(checkout), bare)
+    path = tmp_path / "wrapping.mcap"
+    log = write(path, demo_content(checkout), bare)
     export_log(log, tmp_path / "out.csv", TableFormat.CSV)
-    assert [int(text) for text in _table(tmp_path / "out.csv")["J4.motor_counts"]] == true
+    out_path = tmp_path / "out.csv"
+    j4_motor_counts = _table(out_path)["J4.motor_counts"]
+    assert [int(text) for text in j4_motor_counts] == true
 
 
 def test_torques_and_temperatures_are_in_the_row_of_their_sync(
@@ -107,22 +115,24 @@ def test_torques_and_temperatures_are_in_the_row_of_their_sync(
     edge = START_NS + (BLOCK_SAMPLES - 1) * 1_000_000 + 500_000
     with LogWriter(path, demo_content(checkout), joints, clock_ns=lambda: 0) as log:
         for time_ns, value in ((START_NS - 5, 20.0), (last + 10**9, 21.0)):
-            log.reading(SlowReading(time_ns, 2, Quantity.TEMPERATURE, value))
+            slow_reading = SlowReading(time_ns, 2, Quantity.TEMPERATURE, value)
+            log.reading(slow_reading)
         for time_ns, value in ((START_NS + 3_999_999, 0.5), (edge, 0.75)):
             log.reading(SlowReading(time_ns, 0, Quantity.TORQUE, value))
-        for sample in samples([[0] * 6] * ROWS):
+        rows = [[0] * 6] * ROWS
+        for sample in samples(rows):
             log.write(sample)
         log.conclude(True)
     export_log(path, tmp_path / "warm.csv", TableFormat.CSV)
     table = _table(tmp_path / "warm.csv")
-    found = {
-        name: {row: text for row, text in enumerate(table[name]) if text}
-        for name in list(table)[-2:]
-    }
-    assert found == {
+    found = {}
+    for name in list(table)[-2:]:
+        found[name] = {row: text for row, text in enumerate(table[name]) if text}
+    expected = {
         "J1.motor_torque_Nm": {3: "0.5", BLOCK_SAMPLES - 1: "0.75"},
         "J3.temperature_degC": {0: "20.0", ROWS - 1: "21.0"},
     }
+    assert found == expected
 
 
 def test_parquet_has_the_same_columns(log: Path, tmp_path: Path) -> None:
@@ -178,8 +188,9 @@ def test_a_damaged_log_leaves_nothing_behind_and_nothing_is_overwritten(
 def test_an_invalid_log_is_exported_and_called_invalid(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    path = tmp_path / "bad.mcap"
     log = write(
-        tmp_path / "bad.mcap",
+        path,
         demo_content(checkout),
         samples([[0] * 6] * 3),
         verdict=(False, "2 late answers"),
@@ -197,6 +208,7 @@ def test_a_link_in_the_place_of_the_unfinished_table_is_not_followed(
     target = tmp_path / "elsewhere"
     target.write_text("mine")
     (tmp_path / "bare.csv.part").symlink_to(target)
-    assert export_log(log, tmp_path / "bare.csv", TableFormat.CSV).rows == ROWS
+    rows = export_log(log, tmp_path / "bare.csv", TableFormat.CSV).rows
+    assert rows == ROWS
     assert target.read_text() == "mine"
     assert not (tmp_path / "bare.csv").is_symlink()

@@ -44,7 +44,9 @@ from tests.daq.console.feeds import Recording, arrivals, facts
 @pytest.fixture(scope="module")
 def cell(checkout: Path) -> Cell:
     """The demo cell."""
-    return load_cell(checkout / "configs" / "cells" / "demo.yaml")
+    cells_folder = checkout / "configs" / "cells"
+    path = cells_folder / "demo.yaml"
+    return load_cell(path)
 
 
 @pytest.fixture
@@ -70,26 +72,29 @@ def test_a_console_gets_every_sample_and_event_in_their_order(cell_file: Path, c
         recording.run(5)  # without a console
         with _console(cell_file, feed) as console:
             recording.run(25)
-            feed.event(CellEvent(50_000_000, 1, EventKind.EMCY, 0x7305, "EMCY 7305h"))
+            event = CellEvent(50_000_000, 1, EventKind.EMCY, 0x7305, "EMCY 7305h")
+            feed.event(event)
             recording.run(10)
             feed.finish()
             packets = [console.recv(LARGEST_PACKET) for _ in range(6)]
     heads = [HEAD.unpack_from(packet) for packet in packets]
-    assert json.loads(packets[0][HEAD.size :])["run"]["axes"] == list(cell.axis_names)
-    assert [number - heads[0][1] for _, number, *_ in heads] == [0, 1, 2, 3, 4, 5]
+    document = json.loads(packets[0][HEAD.size :])
+    axes = document["run"]["axes"]
+    assert axes == list(cell.axis_names)
+    numbers = [number - heads[0][1] for _, number, *_ in heads]
+    assert numbers == [0, 1, 2, 3, 4, 5]
     kinds = ["samples" if kind == SAMPLES else next(iter(json.loads(packet[HEAD.size :]))) for packet, (kind, *_) in  # noqa: E501
              zip(packets, heads, strict=True)]  # fmt: skip
-    assert kinds == ["run", "samples", "samples", "samples", "events", "samples"]
-    cycles = [
-        cycle
-        for packet, head in zip(packets, heads, strict=True)
-        if head[0] == SAMPLES
-        for cycle in np.frombuffer(packet[HEAD.size :], packet_dtype(len(cell.axes)))[
-            "cycle"
-        ].tolist()
-    ]
+    expected = ["run", "samples", "samples", "samples", "events", "samples"]
+    assert kinds == expected
+    cycles = []
+    for packet, head in zip(packets, heads, strict=True):
+        if head[0] == SAMPLES:
+            rows = np.frombuffer(packet[HEAD.size :], packet_dtype(len(cell.axes)))
+            cycles.extend(rows["cycle"].tolist())
     assert cycles == list(range(5, 40))
-    assert heads[-1][2] == 40  # all samples of the run, also those from before
+    last_head = heads[-1]
+    assert last_head[2] == 40  # all samples of the run, also those from before
 
 
 def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(
@@ -103,7 +108,8 @@ def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(
             numbers = []
             while True:
                 try:
-                    numbers.append(HEAD.unpack_from(console.recv(LARGEST_PACKET))[1])
+                    unpack = HEAD.unpack_from(console.recv(LARGEST_PACKET))
+                    numbers.append(unpack[1])
                 except BlockingIOError:
                     break
             recording.run(10)
@@ -111,7 +117,8 @@ def test_a_console_that_does_not_read_loses_packets_and_delays_nothing(
         recording.run(20)  # it has gone
         assert not feed._consoles
     assert 0 < len(numbers) < 5000
-    assert after[1] - numbers[-1] > 100
+    last_number = numbers[-1]
+    assert after[1] - last_number > 100
     assert after[2] == 60_010
 
 
@@ -144,11 +151,9 @@ def test_a_stop_is_acknowledged_and_its_end_reported_while_the_curves_stall(
             assert asking.recv(len(ACCEPTED)) == ACCEPTED
             assert stopped.wait(10)
             feed.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
-        assert json.loads(asking.recv(4096)) == {
-            "ok": False,
-            "axes_stopped": True,
-            "text": "stopped",
-        }
+        document = json.loads(asking.recv(4096))
+        expected = {"ok": False, "axes_stopped": True, "text": "stopped"}
+        assert document == expected
 
 
 def test_silent_clients_delay_no_stop(cell_file: Path) -> None:
@@ -282,7 +287,8 @@ def test_an_error_that_cannot_be_written_is_named() -> None:
             raise ValueError("no text")
 
     assert end_of(Unwritable())["text"] == "Unwritable"
-    assert end_of(_behind(Unwritable()))["text"].startswith("node 2: ")
+    error = _behind(Unwritable())
+    assert end_of(error)["text"].startswith("node 2: ")
 
 
 def _end_at(console: socket.socket) -> dict[str, object]:
@@ -304,8 +310,9 @@ def test_samples_that_cannot_be_sent_do_not_keep_the_end_from_a_console(
             feed._packed = ["no bytes"]  # type: ignore[list-item]
             raise _behind(SdoAbortedError(0x0601_0002))
         end = _end_at(console)
-    assert end == {
+    expected = {
         "ok": False,
         "axes_stopped": True,
         "text": "node 2: TPDO1: writing 0x0 to 1A00h:00: aborted",
     }
+    assert end == expected

@@ -54,10 +54,12 @@ class Bench:
 
     def prepare(self) -> Bench:
         """Make all files."""
-        shutil.copytree(self.checkout / "configs", self.folder / "configs")
+        configs_folder = self.checkout / "configs"
+        shutil.copytree(configs_folder, self.folder / "configs")
         self.data.mkdir()
         self.out.parent.mkdir()
-        self.write_csv(np.hstack((self.joint_deg, self.current_a)))
+        stacked_joint_deg = np.hstack((self.joint_deg, self.current_a))
+        self.write_csv(stacked_joint_deg)
         self.describe()
         return self
 
@@ -67,14 +69,16 @@ class Bench:
             delimiter.join(NAMES),
             *(delimiter.join(map(repr, row)) for row in values.tolist()),
         ]
-        (self.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        run_path = self.data / "run.csv"
+        run_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def spoil_csv(self, old: str, new: str) -> None:
         """Replace something in the recording."""
         path = self.data / "run.csv"
         text = path.read_text(encoding="utf-8")
         assert old in text
-        path.write_text(text.replace(old, new, 1), encoding="utf-8")
+        changed_text = text.replace(old, new, 1)
+        path.write_text(changed_text, encoding="utf-8")
 
     @property
     def description(self) -> Path:
@@ -91,8 +95,9 @@ class Bench:
             "rate_hz": 1000,
         }
         document.update(changes)
+        text = json.dumps({key: value for key, value in document.items() if value is not None})
         self.description.write_text(
-            json.dumps({key: value for key, value in document.items() if value is not None}),
+            text,
             encoding="utf-8",
         )
 
@@ -105,7 +110,8 @@ class Bench:
     @property
     def left(self) -> list[str]:
         """List the folder of the log."""
-        return sorted(path.name for path in self.out.parent.iterdir())
+        files = self.out.parent.iterdir()
+        return sorted(path.name for path in files)
 
 
 @pytest.fixture
@@ -119,7 +125,8 @@ def test_joint_degrees_come_back_as_radians(bench: Bench) -> None:
     run, cell = load_run(bench.out)
     assert cell.name == "demo"
     assert run.rate_hz == pytest.approx(1000.0)
-    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    expected = np.radians(bench.joint_deg)
+    np.testing.assert_allclose(run.position_rad, expected, atol=2e-9)
     np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
     assert run.payload is None
     assert bench.left == ["run.mcap"]
@@ -127,41 +134,48 @@ def test_joint_degrees_come_back_as_radians(bench: Bench) -> None:
 
 def test_motor_radians_counts_and_joint_degrees_are_the_same_run(bench: Bench) -> None:
     cell = load_run_of(bench)
-    motor_rad = np.radians(bench.joint_deg) @ cell.T
+    joint_rad = np.radians(bench.joint_deg)
+    motor_rad = joint_rad @ cell.T
     counts = np.rint(motor_rad / (2 * pi) * 65536)
     for unit, values in (("rad", motor_rad), ("counts", counts)):
         bench.write_csv(np.hstack((values, bench.current_a)))
-        bench.describe(
-            position={"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": "motor"}
-        )
+        position = {"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": "motor"}
+        bench.describe(position=position)
         bench.out.unlink(missing_ok=True)
         assert bench.run() == 0
-        np.testing.assert_allclose(
-            load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=3e-6
-        )
+        position_rad = load_run(bench.out)[0].position_rad
+        expected = np.radians(bench.joint_deg)
+        np.testing.assert_allclose(position_rad, expected, atol=3e-6)
 
 
 def load_run_of(bench: Bench) -> FloatArray:
     """R of the bench's cell."""
-    tree = parse_yaml((bench.folder / "configs/cells/demo.yaml").read_bytes(), "cell").tree
-    return np.array(tree["drive_train"]["ratio"], dtype=np.float64)
+    text = (bench.folder / "configs/cells/demo.yaml").read_bytes()
+    tree = parse_yaml(text, "cell").tree
+    ratio = tree["drive_train"]["ratio"]
+    return np.array(ratio, dtype=np.float64)
 
 
 def test_column_numbers_semicolons_and_decimal_commas(bench: Bench) -> None:
-    bench.write_csv(np.hstack((bench.joint_deg, 1000.0 * bench.current_a)), delimiter=";")
+    stacked_joint_deg = np.hstack((bench.joint_deg, 1000.0 * bench.current_a))
+    bench.write_csv(stacked_joint_deg, delimiter=";")
     path = bench.data / "run.csv"
-    path.write_text(
-        "exported by X\n" + path.read_text(encoding="utf-8").replace(".", ","), encoding="utf-8-sig"
-    )
+    text = path.read_text(encoding="utf-8")
+    changed_text = text.replace(".", ",")
+    path.write_text("exported by X\n" + changed_text, encoding="utf-8-sig")
+    position = {"file": "run.csv", "columns": [1, 2, 3, 4, 5, 6], "unit": "deg", "side": "joint"}
+    current = {"file": "run.csv", "columns": [7, 8, 9, 10, 11, 12], "unit": "A", "factor": 0.001}
+    table = {"delimiter": ";", "decimal": ",", "skip_rows": 1}
     bench.describe(
-        table={"delimiter": ";", "decimal": ",", "skip_rows": 1},
-        position={"file": "run.csv", "columns": [1, 2, 3, 4, 5, 6], "unit": "deg", "side": "joint"},
-        current={"file": "run.csv", "columns": [7, 8, 9, 10, 11, 12], "unit": "A", "factor": 0.001},
+        table=table,
+        position=position,
+        current=current,
         payload="disc",
     )
     assert bench.run() == 0
     run = load_run(bench.out)[0]
-    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    expected = np.radians(bench.joint_deg)
+    np.testing.assert_allclose(run.position_rad, expected, atol=2e-9)
     np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
     assert run.payload is not None
     assert run.payload.known == {"m": 4.59}
@@ -174,15 +188,16 @@ def test_a_robot_with_a_joint_that_follows_an_axis_is_imported_by_its_axes(bench
       <limit lower="-9" upper="9" velocity="1" effort="1"/>
       <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
     text = urdf.read_text(encoding="utf-8")
-    urdf.write_text(text.replace("</robot>", follower), encoding="utf-8")
+    changed_text = text.replace("</robot>", follower)
+    urdf.write_text(changed_text, encoding="utf-8")
     assert bench.run() == 0
     run, cell = load_run(bench.out)
     still = np.zeros_like(run.position_rad)
     joints = model_of(cell).follow(Motion(run.position_rad, still, still)).joints
-    np.testing.assert_allclose(joints.position_rad[:, :6], np.radians(bench.joint_deg), atol=2e-9)
-    np.testing.assert_allclose(
-        joints.position_rad[:, 6], 0.1 - 0.5 * np.radians(bench.joint_deg[:, 4]), atol=2e-9
-    )
+    expected = np.radians(bench.joint_deg)
+    np.testing.assert_allclose(joints.position_rad[:, :6], expected, atol=2e-9)
+    joint_rad = np.radians(bench.joint_deg[:, 4])
+    np.testing.assert_allclose(joints.position_rad[:, 6], 0.1 - 0.5 * joint_rad, atol=2e-9)
 
 
 def test_the_same_files_give_the_same_log(bench: Bench) -> None:
@@ -197,7 +212,8 @@ def test_the_same_files_give_the_same_log(bench: Bench) -> None:
 def test_nothing_is_lost_by_counting(values: FloatArray) -> None:
     raw, quantum = quantise(values)
     largest = np.abs(values).max(axis=0)
-    assert np.abs(raw).max() <= 2**31 - 1
+    largest_absolute_raw = np.abs(raw).max()
+    assert largest_absolute_raw <= 2**31 - 1
     assert (np.abs(values - raw * quantum) <= quantum / 2).all()
     assert (quantum[largest > 1e-200] <= 1e-9 * largest[largest > 1e-200]).all()
 
@@ -214,7 +230,8 @@ def test_wrong_columns(
     bench: Bench, capsys: pytest.CaptureFixture[str], old: str, new: str, said: tuple[str, ...]
 ) -> None:
     if old == "\n20.0,":
-        rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+        run_path = bench.data / "run.csv"
+        rows = run_path.read_text(encoding="utf-8").splitlines()
         old = rows[7]
         new = rows[7].partition(",")[2]
         said = ("run.csv:8", "11 columns", "12, as in the header")
@@ -237,7 +254,8 @@ def _refused(bench: Bench, capsys: pytest.CaptureFixture[str], code: int, *said:
 def test_a_field_that_is_no_finite_number(
     bench: Bench, capsys: pytest.CaptureFixture[str], word: str
 ) -> None:
-    rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    run_path = bench.data / "run.csv"
+    rows = run_path.read_text(encoding="utf-8").splitlines()
     fields = rows[41].split(",")
     fields[8] = word
     bench.spoil_csv(rows[41], ",".join(fields))
@@ -264,8 +282,10 @@ def test_a_copy_of_a_file_is_no_other_axis(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _file_of_each_axis(bench)
-    first = sorted(bench.data.glob("*1.csv"))[0]
-    second = sorted(bench.data.glob("*2.csv"))[0]
+    files = bench.data.glob("*1.csv")
+    first = sorted(files)[0]
+    sorted_files = sorted(bench.data.glob("*2.csv"))
+    second = sorted_files[0]
     second.write_bytes(first.read_bytes())
     _refused(bench, capsys, 4, second.name, f"of {first.name} in all")
 
@@ -276,8 +296,10 @@ def test_units_by_the_name_of_an_axis_are_compared_with_the_file(
     units = ["deg"] * 6 + ["A"] * 5 + ["mA"]
     header = ",".join(NAMES)
     bench.spoil_csv(header, header + "\n" + ",".join(units))
-    of_axes = dict.fromkeys(load_cell(bench.folder / "configs/cells/demo.yaml").axis_names, "A")
-    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": of_axes})
+    path = bench.folder / "configs/cells/demo.yaml"
+    of_axes = dict.fromkeys(load_cell(path).axis_names, "A")
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": of_axes}
+    bench.describe(current=current)
     _refused(bench, capsys, 4, f"column {NAMES[11]}", "unit 'mA' in the line of units", "'A'")
 
 
@@ -288,14 +310,16 @@ def test_a_missing_file(bench: Bench, capsys: pytest.CaptureFixture[str]) -> Non
 
 @pytest.mark.parametrize("text", ["", "\n\n", ",".join(NAMES), ",".join(NAMES) + "\n"])
 def test_an_empty_file(bench: Bench, capsys: pytest.CaptureFixture[str], text: str) -> None:
-    (bench.data / "run.csv").write_text(text, encoding="utf-8")
+    run_path = bench.data / "run.csv"
+    run_path.write_text(text, encoding="utf-8")
     _refused(bench, capsys, 4, "before the numbers", "a line of numbers for each sample")
 
 
 def test_every_truncation_that_shows_is_refused(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = (bench.data / "run.csv").read_bytes().rstrip(b"\n")
+    run_path = bench.data / "run.csv"
+    data = run_path.read_bytes().rstrip(b"\n")
     last = data.rpartition(b"\n")[2]
     for keep in (3, len(last) // 2, last.rindex(b","), last.rindex(b",") + 1):
         (bench.data / "run.csv").write_bytes(data[: len(data) - len(last) + keep])
@@ -308,28 +332,31 @@ def test_binary_is_no_csv(bench: Bench, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_degrees_declared_as_radians(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.describe(
-        position={"file": "run.csv", "columns": NAMES[:6], "unit": "rad", "side": "joint"}
-    )
+    position = {"file": "run.csv", "columns": NAMES[:6], "unit": "rad", "side": "joint"}
+    bench.describe(position=position)
     _refused(bench, capsys, 4, "degrees were taken for radians")
 
 
 def test_radians_declared_as_degrees(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.write_csv(np.hstack((np.radians(bench.joint_deg), bench.current_a)))
+    joint_rad = np.radians(bench.joint_deg)
+    stacked_joint_rad = np.hstack((joint_rad, bench.current_a))
+    bench.write_csv(stacked_joint_rad)
     _refused(bench, capsys, 4, "radians were taken for degrees")
 
 
 def test_fractional_counts(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.describe(
-        position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
-    )
+    position = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(position=position)
     _refused(bench, capsys, 4, "run.csv:2, column q2", "a whole number of encoder counts")
 
 
 def test_files_of_different_length(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
-    (bench.data / "short.csv").write_text("\n".join(lines[:-5]) + "\n", encoding="utf-8")
-    bench.describe(current={"file": "short.csv", "columns": NAMES[6:], "unit": "A"})
+    run_path = bench.data / "run.csv"
+    lines = run_path.read_text(encoding="utf-8").splitlines()
+    short_path = bench.data / "short.csv"
+    short_path.write_text("\n".join(lines[:-5]) + "\n", encoding="utf-8")
+    current = {"file": "short.csv", "columns": NAMES[6:], "unit": "A"}
+    bench.describe(current=current)
     _refused(bench, capsys, 4, "300 rows in run.csv and 295 rows in short.csv")
 
 
@@ -438,8 +465,10 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
     bench.joint_deg = 30.0 * np.sin(2.0 * np.pi * seconds + np.arange(6))
     bench.current_a = np.cos(seconds * 140.0 + np.arange(6))
     bench.joint_deg[500, 2] += 0.5  # one outlier is not taken for a wrong rate
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
-    bench.describe(rate_hz=1000.0 * wrong)
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
+    rate_hz = 1000.0 * wrong
+    bench.describe(rate_hz=rate_hz)
     if wrong > 1.0:
         _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
     else:
@@ -456,7 +485,8 @@ def test_currents_without_their_sign_are_noticed(
     bench.joint_deg = 20.0 * np.sin(5.0 * seconds + np.arange(6))
     current = np.cos(30.0 * seconds + np.arange(6))
     bench.current_a = np.abs(current) if size else current
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     assert bench.run() == 0
     assert ("J1, J2, J3, J4, J5, J6: found currents that are never negative" in caplog.text) is size
     capsys.readouterr()
@@ -473,7 +503,8 @@ def test_a_step_that_no_motor_makes(
 ) -> None:
     """A step of 0.5 rad in one sample: the speeds over many samples do not show it."""
     bench.joint_deg[120 : 121 if back else None, 2] += np.degrees(0.5)
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _refused(
         bench,
         capsys,
@@ -490,7 +521,8 @@ def test_a_step_of_an_axis_that_rests_is_refused_too(
     """Nothing else of that axis changes, and the step itself is no noise to compare it with."""
     bench.joint_deg[:, 2] = 60.0
     bench.joint_deg[120, 2] += np.degrees(0.5)
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _refused(
         bench,
         capsys,
@@ -509,19 +541,24 @@ def test_a_glitch_that_no_limit_rules_out_is_said_and_left_to_the_fit(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bench.joint_deg[120, 2] += SMALL_GLITCH_DEG
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     assert bench.run() == 0
-    said = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    said = " ".join(printed.split())
     assert "run.csv:122, column q3, axis J3: a position that leaves its course by up to 1." in said
     run, cell = load_run(bench.out)
-    assert np.degrees(run.position_rad[120, 2]) == pytest.approx(bench.joint_deg[120, 2], abs=1e-4)
+    position_deg = np.degrees(run.position_rad[120, 2])
+    assert position_deg == pytest.approx(bench.joint_deg[120, 2], abs=1e-4)
     (fault,) = find_faults(run.position_rad, run.current_a, run.rate_hz, cell.ratio)
-    assert (fault.kind, fault.axis, fault.stretches.tolist()) == (FaultKind.GLITCH, 2, [[120, 121]])
+    expected = (FaultKind.GLITCH, 2, [[120, 121]])
+    assert (fault.kind, fault.axis, fault.stretches.tolist()) == expected
 
 
 def test_a_glitch_of_a_current_among_resampled_rows_does_not_reach_the_log(bench: Bench) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _with_time(bench, UNEVEN_MS)
     assert bench.run() == 0
     sound, _ = load_run(bench.out)
@@ -532,14 +569,16 @@ def test_a_glitch_of_a_current_among_resampled_rows_does_not_reach_the_log(bench
     assert bench.run() == 0
     mended, _ = load_run(bench.out)
     assert np.array_equal(mended.position_rad, sound.position_rad)
-    assert np.abs(mended.current_a - sound.current_a).max() < 0.1
+    current_difference_a = mended.current_a - sound.current_a
+    assert np.abs(current_difference_a).max() < 0.1
 
 
 def test_an_axis_at_rest_may_have_no_current(bench: Bench) -> None:
     """Its brake holds it, and its motor has no power."""
     bench.joint_deg[:, 2] = 60.0
     bench.current_a[:, 2] = 0.0
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     assert bench.run() == 0
 
 
@@ -548,13 +587,15 @@ def test_a_step_is_found_in_resampled_samples_too(
 ) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
     bench.joint_deg[150:, 3] += np.degrees(0.5)
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _with_time(bench, UNEVEN_MS)
     _refused(bench, capsys, 4, "column q4, axis J4", "in one sample")
 
 
 def test_noise_and_a_coarse_encoder_are_no_steps(bench: Bench) -> None:
-    noise = np.random.default_rng(2).normal(scale=0.2, size=(300, 6))
+    rng = np.random.default_rng(2)
+    noise = rng.normal(scale=0.2, size=(300, 6))
     bench.write_csv(np.hstack((np.round((bench.joint_deg + noise) / 0.1) * 0.1, bench.current_a)))
     assert bench.run() == 0
 
@@ -563,15 +604,18 @@ def test_noise_and_a_coarse_encoder_are_no_steps(bench: Bench) -> None:
 def test_a_counter_of_fewer_than_32_bits_that_wraps(
     bench: Bench, capsys: pytest.CaptureFixture[str], bits: int, signed: bool
 ) -> None:
-    counts = np.rint(np.radians(bench.joint_deg) @ load_run_of(bench).T / (2 * pi) * 65536)
+    joint_rad = np.radians(bench.joint_deg)
+    counts = np.rint(joint_rad @ load_run_of(bench).T / (2 * pi) * 65536)
     least = -(2 ** (bits - 1)) if signed else 0
-    wrapped = (counts[:, 0] - least) % 2**bits + least
-    assert np.abs(np.diff(wrapped)).max() > 2 ** (bits - 1)
+    count_difference = counts[:, 0] - least
+    wrapped = count_difference % 2**bits + least
+    absolute_wrapped_step = np.abs(np.diff(wrapped))
+    assert absolute_wrapped_step.max() > 2 ** (bits - 1)
     counts[:, 0] = wrapped
-    bench.write_csv(np.hstack((counts, bench.current_a)))
-    bench.describe(
-        position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
-    )
+    stacked_counts = np.hstack((counts, bench.current_a))
+    bench.write_csv(stacked_counts)
+    position = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    bench.describe(position=position)
     _refused(
         bench, capsys, 4, "column q1", f"a counter of {bits} bits that wraps", "unwrap the column"
     )
@@ -585,8 +629,10 @@ def test_a_row_or_two_are_no_recording(
     if timed:
         _with_time(bench, np.arange(300.0))
     path = bench.data / "run.csv"
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines(keepends=True)
     path.write_text(
-        "".join(path.read_text(encoding="utf-8").splitlines(keepends=True)[: rows + 1]),
+        "".join(lines[: rows + 1]),
         encoding="utf-8",
     )
     _refused(bench, capsys, 4, f"{rows} rows of numbers", "was the export interrupted?")
@@ -599,7 +645,9 @@ def test_a_rate_that_drifts(
 ) -> None:
     """The drift scales velocities, and gains by up to 17 %, while every single step looks right."""
     share = (np.arange(299) > 150) if sudden else np.linspace(0.0, 1.0, 299)
-    _with_time(bench, np.concatenate(([0.0], np.cumsum(4.0 * (1.0 + change * share)))))
+    cumulative = np.cumsum(4.0 * (1.0 + change * share))
+    time_s = np.concatenate(([0.0], cumulative))
+    _with_time(bench, time_s)
     _refused(
         bench,
         capsys,
@@ -641,7 +689,8 @@ def test_an_import_that_is_terminated_leaves_nothing(bench: Bench) -> None:
 
 def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     bench.current_a[120, 3] = 1e300
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _refused(bench, capsys, 4, "run.csv:122, column i4", "1e+300")
 
 
@@ -650,7 +699,8 @@ def test_a_dead_channel(
     bench: Bench, capsys: pytest.CaptureFixture[str], value: float, words: str
 ) -> None:
     bench.current_a[:, 2] = value
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _refused(bench, capsys, 4, "column i3", words)
 
 
@@ -673,27 +723,34 @@ def test_rates_beyond_reason(
 def _with_time(
     bench: Bench, time_s: np.ndarray[tuple[Any, ...], np.dtype[np.floating[Any]]]
 ) -> None:
-    lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    run_path = bench.data / "run.csv"
+    lines = run_path.read_text(encoding="utf-8").splitlines()
     timed = [
         "t," + lines[0],
         *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True)),
     ]
     (bench.data / "run.csv").write_text("\n".join(timed) + "\n", encoding="utf-8")
-    bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "ms"})
+    time = {"file": "run.csv", "column": "t", "unit": "ms"}
+    bench.describe(rate_hz=None, time=time)
 
 
 def test_the_rate_of_a_time_column(bench: Bench) -> None:
+    time_s = (
+        5000.0 + 4.0 * np.arange(300) + 0.3 * np.sin(np.arange(300)) * (np.arange(300) % 299 != 0)
+    )
     _with_time(
         bench,
-        5000.0 + 4.0 * np.arange(300) + 0.3 * np.sin(np.arange(300)) * (np.arange(300) % 299 != 0),
+        time_s,
     )
     assert bench.run() == 0
-    assert load_run(bench.out)[0].rate_hz == pytest.approx(250.0)
+    rate_hz = load_run(bench.out)[0].rate_hz
+    assert rate_hz == pytest.approx(250.0)
 
 
 @pytest.mark.parametrize(("index", "shift"), [(100, 12.0), (100, -4.0), (100, -5.0), (299, 9.0)])
 def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> None:
-    _with_time(bench, 4.0 * np.arange(300) + shift * (np.arange(300) >= index))
+    time_s = 4.0 * np.arange(300) + shift * (np.arange(300) >= index)
+    _with_time(bench, time_s)
     with pytest.raises(TableUnfit, match=rf"run\.csv:{index + 2}, column t"):
         import_recording(bench.description, bench.data, bench.out, software="x")
     assert bench.left == []
@@ -720,7 +777,8 @@ def test_jittered_stamps_are_the_sample_times(
 ) -> None:
     bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
     bench.current_a = np.cos(UNEVEN_MS[:, None] / 280.0 + np.arange(6))
-    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
+    bench.write_csv(stacked_joint_deg)
     _with_time(bench, UNEVEN_MS)
     assert (
         main(
@@ -738,17 +796,18 @@ def test_jittered_stamps_are_the_sample_times(
     )
     document = json.loads(capsys.readouterr().out)
     assert document["timing"]["resampled"] is True
-    assert document["timing"]["longest_step_s"] == pytest.approx(0.005)
-    assert json_tree(info_report(bench.out))["timing"] == document["timing"]
+    longest_step_s = document["timing"]["longest_step_s"]
+    assert longest_step_s == pytest.approx(0.005)
+    report = info_report(bench.out)
+    timing = json_tree(report)["timing"]
+    assert timing == document["timing"]
     run = load_run(bench.out)[0]
     at_ms = 1e3 * run.time_s[:, None]
-    assert (
-        np.abs(np.degrees(run.position_rad) - 20.0 * np.sin(at_ms / 160.0 + np.arange(6))).max()
-        < 1e-3
-    )
-    np.testing.assert_allclose(
-        run.current_a, np.cos(at_ms / 280.0 + np.arange(6)), atol=(5.0 / 280.0) ** 2 / 8
-    )
+    position_deg = np.degrees(run.position_rad)
+    absolute_position_deg = np.abs(position_deg - 20.0 * np.sin(at_ms / 160.0 + np.arange(6)))
+    assert absolute_position_deg.max() < 1e-3
+    expected = np.cos(at_ms / 280.0 + np.arange(6))
+    np.testing.assert_allclose(run.current_a, expected, atol=(5.0 / 280.0) ** 2 / 8)
 
 
 TURN_WITH_WRAPS = np.array([2**30, *[1024] * 5])
@@ -760,11 +819,15 @@ def _with_counts_that_wrap(bench: Bench, joint_rad: FloatArray) -> None:
     """
     cell = bench.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8").replace("revolution: 65536", f"revolution: {2**30}", 1)
-    cell.write_text(text.replace("revolution: 65536", "revolution: 1024"), encoding="utf-8")
+    changed_text = text.replace("revolution: 65536", "revolution: 1024")
+    cell.write_text(changed_text, encoding="utf-8")
     turns = joint_rad @ load_run_of(bench).T / (2 * pi)
     counts = np.rint(turns * TURN_WITH_WRAPS).astype(np.int64).astype(np.int32).astype(np.float64)
-    assert np.abs(np.diff(counts[:, 0])).max() > 2**31
-    bench.write_csv(np.hstack((counts, bench.current_a)))
+    counts_steps = np.diff(counts[:, 0])
+    absolute_counts_step = np.abs(counts_steps)
+    assert absolute_counts_step.max() > 2**31
+    stacked_counts = np.hstack((counts, bench.current_a))
+    bench.write_csv(stacked_counts)
 
 
 def test_counts_at_a_rate_go_on_over_a_wrap(
@@ -788,42 +851,48 @@ def test_counts_without_a_sign_are_those_with_one(
     """A drive's counter of 32 bits that a tool reads as unsigned jumps by 2³² at zero;
     one column stays above it.
     """
-    motor_rad = np.radians(bench.joint_deg) @ load_run_of(bench).T
+    joint_rad = np.radians(bench.joint_deg)
+    motor_rad = joint_rad @ load_run_of(bench).T
     counts = np.rint(motor_rad / (2 * pi) * 65536)
     counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
     bench.describe(position=counted)
-    bench.write_csv(np.hstack((counts, bench.current_a)))
+    stacked_counts = np.hstack((counts, bench.current_a))
+    bench.write_csv(stacked_counts)
     assert bench.run() == 0
     expected = load_run(bench.out)[0].position_rad
     bench.out.unlink()
     unsigned = np.where(counts < 0, counts + 2**32, counts)
-    assert (np.abs(np.diff(unsigned, axis=0)) > 2**31).any()
-    bench.write_csv(np.hstack((unsigned, bench.current_a)))
+    unsigned_steps = np.diff(unsigned, axis=0)
+    absolute_unsigned_step = np.abs(unsigned_steps)
+    assert (absolute_unsigned_step > 2**31).any()
+    stacked_unsigned = np.hstack((unsigned, bench.current_a))
+    bench.write_csv(stacked_unsigned)
     capsys.readouterr()
     assert bench.run() == 0
     assert (
         "column q1: counts of 32 bits without a sign, read as counts with one"
     ) in capsys.readouterr().out
-    np.testing.assert_array_equal(load_run(bench.out)[0].position_rad, expected)
+    position_rad = load_run(bench.out)[0].position_rad
+    np.testing.assert_array_equal(position_rad, expected)
 
 
 def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Bench) -> None:
     turn = TURN_WITH_WRAPS
     ratio = load_run_of(bench)
-    _with_counts_that_wrap(
-        bench, np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6)))
-    )
+    joint_rad = np.radians(30.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6)))
+    _with_counts_that_wrap(bench, joint_rad)
     _with_time(bench, UNEVEN_MS)
     counted = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
-    bench.describe(
-        rate_hz=None, position=counted, time={"file": "run.csv", "column": "t", "unit": "ms"}
-    )
+    time = {"file": "run.csv", "column": "t", "unit": "ms"}
+    bench.describe(rate_hz=None, position=counted, time=time)
     assert bench.run() == 0
     run = load_run(bench.out)[0]
     expected = np.radians(30.0 * np.sin(1e3 * run.time_s[:, None] / 160.0 + np.arange(6)))
-    error = ((run.position_rad - expected) @ ratio.T / (2 * pi) * turn)[:, 1:]
+    position_difference_rad = run.position_rad - expected
+    error = (position_difference_rad @ ratio.T / (2 * pi) * turn)[:, 1:]
     assert np.abs(error).max() < 1.0
-    assert np.sqrt(np.mean(error**2)) < 0.35  # once rounded; a second time would make 0.41 of 0.29
+    rms_error = np.sqrt(np.mean(error**2))
+    assert rms_error < 0.35  # once rounded; a second time would make 0.41 of 0.29
     assert np.abs(run.position_rad[:, 0] - expected[:, 0]).max() < 1e-6
 
 
@@ -838,7 +907,8 @@ def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(bench: Be
 def test_the_first_stamp_is_when_the_run_began(
     bench: Bench, first: float, unit: str, started_s: float, recorded: bool
 ) -> None:
-    _with_time(bench, first + 4.0 * np.arange(300))
+    time_s = first + 4.0 * np.arange(300)
+    _with_time(bench, time_s)
     assert bench.run() == 0
     run = load_run(bench.out)[0]
     assert run.started_s == pytest.approx(started_s, abs=1e-6)
@@ -848,9 +918,11 @@ def test_the_first_stamp_is_when_the_run_began(
 
 def test_without_stamps_or_before_a_trigger_nothing_is_known_of_the_start(bench: Bench) -> None:
     assert bench.run() == 0
-    assert load_run(bench.out)[0].started_s is None
+    started_s = load_run(bench.out)[0].started_s
+    assert started_s is None
     bench.out.unlink()
-    _with_time(bench, 4.0 * np.arange(300) - 100.0)
+    time_s = 4.0 * np.arange(300) - 100.0
+    _with_time(bench, time_s)
     assert bench.run() == 0
     assert load_run(bench.out)[0].started_s is None
 
@@ -866,7 +938,8 @@ def test_a_date_in_a_file_is_when_the_run_began(bench: Bench) -> None:
         [head, *(date + row.partition(",")[2] for date, row in zip(dated, rows, strict=True))]
     )
     path.write_text(text + "\n", encoding="utf-8")
-    bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "iso8601"})
+    time = {"file": "run.csv", "column": "t", "unit": "iso8601"}
+    bench.describe(rate_hz=None, time=time)
     assert bench.run() == 0
     run = load_run(bench.out)[0]
     assert run.rate_hz == pytest.approx(100.0)
@@ -874,30 +947,33 @@ def test_a_date_in_a_file_is_when_the_run_began(bench: Bench) -> None:
 
 
 def test_a_unit_that_makes_a_stamp_absurd(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    _with_time(bench, 1_772_348_400_000_000.0 + 4.0 * np.arange(300))
+    time_s = 1_772_348_400_000_000.0 + 4.0 * np.arange(300)
+    _with_time(bench, time_s)
     _refused(bench, capsys, 4, "run.csv:2, column t", "correct `unit` of `time`")
 
 
 def test_a_first_row_that_is_there_twice(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    _with_time(bench, 4.0 * np.arange(300))
-    rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    time_s = 4.0 * np.arange(300)
+    _with_time(bench, time_s)
+    run_path = bench.data / "run.csv"
+    rows = run_path.read_text(encoding="utf-8").splitlines()
     bench.spoil_csv(rows[1], f"{rows[1]}\n{rows[1]}")
     assert bench.run() == 0
     assert "1 duplicated and dropped" in capsys.readouterr().out
-    np.testing.assert_allclose(
-        load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=2e-9
-    )
+    position_rad = load_run(bench.out)[0].position_rad
+    expected = np.radians(bench.joint_deg)
+    np.testing.assert_allclose(position_rad, expected, atol=2e-9)
 
 
 def test_zero_offsets_count_on_the_joint_side_too(bench: Bench) -> None:
     cell = bench.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8")
-    cell.write_text(
-        text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 30.0", 1), encoding="utf-8"
-    )
+    changed_text = text.replace("zero_offset_deg: 0.0", "zero_offset_deg: 30.0", 1)
+    cell.write_text(changed_text, encoding="utf-8")
     assert bench.run() == 0
     expected = np.radians(bench.joint_deg + np.array([30.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, expected, atol=2e-9)
+    position_rad = load_run(bench.out)[0].position_rad
+    np.testing.assert_allclose(position_rad, expected, atol=2e-9)
 
 
 @pytest.mark.parametrize("mapping", [False, True])
@@ -905,7 +981,8 @@ def test_a_factor_for_each_axis(bench: Bench, mapping: bool) -> None:
     factors = [0.5, 1, -2.0, 0.1, 3, 1.0]
     named = dict(reversed([*zip((f"J{i}" for i in range(1, 7)), factors, strict=True)]))
     factor = named if mapping else factors
-    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor})
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor}
+    bench.describe(current=current)
     assert bench.run() == 0
     np.testing.assert_allclose(
         load_run(bench.out)[0].current_a, bench.current_a * factors, atol=3e-9
@@ -924,7 +1001,8 @@ def test_a_factor_for_each_axis(bench: Bench, mapping: bool) -> None:
 def test_factors_of_other_axes(
     bench: Bench, capsys: pytest.CaptureFixture[str], factor: object, said: tuple[str, ...]
 ) -> None:
-    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor})
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor}
+    bench.describe(current=current)
     _refused(bench, capsys, 6, *said)
 
 
@@ -934,15 +1012,11 @@ SPEEDS = [f"v{i}" for i in range(1, 7)]
 def _with_velocity(bench: Bench, velocity_deg_s: FloatArray, **changes: object) -> None:
     header = ",".join((*NAMES, *SPEEDS))
     values = np.hstack((bench.joint_deg, bench.current_a, velocity_deg_s))
-    np.savetxt(bench.data / "run.csv", values, delimiter=",", header=header, comments="")
+    run_path = bench.data / "run.csv"
+    np.savetxt(run_path, values, delimiter=",", header=header, comments="")
+    velocity = {"file": "run.csv", "columns": SPEEDS, "unit": "deg/s", "side": "joint", **changes}
     bench.describe(
-        velocity={
-            "file": "run.csv",
-            "columns": SPEEDS,
-            "unit": "deg/s",
-            "side": "joint",
-            **changes,
-        },
+        velocity=velocity,
     )
 
 
@@ -965,7 +1039,8 @@ def test_velocities_that_agree_change_nothing(bench: Bench, side: str, unit: str
         unit=unit,
     )
     assert bench.run() == 0
-    assert np.array_equal(read_log(bench.out).samples.position_counts, expected)
+    samples = read_log(bench.out).samples
+    assert np.array_equal(samples.position_counts, expected)
 
 
 @pytest.mark.parametrize(
@@ -985,16 +1060,19 @@ def test_velocities_that_disagree_name_the_axis(
     factors: tuple[float, ...],
     said: tuple[str, ...],
 ) -> None:
-    _with_velocity(bench, _velocity_deg_s() * factors)
+    velocity_deg_s = _velocity_deg_s() * factors
+    _with_velocity(bench, velocity_deg_s)
     _refused(bench, capsys, 4, *said)
 
 
 def test_counts_need_an_encoder(bench: Bench) -> None:
     cell = bench.folder / "configs/cells/tx40.yaml"
+    position = {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"}
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": "Nm(motor, a priori)"}
     bench.describe(
         cell=str(cell),
-        position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"},
-        current={"file": "run.csv", "columns": NAMES[6:], "unit": "Nm(motor, a priori)"},
+        position=position,
+        current=current,
     )
     with pytest.raises(ConfigurationInconsistent, match="counts_per_revolution"):
         import_recording(bench.description, bench.data, bench.out, software="x")
@@ -1013,13 +1091,17 @@ def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> Non
     current = np.loadtxt(shared_data / "tx40/curr_data.csv", delimiter=",", skiprows=1)
     assert run.position_rad.shape == (45000, 6)
     assert run.rate_hz == pytest.approx(5000.0)
-    offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
+    zero_offset_rad = [axis.zero_offset_rad for axis in cell.axes]
+    offset_rad = np.array(zero_offset_rad)
+    largest_absolute_motor_rad = np.abs(motor_rad).max()
+    position_difference_rad = run.position_rad - offset_rad
     np.testing.assert_allclose(
-        (run.position_rad - offset_rad) @ cell.ratio.T,
+        position_difference_rad @ cell.ratio.T,
         motor_rad,
-        atol=1e-9 * np.abs(motor_rad).max(),
+        atol=1e-9 * largest_absolute_motor_rad,
     )
-    np.testing.assert_allclose(run.current_a, current, atol=1e-9 * np.abs(current).max())
+    largest_absolute_current = np.abs(current).max()
+    np.testing.assert_allclose(run.current_a, current, atol=1e-9 * largest_absolute_current)
     # NOTICE: q2 has an offset of −π/2, q3 of +π/2; the arm starts stretched up, both URDF angles
     # near zero.
     np.testing.assert_allclose(run.position_rad[0, 1:3], 0.0, atol=1e-3)
@@ -1065,11 +1147,13 @@ def with_slow_columns(
     names = [f"t{i}" for i in range(1, 7)] + [f"c{i}" for i in range(1, 7)]
     values = np.hstack((torque_nm, temperature_c)).tolist()
     lines = [",".join(names), *(",".join(map(repr, row)) for row in values)]
-    (bench.data / "slow.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    slow_path = bench.data / "slow.csv"
+    slow_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    temperature = {"file": "slow.csv", "columns": names[6:]}
     bench.describe(
         rate_hz=50,
         torque={"file": "slow.csv", "columns": names[:6], **torque},
-        temperature={"file": "slow.csv", "columns": names[6:]},
+        temperature=temperature,
     )
 
 
@@ -1081,12 +1165,16 @@ def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(
     gain = np.array([33.0, 32.0, 24.0, -9.0, 16.0, 6.8])
     motor_nm = gain * bench.current_a / np.diag(ratio)
     torque = motor_nm if side == "motor" else motor_nm @ ratio
-    temperature_c = np.linspace(25.0, 31.0, 300)[:, None] + np.arange(6)
-    with_slow_columns(bench, 1000.0 * torque, temperature_c, side=side, factor=0.001)
+    grid = np.linspace(25.0, 31.0, 300)
+    temperature_c = grid[:, None] + np.arange(6)
+    torque_nm = 1000.0 * torque
+    with_slow_columns(bench, torque_nm, temperature_c, side=side, factor=0.001)
     assert bench.run() == 0
     run, _ = load_run(bench.out)
     # 300 rows at 50 Hz: a torque in every second row, a temperature a second.
-    assert info_report(bench.out).slow_readings == {"torque": 6 * 150, "temperature": 6 * 6}
+    slow_readings = info_report(bench.out).slow_readings
+    expected = {"torque": 6 * 150, "temperature": 6 * 6}
+    assert slow_readings == expected
     slopes = [torque_slope([channel]) for channel in run.torque_channels]
     assert [slope.value for slope in slopes if slope is not None] == pytest.approx(gain, rel=1e-6)
     assert run.temperature_c is not None
@@ -1113,7 +1201,8 @@ def test_a_torque_column_too_few_and_a_factor_of_zero_are_refused(bench: Bench) 
 
 def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
     columns = [*SPEEDS[:3], "i4", *SPEEDS[4:]]
-    bench.describe(torque={"file": "./run.csv", "columns": columns, "side": "motor"})
+    torque = {"file": "./run.csv", "columns": columns, "side": "motor"}
+    bench.describe(torque=torque)
     with pytest.raises(
         ConfigurationInconsistent,
         match=r"torque\.columns: found i4 of .*, which "
@@ -1125,13 +1214,15 @@ def test_a_column_is_not_both_current_and_torque(bench: Bench) -> None:
 def test_the_shipped_description_shows_every_setting(checkout: Path) -> None:
     """Its lines that are commented out are valid, and with them nothing is missing."""
     text = (checkout / "configs/imports/tx40.yaml").read_text(encoding="utf-8")
-    document = parse_yaml(re.sub(r"(?m)^# ( *[a-z_]+:)", r"\1", text).encode(), "tx40.yaml")
+    encoded_text = re.sub(r"(?m)^# ( *[a-z_]+:)", r"\1", text).encode()
+    document = parse_yaml(encoded_text, "tx40.yaml")
     wanted = read_model(document, ImportDescription)
     assert document.tree.keys() == ImportDescription.model_fields.keys()
     sections = {"table": wanted.table, "time": wanted.time, **dict(wanted.sections())}
     for key, section in sections.items():
         assert section is not None
-        assert document.tree[key].keys() == {field.name for field in fields(section)}, key
+        expected = {field.name for field in fields(section)}
+        assert document.tree[key].keys() == expected, key
 
 
 def test_an_import_without_them_has_neither(bench: Bench) -> None:
@@ -1162,8 +1253,10 @@ def test_stamps_in_another_unit_have_no_rate_of_a_robot(
     bench = Bench(checkout, tmp_path).prepare()
     rows = np.hstack((step * np.arange(300.0)[:, None], bench.joint_deg, bench.current_a))
     lines = [",".join(("t", *NAMES)), *(",".join(map(repr, row)) for row in rows.tolist())]
-    (bench.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "s"})
+    run_path = bench.data / "run.csv"
+    run_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    time = {"file": "run.csv", "column": "t", "unit": "s"}
+    bench.describe(rate_hz=None, time=time)
     with pytest.raises(TableUnfit, match="Hz with `unit: s`"):
         import_recording(bench.description, bench.data, bench.out, software="test")
 
@@ -1183,16 +1276,21 @@ def _two_files(bench: Bench) -> None:
 def test_times_that_are_kept_are_rows_of_the_other_file(bench: Bench) -> None:
     """0.4 to 0.8 s at 250 Hz; the files that have no stamps give the same rows."""
     _two_files(bench)
+    position = {"file": "position.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"}
+    current = {"file": "current.csv", "columns": NAMES[6:], "unit": "A"}
+    time = {"file": "position.csv", "column": "t", "unit": "s"}
+    keep = {"from_s": 0.4, "to_s": 0.8}
     bench.describe(
-        position={"file": "position.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"},
-        current={"file": "current.csv", "columns": NAMES[6:], "unit": "A"},
+        position=position,
+        current=current,
         rate_hz=None,
-        time={"file": "position.csv", "column": "t", "unit": "s"},
-        keep={"from_s": 0.4, "to_s": 0.8},
+        time=time,
+        keep=keep,
     )
     assert bench.run() == 0
     run, _ = load_run(bench.out)
-    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg[100:201]), atol=2e-9)
+    expected = np.radians(bench.joint_deg[100:201])
+    np.testing.assert_allclose(run.position_rad, expected, atol=2e-9)
     np.testing.assert_allclose(run.current_a, bench.current_a[100:201], atol=1e-9)
     assert run.started_s == pytest.approx(0.4)
 
@@ -1208,9 +1306,9 @@ def test_times_that_are_kept_are_rows_of_the_other_file(bench: Bench) -> None:
 def test_rows_are_kept_at_a_stated_rate(bench: Bench, keep: dict[str, float], rows: slice) -> None:
     bench.describe(keep=keep)
     assert bench.run() == 0
-    np.testing.assert_allclose(
-        load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg[rows]), atol=2e-9
-    )
+    position_rad = load_run(bench.out)[0].position_rad
+    expected = np.radians(bench.joint_deg[rows])
+    np.testing.assert_allclose(position_rad, expected, atol=2e-9)
 
 
 @pytest.mark.parametrize(
@@ -1233,7 +1331,8 @@ def test_a_part_that_is_none_is_refused(
 def test_a_held_out_end_becomes_a_log_of_its_own(bench: Bench, timed: bool) -> None:
     """No sample is in both, and none is lost."""
     if timed:
-        _with_time(bench, 1_772_348_400_000.0 + 4.0 * np.arange(300))
+        time_s = 1_772_348_400_000.0 + 4.0 * np.arange(300)
+        _with_time(bench, time_s)
     part = {"from_s": 0.8 if timed else 0.2}
     if timed:
         time = {"file": "run.csv", "column": "t", "unit": "ms"}
@@ -1248,13 +1347,16 @@ def test_a_held_out_end_becomes_a_log_of_its_own(bench: Bench, timed: bool) -> N
     assert imported.holdout is not None
     assert imported.holdout.samples == 100
     runs = [load_run(path)[0] for path in (bench.out, held_out)]
-    joined = np.vstack([run.position_rad for run in runs])
-    np.testing.assert_allclose(joined, np.radians(bench.joint_deg), atol=2e-9)
-    np.testing.assert_allclose(
-        np.vstack([run.current_a for run in runs]), bench.current_a, atol=1e-9
-    )
+    position_rad = [run.position_rad for run in runs]
+    joined = np.vstack(position_rad)
+    expected = np.radians(bench.joint_deg)
+    np.testing.assert_allclose(joined, expected, atol=2e-9)
+    current_a = [run.current_a for run in runs]
+    stacked_current_a = np.vstack(current_a)
+    np.testing.assert_allclose(stacked_current_a, bench.current_a, atol=1e-9)
     if timed:
-        assert runs[1].started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
+        started_s = runs[1].started_s
+        assert started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
     assert read_log(bench.out).head.run.run_id != read_log(held_out).head.run.run_id
 
 
@@ -1267,7 +1369,8 @@ def test_the_command_writes_both_logs_and_reports_them(
     assert main([*command, "--holdout", str(held_out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["samples"] == 200
-    assert report["holdout"] == {"log": str(held_out), "samples": 100}
+    expected = {"log": str(held_out), "samples": 100}
+    assert report["holdout"] == expected
 
 
 @pytest.mark.parametrize(
@@ -1294,13 +1397,14 @@ def test_a_held_out_part_that_is_none_is_refused(
 def test_a_log_that_cannot_be_written_leaves_no_held_out_part(bench: Bench) -> None:
     bench.describe(holdout={"from_s": 0.2})
     bench.out.write_bytes(b"mine")
+    holdout = bench.out.with_name("held-out.mcap")
     with pytest.raises(UsageError):
         import_recording(
             bench.description,
             bench.data,
             bench.out,
             software="test",
-            holdout=bench.out.with_name("held-out.mcap"),
+            holdout=holdout,
         )
     assert bench.left == ["run.mcap"]
 
@@ -1326,7 +1430,8 @@ def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: 
     for log, part in zip(logs, (1, 0), strict=True):
         run, _ = load_run(log)
         assert run.rate_hz == pytest.approx(125.0)
-        np.testing.assert_allclose(run.position_rad, whole.position_rad[is_fit == part], atol=1e-8)
+        expected = whole.position_rad[is_fit == part]
+        np.testing.assert_allclose(run.position_rad, expected, atol=1e-8)
         np.testing.assert_allclose(run.current_a, whole.current_a[is_fit == part], atol=1e-6)
 
 
@@ -1338,11 +1443,14 @@ def _file_of_each_axis(bench: Bench, later_s: float = 0.0, began_s: float = 0.0)
         lines = ["t,position,current", *(",".join(map(repr, row)) for row in columns.tolist())]
         (bench.data / f"axis{axis + 1}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     files = [f"axis{axis + 1}.csv" for axis in range(6)]
+    current = {"file": files, "columns": ["current"] * 6, "unit": "A"}
+    position = {"file": files, "columns": ["position"], "unit": "deg", "side": "joint"}
+    time = {"file": "axis1.csv", "column": "t", "unit": "s"}
     bench.describe(
-        position={"file": files, "columns": ["position"], "unit": "deg", "side": "joint"},
-        current={"file": files, "columns": ["current"] * 6, "unit": "A"},
+        position=position,
+        current=current,
         rate_hz=None,
-        time={"file": "axis1.csv", "column": "t", "unit": "s"},
+        time=time,
     )
 
 
@@ -1350,7 +1458,8 @@ def test_axes_come_from_a_file_each(bench: Bench) -> None:
     _file_of_each_axis(bench)
     assert bench.run() == 0
     run, _ = load_run(bench.out)
-    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    expected = np.radians(bench.joint_deg)
+    np.testing.assert_allclose(run.position_rad, expected, atol=2e-9)
     np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
 
 
@@ -1415,7 +1524,8 @@ def test_files_and_columns_that_do_not_match_are_refused(
     said: str,
 ) -> None:
     _file_of_each_axis(bench)
-    bench.describe(current={"file": files, "columns": columns, "unit": "A"})
+    current = {"file": files, "columns": columns, "unit": "A"}
+    bench.describe(current=current)
     _refused(bench, capsys, 6, said)
 
 
@@ -1436,9 +1546,12 @@ def test_currents_of_one_cell_may_have_several_units(bench: Bench, kind: str) ->
         stated = units
     else:
         stated = list(units.values())
-    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": stated})
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": stated}
+    bench.describe(current=current)
     assert bench.run() == 0
-    assert [axis.gain_unit for axis in load_run(bench.out)[1].axes][:3] == [
+    axes = load_run(bench.out)[1].axes
+    gain_units = [axis.gain_unit for axis in axes]
+    assert gain_units[:3] == [
         "Nm/Nm",
         "Nm/N",
         "Nm/Nm",
@@ -1449,7 +1562,8 @@ def test_currents_of_one_cell_may_have_several_units(bench: Bench, kind: str) ->
 def test_units_of_other_axes_are_refused(
     bench: Bench, capsys: pytest.CaptureFixture[str], unit: object
 ) -> None:
-    bench.describe(current={"file": "run.csv", "columns": NAMES[6:], "unit": unit})
+    current = {"file": "run.csv", "columns": NAMES[6:], "unit": unit}
+    bench.describe(current=current)
     _refused(bench, capsys, 6, "current.unit")
 
 
@@ -1459,7 +1573,8 @@ def test_axes_that_count_the_other_way_are_reversed(bench: Bench, unit: str) -> 
     values = bench.joint_deg
     side = "joint"
     if unit == "counts":
-        values = np.rint(np.radians(bench.joint_deg) @ load_run_of(bench).T / (2 * pi) * 65536)
+        joint_rad = np.radians(bench.joint_deg)
+        values = np.rint(joint_rad @ load_run_of(bench).T / (2 * pi) * 65536)
         side = "motor"
     section = {"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": side}
     bench.write_csv(np.hstack((values, bench.current_a)))
@@ -1470,18 +1585,22 @@ def test_axes_that_count_the_other_way_are_reversed(bench: Bench, unit: str) -> 
     values = values.copy()
     values[:, [1, 3]] *= -1.0
     bench.write_csv(np.hstack((values, bench.current_a)))
-    bench.describe(position={**section, "reversed": ["J2", "J4"]})
+    position = {**section, "reversed": ["J2", "J4"]}
+    bench.describe(position=position)
     assert bench.run() == 0
-    np.testing.assert_allclose(load_run(bench.out)[0].position_rad, expected, atol=1e-9)
+    position_rad = load_run(bench.out)[0].position_rad
+    np.testing.assert_allclose(position_rad, expected, atol=1e-9)
 
 
 def test_velocities_have_signs_of_their_own(bench: Bench) -> None:
     names = [*NAMES, *(f"v{axis + 1}" for axis in range(6))]
     velocity = np.gradient(bench.joint_deg, 0.001, axis=0)
     velocity[:, 2] *= -1.0
-    rows = np.hstack((bench.joint_deg, bench.current_a, velocity)).tolist()
+    stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a, velocity))
+    rows = stacked_joint_deg.tolist()
     lines = [",".join(names), *(",".join(map(repr, row)) for row in rows)]
-    (bench.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    run_path = bench.data / "run.csv"
+    run_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     section = {"file": "run.csv", "columns": names[12:], "unit": "deg/s", "side": "joint"}
     bench.describe(velocity=section)
     assert bench.run() == 4
@@ -1546,7 +1665,8 @@ def test_a_setting_for_bags_is_refused_where_no_file_is_a_bag(
 
 
 def test_settings_for_bags_and_csv_are_refused_for_matlab(bench: Bench) -> None:
-    savemat(bench.data / "run.mat", {"q": bench.joint_deg, "i": bench.current_a})
+    run_path = bench.data / "run.mat"
+    savemat(run_path, {"q": bench.joint_deg, "i": bench.current_a})
     position = {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"}
     current = {"file": "run.mat", "columns": ["i"], "unit": "A"}
     bench.describe(position=position, current=current)

@@ -43,12 +43,12 @@ def slide(tmp_path: Path) -> Path:
     way = (1.0 - np.cos(np.pi * phase)) / 2.0
     there = np.floor(time_s / 1.5)
     ends = 0.3 * np.sin(1.0 + 2.0 * np.arange(40))
-    position_m = ends[there.astype(int)] + way * (
-        ends[there.astype(int) + 1] - ends[there.astype(int)]
-    )
-    force = MASS_KG * np.gradient(np.gradient(position_m, time_s), time_s) + 20.0 * np.sign(
-        np.gradient(position_m)
-    )
+    end_difference = ends[there.astype(int) + 1] - ends[there.astype(int)]
+    position_m = ends[there.astype(int)] + way * (end_difference)
+    position_m_gradient = np.gradient(position_m, time_s)
+    position_m_gradient_gradient = np.gradient(position_m_gradient, time_s)
+    direction = np.sign(np.gradient(position_m))
+    force = MASS_KG * position_m_gradient_gradient + 20.0 * direction
     table = np.column_stack((time_s, position_m, 1000.0 * position_m, force / GAIN_N_V))
     np.savetxt(
         tmp_path / "run.csv", table, delimiter=",", header="t,m,mm,V", comments="", fmt="%.9g"
@@ -80,9 +80,11 @@ def _import(folder: Path, unit: str) -> int:
 
 def test_metres_and_millimetres_are_the_same_run(slide: Path) -> None:
     assert _import(slide, "m") == _import(slide, "mm") == ExitCode.OK
-    (first, cell), (second, _) = load_run(slide / "m.mcap"), load_run(slide / "mm.mcap")
+    path = slide / "m.mcap"
+    (first, cell), (second, _) = load_run(path), load_run(slide / "mm.mcap")
     np.testing.assert_allclose(first.position_rad, second.position_rad, atol=2e-9)
-    assert np.ptp(first.position_rad) == pytest.approx(0.6, abs=0.02)
+    position_range_rad = np.ptp(first.position_rad)
+    assert position_range_rad == pytest.approx(0.6, abs=0.02)
     found = identify(
         model_of(cell),
         [first],
@@ -98,7 +100,8 @@ def test_metres_and_millimetres_are_the_same_run(slide: Path) -> None:
 
 def test_metres_of_an_axis_that_turns(slide: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (slide / "slide.urdf").write_text(URDF.format(mass=MASS_KG, kind="revolute"))
-    turning = CELL.replace("N/V", "Nm/V").replace("_mm", "_deg").replace("-800, 800", "-50, 50")
+    changed_cell = CELL.replace("N/V", "Nm/V")
+    turning = changed_cell.replace("_mm", "_deg").replace("-800, 800", "-50, 50")
     (slide / "cell.yaml").write_text(turning)
     assert _import(slide, "m") == ExitCode.CONFIGURATION
     assert "m, while axis X turns" in capsys.readouterr().err
@@ -133,7 +136,8 @@ def test_a_number_that_no_robot_has(
         ["import", str(slide / "run.yaml"), "--data", str(slide), "--out", str(slide / "run.mcap")]
     )
     assert code == ExitCode.DATA_UNFIT
-    assert f"as {section}" in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert f"as {section}" in error_output
     assert not list(slide.glob("run.mcap*"))
 
 

@@ -80,7 +80,8 @@ def test_slow_readings_come_back_and_leave_the_samples_alone(
     axes, rows = recording
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
-        bare = write(Path(folder) / "b.mcap", content(axes), rows)
+        b_path = Path(folder) / "b.mcap"
+        bare = write(b_path, content(axes), rows)
         with LogWriter(path, content(axes), joints, clock_ns=lambda: 0) as writer:
             writer.readings(readings)
             for sample in rows:
@@ -89,19 +90,21 @@ def test_slow_readings_come_back_and_leave_the_samples_alone(
         found = read_log(path)
         without = read_log(bare)
         # Such topics are in a log only where it has some.
-        assert [b"AxisReading" in log.read_bytes() for log in (path, bare)] == [
-            bool(readings),
-            False,
-        ]
+        expected = [bool(readings), False]
+        assert [b"AxisReading" in log.read_bytes() for log in (path, bare)] == expected
     assert found.readings == tuple(readings)
     assert without.readings == ()
-    assert found.samples.position_counts.tolist() == without.samples.position_counts.tolist()
+    position_counts = found.samples.position_counts.tolist()
+    assert position_counts == without.samples.position_counts.tolist()
 
 
 def test_a_reading_of_an_axis_that_the_log_lacks_is_refused(tmp_path: Path) -> None:
-    with LogWriter(tmp_path / "a.mcap", content(2), joints, clock_ns=lambda: 0) as log:
-        log.reading(SlowReading(5, 2, Quantity.TORQUE, 1.0))
-        for sample in samples([(1, 2), (3, 4)]):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, content(2), joints, clock_ns=lambda: 0) as log:
+        slow_reading = SlowReading(5, 2, Quantity.TORQUE, 1.0)
+        log.reading(slow_reading)
+        rows = [(1, 2), (3, 4)]
+        for sample in samples(rows):
             log.write(sample)
         log.conclude(valid=True)
     with pytest.raises(
@@ -117,8 +120,10 @@ def test_an_event_that_names_a_file_whose_name_is_no_utf_8_is_logged(tmp_path: P
     event = CellEvent(
         START_NS, None, EventKind.ENDED, 0, "OutputFailed: \udcff.mcap: no space left"
     )
-    log = read_log(write(tmp_path / "a.mcap", content(2), samples([[0, 0]]), [event]))
-    assert [found.text for found in log.events] == [r"OutputFailed: \udcff.mcap: no space left"]
+    path = tmp_path / "a.mcap"
+    log = read_log(write(path, content(2), samples([[0, 0]]), [event]))
+    texts = [found.text for found in log.events]
+    assert texts == [r"OutputFailed: \udcff.mcap: no space left"]
 
 
 @settings(deadline=None, max_examples=60)
@@ -126,13 +131,20 @@ def test_an_event_that_names_a_file_whose_name_is_no_utf_8_is_logged(tmp_path: P
 def test_round_trip(recording: tuple[int, list[Sample]], events: list[CellEvent]) -> None:
     axes, rows = recording
     with TemporaryDirectory() as folder:
-        log = read_log(write(Path(folder) / "a.mcap", content(axes), rows, events))
-    assert log.samples.cycle.tolist() == [s.cycle for s in rows]
-    assert log.samples.time_ns.tolist() == [s.time_ns for s in rows]
-    assert log.samples.position_counts.tolist() == [list(s.position_counts) for s in rows]
-    assert log.samples.current_raw.tolist() == [list(s.current_raw) for s in rows]
-    assert log.samples.statusword.tolist() == [list(s.statusword) for s in rows]
-    assert log.samples.missing.tolist() == [s.missing for s in rows]
+        path = Path(folder) / "a.mcap"
+        log = read_log(write(path, content(axes), rows, events))
+    expected = [s.cycle for s in rows]
+    assert log.samples.cycle.tolist() == expected
+    time_ns = [s.time_ns for s in rows]
+    assert log.samples.time_ns.tolist() == time_ns
+    position_counts = [list(s.position_counts) for s in rows]
+    assert log.samples.position_counts.tolist() == position_counts
+    current_raw = log.samples.current_raw.tolist()
+    assert current_raw == [list(s.current_raw) for s in rows]
+    statuswords = [list(s.statusword) for s in rows]
+    assert log.samples.statusword.tolist() == statuswords
+    missing = log.samples.missing.tolist()
+    assert missing == [s.missing for s in rows]
     assert log.events == tuple(events)
 
 
@@ -143,16 +155,15 @@ def test_the_start_and_the_end_come_back(tmp_path: Path, axes: int) -> None:
         Sample(k, k, (1,) * axes, (2,) * axes, (3,) * axes, missing)
         for k, missing in ((3, 0), (4, 1), (9, 1))
     ]
-    log = read_log(write(tmp_path / "a.mcap", start, rows, verdict=(False, "emergency stop")))
+    path = tmp_path / "a.mcap"
+    log = read_log(write(path, start, rows, verdict=(False, "emergency stop")))
     assert log.head.run == start.run
     assert log.head.readback == start.readback
-    assert log.head.files["cell.yaml"] == start.files["cell.yaml"]
+    cell_yaml = log.head.files["cell.yaml"]
+    assert cell_yaml == start.files["cell.yaml"]
     statistics = log.statistics
-    assert (statistics.samples, statistics.lost_cycles, statistics.missing) == (
-        3,
-        4,
-        (2,) + (0,) * (axes - 1),
-    )
+    expected = (3, 4, (2,) + (0,) * (axes - 1))
+    assert (statistics.samples, statistics.lost_cycles, statistics.missing) == expected
     assert (statistics.valid, statistics.reason) == (False, "emergency stop")
     assert not (tmp_path / "a.mcap.part").exists()
 
@@ -161,7 +172,8 @@ def test_the_start_and_the_end_come_back(tmp_path: Path, axes: int) -> None:
 def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
     rows = samples([[k * (i + 1) for i in range(axes)] for k in range(45)], missing=1)
     event = CellEvent(START_NS, 0, EventKind.EMCY, 0x8130, "Lebenszeichen fehlt: Ä")
-    path = write(tmp_path / "a.mcap", content(axes), rows, [event])
+    a_path = tmp_path / "a.mcap"
+    path = write(a_path, content(axes), rows, [event])
     decoded: dict[str, list[Any]] = {}
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -175,7 +187,8 @@ def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
     assert len(decoded["/cell/samples"]) == len(rows)
     for message, sample in zip(decoded["/cell/samples"], rows, strict=True):
         assert message.stamp.sec * 10**9 + message.stamp.nanosec == sample.time_ns
-        assert (message.cycle, message.missing) == (sample.cycle, sample.missing)
+        expected = (sample.cycle, sample.missing)
+        assert (message.cycle, message.missing) == expected
         assert tuple(message.position_counts) == sample.position_counts
         assert tuple(message.current_raw) == sample.current_raw
         assert tuple(message.statusword) == sample.statusword
@@ -185,7 +198,8 @@ def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
     assert len(decoded["/joint_states"]) == 3  # 45 ms at 50 Hz
     state = decoded["/joint_states"][1]
     assert state.name == [f"J{i + 1}" for i in range(axes)]
-    assert list(state.position) == pytest.approx(joints(rows[20].position_counts))
+    counts = rows[20].position_counts
+    assert list(state.position) == pytest.approx(joints(counts))
 
 
 def test_samples_are_on_disk_within_200_ms_of_recorded_time(
@@ -194,7 +208,9 @@ def test_samples_are_on_disk_within_200_ms_of_recorded_time(
     monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
     rows = samples([[k] for k in range(1000)])
     reader = LogReader(tmp_path / "a.mcap")
-    blocks = [len(block.cycle) for block in LogReader(write(tmp_path / "a.mcap", content(1), rows))]
+    a_path = tmp_path / "a.mcap"
+    path = write(a_path, content(1), rows)
+    blocks = [len(block.cycle) for block in LogReader(path)]
     assert max(blocks) <= 150
     assert sum(blocks) == 1000
     assert reader.digest == ""
@@ -203,7 +219,8 @@ def test_samples_are_on_disk_within_200_ms_of_recorded_time(
 def test_samples_are_on_disk_within_200_ms_of_wall_time(tmp_path: Path) -> None:
     now_ns = 0
     rows = samples([[k] for k in range(20)])
-    with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: now_ns) as log:
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, content(1), joints, clock_ns=lambda: now_ns) as log:
         sizes = []
         for sample in rows:
             now_ns += 50_000_000
@@ -218,7 +235,8 @@ def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None
         pytest.raises(RuntimeError, match="bus gone"),
         LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log,
     ):
-        for sample in samples([[k] for k in range(7)]):
+        rows = [[k] for k in range(7)]
+        for sample in samples(rows):
             log.write(sample)
         raise RuntimeError("bus gone")
     assert not path.exists()
@@ -229,14 +247,16 @@ def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None
         found.extend(StreamReader(stream).records)
     sequences = [record.sequence for record in found if isinstance(record, Message)]
     # Seven samples; after the first of them the first JointState and currents.
-    assert sequences == [10, 0, 0, *range(11, 17)]
+    expected = [10, 0, 0, *range(11, 17)]
+    assert sequences == expected
     with pytest.raises(UsageError, match="unfinished"):
         write(path, content(1), samples([[0]]))
     assert part.read_bytes() == data
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", content(1), samples([[0]]))
+    a_path = tmp_path / "a.mcap"
+    path = write(a_path, content(1), samples([[0]]))
     before = path.read_bytes()
     with pytest.raises(UsageError, match="a file of that name"):
         write(path, content(1), samples([[1]]))
@@ -255,7 +275,8 @@ def test_a_file_that_appeared_meanwhile_is_not_replaced(
 
     def record() -> None:
         with LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log:
-            for sample in samples([[number] for number in range(5)]):
+            rows = [[number] for number in range(5)]
+            for sample in samples(rows):
                 log.write(sample)
             log.conclude(True)
             path.write_bytes(b"another program's")
@@ -274,8 +295,10 @@ def test_a_file_system_without_hard_links_gives_the_name_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _without_hard_links(monkeypatch)
-    path = write(tmp_path / "a.mcap", content(1), samples([[0]]))
-    assert len(read_log(path).samples.cycle) == 1
+    a_path = tmp_path / "a.mcap"
+    path = write(a_path, content(1), samples([[0]]))
+    cycle = read_log(path).samples.cycle
+    assert len(cycle) == 1
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -295,29 +318,34 @@ def _without_hard_links(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_sample_that_does_not_fit_is_refused(tmp_path: Path, sample: Sample) -> None:
+    path = tmp_path / "a.mcap"
     with pytest.raises(ValueError, match="does not fit a log of 1 axes"):
-        write(tmp_path / "a.mcap", content(1), [sample])
+        write(path, content(1), [sample])
 
 
 def test_a_log_without_samples_is_incomplete(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
     with pytest.raises(LogIncomplete, match="no samples"):
-        read_log(write(tmp_path / "a.mcap", content(1), []))
+        read_log(write(path, content(1), []))
 
 
 def test_samples_have_chunks_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A constant layout, so that a chunk is one `frombuffer`."""
     monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
-    events = [CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")]
-    file = RecordFile(
-        write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events)
-    )
+    cell_event = CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")
+    events = [cell_event]
+    path = tmp_path / "a.mcap"
+    file = RecordFile(write(path, content(2), samples([[k, k] for k in range(900)]), events))
     sizes = [chunk.uncompressed_size for offset, chunk in file if isinstance(chunk, Chunk)]
-    blocks = list(LogReader(tmp_path / "a.mcap"))
-    assert [len(block.cycle) for block in blocks] == [1, *[150] * 5, 149]
+    a_path = tmp_path / "a.mcap"
+    blocks = list(LogReader(a_path))
+    expected = [1, *[150] * 5, 149]
+    cycle_counts = [len(block.cycle) for block in blocks]
+    assert cycle_counts == expected
     assert len(sizes) == 2 * len(blocks)
-    np.testing.assert_array_equal(
-        np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900)
-    )
+    position_counts = [b.position_counts for b in blocks]
+    stacked_position_counts = np.concatenate(position_counts)
+    np.testing.assert_array_equal(stacked_position_counts[:, 1], np.arange(900))
 
 
 @pytest.mark.parametrize("size", [1, 7, 149, 151, 10_000])
@@ -325,23 +353,27 @@ def test_the_size_of_a_block_changes_nothing_but_the_blocks(
     size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", size)
-    path = write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]))
+    a_path = tmp_path / "a.mcap"
+    path = write(a_path, content(2), samples([[k, k] for k in range(900)]))
     blocks = list(LogReader(path))
-    assert max(len(block.cycle) for block in blocks) <= size + 149
-    np.testing.assert_array_equal(
-        np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900)
-    )
+    largest_cycle_count = max(len(block.cycle) for block in blocks)
+    assert largest_cycle_count <= size + 149
+    stacked_position_counts = np.concatenate([b.position_counts for b in blocks])
+    np.testing.assert_array_equal(stacked_position_counts[:, 1], np.arange(900))
     whole = LogReader(path)
     assert (len(list(whole.until_damage())), whole.damage) == (len(blocks), None)
     path.write_bytes(path.read_bytes()[: whole.whole_bytes - 5])
     cut = LogReader(path)
-    saved = np.concatenate([b.position_counts for b in cut.until_damage()])[:, 1]
+    position_counts = [b.position_counts for b in cut.until_damage()]
+    saved = np.concatenate(position_counts)[:, 1]
     assert cut.damage is not None
     np.testing.assert_array_equal(saved, np.arange(900))
 
 
 def test_a_log_of_which_no_one_said_how_it_went_is_not_valid(tmp_path: Path) -> None:
-    with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: 0) as log:
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log:
         log.write(samples([[1]])[0])
-    statistics = read_log(tmp_path / "a.mcap").statistics
+    a_path = tmp_path / "a.mcap"
+    statistics = read_log(a_path).statistics
     assert (statistics.valid, statistics.reason) == (False, "not concluded")

@@ -31,13 +31,13 @@ from tests.daq.logs import content, samples, write
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small log."""
     rows = samples([[k * k, -k] for k in range(450)])
-    return write(tmp_path_factory.mktemp("logs") / "good.mcap", content(2), rows)
+    path = tmp_path_factory.mktemp("logs") / "good.mcap"
+    return write(path, content(2), rows)
 
 
 def _same(one: Log, other: Log) -> bool:
-    pairs = [
-        (getattr(one.samples, n), getattr(other.samples, n)) for n in type(one.samples).__slots__
-    ]
+    slots = type(one.samples).__slots__
+    pairs = [(getattr(one.samples, n), getattr(other.samples, n)) for n in slots]
     heads = (one.head, one.events, one.statistics) == (other.head, other.events, other.statistics)
     return heads and all(np.array_equal(a, b) for a, b in pairs)
 
@@ -116,30 +116,36 @@ def _foreign(path: Path, profile: str, topic: str, schema: str) -> Path:
 
 def test_mcap_of_others(tmp_path: Path) -> None:
     for profile in ("ros1", "ros2"):
+        path = tmp_path / "a.mcap"
         with pytest.raises(
             LogForeign,
             match=r"a bag of mcap-python.* with /x; expected a log of "
             r"drivegain",
         ):
-            read_log(_foreign(tmp_path / "a.mcap", profile, "/x", "a/msg/B"))
+            read_log(_foreign(path, profile, "/x", "a/msg/B"))
+    b_path = tmp_path / "b.mcap"
     with pytest.raises(LogForeign, match="/cell/samples as a/msg/B"):
-        read_log(_foreign(tmp_path / "b.mcap", "ros2", "/cell/samples", "a/msg/B"))
+        read_log(_foreign(b_path, "ros2", "/cell/samples", "a/msg/B"))
 
 
 def _record(opcode: int, body: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(body)) + body
+    packed = struct.pack("<BQ", opcode, len(body))
+    return packed + body
 
 
 def _file(path: Path, *records: bytes) -> Path:
     data = MAGIC + b"".join(records)
-    data += _record(Opcode.DATA_END, struct.pack("<I", zlib.crc32(data)))
+    body = struct.pack("<I", zlib.crc32(data))
+    data += _record(Opcode.DATA_END, body)
     path.write_bytes(data + _record(Opcode.FOOTER, b"\0" * 20) + MAGIC)
     return path
 
 
 def _chunk(size: int, crc: int, compression: bytes, data: bytes) -> bytes:
-    head = struct.pack("<QQQI", 0, 0, size, crc) + struct.pack("<I", len(compression)) + compression
-    return _record(Opcode.CHUNK, head + struct.pack("<Q", len(data)) + data)
+    packed = struct.pack("<QQQI", 0, 0, size, crc)
+    head = packed + struct.pack("<I", len(compression)) + compression
+    body = head + struct.pack("<Q", len(data)) + data
+    return _record(Opcode.CHUNK, body)
 
 
 BOMB = zstandard.compress(b"\0" * 2**27)
@@ -161,8 +167,9 @@ BOMB = zstandard.compress(b"\0" * 2**27)
     ],
 )
 def test_a_file_made_to_harm(tmp_path: Path, record: bytes, message: str) -> None:
+    path = tmp_path / "a.mcap"
     with pytest.raises((LogCorrupt, LogIncomplete), match=message):
-        read_log(_file(tmp_path / "a.mcap", record))
+        read_log(_file(path, record))
 
 
 def test_a_log_packed_anew_by_another_tool_is_the_same(good: Path, tmp_path: Path) -> None:

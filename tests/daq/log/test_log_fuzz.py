@@ -48,7 +48,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small log."""
     rows = samples([[k * k, -k] for k in range(320)])
     events = [CellEvent(START_NS, None, EventKind.MOVE_START, k, "move") for k in range(3)]
-    return write(tmp_path_factory.mktemp("logs") / "good.mcap", content(2), rows, events)
+    path = tmp_path_factory.mktemp("logs") / "good.mcap"
+    return write(path, content(2), rows, events)
 
 
 def _attack(path: Path, original: Log | None) -> None:
@@ -133,9 +134,12 @@ TEXTS = st.text(max_size=12) | st.sampled_from(
 
 @st.composite
 def _records(draw: st.DrawFn) -> bytes:
-    kind = draw(st.sampled_from(("any", "metadata", "attachment", "chunk", "length")))
+    sampled = st.sampled_from(("any", "metadata", "attachment", "chunk", "length"))
+    kind = draw(sampled)
     if kind == "any":
-        return raw_record(draw(st.integers(0, 255)), draw(st.binary(max_size=60)))
+        opcode = draw(st.integers(0, 255))
+        body = draw(st.binary(max_size=60))
+        return raw_record(opcode, body)
     if kind == "length":
         return raw_record(draw(st.integers(1, 15)), draw(st.binary(max_size=20)), draw(BITS64))
     if kind == "metadata":
@@ -161,20 +165,23 @@ def _records(draw: st.DrawFn) -> bytes:
 def test_records_made_up_with_right_checksums_are_read_or_named(
     tmp_path: Path, records: list[bytes]
 ) -> None:
-    path = finished_file(tmp_path / "made.mcap", [HEADER, *records])
+    made_path = tmp_path / "made.mcap"
+    path = finished_file(made_path, [HEADER, *records])
     _attack(path, None)
 
 
 @st.composite
 def _messages(draw: st.DrawFn) -> bytes:
-    kind = draw(st.sampled_from(("sample", "event", "any")))
+    sampled = st.sampled_from(("sample", "event", "any"))
+    kind = draw(sampled)
     channel = draw(st.sampled_from((1, 1, 2, 2, 3)))
     if kind == "sample":
         axes = draw(st.integers(1, 3))
         record = np.zeros(1, dtype=sample_dtype(axes))
+        itemsize = sample_dtype(axes).itemsize
         record["opcode"], record["length"], record["channel"] = (
             Opcode.MESSAGE,
-            sample_dtype(axes).itemsize - 9,
+            itemsize - 9,
             channel,
         )
         record["encapsulation"] = draw(st.sampled_from((0x100, 0x100, 0)))
@@ -193,13 +200,13 @@ def _messages(draw: st.DrawFn) -> bytes:
             draw(BITS32),
             draw(st.integers(-2, 40)),
         )
-        data = (
-            body + struct.pack("<I", length) + words.encode() + b"\0" + draw(st.binary(max_size=20))
-        )
+        packed = struct.pack("<I", length)
+        data = body + packed + words.encode() + b"\0" + draw(st.binary(max_size=20))
     else:
         data = draw(st.binary(max_size=60))
     head = struct.pack("<HIQQ", channel, 0, draw(BITS64), draw(BITS64))
-    return raw_record(Opcode.MESSAGE, head + data, draw(st.none() | st.none() | BITS16))
+    head_body = head + data
+    return raw_record(Opcode.MESSAGE, head_body, draw(st.none() | st.none() | BITS16))
 
 
 @settings(FUZZ, max_examples=200)
@@ -225,9 +232,9 @@ def test_messages_made_up_in_genuine_chunks_are_read_or_named(
         metadata_record(RUN, sealed(run_record(start.run))),
     ]
     chunk = chunk_record((TOPICS if defined else b"") + b"".join(messages))
-    path = finished_file(
-        tmp_path / "made.mcap", [*before, chunk, metadata_record(STATISTICS, sealed(statistics))]
-    )
+    records = [*before, chunk, metadata_record(STATISTICS, sealed(statistics))]
+    made_path = tmp_path / "made.mcap"
+    path = finished_file(made_path, records)
     _attack(path, None)
 
 
@@ -259,7 +266,10 @@ def test_the_made_up_files_are_ones_that_a_reader_takes(good: Path, tmp_path: Pa
         chunk_record(TOPICS + record.tobytes()),
         metadata_record(STATISTICS, statistics),
     ]
-    assert len(read_log(finished_file(tmp_path / "made.mcap", made)).samples.cycle) == 1
+    made_path = tmp_path / "made.mcap"
+    path = finished_file(made_path, made)
+    cycle = read_log(path).samples.cycle
+    assert len(cycle) == 1
 
 
 def _is_open(path: Path) -> bool:
@@ -293,16 +303,18 @@ def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
     file.
     """
     record = np.zeros(500_000, dtype=sample_dtype(2))
-    for name, value in (("opcode", 5), ("length", sample_dtype(2).itemsize - 9), ("channel", 1)):
+    itemsize = sample_dtype(2).itemsize
+    for name, value in (("opcode", 5), ("length", itemsize - 9), ("channel", 1)):
         record[name] = value
     record["encapsulation"] = 0x100
     for name in ("positions", "currents", "statuswords"):
         record[name] = 2
     chunk = chunk_record(record.tobytes())
     assert len(chunk) * 200 < record.nbytes
-    path = finished_file(
-        tmp_path / "bomb.mcap", [HEADER, chunk_record(TOPICS + record[:1].tobytes()), *[chunk] * 8]
-    )
+    tobytes = record[:1].tobytes()
+    records = [HEADER, chunk_record(TOPICS + tobytes), *[chunk] * 8]
+    bomb_path = tmp_path / "bomb.mcap"
+    path = finished_file(bomb_path, records)
     taken = 0
     with pytest.raises(LogUnreadable, match="times the file"):
         for block in LogReader(path):

@@ -40,9 +40,10 @@ def read(path: Path, *columns: str | int, time: TimeColumn | None = None) -> Tab
 def test_matrices_vectors_and_fields_are_read(packed: bool, tmp_path: Path) -> None:
     clock_ns = 1_700_000_000_123_456_789 + 4_000_000 * np.arange(ROWS, dtype=np.uint64)
     seconds = np.arange(ROWS) * 4e-3
+    current = CURRENT.T.astype(np.float32)
     variables = {
         "q": Q,
-        "turned": np.asfortranarray(CURRENT.T.astype(np.float32)),
+        "turned": np.asfortranarray(current),
         "t": seconds,
         "run": {"counts": (1000.0 * Q).astype(np.int16), "t": clock_ns, "note": "bare"},
     }
@@ -59,9 +60,11 @@ def test_matrices_vectors_and_fields_are_read(packed: bool, tmp_path: Path) -> N
     )
     np.testing.assert_array_equal(table.values, np.column_stack(expected))
     assert table.stamps is not None
-    assert table.stamps.first_ns == int(clock_ns[0])
+    clock_n = int(clock_ns[0])
+    assert table.stamps.first_ns == clock_n
     np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
-    other = read(path, time=TimeColumn(file="run.mat", column="t", unit=TimeUnit.SECOND))
+    time_column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.SECOND)
+    other = read(path, time=time_column)
     assert other.stamps is not None
     assert other.values.shape == (ROWS, 0)
     np.testing.assert_array_equal(other.stamps.time_s, seconds)
@@ -156,7 +159,8 @@ def test_files_of_other_formats_are_refused(content: bytes, message: str, tmp_pa
 
 
 def _element(kind: int, data: bytes) -> bytes:
-    return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+    packed = struct.pack("<II", kind, len(data))
+    return packed + data + bytes(-len(data) % 8)
 
 
 HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
@@ -169,7 +173,8 @@ def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
     heads = []
     for level in range(depth):
         name = _element(1, b"q" if level == depth - 1 else b"")
-        head = _element(6, struct.pack("<II", 1, 0)) + _element(5, struct.pack("<2i", 1, 1)) + name
+        packed = struct.pack("<II", 1, 0)
+        head = _element(6, packed) + _element(5, struct.pack("<2i", 1, 1)) + name
         size += len(head)
         heads.append(struct.pack("<II", 14, size) + head)
         size += 8
@@ -181,9 +186,8 @@ def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
 
 def test_an_object_is_named(tmp_path: Path) -> None:
     """MATLAB's table, timetable and timeseries have no dimensions and no numbers of their own."""
-    body = _element(6, struct.pack("<II", 17, 0)) + b"".join(
-        _element(1, word) for word in (b"run", b"MCOS", b"table")
-    )
+    packed = struct.pack("<II", 17, 0)
+    body = _element(6, packed) + b"".join(_element(1, word) for word in (b"run", b"MCOS", b"table"))
     path = tmp_path / "table.mat"
     path.write_bytes(HEADER + _element(14, body))
     with pytest.raises(
@@ -258,10 +262,12 @@ def test_a_matrix_is_imported_with_its_columns_as_axes(checkout: Path, tmp_path:
 
 def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.mat"
-    savemat(path, {"q": Q, "t": np.linspace(0.0, 1e300, ROWS), "n": np.full(ROWS, 2**62)})
+    grid = np.linspace(0.0, 1e300, ROWS)
+    savemat(path, {"q": Q, "t": grid, "n": np.full(ROWS, 2**62)})
     for column, unit in (("t", TimeUnit.SECOND), ("n", TimeUnit.MICROSECOND)):
+        time = TimeColumn(file="run.mat", column=column, unit=unit)
         with pytest.raises(TableUnfit, match="a stamp of"):
-            read(path, "q.1", time=TimeColumn(file="run.mat", column=column, unit=unit))
+            read(path, "q.1", time=time)
     with pytest.raises(TableUnfit, match=r"VARIABLE|no variable"):
         read(path, "q." + 5000 * "1")
 

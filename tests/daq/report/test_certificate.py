@@ -86,24 +86,27 @@ class Reader(HTMLParser):
 
 def _with_smooth() -> Calibration:
     """A term without a name on J2: its torque is that of the B-splines alone."""
-    placed = PlacedEffect(Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5), 1)
+    smooth = Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5)
+    placed = PlacedEffect(smooth, 1)
     found = tuple(
         Parameter(c.name, 0.1 * k - 0.3, 0.02, c.unit) for k, c in enumerate(placed.columns)
     )
-    effect = AcceptedEffect(placed.effect.name, "J2", dict(placed.effect.settings), found, 5.0, 3.0)
+    settings = dict(placed.effect.settings)
+    effect = AcceptedEffect(placed.effect.name, "J2", settings, found, 5.0, 3.0)
     made = demo_calibration()
-    return replace(made, effects=(effect,), parameters=(*made.parameters, *found))
+    parameters = (*made.parameters, *found)
+    return replace(made, effects=(effect,), parameters=parameters)
 
 
 def _page(calibration: Calibration, earlier: Calibration | None = None) -> str:
-    return certificate_page(
-        certify(calibration, without_controller(calibration, "not read", NOW), earlier)
-    )
+    comparison = without_controller(calibration, "not read", NOW)
+    return certificate_page(certify(calibration, comparison, earlier))
 
 
 def test_every_number_of_the_document_is_on_the_page() -> None:
     calibration = demo_calibration()
-    certificate = certify(calibration, without_controller(calibration, "not read", NOW))
+    comparison = without_controller(calibration, "not read", NOW)
+    certificate = certify(calibration, comparison)
     text = certificate_page(certificate)
     report = certificate_report(certificate)
     page = Reader(text)
@@ -147,7 +150,8 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     alike = PayloadMass.of("disc", 4.59, [gain.value / 4.59 for gain in gains], gains).weighed_to(
         0.0459
     )
-    texts = Reader(_page(replace(calibration, payload_mass=(alike,)))).texts
+    changed_calibration = replace(calibration, payload_mass=(alike,))
+    texts = Reader(_page(changed_calibration)).texts
     sheet = next(text for text in texts if text.startswith("disc: 4.59 kg in the cell file"))
     assert "if the mass of disc is wrong by 1 %, every gain is wrong by 1 %" in sheet
     assert "4.59 kg ± 0.0459 kg, which is ± 1 % of every gain, not included in σ" in sheet
@@ -156,17 +160,15 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     # With the drawing known too, each gain has a number.
     shares = np.linspace(0.1, 0.6, len(gains))
     slopes = [share * gain.value / 4.59 for share, gain in zip(shares, gains, strict=True)]
-    drawn = replace(
-        calibration, payload_mass=(PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),)
-    )
-    sheet = next(
-        text
-        for text in Reader(_page(drawn)).texts
-        if text.startswith("disc: 4.59 kg in the cell file")
-    )
+    payload_mass = (PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),)
+    drawn = replace(calibration, payload_mass=payload_mass)
+    reader = Reader(_page(drawn))
+    sheet = next(text for text in reader.texts if text.startswith("disc: 4.59 kg in the cell file"))
     assert f"the gains are wrong by: {gains[0].axis} 0.10 %, " in sheet
     assert "which is at most ± 0.6 % of every gain, not included in σ" in sheet
-    report = json_tree(certificate_report(certify(drawn, without_controller(drawn, "", NOW))))
+    comparison = without_controller(drawn, "", NOW)
+    certificate = certify(drawn, comparison)
+    report = json_tree(certificate_report(certificate))
     (found,) = report["payload_mass"]
     assert (found["payload"], found["mass_kg"], found["tolerance_kg"]) == ("disc", 4.59, 0.0459)
     for one, gain, share in zip(found["gains"], gains, shares, strict=True):
@@ -179,34 +181,39 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
 def test_what_files_say_is_escaped() -> None:
     made = demo_calibration()
     gains = tuple(replace(gain, axis=f"{gain.axis}{HOSTILE}") for gain in made.gains)
-    hostile = with_recordings(
-        replace(made, cell=HOSTILE, gains=gains, software=HOSTILE), operator=HOSTILE
-    )
+    calibration = replace(made, cell=HOSTILE, gains=gains, software=HOSTILE)
+    hostile = with_recordings(calibration, operator=HOSTILE)
     text = _page(hostile)
     assert "<script" not in text
-    assert f"Cell {HOSTILE}" in Reader(text).texts
+    texts = Reader(text).texts
+    assert f"Cell {HOSTILE}" in texts
 
 
 def test_a_calibration_of_the_library_has_no_program_and_no_time() -> None:
-    text = _page(replace(demo_calibration(), created="", software=""))
+    calibration = replace(demo_calibration(), created="", software="")
+    text = _page(calibration)
     assert "made time not known by software not known." in " ".join(text.split())
 
 
 def test_a_term_without_a_name_is_its_curve() -> None:
     calibration = _with_smooth()
-    curve = curve_of(calibration.effects[0], calibration)
+    accepted = calibration.effects[0]
+    curve = curve_of(accepted, calibration)
     assert curve is not None
     assert curve.half_nm is None
-    assert (curve.x[0], curve.x[-1]) == (-2.38838, 1.5)
+    expected = (-2.38838, 1.5)
+    assert (curve.x[0], curve.x[-1]) == expected
     # The shapes leave out the constant, whose B-spline weights are all one: the weights of the
     # curve sum to zero.
     placed = Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5)
     weights = np.linalg.lstsq(placed.shapes(curve.x).T, curve.torque_nm, rcond=None)[0]
-    assert weights == pytest.approx([one.value for one in calibration.effects[0].coefficients])
+    coefficients = calibration.effects[0].coefficients
+    assert weights == pytest.approx([one.value for one in coefficients])
     text = _page(calibration)
     for internal in ("lower", "upper", "other_axis", "signed", "part 7", "2.38838"):
         assert internal not in text.partition("</style>")[2]
-    assert size_text(calibration.effects[0], calibration) in " ".join(Reader(text).texts)
+    first_effect = calibration.effects[0]
+    assert size_text(first_effect, calibration) in " ".join(Reader(text).texts)
 
 
 def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
@@ -215,11 +222,13 @@ def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
     """
     loss = Parameter("c", 0.1, 0.001, "Nm/Nm")
     rest = Parameter("d", 0.002, 0.004, "kg m²")
-    text = named_size(LoadFriction(0, 0.58, 1), (loss, rest))
-    assert (
-        text == f"{with_deviation(10.0, 0.1)} % of the load torque, beside a rotor of "
+    effect = LoadFriction(0, 0.58, 1)
+    text = named_size(effect, (loss, rest))
+    expected = (
+        f"{with_deviation(10.0, 0.1)} % of the load torque, beside a rotor of "
         f"{with_deviation(0.6, 0.04)} kg m²"
     )
+    assert text == expected
     assert named_size(LoadFriction(0), (loss,)) == (
         f"{with_deviation(10.0, 0.1)} % of the load torque"
     )
@@ -227,9 +236,10 @@ def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
 
 def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
     made = _with_smooth()
+    gains = tuple(replace(one, unit="N/A") if one.axis == "J2" else one for one in made.gains)
     sliding = replace(
         made,
-        gains=tuple(replace(one, unit="N/A") if one.axis == "J2" else one for one in made.gains),
+        gains=gains,
     )
     texts = Reader(_page(sliding)).texts
     assert {"force [N]", "joint position [m]"} <= set(texts)
@@ -239,9 +249,10 @@ def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
 
 def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
     calibration = demo_calibration()
+    gains = tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains)
     vague = replace(
         calibration,
-        gains=tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains),
+        gains=gains,
     )
     texts = Reader(_page(vague)).texts
     (entry,) = (
@@ -254,13 +265,11 @@ def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
 
 def test_the_verdict_is_that_of_the_gates() -> None:
     calibration = demo_calibration()
-    assert (
-        certify(calibration, without_controller(calibration, "", NOW)).verdict
-        is Verdict.NOT_COMPARED
-    )
-    vague = replace(
-        calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:])
-    )
+    comparison = without_controller(calibration, "", NOW)
+    assert certify(calibration, comparison).verdict is Verdict.NOT_COMPARED
+    changed_gain = replace(calibration.gains[0], std=5.0)
+    gains = (changed_gain, *calibration.gains[1:])
+    vague = replace(calibration, gains=gains)
     refused = certify(vague, without_controller(vague, "", NOW))
     assert refused.verdict is Verdict.REFUSED
     assert refused.sentence.startswith("Must not be written: J1: σ 14.75 %, expected at most 3 %")
@@ -287,9 +296,8 @@ REVERSED = Diagnosis(
 
 def test_the_verdict_names_what_is_to_be_checked() -> None:
     calibration = replace(demo_calibration(), diagnoses=(ZERO_OFF,))
-    certificate = certify(
-        calibration, replace(without_controller(calibration, "", NOW), refusals=())
-    )
+    comparison = replace(without_controller(calibration, "", NOW), refusals=())
+    certificate = certify(calibration, comparison)
     assert certificate.verdict is Verdict.NOT_COMPARED
     assert certificate.sentence.endswith(" But CHECK J2: the zero of J2 off by +2.00 ± 0.05 °.")
     assert "verdict act" in certificate_page(certificate)
@@ -300,7 +308,8 @@ def test_the_verdict_names_what_is_to_be_checked() -> None:
 
 def test_a_wrong_description_that_refuses_a_write_is_said_once() -> None:
     calibration = replace(demo_calibration(), diagnoses=(REVERSED,))
-    certificate = certify(calibration, without_controller(calibration, "", NOW))
+    comparison = without_controller(calibration, "", NOW)
+    certificate = certify(calibration, comparison)
     assert certificate.sentence == (
         "Must not be written: J2: a position that counts the other way, expected its axis."
     )
@@ -311,8 +320,10 @@ def test_without_a_controller_no_message_names_a_current_gain() -> None:
     calibration = demo_calibration()
     first = calibration.gains[0]
     reversed_gain = replace(first, value=-first.value)
-    reversed_first = replace(calibration, gains=(reversed_gain, *calibration.gains[1:]))
-    certificate = certify(reversed_first, without_controller(reversed_first, "", NOW))
+    gains = (reversed_gain, *calibration.gains[1:])
+    reversed_first = replace(calibration, gains=gains)
+    comparison = without_controller(reversed_first, "", NOW)
+    certificate = certify(reversed_first, comparison)
     (sign,) = (one for one in certificate.comparison.refusals if one.gate is Gate.SIGN)
     assert sign.found == "gain -33.9, nameplate 32.96"
     assert "current gain" not in certificate_page(certificate)
@@ -320,33 +331,40 @@ def test_without_a_controller_no_message_names_a_current_gain() -> None:
 
 def test_gains_that_were_held_are_the_first_reason() -> None:
     calibration = demo_calibration()
+    gains = tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains)
     held = replace(
         calibration,
-        gains=tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains),
+        gains=gains,
     )
-    worse = replace(held, effects=(replace(held.effects[0], error_after_percent=6.2),))
-    certificate = certify(worse, without_controller(worse, "", NOW))
+    changed_effect = replace(held.effects[0], error_after_percent=6.2)
+    effects = (changed_effect,)
+    worse = replace(held, effects=effects)
+    comparison = without_controller(worse, "", NOW)
+    certificate = certify(worse, comparison)
     assert certificate.sentence == (
         "Must not be written: the gains were held fixed (`--gains fixed`), so there is nothing "
         "to write."
     )
-    assert certificate.comparison.refusals[0].gate is Gate.NOT_IDENTIFIED
+    first_refusal = certificate.comparison.refusals[0]
+    assert first_refusal.gate is Gate.NOT_IDENTIFIED
 
 
 def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:
     calibration = demo_calibration()
     first = calibration.gains[0]
+    gains = (replace(first, value=0.9 * first.value), *calibration.gains[1:])
     earlier = replace(
         calibration,
-        gains=(replace(first, value=0.9 * first.value), *calibration.gains[1:]),
+        gains=gains,
         effects=(),
     )
     texts = Reader(_page(calibration, earlier)).texts
     assert texts.count("differs from the earlier calibration") == 1
     assert "+11.1" in texts
     assert any(text.startswith("New: J3 has friction that grows with the load") for text in texts)
+    changed_earlier = replace(earlier, cell="other")
     with pytest.raises(CalibrationRefused, match="of the same cell"):
-        _page(calibration, replace(earlier, cell="other"))
+        _page(calibration, changed_earlier)
 
 
 def test_the_verb_writes_one_page_and_never_over_another_file(
@@ -355,7 +373,8 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     file = tmp_path / "calibration.yaml"
     page = tmp_path / "calibration.html"
     save_calibration(demo_calibration(), file)
-    cell = str(checkout / "configs" / "cells" / "demo.yaml")
+    cells_folder = checkout / "configs" / "cells"
+    cell = str(cells_folder / "demo.yaml")
     assert (
         main(["certificate", str(file), "--cell", cell, "--beside", str(file), "--json"])
         == ExitCode.OK
@@ -363,11 +382,11 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     document = json.loads(capsys.readouterr().out)
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
-    assert [axis["key"] for axis in document["axes"]] == [
-        f"drives.J{number}.gain" for number in range(1, 7)
-    ]
+    expected = [f"drives.J{number}.gain" for number in range(1, 7)]
+    assert [axis["key"] for axis in document["axes"]] == expected
     # J4 went from -11.52 to -9.21: its size decreased. The current gain is no calibration's.
-    assert document["axes"][3]["change_sigmas"] < 0.0 < document["axes"][0]["change_sigmas"]
+    change_sigmas = document["axes"][3]["change_sigmas"]
+    assert change_sigmas < 0.0 < document["axes"][0]["change_sigmas"]
     texts = Reader(page.read_text(encoding="utf-8")).texts
     assert (
         "More than noise: the probability that noise alone makes such a change, on any axis, is "
@@ -377,7 +396,8 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     assert not {axis["written"] for axis in document["axes"]} & set(texts)
     assert not any("would be written" in text for text in texts)
     assert main(["certificate", str(file), "--json"]) == ExitCode.OK
-    unread = json.loads(capsys.readouterr().out)["axes"]
+    printed = capsys.readouterr().out
+    unread = json.loads(printed)["axes"]
     assert all(axis["key"] is axis["line"] is None for axis in unread)
     assert "the nameplate is taken as exact on all axes." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
@@ -405,9 +425,11 @@ def cell_file(tmp_path: Path, checkout: Path) -> Path:
 def _certificate(cell_file: Path, calibration_file: Path, **changes: object) -> Certificate:
     content = calibration_file.read_bytes()
     calibration = replace(load_calibration(calibration_file), **changes)  # type: ignore[arg-type]
-    request = Request(calibration, datetime.now(UTC), file=calibration_file, content=content)
+    now = datetime.now(UTC)
+    request = Request(calibration, now, file=calibration_file, content=content)
     compared = compare(load_cell(cell_file), request)
-    return certify(calibration, compared, origin=Origin(sha256(content)))
+    origin = Origin(sha256(content))
+    return certify(calibration, compared, origin=origin)
 
 
 def _apply(cell_file: Path, calibration_file: Path) -> None:
@@ -429,11 +451,14 @@ def test_a_certificate_has_the_same_id_each_time_and_another_calibration_another
     names = [Origin.of(one).id for one in (calibration, calibration, other)]
     assert names[0] == names[1] != names[2]
     assert names[0] == sha256(file.read_bytes())[:12]
-    certificate = certify(calibration, without_controller(calibration, "", NOW))
+    comparison = without_controller(calibration, "", NOW)
+    certificate = certify(calibration, comparison)
     document = _document(certificate)
     assert document["id"] == names[0]
-    assert document["sha256"] == sha256(encode_calibration(calibration))
-    assert f"Calibration certificate {names[0]}" in Reader(certificate_page(certificate)).texts
+    expected = sha256(encode_calibration(calibration))
+    assert document["sha256"] == expected
+    texts = Reader(certificate_page(certificate)).texts
+    assert f"Calibration certificate {names[0]}" in texts
 
 
 def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
@@ -443,7 +468,9 @@ def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
     assert certificate.verdict is Verdict.READY
     document = _document(certificate)
     assert document["status"]["state"] == "not written"
-    assert document["status"]["write"] is document["status"]["acceptance"] is None
+    write = document["status"]["write"]
+    acceptance = document["status"]["acceptance"]
+    assert write is acceptance is None
     texts = Reader(certificate_page(certificate)).texts
     assert "What would be written into controllers/demo.yaml" in texts
     assert {axis["written"] for axis in document["axes"]} <= set(texts)
@@ -453,7 +480,8 @@ def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
 def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
     cell_file: Path,
 ) -> None:
-    controller = cell_file.parents[1] / "controllers" / "demo.yaml"
+    controllers_folder = cell_file.parents[1] / "controllers"
+    controller = controllers_folder / "demo.yaml"
     text = controller.read_text(encoding="utf-8")
     commented = text.replace(
         "# Nm at the joint per A", "# Nm at the joint per A, from the data sheet"
@@ -467,7 +495,9 @@ def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
     status = document["status"]
     assert status["state"] == "written"
     assert status["write"]["who"].startswith("A. Miller")
-    assert status["write"]["target"] == str(cell_file.parents[1] / "controllers" / "demo.yaml")
+    demo_path = cell_file.parents[1] / "controllers" / "demo.yaml"
+    expected = str(demo_path)
+    assert status["write"]["target"] == expected
     assert status["ended"] is None
     assert document["sentence"].startswith("Written on ")
     assert "by A. Miller" in document["sentence"]
@@ -492,7 +522,8 @@ def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
     certificate = _certificate(cell_file, calibration_file)
     document = _document(certificate)
     assert document["status"]["state"] == "replaced"
-    assert document["status"]["ended"]["who"].startswith("B. Ode")
+    ended = document["status"]["ended"]
+    assert ended["who"].startswith("B. Ode")
     assert "; rolled back on " in document["status"]["text"]
     assert not document["sentence"].startswith("Written")
     assert ("What would be written into controllers/demo.yaml") in Reader(
@@ -503,9 +534,11 @@ def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
 def test_a_file_that_was_changed_by_hand_after_the_write_is_noticed(cell_file: Path) -> None:
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
-    controller = cell_file.parents[1] / "controllers" / "demo.yaml"
+    controllers_folder = cell_file.parents[1] / "controllers"
+    controller = controllers_folder / "demo.yaml"
     text = controller.read_text(encoding="utf-8")
-    controller.write_text(text.replace("gain: 33.9", "gain: 34.9", 1), encoding="utf-8")
+    changed_text = text.replace("gain: 33.9", "gain: 34.9", 1)
+    controller.write_text(changed_text, encoding="utf-8")
     document = _document(_certificate(cell_file, calibration_file))
     assert document["status"]["state"] == "replaced"
     assert "; the file has other gains now (as of " in document["status"]["text"]
@@ -516,7 +549,8 @@ def test_a_written_calibration_that_a_check_would_refuse_today_says_both(cell_fi
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
     policy = "\npolicy: {apply: {max_std_percent: 0.1}}\n"
-    cell_file.write_text(cell_file.read_text(encoding="utf-8") + policy, encoding="utf-8")
+    text = cell_file.read_text(encoding="utf-8")
+    cell_file.write_text(text + policy, encoding="utf-8")
     certificate = _certificate(cell_file, calibration_file)
     assert certificate.verdict is Verdict.REFUSED
     assert certificate.sentence.startswith("Written on ")
@@ -533,9 +567,8 @@ def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
     for place, kind in enumerate(payloads):
         recording = replace(demo_recording(), recorded_s=1.7e9 + 60.0 * place)
         payload = "disc" if kind == "l" else None
-        sources.append(
-            Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording)
-        )
+        source = Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording)
+        sources.append(source)
     return tuple(reversed(sources))
 
 
@@ -569,7 +602,8 @@ def test_with_friction_by_payload_no_order_of_runs_moves_the_gains() -> None:
 def test_an_order_that_no_clock_tells_is_not_said() -> None:
     first, *others = _recorded_in_order("bllb")
     unknown = replace(first, recording=None)
-    assert order_text(replace(demo_calibration(), sources=(unknown, *others))) == ""
+    calibration = replace(demo_calibration(), sources=(unknown, *others))
+    assert order_text(calibration) == ""
 
 
 def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
@@ -584,15 +618,17 @@ def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
     record_session(
         audit, AuditAction.ACCEPTED, at=NOW, who="A. Miller", subject="x", details=details
     )
-    status = _document(_certificate(cell_file, calibration_file))["status"]
+    certificate = _certificate(cell_file, calibration_file)
+    status = _document(certificate)["status"]
     assert status["state"] == "accepted"
-    assert status["acceptance"] == {
+    expected = {
         "at": NOW.isoformat(),
         "who": "A. Miller",
         "accepted": True,
         "remark": "",
         "undo": "",
     }
+    assert status["acceptance"] == expected
     assert "; accepted on 2025-01-02 03:00 UTC by A. Miller (as of " in status["text"]
 
 
@@ -668,6 +704,7 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
     save_calibration(demo_calibration(), file)
     digest = sha256(file.read_bytes())
     at = NOW.isoformat()
+    fitted = Fitted(calibration_sha256=digest, sentences=())
     state = JobState(
         session=folder.name,
         cell="demo",
@@ -675,15 +712,19 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
         plans_sha256="p",
         began=at,
         attempt_began=at,
-        fitted=Fitted(calibration_sha256=digest, sentences=()),
+        fitted=fitted,
     )
     save(Session(folder, state))
     assert session_of(file, digest) == folder.name
-    assert session_of(file, "0" * 64) is None
-    assert session_of(tmp_path / "calibration.yaml", digest) is None
+    session = session_of(file, "0" * 64)
+    assert session is None
+    calibration = tmp_path / "calibration.yaml"
+    assert session_of(calibration, digest) is None
     assert main(["certificate", str(file), "--json"]) == ExitCode.OK
-    assert json.loads(capsys.readouterr().out)["session"] == folder.name
-    assert folder.name in Reader(file.with_suffix(".html").read_text(encoding="utf-8")).texts
+    document = json.loads(capsys.readouterr().out)
+    assert document["session"] == folder.name
+    text = file.with_suffix(".html").read_text(encoding="utf-8")
+    assert folder.name in Reader(text).texts
 
 
 @pytest.mark.parametrize("name", ["page.pdf", "page.htm", "page.html.txt"])
@@ -711,5 +752,6 @@ def test_the_earlier_name_of_the_verb_writes_the_same_page(
     for verb in ("certificate", "report"):
         page = tmp_path / f"{verb}.html"
         assert main([verb, str(file), "--out", str(page), "--json"]) == ExitCode.OK
-        found.append((page.read_bytes(), capsys.readouterr().out))
+        printed = capsys.readouterr().out
+        found.append((page.read_bytes(), printed))
     assert found[0] == found[1]

@@ -61,13 +61,13 @@ def full_calibration(cell_file: Path) -> Calibration:
     three effects, five logs, a finding, a weighed payload.
     """
     made = load_calibration(calibration_for(cell_file))
-    placed = PlacedEffect(Smooth(Abscissa.POSITION, lower=-2.4, upper=1.5), 1)
+    effect = Smooth(Abscissa.POSITION, lower=-2.4, upper=1.5)
+    placed = PlacedEffect(effect, 1)
     weights = tuple(
         Parameter(one.name, 0.1 * k - 0.3, 0.02, one.unit) for k, one in enumerate(placed.columns)
     )
-    smooth = AcceptedEffect(
-        placed.effect.name, "J2", dict(placed.effect.settings), weights, 5.0, 3.0
-    )
+    settings = dict(placed.effect.settings)
+    smooth = AcceptedEffect(placed.effect.name, "J2", settings, weights, 5.0, 3.0)
     of_load = made.effects[0]
     at = datetime.fromisoformat(made.created) - timedelta(hours=1)
     bare = [
@@ -79,22 +79,26 @@ def full_calibration(cell_file: Path) -> Calibration:
         for name, role in (("loaded-1", "fit"), ("loaded-2", "fit"), ("held-out", "holdout"))
     ]
     slopes = [gain.value / 4.59 for gain in made.gains]
+    payload_mass = (PayloadMass.of("disc", 4.59, slopes, made.gains).weighed_to(0.005),)
+    diagnosis = Diagnosis(
+        "torque-above-limit",
+        ("loaded-1",),
+        ("J5",),
+        found="a torque of 21.4 Nm of the load on J5 in loaded-1",
+        expected="at most 20 Nm, as the URDF allows",
+        remedy="check the mass of the payload and the limits in the URDF",
+    )
+    diagnoses = (diagnosis,)
+    effects = (of_load, smooth, replace(of_load, axis="J5"))
+    parameters = (*made.parameters, *weights)
+    sources = (*bare, *loaded)
     return replace(
         made,
-        effects=(of_load, smooth, replace(of_load, axis="J5")),
-        parameters=(*made.parameters, *weights),
-        sources=(*bare, *loaded),
-        payload_mass=(PayloadMass.of("disc", 4.59, slopes, made.gains).weighed_to(0.005),),
-        diagnoses=(
-            Diagnosis(
-                "torque-above-limit",
-                ("loaded-1",),
-                ("J5",),
-                found="a torque of 21.4 Nm of the load on J5 in loaded-1",
-                expected="at most 20 Nm, as the URDF allows",
-                remedy="check the mass of the payload and the limits in the URDF",
-            ),
-        ),
+        effects=effects,
+        parameters=parameters,
+        sources=sources,
+        payload_mass=payload_mass,
+        diagnoses=diagnoses,
     )
 
 
@@ -119,10 +123,13 @@ def page_of(state: str, cell_file: Path) -> str:
         ]
         assert main(written) == ExitCode.OK
     if state == "not compared":
-        (cell_file.parents[1] / "controllers" / "demo.yaml").unlink()
-    request = Request(calibration, datetime.now(UTC), file=file, content=file.read_bytes())
+        controllers_folder = cell_file.parents[1] / "controllers"
+        (controllers_folder / "demo.yaml").unlink()
+    now = datetime.now(UTC)
+    request = Request(calibration, now, file=file, content=file.read_bytes())
     compared = compare(load_cell(cell_file), request, COMMAND)
-    certificate = certify(calibration, compared, origin=Origin(sha256(request.signed), SESSION))
+    origin = Origin(sha256(request.signed), SESSION)
+    certificate = certify(calibration, compared, origin=origin)
     expected = {
         "ready": Verdict.READY,
         "written": Verdict.UNCHANGED,
@@ -165,7 +172,8 @@ class TestInTheBrowser:
         assert pages == dict.fromkeys(PAPERS, 1)
         # A section that the reader has opened follows on sheets of its own.
         page.evaluate("document.querySelector('details').open = true")
-        assert count_pages(page.pdf(format="A4")) > 1
+        document = page.pdf(format="A4")
+        assert count_pages(document) > 1
         page.close()
 
     def test_paper_shows_digests_and_lines_to_sign_and_the_screen_does_not(
@@ -198,7 +206,8 @@ class TestInTheBrowser:
             "J1: a spring",
         ]
         page = browser.new_page(viewport={"width": 376, "height": 844})
-        page.set_content(ranking([(name, 10.0, "full") for name in names], "Candidates", "unit"))
+        rows = [(name, 10.0, "full") for name in names]
+        page.set_content(ranking(rows, "Candidates", "unit"))
         crossed = page.evaluate(CROSSED)
         page.close()
         assert crossed == []
@@ -225,7 +234,8 @@ def test_the_sheet_has_every_digest_and_three_lines_to_sign(cell_file: Path) -> 
     for digest in (*digests, calibration.configuration_sha256):
         assert on_paper.count(digest) == 1
     assert ">held-out (held out)</dt>" in on_paper
-    assert re.findall("<span>(Name|Date|Signature)</span>", on_paper) == [
+    matches = re.findall("<span>(Name|Date|Signature)</span>", on_paper)
+    assert matches == [
         "Name",
         "Date",
         "Signature",

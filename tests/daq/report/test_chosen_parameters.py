@@ -15,16 +15,21 @@ from ident.physical.full_parameters import RestsOn
 
 def test_the_head_and_the_report_name_the_same_parameters() -> None:
     """What a payload adds to friction is no part of the robot without one."""
+    column = Column(f"fv1{LOADED}", "Nm/(rad/s)")
     columns = (
         Column("m1", "kg"),
-        Column(f"fv1{LOADED}", "Nm/(rad/s)"),
+        column,
         Column("fv1", "Nm/(rad/s)"),
     )
+    model = SimpleNamespace(columns=columns)
+    basis = (RestsOn.PRIOR, RestsOn.PRIOR, RestsOn.DATA)
+    shares = np.array([1.0, 1.0, 0.0])
+    standard = np.ones(3)
     choice: Any = SimpleNamespace(
-        model=SimpleNamespace(columns=columns),
-        standard=np.ones(3),
-        basis=(RestsOn.PRIOR, RestsOn.PRIOR, RestsOn.DATA),
-        shares=np.array([1.0, 1.0, 0.0]),
+        model=model,
+        standard=standard,
+        basis=basis,
+        shares=shares,
     )
     assert [one.name for one in chosen_parameters(choice)] == ["m1", "fv1"]
     assert names_by_prior(choice) == ["m1"]

@@ -37,15 +37,20 @@ NAMES = st.text(
 
 @given(name=NAMES)
 def test_a_name_of_any_bytes_comes_back_from_the_document(name: str) -> None:
-    made = Whole(parts=[Part(name=name, sigma=1.0)], sizes=(), by_name={name: 2.0})
-    assert json.loads(json_text(made)) == json_tree(made)
-    assert json_tree(made)["parts"][0]["name"] == name
-    assert list(json_tree(made)["by_name"]) == [name]
+    parts = [Part(name=name, sigma=1.0)]
+    made = Whole(parts=parts, sizes=(), by_name={name: 2.0})
+    document = json.loads(json_text(made))
+    assert document == json_tree(made)
+    first_part = json_tree(made)["parts"][0]
+    assert first_part["name"] == name
+    by_name = json_tree(made)["by_name"]
+    assert list(by_name) == [name]
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_a_number_that_json_lacks_is_null_wherever_it_is(number: float) -> None:
-    made = Whole(parts=[Part(name="J1", sigma=number)], sizes=(1.0, number), by_name={"J1": number})
+    parts = [Part(name="J1", sigma=number)]
+    made = Whole(parts=parts, sizes=(1.0, number), by_name={"J1": number})
     assert json_tree(made) == {
         "parts": [{"name": "J1", "sigma": None}],
         "sizes": [1.0, None],
@@ -54,8 +59,10 @@ def test_a_number_that_json_lacks_is_null_wherever_it_is(number: float) -> None:
 
 
 def test_a_key_with_a_default_is_there_where_it_was_given() -> None:
-    assert "remark" not in json_tree(Whole(parts=[], sizes=(), by_name={}))
-    assert json_tree(Whole(parts=[], sizes=(), by_name={}, remark=""))["remark"] == ""
+    report = Whole(parts=[], sizes=(), by_name={})
+    assert "remark" not in json_tree(report)
+    whole = Whole(parts=[], sizes=(), by_name={}, remark="")
+    assert json_tree(whole)["remark"] == ""
 
 
 @dataclass(frozen=True)
@@ -90,4 +97,5 @@ def test_a_document_takes_the_attributes_of_its_sources_by_name_and_the_first_so
 
 
 def test_a_source_that_is_none_gives_null_to_what_the_others_lack() -> None:
-    assert json_tree(Part.of(None, name="J1")) == {"name": "J1", "sigma": None}
+    report = Part.of(None, name="J1")
+    assert json_tree(report) == {"name": "J1", "sigma": None}

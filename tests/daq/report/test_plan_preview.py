@@ -36,29 +36,39 @@ WALL = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
 def cell(checkout: Path) -> Cell:
     """The demo cell with a wall in front of the arm."""
     clearance = Clearance(None, 0.02, (), (WALL,))
-    return replace(load_cell(checkout / "configs/cells/demo.yaml"), clearance=clearance)
+    path = checkout / "configs/cells/demo.yaml"
+    return replace(load_cell(path), clearance=clearance)
 
 
 @pytest.fixture(scope="module")
 def checker(cell: Cell) -> Checker:
     """Distances of its arm."""
-    return scene_of(cell, model_of(cell).robot, 4.59).checker
+    robot = model_of(cell).robot
+    return scene_of(cell, robot, 4.59).checker
 
 
 @pytest.fixture(scope="module")
 def drawn(cell: Cell, checker: Checker) -> dict[str, Any]:
     """The data of its page."""
-    found: dict[str, Any] = json.loads(json.dumps(preview_data(cell, MOVES, checker)))
+    text = json.dumps(preview_data(cell, MOVES, checker))
+    found: dict[str, Any] = json.loads(text)
     return found
 
 
 def test_the_rows_pass_through_every_target_at_its_time(cell: Cell, drawn: dict[str, Any]) -> None:
-    at = poses(model_of(cell).robot, np.array(TARGETS)).origin_m.swapaxes(0, 1)
+    robot = model_of(cell).robot
+    position_rad = np.array(TARGETS)
+    origin_m = poses(robot, position_rad).origin_m
+    at = origin_m.swapaxes(0, 1)
     chains = np.array(drawn["origins_m"])
     np.testing.assert_allclose(chains[0], at[0], atol=0.001)
-    np.testing.assert_allclose(chains[-1], at[-1], atol=0.001)
+    expected = at[-1]
+    last_chain = chains[-1]
+    np.testing.assert_allclose(last_chain, expected, atol=0.001)
     second = [row for row, number in enumerate(drawn["move"]) if number == 2]
-    assert np.abs(chains[second] - at[1]).max(axis=(1, 2)).min() < 0.001
+    chain_difference = np.abs(chains[second] - at[1])
+    largest_chain_difference = chain_difference.max(axis=(1, 2))
+    assert largest_chain_difference.min() < 0.001
     assert drawn["time_s"][-1] == pytest.approx(experiment_duration_s(cell, MOVES), abs=2 * STEP_S)
     # Half of its limits at most, and the slowest axis of each move at just that.
     speeds = np.array([axis["values"] for axis in drawn["speeds"]])
@@ -69,13 +79,16 @@ def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
     checker: Checker, drawn: dict[str, Any]
 ) -> None:
     capsules = checker.scene.capsules
-    at = poses(checker.robot, np.array([TARGETS[0]]))
+    position_rad = np.array([TARGETS[0]])
+    at = poses(checker.robot, position_rad)
     for capsule, ends in zip(capsules, drawn["ends_m"][0], strict=True):
         rotation = at.rotation[capsule.link + 1, 0]
         origin = at.origin_m[capsule.link + 1, 0]
         expected = [rotation @ np.array(end) + origin for end in (capsule.start_m, capsule.end_m)]
         np.testing.assert_allclose(ends, expected, atol=0.001)
-    margin_m = checker.margins(np.array([TARGETS[0], TARGETS[-1]]))
+    last_target = TARGETS[-1]
+    position = np.array([TARGETS[0], last_target])
+    margin_m = checker.margins(position)
     found = [drawn["clearance_mm"][row] for row in (0, -1)]
     np.testing.assert_allclose(found, 1000.0 * (margin_m + 0.02), atol=0.06)
     assert [box["name"] for box in drawn["boxes"]] == ["wall"]
@@ -84,7 +97,8 @@ def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
 def test_the_reach_is_that_of_every_moving_capsule_at_every_row(
     checker: Checker, drawn: dict[str, Any]
 ) -> None:
-    shares = np.linspace(0.0, 1.0, 21)[:, None]
+    grid = np.linspace(0.0, 1.0, 21)
+    shares = grid[:, None]
     points = []
     radii = []
     for row in drawn["ends_m"]:
@@ -94,14 +108,16 @@ def test_the_reach_is_that_of_every_moving_capsule_at_every_row(
                 radii.append(np.full(21, capsule.radius_m))
     along = np.concatenate(points)
     radius = np.concatenate(radii)
-    np.testing.assert_allclose(
-        drawn["reach"]["lower_m"], (along - radius[:, None]).min(axis=0), atol=0.002
-    )
-    np.testing.assert_allclose(
-        drawn["reach"]["upper_m"], (along + radius[:, None]).max(axis=0), atol=0.002
-    )
+    along_difference = along - radius[:, None]
+    expected = along_difference.min(axis=0)
+    lower_m = drawn["reach"]["lower_m"]
+    np.testing.assert_allclose(lower_m, expected, atol=0.002)
+    largest_along = (along + radius[:, None]).max(axis=0)
+    upper_m = drawn["reach"]["upper_m"]
+    np.testing.assert_allclose(upper_m, largest_along, atol=0.002)
     across = (np.hypot(along[:, 0], along[:, 1]) + radius).max()
-    assert drawn["reach"]["radius_m"] == pytest.approx(across, abs=0.002)
+    radius_m = drawn["reach"]["radius_m"]
+    assert radius_m == pytest.approx(across, abs=0.002)
 
 
 def test_the_page_says_what_is_not_known(cell: Cell, checker: Checker) -> None:
@@ -112,7 +128,9 @@ def test_the_page_says_what_is_not_known(cell: Cell, checker: Checker) -> None:
     assert "below z = 0" not in page
     assert re.search(r"Smallest clearance: -\d+ mm, at [\d.]+ s; 20 mm must be kept", page)
     bare = replace(cell, clearance=None)
-    page = preview_page(bare, MOVES, scene_of(bare, model_of(bare).robot, 4.59).checker, b"plan")
+    robot = model_of(bare).robot
+    scene = scene_of(bare, robot, 4.59)
+    page = preview_page(bare, MOVES, scene.checker, b"plan")
     assert "nothing checks the way there" in page
 
 
@@ -123,7 +141,8 @@ def test_the_page_needs_no_other_file_and_runs_only_its_own_script(
     page = preview_page(hostile, MOVES, checker, b"plan")
     assert not re.search(r"https?:|src=|url\(", page)
     assert "<script>alert" not in page
-    turned = preview_page(replace(cell, name="a\u202eb"), MOVES, checker, b"plan")
+    changed_cell = replace(cell, name="a\u202eb")
+    turned = preview_page(changed_cell, MOVES, checker, b"plan")
     assert "\u202e" not in turned
     assert turned.count("a\\u202eb") == 2
     (script,) = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)

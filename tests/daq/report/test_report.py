@@ -40,21 +40,26 @@ def _torques(samples: int = 3000) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _drawings(kind: str) -> tuple[str, ...]:
     time_s, measured_nm, predicted_nm = _torques()
     if kind == "torque":
-        return plot_torques(time_s, measured_nm, predicted_nm, AXES, forces=("Nm",) * len(AXES))
+        forces = ("Nm",) * len(AXES)
+        return plot_torques(time_s, measured_nm, predicted_nm, AXES, forces=forces)
+    before_nm = measured_nm[:, 2] - 0.5 * predicted_nm[:, 2]
+    after_nm = measured_nm[:, 2] - predicted_nm[:, 2]
+    velocity_rad_s = np.cos(3 * time_s)
     return plot_residual(
         time_s,
-        measured_nm[:, 2] - 0.5 * predicted_nm[:, 2],
-        measured_nm[:, 2] - predicted_nm[:, 2],
+        before_nm,
+        after_nm,
         variable=predicted_nm[:, 2],
         variable_label="load torque [Nm]",
-        velocity_rad_s=np.cos(3 * time_s),
+        velocity_rad_s=velocity_rad_s,
     )
 
 
 @pytest.mark.parametrize(("kind", "panels"), [("torque", 6), ("residual", 4)])
 def test_a_file_of_drawings_is_whole_and_the_same_twice(kind: str, panels: int) -> None:
     drawn = sheet(_drawings(kind), "J3 <&> run")
-    assert drawn == sheet(_drawings(kind), "J3 <&> run")
+    expected = sheet(_drawings(kind), "J3 <&> run")
+    assert drawn == expected
     assert len(drawn) < 400_000
     assert b"var(" not in drawn  # not every viewer of pictures knows variables
     root = ElementTree.fromstring(drawn)
@@ -63,13 +68,16 @@ def test_a_file_of_drawings_is_whole_and_the_same_twice(kind: str, panels: int) 
     places = {(float(one.attrib["x"]), float(one.attrib["y"])) for one in inner}
     assert len(places) == panels
     for one in inner:
-        assert float(one.attrib["x"]) + float(one.attrib["width"]) < float(root.attrib["width"])
-        assert float(one.attrib["y"]) + float(one.attrib["height"]) < float(root.attrib["height"])
+        width = float(one.attrib["width"])
+        assert float(one.attrib["x"]) + width < float(root.attrib["width"])
+        height = float(one.attrib["height"])
+        assert float(one.attrib["y"]) + height < float(root.attrib["height"])
 
 
 def test_the_picture_of_the_gains_is_whole_and_the_same_twice() -> None:
     drawn = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
-    assert drawn == plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+    expected = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+    assert drawn == expected
     assert matplotlib.image.imread(io.BytesIO(drawn)).shape[1] > 900
 
 
@@ -77,8 +85,9 @@ def test_the_picture_of_the_gains_is_whole_and_the_same_twice() -> None:
 def test_any_number_of_axes_has_its_panels(axes: int) -> None:
     time_s = np.arange(50) / 10.0
     torque_nm = np.ones((50, axes))
+    forces = ("Nm",) * axes
     drawn = plot_torques(
-        time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), forces=("Nm",) * axes
+        time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), forces=forces
     )
     assert len(drawn) == axes
     ElementTree.fromstring(sheet(drawn, "t"))
@@ -86,9 +95,8 @@ def test_any_number_of_axes_has_its_panels(axes: int) -> None:
 
 def test_a_run_of_which_nothing_could_be_used_is_drawn_all_the_same() -> None:
     nothing = np.full((50, 2), np.nan)
-    for one in plot_torques(
-        np.arange(50) / 10.0, nothing, nothing, ("J1", "J2"), forces=("Nm", "Nm")
-    ):
+    time_s = np.arange(50) / 10.0
+    for one in plot_torques(time_s, nothing, nothing, ("J1", "J2"), forces=("Nm", "Nm")):
         assert "nan" not in one.partition("error nan")[2]
 
 
@@ -103,7 +111,8 @@ def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_drawing(samples: int, plac
     assert len(kept) <= 3000
     assert np.all(np.diff(kept) >= 0.0)
     assert np.nanmax(values) == 1.0
-    assert kept[np.nanargmax(values)] == x[round(place * (samples - 1))]
+    expected = x[round(place * (samples - 1))]
+    assert kept[np.nanargmax(values)] == expected
     gap = kept[~np.isfinite(values)]
     assert gap.min() == pytest.approx(0.6, abs=0.01)
     assert gap.max() == pytest.approx(0.7, abs=0.01)
@@ -113,7 +122,8 @@ def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_drawing(samples: int, plac
 def test_a_chart_draws_its_values_to_scale_and_breaks_at_gaps() -> None:
     """The scale of y is found from the grid lines of the drawing itself."""
     values = np.array([0.0, 10.0, np.nan, -10.0])
-    drawn = ElementTree.fromstring(chart((Line(np.arange(4.0), values),), "t", ("x", "y")))
+    lines = (Line(np.arange(4.0), values),)
+    drawn = ElementTree.fromstring(chart(lines, "t", ("x", "y")))
     down = {float(t.text): float(t.attrib["y"]) - 4 for t in drawn.iter("text") if t.attrib.get("class") == "soft end"  # noqa: E501
             and t.text and t.text.lstrip("-").replace(".", "").isdigit()}  # fmt: skip
     (path,) = drawn.iter("path")
@@ -123,12 +133,14 @@ def test_a_chart_draws_its_values_to_scale_and_breaks_at_gaps() -> None:
         [down[0.0], down[10.0], down[-10.0]], abs=0.1
     )
     x = [float(one) for _, one, _ in pieces]
-    assert (x[1] - x[0]) / (x[2] - x[0]) == pytest.approx(1 / 3, abs=0.01)
+    difference = x[1] - x[0]
+    assert difference / (x[2] - x[0]) == pytest.approx(1 / 3, abs=0.01)
 
 
 def test_a_name_of_any_length_leaves_the_scale_free() -> None:
     for name in ("J1", "shoulder_lift_joint", "a name that is longer than all the room there is"):
-        drawn = ElementTree.fromstring(before_after_drawing([(name, 3.0, 2.0)], "t", "%"))
+        rows = [(name, 3.0, 2.0)]
+        drawn = ElementTree.fromstring(before_after_drawing(rows, "t", "%"))
         left = min(float(one.attrib["x1"]) for one in drawn.iter("line"))
         (shown,) = (one for one in drawn.iter("text") if one.text == name)
         assert float(shown.attrib.get("textLength", 8.5 * len(name))) < left
@@ -136,9 +148,8 @@ def test_a_name_of_any_length_leaves_the_scale_free() -> None:
 
 def test_no_word_of_a_ranking_is_cut_off() -> None:
     name = "J3: a torque that depends on the predicted current and that no named effect explains"
-    drawn = ElementTree.fromstring(
-        ranking([(name, 5846.2, "full"), ("J2: a spring", 3.2, "empty")], "t", "%")
-    )
+    rows = [(name, 5846.2, "full"), ("J2: a spring", 3.2, "empty")]
+    drawn = ElementTree.fromstring(ranking(rows, "t", "%"))
     width, height = map(float, drawn.attrib["viewBox"].split()[2:])
     texts = [
         (one.text or "", float(one.attrib["x"]), float(one.attrib["y"]))
@@ -154,7 +165,8 @@ def test_no_grid_line_of_a_ranking_crosses_a_name() -> None:
         "J3: a torque that depends on the load torque and that no named effect explains",
         "J2: a spring",
     )
-    drawn = ElementTree.fromstring(ranking([(name, 5846.2, "full") for name in names], "t", "%"))
+    rows = [(name, 5846.2, "full") for name in names]
+    drawn = ElementTree.fromstring(ranking(rows, "t", "%"))
     lines = [(float(one.attrib["y1"]), float(one.attrib["y2"])) for one in drawn.iter("line")]
     words = " ".join(names)
     baselines = [
@@ -196,9 +208,9 @@ def test_every_factor_of_a_sum_but_one_can_be_read_back(terms: list[tuple[str, f
 def test_the_table_says_error_and_truth_within_80_columns() -> None:
     gains = demo_calibration().gains
     out = io.StringIO()
-    Console(file=out, width=80).print(
-        gain_table(gains, {gain.axis: gain.value / 1.01 for gain in gains})
-    )
+    console = Console(file=out, width=80)
+    truth = {gain.axis: gain.value / 1.01 for gain in gains}
+    console.print(gain_table(gains, truth))
     text = out.getvalue()
     assert "…" not in text
     assert text.count("+1.00") == 6
@@ -230,7 +242,8 @@ def test_a_torque_of_the_drive_is_questioned_only_beyond_its_noise() -> None:
         Gain(name, sign * 10.0, 0.1, "Nm/A", sign * 10.0)
         for name, sign in (("J1", 1), ("J2", -1), ("J3", 1))
     ]
-    slopes = [TorqueSlope(10.4, 0.1, 90), TorqueSlope(-10.6, 0.1, 90), None]
+    torque_slope = TorqueSlope(-10.6, 0.1, 90)
+    slopes = [TorqueSlope(10.4, 0.1, 90), torque_slope, None]
     (sentence,) = torque_sentences(slopes, gains)
     assert "by more than 3 σ on J2 (+6.0 %): a wrong torque constant" in sentence
     assert list(torque_sentences(slopes[:1], gains[:1])) == []

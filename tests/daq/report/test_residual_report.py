@@ -94,20 +94,23 @@ VOID = {"meta", "img", "br", "link"}
 def finding(
     placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedEffect, ...] = ()
 ) -> Finding:
+    deviations = np.ones(len(placed.effect.coefficients))
+    error_fall = 1.0 / 3.0
+    fold_errors = np.ones(8)
     return Finding(
         effect=placed.effect,
         axis=placed.axis,
         coefficients=np.ones(len(placed.effect.coefficients)),
-        deviations=np.ones(len(placed.effect.coefficients)),
+        deviations=deviations,
         probability=0.001,
         folds_better=1.0,
         explained=0.4,
         error_before_percent=9.0,
         error_after_percent=6.0,
-        error_fall=1.0 / 3.0,
+        error_fall=error_fall,
         held_out_fall=100.0 if passed else 3.0,
         passed=passed,
-        fold_errors=np.ones(8),
+        fold_errors=fold_errors,
         ambiguity=rivals,
     )
 
@@ -120,14 +123,16 @@ class Closed:
     account: Account
 
     def page(self) -> str:
-        return residual_page(self.fitted, self.account, calibration_of(self.fitted, CREATED))
+        calibration = calibration_of(self.fitted, CREATED)
+        return residual_page(self.fitted, self.account, calibration)
 
     def document(self) -> dict[str, Any]:
         document: dict[str, Any] = json.loads(json_text(self.report()))
         return document
 
     def report(self) -> ResidualReport:
-        return residual_report(self.fitted, self.account, calibration_of(self.fitted, CREATED))
+        calibration = calibration_of(self.fitted, CREATED)
+        return residual_report(self.fitted, self.account, calibration)
 
 
 @pytest.fixture(scope="module")
@@ -140,8 +145,10 @@ def shelf() -> Shelf:
         run = record(truth, name, rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
         current = run.current_a.copy()
         current[:, 2] += 4.0 * run.position_rad[:, 2] / GAINS[2]
-        runs[name] = replace(run, current_a=current, digest=f"{index:064x}")
-    return Shelf(load_cell(shipped_configurations() / "cells" / "demo.yaml"), runs)
+        digest = f"{index:064x}"
+        runs[name] = replace(run, current_a=current, digest=digest)
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    return Shelf(load_cell(path), runs)
 
 
 @pytest.fixture(scope="module")
@@ -153,19 +160,23 @@ def shelved(shelf: Shelf) -> Iterator[Shelf]:
 
 @pytest.fixture(scope="module")
 def closed(shelved: Shelf) -> Closed:
-    fitted = fit([Path(name) for name in NAMES[:3]], holdout=[Path(NAMES[3])])
+    logs = [Path(name) for name in NAMES[:3]]
+    holdout = [Path(NAMES[3])]
+    fitted = fit(logs, holdout=holdout)
     start = fitted.evidence()
     after = with_effects(start, (SPRING,))
     rival = PlacedEffect(LoadFriction(0), 1)
     limits_nm = np.array([0.5, 1.25, 0.25, 0.1, 0.2, 0.05])
+    findings = (finding(SPRING, rivals=(rival,)), finding(rival, passed=False))
     first = Step(
-        (finding(SPRING, rivals=(rival,)), finding(rival, passed=False)),
+        findings,
         (),
         limits_nm,
         finding(SPRING),
         after,
     )
-    first = replace(first, accepted=first.findings[0])
+    accepted = first.findings[0]
+    first = replace(first, accepted=accepted)
     last = Step(
         (finding(rival, passed=False),),
         (finding(PlacedEffect(Periodic(0), 3), passed=False),),
@@ -174,7 +185,8 @@ def closed(shelved: Shelf) -> Closed:
         after,
     )
     steps = (first, last)
-    return Closed(replace(fitted, steps=steps), account(start, steps))
+    changed_fitted = replace(fitted, steps=steps)
+    return Closed(changed_fitted, account(start, steps))
 
 
 def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out(
@@ -188,7 +200,8 @@ def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out
             math.nan if axis == SPRING.axis else error
             for axis, error in enumerate(errors.holdout.axes)
         )
-        return replace(errors, holdout=RelativeError(axes, errors.holdout.total))
+        holdout = RelativeError(axes, errors.holdout.total)
+        return replace(errors, holdout=holdout)
 
     turns = tuple(
         None
@@ -196,23 +209,24 @@ def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out
         else replace(turn, before=resting(turn.before), after=resting(turn.after))
         for turn in closed.account.turns
     )
-    (found,) = (
-        text
-        for text in headline(closed.fitted, replace(closed.account, turns=turns), ())
-        if "J3 has" in text
-    )
+    changed_account = replace(closed.account, turns=turns)
+    (found,) = (text for text in headline(closed.fitted, changed_account, ()) if "J3 has" in text)
     assert "nan" not in found
     assert "on moves left out in turn" in found
 
 
 def test_gravity_is_placed_on_all_axes_in_the_document(closed: Closed) -> None:
     first, last = closed.fitted.steps
+    placed = PlacedEffect(GravityDirection(), 0)
+    findings = (*first.findings, finding(placed, passed=False))
     tried = replace(
         first,
-        findings=(*first.findings, finding(PlacedEffect(GravityDirection(), 0), passed=False)),
+        findings=findings,
     )
-    document = replace(closed, fitted=replace(closed.fitted, steps=(tried, last))).document()
-    found = document["turns"][0]["findings"][-1]
+    fitted = replace(closed.fitted, steps=(tried, last))
+    document = replace(closed, fitted=fitted).document()
+    first_turn = document["turns"][0]
+    found = first_turn["findings"][-1]
     assert (found["effect"], found["axis"]) == ("gravity-direction", "all axes")
 
 
@@ -287,7 +301,8 @@ def test_the_page_is_self_contained(shown: Reader) -> None:
     drawings = [element for element in page.elements if element.tag == "svg"]
     assert all(drawing.attributes["aria-label"] for drawing in drawings)
     # Changes and errors, four of the effect, torques of six axes, gains, two rounds.
-    assert len(drawings) == 2 + 4 + 6 + 1 + 2
+    expected = 2 + 4 + 6 + 1 + 2
+    assert len(drawings) == expected
 
 
 def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
@@ -320,11 +335,13 @@ def test_an_effect_that_hardly_lowers_the_error_is_called_small(closed: Closed) 
     (turn, *others) = closed.account.turns
     assert turn is not None
     assert turn.before.holdout is not None
-    nearly = replace(
-        turn.before.holdout, axes=tuple(0.95 * error for error in turn.before.holdout.axes)
-    )
-    small = replace(turn, after=replace(turn.after, holdout=nearly))
-    sentences = summary(closed.fitted, replace(closed.account, turns=(small, *others)), ())
+    axes = tuple(0.95 * error for error in turn.before.holdout.axes)
+    nearly = replace(turn.before.holdout, axes=axes)
+    changed_after = replace(turn.after, holdout=nearly)
+    small = replace(turn, after=changed_after)
+    turns = (small, *others)
+    changed_account = replace(closed.account, turns=turns)
+    sentences = summary(closed.fitted, changed_account, ())
     assert any(
         one.startswith("J3 has a spring, a small effect: the error of J3 on held-out")
         for one in sentences
@@ -337,13 +354,16 @@ def test_what_files_say_is_escaped(closed: Closed) -> None:
     axes = tuple(replace(axis, name=f"{axis.name}{HOSTILE}") for axis in fitted.cell.axes)
     after = fitted.steps[-1].after
     datasets = tuple(replace(data, name=HOSTILE) for data in after.datasets)
+    steps = tuple(
+        replace(step, after=replace(step.after, datasets=datasets)) for step in fitted.steps
+    )
+    sources = tuple(replace(source, name=HOSTILE, partial=True) for source in fitted.sources)
+    cell = replace(fitted.cell, name=HOSTILE, axes=axes)
     hostile = replace(
         fitted,
-        cell=replace(fitted.cell, name=HOSTILE, axes=axes),
-        sources=tuple(replace(source, name=HOSTILE, partial=True) for source in fitted.sources),
-        steps=tuple(
-            replace(step, after=replace(step.after, datasets=datasets)) for step in fitted.steps
-        ),
+        cell=cell,
+        sources=sources,
+        steps=steps,
     )
     text = Closed(hostile, closed.account).page()
     assert "<script" not in text
@@ -358,19 +378,21 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
     reported = closed.account.total
     document = closed.document()
     for key, errors in (("before", reported.before), ("after", reported.after)):
-        assert document[key]["relative_error_percent"]["axes"] == pytest.approx(
-            errors.in_sample.axes
-        )
-        assert document[key]["cross_validated_error_percent"]["total"] == pytest.approx(
-            errors.cross_validated.total
-        )
+        axes = document[key]["relative_error_percent"]["axes"]
+        assert axes == pytest.approx(errors.in_sample.axes)
+        total = document[key]["cross_validated_error_percent"]["total"]
+        assert total == pytest.approx(errors.cross_validated.total)
         assert errors.holdout is not None
-        assert document[key]["holdout_error_percent"]["axes"] == pytest.approx(errors.holdout.axes)
+        holdout_error_percent = document[key]["holdout_error_percent"]
+        assert holdout_error_percent["axes"] == pytest.approx(errors.holdout.axes)
         assert document[key]["left_out_runs"] is None
-    final = closed.fitted.steps[-1].after.estimate
+    last_step = closed.fitted.steps[-1]
+    final = last_step.after.estimate
     for motor, change in enumerate(document["gain_changes"]):
-        assert change["axis"] == f"J{motor + 1}"
-        assert change["before"] == pytest.approx(closed.fitted.identification.estimate.gains[motor])
+        expected = f"J{motor + 1}"
+        assert change["axis"] == expected
+        gains = closed.fitted.identification.estimate.gains
+        assert change["before"] == pytest.approx(gains[motor])
         assert change["after"] == pytest.approx(final.gains[motor])
         assert change["after_std"] == pytest.approx(final.gains_std[motor])
     first, last = document["turns"]
@@ -380,11 +402,14 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
     index = [column.name for column in final.unknowns].index(SPRING.columns[0].name)
     assert stiffness["value"] == pytest.approx(final.parameters[index])
     assert stiffness["std"] == pytest.approx(final.parameters_std[index])
-    assert stiffness["unit"] == SPRING.columns[0].unit
+    unit = SPRING.columns[0].unit
+    assert stiffness["unit"] == unit
     assert first["accepted"]["ambiguity"] == ["load-friction on J2"]
-    assert first["findings"][1]["ambiguity"] is None
+    ambiguity = first["findings"][1]["ambiguity"]
+    assert ambiguity is None
     assert (last["accepted"], last["added"], last["before"]) == (None, [], None)
-    assert last["structures"][0]["effect"] == "periodic-motor-angle"
+    first_structure = last["structures"][0]
+    assert first_structure["effect"] == "periodic-motor-angle"
     assert last["detection_limits"][1] == {"axis": "J2", "rms": 1.25, "unit": "Nm"}
 
 
@@ -393,10 +418,12 @@ def test_a_correction_of_the_description_is_shown_by_the_error_of_all_axes(close
     assert turn is not None
     assert turn.before.holdout is not None
     assert turn.after.holdout is not None
-    sentence = _effect_sentence(
-        closed.fitted, closed.account, turn, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
-    )
-    change = error_change_text(turn.before.holdout.total, turn.after.holdout.total)
+    placed = PlacedEffect(ZeroOffset(), 1)
+    step = closed.fitted.steps[0]
+    sentence = _effect_sentence(closed.fitted, closed.account, turn, placed, step)
+    before_percent = turn.before.holdout.total
+    after_percent = turn.after.holdout.total
+    change = error_change_text(before_percent, after_percent)
     assert sentence == (
         f"J2 has a zero that is off: the error of all axes on held-out runs {change}."
     )
@@ -409,45 +436,53 @@ def test_what_the_choice_of_effects_adds_to_sigma_is_said_where_it_counts(closed
         replace(gain, choice_std=share * gain.after_std)
         for gain, share in zip(gains, (0.1, 0.5, 0.1, 0.1, 0.1, 0.1), strict=True)
     )
-    changed = replace(closed.account, total=replace(closed.account.total, gains=chosen))
+    total = replace(closed.account.total, gains=chosen)
+    changed = replace(closed.account, total=total)
     sentence = "σ of the gains includes the choice of the effects (squares add): 50 % of it on J2."
     assert sentence in summary(closed.fitted, changed, ())
     assert not any(
         "choice of the effects" in text for text in summary(closed.fitted, closed.account, ())
     )
-    opened = replace(closed.fitted.steps[-1], left_open=(SPRING,))
-    undecided = replace(closed.fitted, steps=(*closed.fitted.steps[:-1], opened))
+    last_step = closed.fitted.steps[-1]
+    opened = replace(last_step, left_open=(SPRING,))
+    steps = (*closed.fitted.steps[:-1], opened)
+    undecided = replace(closed.fitted, steps=steps)
     more = (
         f"{sentence} spring on J3 is not in the model and may be true: σ holds what that "
         "would move."
     )
     assert more in summary(undecided, changed, ())
     document = Closed(closed.fitted, changed).document()
-    assert document["gain_changes"][1]["choice_std"] == chosen[1].choice_std
+    choice_std = document["gain_changes"][1]["choice_std"]
+    assert choice_std == chosen[1].choice_std
 
 
 def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) -> None:
     document = closed.document()
-    finding = document["turns"][0]["findings"][0]
+    first_turn = document["turns"][0]
+    finding = first_turn["findings"][0]
     turn = document["turns"][0]
-    described = (checkout / "docs" / "reference" / "residual-json.md").read_text(encoding="utf-8")
+    reference_folder = checkout / "docs" / "reference"
+    described = (reference_folder / "residual-json.md").read_text(encoding="utf-8")
     floors = document["noise_floor"]
+    first_gain_change = document["gain_changes"][0]
+    first_motor = floors["motors"][0]
     named = (
         document,
         turn,
         finding,
         document["before"],
-        document["gain_changes"][0],
+        first_gain_change,
         floors,
-        floors["motors"][0],
+        first_motor,
     )
     for key in {key for part in named for key in part}:
         assert f"`{key}`" in described, key
-    assert (
-        document["filter"]["position_cutoff_hz"]
-        == closed.fitted.cell.conditioning.position_cutoff_hz
-    )
-    assert set(document["before"]) == set(document["after"]) == set(turn["before"])
+    position_cutoff_hz = document["filter"]["position_cutoff_hz"]
+    assert position_cutoff_hz == closed.fitted.cell.conditioning.position_cutoff_hz
+    before = set(document["before"])
+    after = set(document["after"])
+    assert before == after == set(turn["before"])
     assert (
         ResidualReport.model_validate_json(json_text(closed.report()), strict=False)
         == closed.report()
@@ -458,31 +493,37 @@ def test_the_document_has_the_calibration_as_its_file_has_it(closed: Closed) -> 
     calibration = as_document(calibration_of(closed.fitted, CREATED))
     document = closed.document()
     assert list(document)[: len(calibration)] == list(calibration)
-    assert json.dumps({key: document[key] for key in calibration}) == json.dumps(calibration)
+    text = json.dumps({key: document[key] for key in calibration})
+    assert text == json.dumps(calibration)
 
 
 def test_what_to_check_comes_first(closed: Closed) -> None:
     odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
-    document = Closed(replace(closed.fitted, diagnoses=(odd,)), closed.account).document()
+    fitted = replace(closed.fitted, diagnoses=(odd,))
+    document = Closed(fitted, closed.account).document()
     sentence = "CHECK loaded-2: found a body; expected another; was it turned? (payload-differs)."
     assert document["summary"][0] == sentence
-    assert document["diagnoses"][0]["runs"] == ["loaded-2"]
+    first_diagnose = document["diagnoses"][0]
+    assert first_diagnose["runs"] == ["loaded-2"]
 
 
 def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(
     closed: Closed,
 ) -> None:
     left_a = closed.account.left_a
+    noise_a = 0.9 * float(left_a[2])
+    motor_noise_floor = MotorNoiseFloor(
+        noise_a, FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True
+    )
     floors = (
         MotorNoiseFloor(4.0 * float(left_a[0]), FloorSource.STANDSTILL, 20, 100.0),
         MotorNoiseFloor(2.0 * float(left_a[1]), FloorSource.REPEATED_MOVES, 20, 100.0),
-        MotorNoiseFloor(
-            0.9 * float(left_a[2]), FloorSource.REPEATED_MOVES, 12, 100.0, is_bound=True
-        ),
+        motor_noise_floor,
         MotorNoiseFloor(0.9 * float(left_a[3]), FloorSource.STANDSTILL, 12, 100.0),
         *(None,) * 2,
     )
-    refuted = Closed(closed.fitted, replace(closed.account, floors=floors))
+    changed_account = replace(closed.account, floors=floors)
+    refuted = Closed(closed.fitted, changed_account)
     first, second = (
         line for line in summary(refuted.fitted, refuted.account, ()) if "no noise floor" in line
     )
@@ -493,18 +534,16 @@ def test_a_noise_floor_above_the_error_of_the_model_is_reported_with_its_cause(
         "J2 has no noise floor: its current between repeated moves scatters 2.0 times"
     )
     motors = refuted.document()["noise_floor"]["motors"]
-    assert [motor and motor["refuted"] for motor in motors] == [
-        True,
-        True,
-        False,
-        False,
-        None,
-        None,
-    ]
-    assert motors[2]["least"] == floors[2].least_a
+    expected = [True, True, False, False, None, None]
+    assert [motor and motor["refuted"] for motor in motors] == expected
+    least_a = floors[2].least_a
+    assert motors[2]["least"] == least_a
     assert motors[3]["least"] is None
-    assert [motor["dwells"] for motor in motors[:3]] == [20, None, None]
-    assert (motors[2]["source"], motors[2]["pairs"]) == ("repeated moves", 12)
+    dwells = [motor["dwells"] for motor in motors[:3]]
+    assert dwells == [20, None, None]
+    source = motors[2]["source"]
+    pairs = motors[2]["pairs"]
+    assert (source, pairs) == ("repeated moves", 12)
     assert motors[2]["left"] == pytest.approx(left_a[2])
 
 
@@ -516,7 +555,8 @@ def test_a_time_skew_is_stated_only_where_instruments_confirm_it(closed: Closed)
     confirmed = replace(biased, seconds=-2e-3, confirmed=True)
     sentence = "Currents were sampled 2.00 ± 0.06 ms before the positions, the same on every axis"
     for skew, stated in ((None, False), (biased, False), (confirmed, True)):
-        made = Closed(closed.fitted, replace(closed.account, skew=skew))
+        changed_account = replace(closed.account, skew=skew)
+        made = Closed(closed.fitted, changed_account)
         sentences = summary(made.fitted, made.account, ())
         assert any(text.startswith(sentence) for text in sentences) is stated
         assert any("Currents were sampled" in text for text in sentences) is stated
@@ -575,8 +615,11 @@ def _with_three_effects(closed: Closed) -> Closed:
     diagnoses, a skew, a refutation, findings that did not join.
     """
     first, last = closed.fitted.steps
-    places = (PlacedEffect(LoadFriction(0), 1), PlacedEffect(Smooth(Abscissa.POSITION), 4))
-    after = replace(first.after, effects=(SPRING, *places))
+    effect = Smooth(Abscissa.POSITION)
+    placed_effect = PlacedEffect(LoadFriction(0), 1)
+    places = (placed_effect, PlacedEffect(effect, 4))
+    effects = (SPRING, *places)
+    after = replace(first.after, effects=effects)
     (turn, _) = closed.account.turns
     assert turn is not None
     found = [finding(place, rivals=(SPRING, places[0])) for place in places]
@@ -584,8 +627,9 @@ def _with_three_effects(closed: Closed) -> Closed:
         SetAside(finding(PlacedEffect(LoadFriction(0), axis)), moved=((3, 2.91),))
         for axis in range(6)
     )
+    placed = PlacedEffect(LoadFriction(0), 3)
     refused = replace(
-        finding(PlacedEffect(LoadFriction(0), 3), passed=False),
+        finding(placed, passed=False),
         refusals=("coefficient is -1 ± 0.1",),
     )
     steps = (
@@ -595,22 +639,28 @@ def _with_three_effects(closed: Closed) -> Closed:
     )
     turns = (turn, *(replace(turn, added=(place,)) for place in places), None)
     gains = tuple(replace(gain, significant=True) for gain in closed.account.total.gains)
+    skew = CurrentDelay(
+        -2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False
+    )
+    total = replace(closed.account.total, gains=gains)
+    holdout_change = PairedChange(1.3, 1.0, 20)
     account = replace(
         closed.account,
         turns=turns,
-        total=replace(closed.account.total, gains=gains),
-        holdout_change=PairedChange(1.3, 1.0, 20),
-        skew=CurrentDelay(
-            -2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False
-        ),
+        total=total,
+        holdout_change=holdout_change,
+        skew=skew,
     )
     odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
-    return Closed(replace(closed.fitted, steps=steps, diagnoses=(odd,)), account)
+    fitted = replace(closed.fitted, steps=steps, diagnoses=(odd,))
+    return Closed(fitted, account)
 
 
 def _calibrated(made: Closed, effects: int) -> Calibration:
-    calibration = calibration_of(replace(made.fitted, steps=()), CREATED)
-    worse = AcceptedEffect("spring", "J3", {}, (), 2.98, 3.11, ("load-friction on J2",) * 5)
+    fitted = replace(made.fitted, steps=())
+    calibration = calibration_of(fitted, CREATED)
+    ambiguity = ("load-friction on J2",) * 5
+    worse = AcceptedEffect("spring", "J3", {}, (), 2.98, 3.11, ambiguity)
     return replace(calibration, effects=(worse,) * effects, diagnoses=made.fitted.diagnoses)
 
 
@@ -618,7 +668,8 @@ def _calibrated(made: Closed, effects: int) -> Calibration:
 def test_what_is_printed_fits_one_screen_and_breaks_no_word(closed: Closed, columns: int) -> None:
     made = _with_three_effects(closed)
     calibration = _calibrated(made, 3)
-    screen = _on_screen(residual_view(made.fitted, made.account, calibration), columns)
+    parts = residual_view(made.fitted, made.account, calibration)
+    screen = _on_screen(parts, columns)
     # Calibration, report and the next command follow, a line each.
     assert len(screen.lines) <= 40 - 3
     assert all(cell_len(line) <= columns for line in screen.lines)
@@ -663,16 +714,22 @@ def test_the_report_has_every_sentence_and_number_of_the_verbose_output(closed: 
     ]
     assert len(sentences) > 15
     # A command in a sentence is an element of its own on the page.
-    joined = " ".join(text.replace(" .", ".").replace(" ,", ",").split())
+    changed_text = text.replace(" .", ".")
+    joined = " ".join(changed_text.replace(" ,", ",").split())
     assert [one for one in sentences if one not in joined and one not in text] == []
     tables = [part for part in parts if isinstance(part, Table)]
-    assert len(tables) == len(made.fitted.steps) + 2
+    expected = len(made.fitted.steps) + 2
+    assert len(tables) == expected
     for table_ in tables[:-1]:
-        cells = [str(cell) for column in table_.columns for cell in (column.header, *column.cells)]
+        cells = []
+        for column in table_.columns:
+            for cell in (column.header, *column.cells):
+                cells.append(str(cell))
         assert [cell for cell in cells if cell and cell not in listed] == []
     # The verbose output has what the screen has.
     shown = residual_view(made.fitted, made.account, calibration)
-    short = [part.text for part in shown if isinstance(part, Sentence)][:-1]
+    texts = [part.text for part in shown if isinstance(part, Sentence)]
+    short = texts[:-1]
     assert set(short) <= {part.text for part in parts if isinstance(part, Sentence)}
 
 
@@ -680,7 +737,8 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(
     closed: Closed, tmp_path: Path
 ) -> None:
     payloads = tuple(replace(one, mass_tolerance_kg=0.0459) for one in closed.fitted.cell.payloads)
-    weighed = replace(closed.fitted, cell=replace(closed.fitted.cell, payloads=payloads))
+    cell = replace(closed.fitted.cell, payloads=payloads)
+    weighed = replace(closed.fitted, cell=cell)
     calibration = calibration_of(weighed, CREATED)
     (payload,) = residual_report(weighed, closed.account, calibration).payload_mass
     assert payload.tolerance_kg == 0.0459
@@ -697,14 +755,16 @@ def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(
     assert load_calibration(path).payload_mass == calibration.payload_mass
     earlier = yaml.safe_load(path.read_text(encoding="utf-8"))
     del earlier["payload_mass"], earlier["digests"]["payload_mass"]
-    path.write_text(yaml.safe_dump(earlier, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    text = yaml.safe_dump(earlier, sort_keys=False, allow_unicode=True)
+    path.write_text(text, encoding="utf-8")
     assert load_calibration(path).payload_mass == ()
 
 
 def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
     gains = closed.account.total.gains
     same = tuple(replace(gain, after=gain.before, significant=False) for gain in gains)
-    marked = (replace(gains[0], significant=True), *same[1:])
+    changed_gain = replace(gains[0], significant=True)
+    marked = (changed_gain, *same[1:])
     for shifts, sentence in (
         (same, "With and without the effects, the gains are the same within noise."),
         (
@@ -713,7 +773,8 @@ def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
             f"J1 by {gains[0].change_percent:+.1f} % of the gain without them.",
         ),
     ):
-        changed = replace(closed.account, total=replace(closed.account.total, gains=shifts))
+        total = replace(closed.account.total, gains=shifts)
+        changed = replace(closed.account, total=total)
         assert sentence in summary(closed.fitted, changed, ())
 
 
@@ -735,13 +796,13 @@ def test_the_summary_says_what_the_effects_change(closed: Closed) -> None:
 def test_a_gain_that_differs_is_not_called_the_same(
     closed: Closed, percent: float, std_percent: float, said: str
 ) -> None:
-    shifts = [
-        replace(gain, after=gain.before, significant=False) for gain in closed.account.total.gains
-    ]
+    gains = closed.account.total.gains
+    shifts = [replace(gain, after=gain.before, significant=False) for gain in gains]
     before = shifts[4].before
     change_std = 0.01 * std_percent * abs(before)
     shifts[4] = replace(shifts[4], after=before * (1.0 + 0.01 * percent), change_std=change_std)
-    changed = replace(closed.account, total=replace(closed.account.total, gains=tuple(shifts)))
+    total = replace(closed.account.total, gains=tuple(shifts))
+    changed = replace(closed.account, total=total)
     assert closed.fitted.cell.target_sigma_percent == 0.5
     sentence = gains_sentence(closed.fitted, changed)
     assert ("the same within noise" in sentence) == (not said)
@@ -759,9 +820,8 @@ def test_what_the_fit_has_checked_is_taken_up_where_the_effects_explain_it(close
     corrected = Diagnosis(
         "zero-off", (), ("J2",), "the zero of J2 off by +35.0 ± 0.1°", "another", "add it"
     )
-    fitted = replace(
-        closed.fitted, diagnoses_before=(large, other, zero), diagnoses=(other, corrected)
-    )
+    diagnoses_before = (large, other, zero)
+    fitted = replace(closed.fitted, diagnoses_before=diagnoses_before, diagnoses=(other, corrected))
     (said,) = (
         one for one in headline(fitted, closed.account, ()) if one.startswith("Without the effects")
     )
@@ -773,7 +833,8 @@ def test_what_the_fit_has_checked_is_taken_up_where_the_effects_explain_it(close
 
 
 def test_an_estimate_of_the_noise_is_said_where_it_has_no_lower_limit(closed: Closed) -> None:
-    unknown = RelativeError((math.nan,) * 6, math.nan)
+    axes = (math.nan,) * 6
+    unknown = RelativeError(axes, math.nan)
     estimate = RelativeError((math.nan, math.nan, 1.7, math.nan, math.nan, math.nan), math.nan)
     for floor, said in (
         (estimate, "(noise leaves 1.7 %, an estimate)."),
@@ -793,27 +854,32 @@ def test_a_correction_that_the_error_hardly_shows_has_its_own_sigma_and_the_axis
 ) -> None:
     turn = closed.account.turns[0]
     assert turn is not None
-    errors = RelativeError((3.2, 2.0, 3.0, 3.0, 3.0, 3.0), 3.12)
+    axes = (3.2, 2.0, 3.0, 3.0, 3.0, 3.0)
+    errors = RelativeError(axes, 3.12)
     before = replace(turn.before, holdout=errors)
-    after = replace(turn.after, holdout=RelativeError((3.0, 2.0, 3.0, 3.0, 3.0, 3.0), 3.09))
+    holdout = RelativeError((3.0, 2.0, 3.0, 3.0, 3.0, 3.0), 3.09)
+    after = replace(turn.after, holdout=holdout)
     small = replace(turn, before=before, after=after)
-    sentence = _effect_sentence(
-        closed.fitted, closed.account, small, PlacedEffect(ZeroOffset(), 1), closed.fitted.steps[0]
-    )
+    placed = PlacedEffect(ZeroOffset(), 1)
+    first_step = closed.fitted.steps[0]
+    sentence = _effect_sentence(closed.fitted, closed.account, small, placed, first_step)
     assert sentence == (
         "J2 has a zero that is off: it hardly shows in the error of all axes on held-out runs, "
         "3.12 % without it and 3.09 % with it; most in that of J1, 3.20 and 3.00 %."
     )
     spring = closed.fitted.steps[0].after
     (size,) = coefficients(spring, SPRING)
-    text = _hardly_shown_text(closed.fitted, SPRING, closed.fitted.steps[0], errors, errors, "here")
+    step = closed.fitted.steps[0]
+    text = _hardly_shown_text(closed.fitted, SPRING, step, errors, errors, "here")
     assert text.startswith(f", by {abs(size.value / size.std):.0f} σ: it hardly shows")
 
 
 def test_the_moves_that_would_help_are_named_after_a_search_too(closed: Closed) -> None:
     advice = Advice("moves with the payload", 60.0, 0.8)
-    weak = GainVerdict(4, 2.4, None, {GainSource.GRAVITY: 2.4}, True, Visibility.WEAK, advice)
-    sentences = headline(replace(closed.fitted, uncertain=(weak,)), closed.account, ())
+    alone_percent = {GainSource.GRAVITY: 2.4}
+    weak = GainVerdict(4, 2.4, None, alone_percent, True, Visibility.WEAK, advice)
+    fitted = replace(closed.fitted, uncertain=(weak,))
+    sentences = headline(fitted, closed.account, ())
     (said,) = (one for one in sentences if one.startswith("Excitation: J5"))
     assert "add 60 s of moves with the payload (σ 0.8 %)" in said
     assert not any(
@@ -832,7 +898,8 @@ def test_the_kind_of_the_errors_is_said_where_several_motors_act_on_a_joint(clos
 def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
-    silent = replace(closed.fitted, steps=(replace(last, after=start),))
+    steps = (replace(last, after=start),)
+    silent = replace(closed.fitted, steps=steps)
     outcome, limits, *_ = summary(silent, account(start, silent.steps), ())
     assert outcome.startswith("No structure found")
     assert "1.2 Nm on J2" in limits
@@ -842,7 +909,8 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     )
     clocked = replace(silent, steps=(replace(last, after=replace(start, datasets=timed)),))
     assert "clock" not in " ".join(summary(clocked, account(start, silent.steps), ()))
-    nothing_tried = replace(silent, steps=(replace(silent.steps[0], findings=(), structures=()),))
+    changed_step = replace(silent.steps[0], findings=(), structures=())
+    nothing_tried = replace(silent, steps=(changed_step,))
     text = Closed(nothing_tried, account(start, silent.steps)).page()
     assert "No structure found" in Reader(text).text
     assert "No candidate could be tried." in Reader(text).text
@@ -850,13 +918,15 @@ def test_silence_is_reported_with_its_size(closed: Closed) -> None:
 
 def test_a_strong_candidate_that_failed_a_check_is_named_with_it(closed: Closed) -> None:
     first, last = closed.fitted.steps
+    placed = PlacedEffect(LoadFriction(0), 1)
     strong = replace(
-        finding(PlacedEffect(LoadFriction(0), 1), passed=False),
+        finding(placed, passed=False),
         explained=0.4,
         refusals=("coefficient is -1 ± 0.1",),
     )
     weak = replace(strong, axis=2, explained=0.1)
-    asked = replace(closed.fitted, steps=(first, replace(last, findings=(weak, strong))))
+    steps = (first, replace(last, findings=(weak, strong)))
+    asked = replace(closed.fitted, steps=steps)
     sentences = [one for one in summary(asked, closed.account, ()) if "failed a check" in one]
     assert sentences == [
         "J2: friction that grows with the load would explain 40 % of the squared residual, but "
@@ -869,21 +939,25 @@ def test_a_first_candidate_that_physics_alone_refuses_is_named_however_little_it
 ) -> None:
     first, last = closed.fitted.steps
     why = "coefficient is -1 ± 0.1 ; physics allows no less than 0"
+    placed = PlacedEffect(LoadFriction(0), 1)
     refused = replace(
-        finding(PlacedEffect(LoadFriction(0), 1), passed=False),
+        finding(placed, passed=False),
         explained=0.1,
         refusals=(why,),
         impossible=why,
     )
     second = replace(refused, effect=Spring())
     noise = replace(refused, axis=2, refusals=("noise makes one as strong with p = 0.400", why))
-    asked = replace(closed.fitted, steps=(first, replace(last, findings=(refused, second, noise))))
+    steps = (first, replace(last, findings=(refused, second, noise)))
+    asked = replace(closed.fitted, steps=steps)
     sentences = [one for one in summary(asked, closed.account, ()) if "impossible" in one]
-    assert sentences == [
+    expected = [
         "J2: friction that grows with the load ranks first on this axis, but its sign or size is "
         f"impossible: {why}. The cause may be another one."
     ]
-    much = replace(asked, steps=(first, replace(last, findings=(replace(refused, explained=0.4),))))
+    assert sentences == expected
+    findings = (replace(refused, explained=0.4),)
+    much = replace(asked, steps=(first, replace(last, findings=findings)))
     assert len([one for one in summary(much, closed.account, ()) if why in one]) == 1
 
 
@@ -893,8 +967,9 @@ def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> N
         "it rests on two moves, too few to test it: record more moves with a large current of "
         "this axis"
     )
+    placed = PlacedEffect(LoadFriction(0), 1)
     untested = replace(
-        finding(PlacedEffect(LoadFriction(0), 1), passed=False),
+        finding(placed, passed=False),
         probability=None,
         explained=0.4,
         refusals=(why,),
@@ -904,15 +979,18 @@ def test_a_candidate_that_was_not_tested_has_no_probability(closed: Closed) -> N
     assert next(candidate_rows(asked, step, 1))[2] == "–"
     (sentence,) = (one for one in summary(asked, closed.account, ()) if why in one)
     assert "p =" not in sentence
-    report = residual_report(asked, closed.account, calibration_of(closed.fitted, CREATED))
-    assert report.turns[-1].findings[0].probability is None
+    calibration = calibration_of(closed.fitted, CREATED)
+    report = residual_report(asked, closed.account, calibration)
+    findings = report.turns[-1].findings
+    assert findings[0].probability is None
 
 
 def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Closed) -> None:
     two_moves_only = np.zeros((20, 1, 1))
     two_moves_only[:2] = 1.0
     why = what_to_record(Saturation(), two_moves_only, None)
-    small = finding(PlacedEffect(Saturation(), 1), passed=False)
+    placed = PlacedEffect(Saturation(), 1)
+    small = finding(placed, passed=False)
     untested = replace(small, explained=0.01, refusals=(why,), too_few_moves=why)
     weaker = replace(untested, effect=Spring())
     impossible = replace(
@@ -922,30 +1000,35 @@ def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Clo
     few_folds = replace(untested, axis=4, folds_better=0.5)
     tiny = replace(untested, axis=5, explained=0.001)
     first, last = closed.fitted.steps
+    findings = (untested, weaker, impossible, no_help, few_folds, tiny)
+    steps = (first, replace(last, findings=findings))
     asked = replace(
         closed.fitted,
-        steps=(
-            first,
-            replace(last, findings=(untested, weaker, impossible, no_help, few_folds, tiny)),
-        ),
+        steps=steps,
     )
     sentences = [one for one in summary(asked, closed.account, ()) if "rests on" in one]
-    assert sentences == [
+    expected = [
         f"These moves do not tell whether J2 has {effect_text(Saturation(), ())}: it rests on two "
         f"moves, too few to test it: record more {RECORD[Abscissa.CURRENT]}."
     ]
+    assert sentences == expected
 
 
 def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    term = PlacedEffect(Smooth(Abscissa.POSITION), 1)
-    name = finding(PlacedEffect(LoadFriction(0), 1))
-    refuted = SetAside(name, "{rival} explains clearly more", term, ((3, 2.91),))
+    effect = Smooth(Abscissa.POSITION)
+    term = PlacedEffect(effect, 1)
+    placed = PlacedEffect(LoadFriction(0), 1)
+    name = finding(placed)
+    moved = ((3, 2.91),)
+    refuted = SetAside(name, "{rival} explains clearly more", term, moved)
     assert refuted.reason([f"J{axis}" for axis in range(1, 7)]) == (
         "it would move the gain of J4 by 2.9 σ, and smooth-position on J2 explains clearly more"
     )
+    steps = (first, replace(last, set_aside=(refuted,)))
+    fitted = replace(closed.fitted, steps=steps)
     sentences = summary(
-        replace(closed.fitted, steps=(first, replace(last, set_aside=(refuted,)))),
+        fitted,
         closed.account,
         (),
     )
@@ -958,10 +1041,14 @@ def test_a_name_that_structure_refutes_is_reported_with_what_it_depends_on(close
 @pytest.mark.usefixtures("undrawn")
 def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     first, last = closed.fitted.steps
-    aside = SetAside(finding(PlacedEffect(Smooth(Abscissa.LOAD), 1)), moved=((3, 2.91),))
-    replaced = SetAside(finding(PlacedEffect(LoadFriction(0), 1)), "{rival} explains more", SPRING)
+    effect = Smooth(Abscissa.LOAD)
+    placed = PlacedEffect(effect, 1)
+    aside = SetAside(finding(placed), moved=((3, 2.91),))
+    placed_effect = PlacedEffect(LoadFriction(0), 1)
+    replaced = SetAside(finding(placed_effect), "{rival} explains more", SPRING)
     steps = (replace(first, set_aside=(replaced, aside)), replace(last, set_aside=(aside,)))
-    made = Closed(replace(closed.fitted, steps=steps), closed.account)
+    fitted = replace(closed.fitted, steps=steps)
+    made = Closed(fitted, closed.account)
     sentences = summary(made.fitted, made.account, ())
     assert (
         sum(
@@ -974,7 +1061,9 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
         "J2 may have friction that grows with the load: it would" in one for one in sentences
     )
     assert any("added: spring on J3 explains more." in one for one in sentences)
-    assert made.document()["turns"][1]["set_aside"][0]["reason"].endswith("the gain of J4 by 2.9 σ")
+    turns = made.document()["turns"]
+    set_aside = turns[1]["set_aside"]
+    assert set_aside[0]["reason"].endswith("the gain of J4 by 2.9 σ")
     assert (
         "Not added to J2: a torque that depends on the load torque and that no named effect "
         "explains: it has no name" in Reader(made.page()).text
@@ -994,7 +1083,8 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     folder = tmp_path / "report"
     rise = PairedChange(5.0, 1.0, 20)
     monkeypatch.setattr(before_after_module, "holdout_change", lambda *_: rise)
-    motors = (PairedChange(0.0, 0.0, 0),) * 3
+    paired_change = PairedChange(0.0, 0.0, 0)
+    motors = (paired_change,) * 3
     monkeypatch.setattr(
         fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3))
     )
@@ -1015,11 +1105,13 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     assert "spring on J3" in message
     assert "--accept-worse-holdout" in message
     assert not out.exists()
-    assert "no calibration was written" in (folder / PAGE).read_text(encoding="utf-8")
+    text = (folder / PAGE).read_text(encoding="utf-8")
+    assert "no calibration was written" in text
     assert main([*command, "--accept-worse-holdout"]) == ExitCode.OK
     assert "because --accept-worse-holdout was given" in capsys.readouterr().out
     assert out.exists()
-    assert json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))["worse_holdout"] is True
+    document = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
+    assert document["worse_holdout"] is True
     with pytest.raises(EffectsRefuted, match="20 independent blocks of moves"):
         fit_module.check_holdout(closed.fitted)
 
@@ -1028,15 +1120,19 @@ def test_effects_that_the_cell_declares_are_in_both_models_of_the_comparison(
     closed: Closed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rise = PairedChange(5.0, 1.0, 20)
-    motors = (PairedChange(0.0, 0.0, 0),) * 3
+    paired_change = PairedChange(0.0, 0.0, 0)
+    motors = (paired_change,) * 3
     monkeypatch.setattr(
         fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3))
     )
     last = closed.fitted.steps[-1]
     assert last.after.effects
-    fit_module.check_holdout(replace(closed.fitted, steps=(replace(last, declared=True),)))
+    steps = (replace(last, declared=True),)
+    changed_fitted = replace(closed.fitted, steps=steps)
+    fit_module.check_holdout(changed_fitted)
+    fitted = replace(closed.fitted, steps=(last,))
     with pytest.raises(EffectsRefuted):
-        fit_module.check_holdout(replace(closed.fitted, steps=(last,)))
+        fit_module.check_holdout(fitted)
 
 
 @pytest.mark.parametrize("options", [(), ("--json",)])
@@ -1071,7 +1167,8 @@ def test_what_was_found_is_printed_although_the_disk_is_full(
 def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed) -> None:
     worse = AcceptedEffect("spring", "J3", {}, (), 2.98, 3.11)
     change = PairedChange(1.3, 1.0, 20)
-    sentences = summary(closed.fitted, replace(closed.account, holdout_change=change), (worse,))
+    changed_account = replace(closed.account, holdout_change=change)
+    sentences = summary(closed.fitted, changed_account, (worse,))
     (whole,) = (one for one in sentences if one.startswith("All axes together"))
     assert whole.endswith(", within its noise (1.3 σ): the effects are kept, but not confirmed.")
     (refused,) = (one for one in sentences if one.startswith("`apply` refuses"))
@@ -1080,9 +1177,8 @@ def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed)
         "it, 2.98 %"
     ) in refused
     better = replace(worse, error_after_percent=2.97)
-    said = summary(
-        closed.fitted, replace(closed.account, holdout_change=replace(change, rise=-1.0)), (better,)
-    )
+    holdout_change = replace(change, rise=-1.0)
+    said = summary(closed.fitted, replace(closed.account, holdout_change=holdout_change), (better,))
     assert not any("within its noise" in one or "`apply` refuses" in one for one in said)
 
 
@@ -1091,11 +1187,16 @@ def test_the_candidate_that_was_added_is_listed_wherever_it_ranks(closed: Closed
     rivals = (
         tuple(finding(PlacedEffect(LoadFriction(0), axis), passed=False) for axis in range(6)) * 3
     )
-    late = replace(first, findings=(*rivals, first.findings[0]), structures=())
-    (table, *_) = turns_view(replace(closed.fitted, steps=(late,)))
+    findings = (*rivals, first.findings[0])
+    late = replace(first, findings=findings, structures=())
+    fitted = replace(closed.fitted, steps=(late,))
+    (table, *_) = turns_view(fitted)
     assert isinstance(table, Table)
-    assert list(table.columns[0].cells)[-1] == "spring"
-    assert list(table.columns[-1].cells)[-1] == "pass"
+    cells = list(table.columns[0].cells)
+    assert cells[-1] == "spring"
+    last_column = table.columns[-1]
+    last_cell = list(last_column.cells)[-1]
+    assert last_cell == "pass"
     assert table.row_count == 7
 
 
@@ -1109,7 +1210,8 @@ def test_what_rises_is_not_said_to_fall() -> None:
 
 
 def test_a_zero_is_read_in_degrees_and_a_slide_in_metres() -> None:
-    turned = Parameter("zero-offset offset 3", -math.radians(2.0), math.radians(0.04), "rad")
+    std = math.radians(0.04)
+    turned = Parameter("zero-offset offset 3", -math.radians(2.0), std, "rad")
     assert named_size(ZeroOffset(), (turned,)) == (
         "offset -2.000 ± 0.040°, to be added to its position"
     )
@@ -1135,15 +1237,18 @@ class OneAmplitude(OfOthers):
 
 
 def test_coefficients_are_given_as_their_class_says_and_not_by_name_or_unit() -> None:
-    found = (Parameter("c", 3.0, 0.1, "s"), Parameter("d", 4.0, 0.1, "Nm/Nm"))
+    parameter = Parameter("c", 3.0, 0.1, "s")
+    found = (parameter, Parameter("d", 4.0, 0.1, "Nm/Nm"))
     assert named_size(OfOthers(), found) == "cosine 3.00 ± 0.10 s, sine 4.00 ± 0.10 Nm/Nm"
     assert named_size(OneAmplitude(), found) == "amplitude 5.00 ± 0.10 s"
 
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:
     axes = ("base", "arm", "wrist")
-    assert PlacedEffect(Coupling(3, 1), 0).name_among(axes) == "coupling on base with wrist"
-    assert effect_text(Coupling(3, 1), axes) == "friction shared with wrist"
+    effect = Coupling(3, 1)
+    assert PlacedEffect(effect, 0).name_among(axes) == "coupling on base with wrist"
+    coupling = Coupling(3, 1)
+    assert effect_text(coupling, axes) == "friction shared with wrist"
     term = Smooth(Abscissa.OTHER_VELOCITY, other_axis=2)
     assert effect_text(term, axes) == (
         "a torque that depends on the velocity of arm and that no named effect explains"
@@ -1156,7 +1261,8 @@ def test_a_folder_that_holds_something_else_is_refused_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     check_report(None)
-    check_report(tmp_path / "new" / "folder")
+    folder_folder = tmp_path / "new" / "folder"
+    check_report(folder_folder)
     assert (tmp_path / "new" / "folder").is_dir()
     for name in (PAGE, DOCUMENT):
         folder = tmp_path / name.partition(".")[0]
@@ -1167,7 +1273,8 @@ def test_a_folder_that_holds_something_else_is_refused_before_any_work(
         # The logs are not read: they do not exist.
         assert main(["residual", "no.mcap", "--report", str(folder)]) == ExitCode.USAGE
         assert name in capsys.readouterr().err
-        assert (folder / name).read_text(encoding="utf-8") == "the user's own"
+        text = (folder / name).read_text(encoding="utf-8")
+        assert text == "the user's own"
     occupied = tmp_path / "file"
     occupied.write_text("", encoding="utf-8")
     with pytest.raises(OutputFailed, match="file"):
@@ -1193,9 +1300,9 @@ def test_a_folder_that_takes_no_file_is_refused_before_any_work(
     "unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"]
 )
 def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
-    text = html_page(
-        f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])]
-    )
+    body = [paragraph(f"{unseen}"), table(unseen, [unseen] * 2, [[unseen, unseen]])]
+    title = f"a{unseen}b"
+    text = html_page(title, body)
     assert unseen not in text
     assert f"<title>a\\u{ord(unseen):04x}b</title>" in text
     text.encode()
@@ -1283,8 +1390,11 @@ def test_the_verb_writes_the_report_and_says_the_same(
                 [*error["axes"], error["total"]], abs=0.005
             )
     assert "scales all gains alike" in text
-    assert text.splitlines()[-1] == f"Written: {folder}/ (certificate: {folder}/report.html)"
-    assert document["noise_floor"]["relative_error_percent"]["total"] is None or math.isfinite(
+    expected = f"Written: {folder}/ (certificate: {folder}/report.html)"
+    last_line = text.splitlines()[-1]
+    assert last_line == expected
+    total = document["noise_floor"]["relative_error_percent"]["total"]
+    assert total is None or math.isfinite(
         document["noise_floor"]["relative_error_percent"]["total"]
     )
     Reader((folder / PAGE).read_text(encoding="utf-8"))
@@ -1303,7 +1413,8 @@ def test_a_gain_that_carries_the_efficiency_of_its_gear_is_named(closed: Closed)
     assert "efficiency of 81.6 %" in next(_gear_sentence("J3", found, in_model=True))
     assert "2.06 % larger" in next(_gear_sentence("J3", found, in_model=True))
     listed = closed.document()["gear_loss"]
-    assert [gear["axis"] for gear in listed] == list(closed.fitted.cell.axis_names)
+    expected = list(closed.fitted.cell.axis_names)
+    assert [gear["axis"] for gear in listed] == expected
     assert all(0.0 < gear["motoring_torque"] < 1.0 for gear in listed)
 
 
@@ -1343,7 +1454,8 @@ def test_whatever_was_found_a_search_prints_one_screen(
     assert lines <= room + 1  # the last one counts the others
     everything = list(found.sentences())
     kept = [text for text in shown if text in everything]
-    assert kept == [text for text in everything if text in kept]  # in their order
+    expected = [text for text in everything if text in kept]
+    assert kept == expected  # in their order
     if len(kept) < len(everything):
         assert shown[-1].startswith(counted(len(everything) - len(kept), "sentence"))
     else:

@@ -36,7 +36,8 @@ def _objects(schema: Any) -> Iterator[dict[str, Any]]:
 
 @pytest.mark.parametrize("report", [*REPORTS.values(), ErrorReport], ids=[*REPORTS, "error"])
 def test_a_schema_allows_no_other_key(report: Any) -> None:
-    objects = list(_objects(TypeAdapter(report).json_schema()))
+    schema = TypeAdapter(report).json_schema()
+    objects = list(_objects(schema))
     assert objects
     of_ident = {Source.__name__, "Recording", Diagnosis.__name__}
     assert {
@@ -78,9 +79,10 @@ def test_every_type_of_a_document_is_published() -> None:
     for module in pkgutil.iter_modules(daq.report.__path__, "daq.report."):
         importlib.import_module(module.name)
     made = {kind for kind in _subclasses(Report) if kind.__module__.startswith("daq.")}
-    published = {
-        found for kind in (*REPORTS.values(), ErrorReport, *FILES) for found in _reports_in(kind)
-    }
+    published = set()
+    for kind in (*REPORTS.values(), ErrorReport, *FILES):
+        for found in _reports_in(kind):
+            published.add(found)
     assert {kind.__name__ for kind in made - published} == set()
 
 
@@ -105,11 +107,10 @@ def _made_by(module: ModuleType, tree: ast.Module, value: ast.expr) -> set[Any]:
     """Types of a value: of a call, or of what is assigned to a name."""
     if isinstance(value, ast.Name):
         places = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
-        given = [
-            one.value
-            for one in places
-            if value.id in {getattr(target, "id", "") for target in one.targets}
-        ]
+        given = []
+        for one in places:
+            if value.id in {getattr(target, "id", "") for target in one.targets}:
+                given.append(one.value)
         return set[Any]().union(*(_made_by(module, tree, one) for one in given))
     assert isinstance(value, ast.Call), ast.unparse(value)
     assert isinstance(value.func, ast.Name), ast.unparse(value)
@@ -118,7 +119,8 @@ def _made_by(module: ModuleType, tree: ast.Module, value: ast.expr) -> set[Any]:
         return {called}
     # Alone: what the arguments are may be imported for the type checker only.
     alone = SimpleNamespace(__annotations__={"return": called.__annotations__["return"]})
-    return _kinds(get_type_hints(alone, called.__globals__)["return"])
+    annotation = get_type_hints(alone, called.__globals__)["return"]
+    return _kinds(annotation)
 
 
 def _module_of(place: str) -> str:
@@ -140,6 +142,5 @@ def test_a_verb_prints_the_types_that_are_published_for_it(place: str) -> None:
         calls = [node for node in nodes if ast.unparse(node.func) == "print_json"]
         printed = printed.union(*(_made_by(module, tree, call.args[0]) for call in calls))
     names = [verb.name for verb in verbs]
-    assert printed == set[Any]().union(
-        *(_kinds(REPORTS[name]) for name in names if name in REPORTS)
-    )
+    expected = set[Any]().union(*(_kinds(REPORTS[name]) for name in names if name in REPORTS))
+    assert printed == expected

@@ -32,7 +32,8 @@ def _found(placed: PlacedEffect, squares: NDArray[np.float64], *rivals: PlacedEf
 
 def _turn(evidence: Evidence, added: Finding | None, *others: Finding) -> Step:
     findings = others if added is None else (added, *others)
-    return Step(findings, (), np.ones(3), added, evidence)
+    limits_nm = np.ones(3)
+    return Step(findings, (), limits_nm, added, evidence)
 
 
 @pytest.fixture
@@ -42,18 +43,23 @@ def evidence() -> Evidence:
 
 
 def test_one_name_where_the_added_effect_is_best_without_each_fold(evidence: Evidence) -> None:
-    added = _found(FRICTION, np.ones(FOLDS), LOSS)
-    (only,) = names_by_split(_turn(evidence, added, _found(LOSS, np.full(FOLDS, 1.2))))
+    squares = np.ones(FOLDS)
+    added = _found(FRICTION, squares, LOSS)
+    step = _turn(evidence, added, _found(LOSS, np.full(FOLDS, 1.2)))
+    (only,) = names_by_split(step)
     assert (only.placed, only.splits, only.of) == (FRICTION, FOLDS, FOLDS)
 
 
 def test_two_names_where_one_fold_decides(evidence: Evidence) -> None:
     """The loss is worse on the first fold alone: without it, it is clearly the better name."""
-    squares = np.full(FOLDS, 0.95) + np.linspace(0.0, 0.01, FOLDS)
+    grid = np.linspace(0.0, 0.01, FOLDS)
+    squares = np.full(FOLDS, 0.95) + grid
     squares[0] = 1.8
     added = _found(FRICTION, np.ones(FOLDS), LOSS)
-    first, second = names_by_split(_turn(evidence, added, _found(LOSS, squares)))
-    assert (first.placed, first.splits) == (FRICTION, FOLDS - 1)
+    step = _turn(evidence, added, _found(LOSS, squares))
+    first, second = names_by_split(step)
+    expected = (FRICTION, FOLDS - 1)
+    assert (first.placed, first.splits) == expected
     assert (second.placed, second.splits) == (LOSS, 1)
 
 
@@ -61,25 +67,32 @@ def test_one_name_where_another_is_better_by_no_more_than_chance(evidence: Evide
     """The simplest name of equals was added: a hinge from beyond the joint's range is a spring."""
     squares = 0.99 + 0.1 * np.resize([-1.0, 1.0], FOLDS)
     added = _found(FRICTION, np.ones(FOLDS), LOSS)
-    (only,) = names_by_split(_turn(evidence, added, _found(LOSS, squares)))
+    step = _turn(evidence, added, _found(LOSS, squares))
+    (only,) = names_by_split(step)
     assert only.placed == FRICTION
 
 
 def test_a_candidate_that_explains_something_else_is_no_name(evidence: Evidence) -> None:
     """A spring that stays beside the friction is another effect, however much it explains."""
-    added = _found(FRICTION, np.ones(FOLDS), LOSS)
-    names = names_by_split(_turn(evidence, added, _found(SPRING, np.full(FOLDS, 0.1))))
+    squares = np.ones(FOLDS)
+    added = _found(FRICTION, squares, LOSS)
+    step = _turn(evidence, added, _found(SPRING, np.full(FOLDS, 0.1)))
+    names = names_by_split(step)
     assert [name.placed for name in names] == [FRICTION]
 
 
 def test_a_candidate_that_failed_a_gate_is_no_name(evidence: Evidence) -> None:
-    added = _found(FRICTION, np.ones(FOLDS), LOSS)
+    squares = np.ones(FOLDS)
+    added = _found(FRICTION, squares, LOSS)
     failed = replace(_found(LOSS, np.full(FOLDS, 0.1)), passed=False)
-    assert [name.placed for name in names_by_split(_turn(evidence, added, failed))] == [FRICTION]
+    step = _turn(evidence, added, failed)
+    assert [name.placed for name in names_by_split(step)] == [FRICTION]
 
 
 def test_no_name_where_nothing_was_added(evidence: Evidence) -> None:
-    assert names_by_split(_turn(evidence, None, _found(LOSS, np.ones(FOLDS)))) == ()
+    squares = np.ones(FOLDS)
+    step = _turn(evidence, None, _found(LOSS, squares))
+    assert names_by_split(step) == ()
 
 
 @given(
@@ -88,8 +101,10 @@ def test_no_name_where_nothing_was_added(evidence: Evidence) -> None:
 def test_each_split_chooses_one_name(pairs: list[tuple[float, float]]) -> None:
     squares = np.array(pairs).T
     added = _found(FRICTION, squares[0], LOSS)
-    names = names_by_split(_turn(object.__new__(Evidence), added, _found(LOSS, squares[1])))
+    step = _turn(object.__new__(Evidence), added, _found(LOSS, squares[1]))
+    names = names_by_split(step)
     assert sum(name.splits for name in names) == FOLDS
-    assert list(names) == sorted(names, key=lambda name: -name.splits)
+    expected = sorted(names, key=lambda name: -name.splits)
+    assert list(names) == expected
     if np.all(squares[0] <= squares[1]):
         assert [name.placed for name in names] == [FRICTION]

@@ -20,10 +20,9 @@ def real(
     folder = tmp_path_factory.mktemp("tx40")
     log = folder / "tx40.mcap"
     file = folder / "calibration.yaml"
-    import_recording(
-        checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test"
-    )
-    save_calibration(
-        calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file
-    )
+    description = checkout / "configs/imports/tx40.yaml"
+    import_recording(description, shared_data / "tx40", log, software="test")
+    fitted = fit([log], gains_fixed=True)
+    created = datetime(2025, 1, 2, tzinfo=UTC)
+    save_calibration(calibration_of(fitted, created), file)
     return file, log

@@ -54,22 +54,26 @@ def test_the_gantry_is_read_in_si_units() -> None:
     assert (x.unit, z.unit, a.unit) == (MILLIMETRE, MILLIMETRE, DEGREE)
     assert x.limits.position == pytest.approx((0.0, 1.4))
     assert (z.limits.velocity, z.limits.acceleration) == pytest.approx((0.6, 4.5))
-    assert a.limits.position == (radians(-175), radians(175))
-    assert [axis.gain_unit for axis in GANTRY.axes] == ["N/A", "N/A", "N/A", "Nm/A", "Nm/A"]
+    expected = (radians(-175), radians(175))
+    assert a.limits.position == expected
+    gain_units = [axis.gain_unit for axis in GANTRY.axes]
+    assert gain_units == ["N/A", "N/A", "N/A", "Nm/A", "Nm/A"]
     assert GANTRY.conditioning.standstill_rad_s == pytest.approx((0.008, 0.008, 0.005, 0.03, 0.03))
     # One turn of the screw moves Z by 20 mm; five of a belt motor move X and Y by 150 mm each.
     assert GANTRY.ratio[2, 2] == pytest.approx(2 * pi / 0.020)
     assert GANTRY.ratio[:2, :2] == pytest.approx(5 * 2 * pi / 0.150 * np.array([[1, 1], [1, -1]]))
-    assert GANTRY.ratio[4].tolist() == [0, 0, 0, -50, 50]
-    kinds = [joint.kind.value for joint in model_of(GANTRY).robot.joints]
+    ratio = GANTRY.ratio[4].tolist()
+    assert ratio == [0, 0, 0, -50, 50]
+    joints = model_of(GANTRY).robot.joints
+    kinds = [joint.kind.value for joint in joints]
     assert kinds == ["prismatic", "prismatic", "prismatic", "revolute", "revolute"]
 
 
 def test_a_turn_of_the_screw_is_its_lead() -> None:
-    scale = scaling(
-        GANTRY, Readback(tuple(AxisReadback(name, 0.003) for name in GANTRY.axis_names))
-    )
-    assert scale.joint_position(np.array([0, 0, 65536, 0, 0])) == pytest.approx([0, 0, 0.020, 0, 0])
+    axes = tuple(AxisReadback(name, 0.003) for name in GANTRY.axis_names)
+    scale = scaling(GANTRY, Readback(axes))
+    counts = np.array([0, 0, 65536, 0, 0])
+    assert scale.joint_position(counts) == pytest.approx([0, 0, 0.020, 0, 0])
     # Both belt motors a turn forwards: X alone moves, by a fifth of the pulley's circumference.
     assert scale.joint_position(np.array([65536, 65536, 0, 0, 0])) == pytest.approx(
         [0.030, 0, 0, 0, 0]
@@ -78,8 +82,10 @@ def test_a_turn_of_the_screw_is_its_lead() -> None:
 
 @pytest.mark.parametrize("name", ["gantry", "seven-axis", "rx90", "kr270"])
 def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
-    cell = load_cell(CHECKOUT / f"configs/cells/{name}.yaml")
-    spec = load_simulation(CHECKOUT / f"configs/simulation/{name}.yaml", cell.payloads[0].name)
+    path = CHECKOUT / f"configs/cells/{name}.yaml"
+    cell = load_cell(path)
+    payload = cell.payloads[0].name
+    spec = load_simulation(CHECKOUT / f"configs/simulation/{name}.yaml", payload)
     np.testing.assert_allclose(spec.ratio, cell.ratio, rtol=1e-9)
     assert spec.gravity_m_s2 == cell.gravity_m_s2
     assert spec.payload is not None
@@ -92,7 +98,8 @@ def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
     for start, axis, true in zip(spec.start_rad, cell.axes, spec.axes, strict=True):
         assert axis.limits.position[0] < start < axis.limits.position[1]
         assert axis.identity is not None
-        assert (axis.node_id, axis.identity.serial) == (true.node_id, true.serial)
+        expected = (true.node_id, true.serial)
+        assert (axis.node_id, axis.identity.serial) == expected
         assert 0.02 < abs(true.gain_nm_per_a / axis.nameplate_gain - 1) < 0.1
 
 
@@ -132,13 +139,15 @@ def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
 def test_mm_and_degrees_are_not_confused(
     configurations: Path, old: str, new: str, message: str
 ) -> None:
-    path = _spoil(configurations / "cells/gantry.yaml", (old, new))
+    gantry_path = configurations / "cells/gantry.yaml"
+    path = _spoil(gantry_path, (old, new))
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(path)
 
 
 def test_limits_in_metres_are_recognised_by_the_urdf(configurations: Path) -> None:
-    path = _spoil(configurations / "cells/gantry.yaml", ("[0, 1400]", "[0, 14]"))
+    gantry_path = configurations / "cells/gantry.yaml"
+    path = _spoil(gantry_path, ("[0, 1400]", "[0, 14]"))
     urdf = configurations / "robots/gantry.urdf"
     _spoil(urdf, ('lower="0.0" upper="1.4"', 'lower="0.0" upper="14.2"'))
     with pytest.raises(
@@ -164,7 +173,8 @@ def test_limits_in_metres_are_recognised_by_the_urdf(configurations: Path) -> No
 def test_a_misspelt_prismatic_axis_is_refused(
     configurations: Path, old: str, new: str, message: str
 ) -> None:
-    path = _spoil(configurations / "cells/gantry.yaml", (old, new))
+    gantry_path = configurations / "cells/gantry.yaml"
+    path = _spoil(gantry_path, (old, new))
     with pytest.raises(SchemaMismatch, match=message):
         load_cell(path)
 
@@ -202,9 +212,8 @@ def test_positions_that_another_zero_brings_within_the_limits_are_not_blamed_on_
 def test_one_start_a_joint(tmp_path: Path) -> None:
     for name in ("gantry.yaml", "gantry-plant.urdf"):
         shutil.copyfile(CHECKOUT / "configs/simulation" / name, tmp_path / name)
-    path = _spoil(
-        tmp_path / "gantry.yaml", ("[700, 450, 200, null, null]", "[700, 450, null, null, null]")
-    )
+    gantry_path = tmp_path / "gantry.yaml"
+    path = _spoil(gantry_path, ("[700, 450, 200, null, null]", "[700, 450, null, null, null]"))
     with pytest.raises(ConfigurationInconsistent, match="joint 3"):
         load_simulation(path)
     _spoil(path, ("[700, 450, null, null, null]", "[700, 450, 200, null]"))
@@ -222,7 +231,8 @@ ENTRY = st.sampled_from((0.0, 0.0, 1.0, -5.0, 50.0, 314.159))
 )
 def test_the_joint_of_a_gain_is_that_of_its_reduction(rows: list[list[float]]) -> None:
     ratio = np.array(rows)
-    assume(np.linalg.matrix_rank(ratio) == len(ratio) and np.linalg.cond(ratio) < 1e6)
+    ratio_rank = np.linalg.matrix_rank(ratio)
+    assume(ratio_rank == len(ratio) and np.linalg.cond(ratio) < 1e6)
     found = ratio[np.arange(len(ratio)), list(gain_joints(ratio))]
     np.testing.assert_array_equal(found, DriveTrain(ratio).reduction)
 
@@ -235,9 +245,12 @@ def test_the_longest_frame_is_that_of_the_standard() -> None:
 def test_seven_axes_do_not_fit_into_a_millisecond(configurations: Path) -> None:
     profile = SEVEN.axes[0].profile
     assert profile is not None
-    assert answer_us([profile] * 6, 1_000_000) == 865.0
+    profiles = [profile] * 6
+    assert answer_us(profiles, 1_000_000) == 865.0
     timed = [("interface: virtual", "interface: socketcan"), ("pacing: lockstep", "pacing: timed")]
-    assert load_cell(_spoil(configurations / "cells/seven-axis.yaml", *timed)).sync is not None
+    seven_axis_path = configurations / "cells/seven-axis.yaml"
+    cell = load_cell(_spoil(seven_axis_path, *timed))
+    assert cell.sync is not None
     path = _spoil(configurations / "cells/seven-axis.yaml", ("period_us: 2000", "period_us: 1000"))
     with pytest.raises(
         ConfigurationInconsistent,

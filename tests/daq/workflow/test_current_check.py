@@ -23,10 +23,8 @@ def readings(cell: Cell, factor: float = 1.0) -> list[ScaleReading]:
     """Readings of drives whose torque constants are the cell's, times a factor;
     each motor has 2 A.
     """
-    constants = [
-        abs(a.nameplate_gain / n)
-        for a, n in zip(cell.axes, DriveTrain(cell.ratio).reduction, strict=True)
-    ]
+    reduction = DriveTrain(cell.ratio).reduction
+    constants = [abs(a.nameplate_gain / n) for a, n in zip(cell.axes, reduction, strict=True)]
     return [ScaleReading(0.002, {}, 2.0, 2.0 * factor * constant, ()) for constant in constants]
 
 
@@ -59,10 +57,10 @@ def test_a_torque_constant_beyond_a_factor_of_three_is_refused_with_the_line(
     path = checkout / "configs/cells/demo.yaml"
     cell = load_cell(path)
     reported = readings(cell)
-    reported[3] = replace(
-        reported[3], rated_torque_nm=factor * (reported[3].rated_torque_nm or 0.0)
-    )
-    line = 1 + next(n for n, text in enumerate(path.read_text().splitlines()) if "-11.52" in text)
+    rated_torque_nm = factor * (reported[3].rated_torque_nm or 0.0)
+    reported[3] = replace(reported[3], rated_torque_nm=rated_torque_nm)
+    lines = path.read_text().splitlines()
+    line = 1 + next(n for n, text in enumerate(lines) if "-11.52" in text)
     if refused:
         where = re.escape(f"demo.yaml:{line}: axes[3].nameplate_gain_nm_per_a")
         with pytest.raises(
@@ -92,9 +90,10 @@ def test_a_controller_with_another_gain_is_refused_with_both_lines(
     with pytest.raises(ConfigurationInconsistent, match=re.escape(words)):
         check_controller(path, load_cell(path))
     # In another unit by declaration, it is the same gain.
-    path.write_text(
-        path.read_text().replace("drives.J3.gain,", "{key: drives.J3.gain, factor: 1000},")
+    changed_text = path.read_text().replace(
+        "drives.J3.gain,", "{key: drives.J3.gain, factor: 1000},"
     )
+    path.write_text(changed_text)
     check_controller(path, load_cell(path))
     controller.unlink()
     check_controller(path, load_cell(path))
@@ -105,11 +104,11 @@ def test_what_was_not_checked_and_what_is_no_reference_is_said(checkout: Path) -
     cell = load_cell(path)
     first = cell.axes[0]
     assert first.profile is not None
-    actual = replace(
-        first, profile=replace(first.profile, tap=TapPoint.ACTUAL), gain_unit="Nm/A(actual)"
-    )
+    profile = replace(first.profile, tap=TapPoint.ACTUAL)
+    actual = replace(first, profile=profile, gain_unit="Nm/A(actual)")
     other = replace(cell.axes[1], gain_unit="Nm/V")
-    changed = replace(cell, axes=(actual, other, *cell.axes[2:]))
+    axes = (actual, other, *cell.axes[2:])
+    changed = replace(cell, axes=axes)
     reported = readings(cell)
     for index in (2, 4):
         reported[index] = replace(reported[index], rated_torque_nm=None, warnings=("nothing",))

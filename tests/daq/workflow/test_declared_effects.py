@@ -29,14 +29,15 @@ def _declaring(*effects: DeclaredEffect) -> Cell:
 
 
 def test_the_shipped_cell_declares_its_balancer() -> None:
-    assert CELL.effects == (
-        DeclaredEffect("counterbalance", AXIS, {"ratio": 0.25, "phase_rad": -1.57}),
-    )
+    settings = {"ratio": 0.25, "phase_rad": -1.57}
+    expected = (DeclaredEffect("counterbalance", AXIS, settings),)
+    assert CELL.effects == expected
     assert declared_effects(CELL) == (PlacedEffect(Counterbalance(0.25, -1.57), AXIS),)
 
 
 def test_settings_that_are_not_given_are_those_of_the_dictionary() -> None:
-    (placed,) = declared_effects(_declaring(DeclaredEffect("gravity-compensator", 2, {})))
+    cell = _declaring(DeclaredEffect("gravity-compensator", 2, {}))
+    (placed,) = declared_effects(cell)
     assert placed.effect.settings == {"order": 1}
 
 
@@ -72,7 +73,8 @@ def test_the_place_of_an_effect_is_checked_with_the_file(
     tmp_path: Path, new: str, message: str
 ) -> None:
     text = (CHECKOUT / "configs/cells/kr270.yaml").read_text(encoding="utf-8")
-    text = text.replace("../", f"{CHECKOUT}/configs/").replace("axis: J2", new, 1)
+    changed_text = text.replace("../", f"{CHECKOUT}/configs/")
+    text = changed_text.replace("axis: J2", new, 1)
     (tmp_path / "cell.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(tmp_path / "cell.yaml")
@@ -85,9 +87,10 @@ def test_what_would_leave_the_effects_out_is_refused() -> None:
 
 
 def test_a_fit_with_given_gains_has_the_effect_too() -> None:
+    runs = heavy_runs(balanced=True)
     start = identify(
         heavy_model(),
-        heavy_runs(balanced=True),
+        runs,
         CONDITIONING,
         method=Method.WLS,
         fixed_gains=GAINS,

@@ -33,14 +33,17 @@ def test_no_log_is_larger_than_the_estimate(
     tmp_path_factory: pytest.TempPathFactory, axes: int, count: int, seed: int
 ) -> None:
     """Noise over the whole range, which no packing makes smaller."""
-    noise = np.random.default_rng(seed).integers(-(2**31), 2**31, size=(count, 2, axes)).tolist()
+    rng = np.random.default_rng(seed)
+    noise = rng.integers(-(2**31), 2**31, size=(count, 2, axes)).tolist()
     rows = [
         Sample(k, START_NS + k * 1_000_000, tuple(p), tuple(c), (k & 0xFFFF,) * axes)
         for k, (p, c) in enumerate(noise)
     ]
     start = content(axes)
-    path = write(tmp_path_factory.mktemp("log") / "a.mcap", start, rows)
-    bound = largest_log_bytes(start.joint_names, 1000.0, count * 1e-3, start.files)
+    a_path = tmp_path_factory.mktemp("log") / "a.mcap"
+    path = write(a_path, start, rows)
+    duration_s = count * 1e-3
+    bound = largest_log_bytes(start.joint_names, 1000.0, duration_s, start.files)
     assert path.stat().st_size <= bound <= 3 * path.stat().st_size + 200_000
 
 
@@ -50,13 +53,15 @@ def test_the_estimate_grows_with_what_it_depends_on() -> None:
     assert largest_log_bytes(names, 1000.0, 120.0, {}) > 1.9 * base
     assert largest_log_bytes(names, 500.0, 60.0, {}) < 0.7 * base
     assert largest_log_bytes((*names, "J3"), 1000.0, 60.0, {}) > base
-    assert largest_log_bytes(names, 1000.0, 60.0, {"robot.urdf": b"x" * 1000}) == base + 2000
+    attached = {"robot.urdf": b"x" * 1000}
+    assert largest_log_bytes(names, 1000.0, 60.0, attached) == base + 2000
 
 
 def test_a_real_disk_is_asked(tmp_path: Path) -> None:
     assert free_bytes(tmp_path) > 0
+    log = tmp_path / "none" / "a.mcap"
     with pytest.raises(OutputFailed, match="no such file"):
-        DiskRoom(tmp_path / "none" / "a.mcap").require(1)
+        DiskRoom(log).require(1)
 
 
 def _rig(

@@ -66,7 +66,8 @@ def test_metadata_carries_second_weighing_and_controller(
 
 
 def test_logs_of_earlier_versions_report_neither() -> None:
-    record_of = run_record(content(6, DISC).run)
+    info = content(6, DISC).run
+    record_of = run_record(info)
     del record_of["payload_entered_kg"], record_of["controller_sha256"]
     run = run_from_record(record_of)
     assert (run.entered_kg, run.controller_sha256) == (None, None)
@@ -74,40 +75,57 @@ def test_logs_of_earlier_versions_report_neither() -> None:
 
 @pytest.mark.parametrize("entered", ["0", "-1", "nan", "inf", "heavy"])
 def test_a_mass_that_is_none_is_no_metadata(entered: str) -> None:
+    info = content(6, DISC).run
     with pytest.raises(ValueError):
-        run_from_record({**run_record(content(6, DISC).run), "payload_entered_kg": entered})
+        run_from_record({**run_record(info), "payload_entered_kg": entered})
 
 
 def test_a_run_knows_how_its_log_came_to_be(tmp_path: Path, checkout: Path) -> None:
     start = demo_content(checkout, DISC)
-    start = replace(start, run=replace(start.run, entered_kg=4.592, controller_sha256="c" * 64))
+    controller_sha256 = "c" * 64
+    changed_run = replace(start.run, entered_kg=4.592, controller_sha256=controller_sha256)
+    start = replace(start, run=changed_run)
     rows = samples([[0] * 6] * 100)
-    rows[7] = replace(rows[7], statusword=(0x1237, LIMIT, 0x1237, 0x1237, 0x1237, 0x1237))
-    run, _ = load_run(write(tmp_path / "a.mcap", start, rows))
-    assert run.recording == Recording(
-        recorded_s=START_NS * 1e-9,
+    statusword = (0x1237, LIMIT, 0x1237, 0x1237, 0x1237, 0x1237)
+    rows[7] = replace(rows[7], statusword=statusword)
+    a_path = tmp_path / "a.mcap"
+    path = write(a_path, start, rows)
+    run, _ = load_run(path)
+    saturated_percent = (0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+    serials = (7,) * 6
+    missing = (0,) * 6
+    recorded_s = START_NS * 1e-9
+    expected = Recording(
+        recorded_s=recorded_s,
         entered_kg=4.592,
-        serials=(7,) * 6,
-        saturated_percent=(0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+        serials=serials,
+        saturated_percent=saturated_percent,
         lost_cycles=0,
-        missing=(0,) * 6,
+        missing=missing,
         controller_sha256="c" * 64,
         operator="Ada",
     )
+    assert run.recording == expected
     undated = replace(start, run=replace(start.run, started_wall_ns=0))
-    run, _ = load_run(write(tmp_path / "imported.mcap", undated, rows))
+    imported_path = tmp_path / "imported.mcap"
+    run, _ = load_run(write(imported_path, undated, rows))
     assert run.recording is not None
     assert run.recording.recorded_s is None
 
 
 def test_a_source_carries_payload_and_recording(tmp_path: Path, checkout: Path) -> None:
-    turning = [[100 * k + axis for axis in range(6)] for k in range(50)]
-    bare = write(tmp_path / "bare.mcap", demo_content(checkout), samples(turning))
-    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), samples(turning[::-1]))
+    turning = []
+    for k in range(50):
+        turning.append([100 * k + axis for axis in range(6)])
+    path = tmp_path / "bare.mcap"
+    bare = write(path, demo_content(checkout), samples(turning))
+    loaded_path = tmp_path / "loaded.mcap"
+    loaded = write(loaded_path, demo_content(checkout, DISC), samples(turning[::-1]))
     reading = LogLoader.of([bare, loaded], None)
     runs = list(reading.runs([bare, loaded], "fit"))
     first, second = reading.sources
-    assert (first.payload, first.mass_kg, first.recording) == (None, None, runs[0].recording)
+    expected = (None, None, runs[0].recording)
+    assert (first.payload, first.mass_kg, first.recording) == expected
     assert (second.payload, second.mass_kg, second.recording) == ("disc", 4.59, runs[1].recording)
     assert second.recording is not None
 
@@ -136,7 +154,8 @@ def truth_runs() -> dict[str, Run]:
 def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(  # noqa: E501
     truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch, nameplate_is_true: bool
 ) -> None:
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    demo_path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(demo_path)
     if nameplate_is_true:
         axes = (
             replace(axis, nameplate_gain=float(g)) for axis, g in zip(cell.axes, GAINS, strict=True)
@@ -150,7 +169,10 @@ def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_wor
 
     monkeypatch.setattr(fit_module, "load_run", load)
     logs = [Path(name) for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
-    found = calibration_of(fit(logs, holdout=[Path("held-out")]), datetime(2025, 1, 2, tzinfo=UTC))
+    holdout = [Path("held-out")]
+    fitted = fit(logs, holdout=holdout)
+    created = datetime(2025, 1, 2, tzinfo=UTC)
+    found = calibration_of(fitted, created)
     held = found.holdout_error_percent
     nameplate = found.nameplate_holdout_error_percent
     assert held is not None
@@ -166,23 +188,27 @@ def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_wor
 
 def _sticking(run: Run) -> Run:
     """With low-speed friction in axis 2 that the declared model lacks."""
-    speed = np.gradient(run.position_rad[:, 1]) * run.rate_hz
+    position_rad_gradient = np.gradient(run.position_rad[:, 1])
+    speed = position_rad_gradient * run.rate_hz
     added = np.zeros_like(run.current_a)
     added[:, 1] = 5.0 * np.sign(speed) * np.exp(-((speed / 0.35) ** 2)) / GAINS[1]
-    return replace(run, current_a=run.current_a + added)
+    current_a = run.current_a + added
+    return replace(run, current_a=current_a)
 
 
 @pytest.fixture(scope="module")
 def with_effect(truth_runs: dict[str, Run]) -> Fit:
     """A loop that has found that friction, on a cell whose nameplate is some per cent off."""
     runs = {name: _sticking(run) for name, run in truth_runs.items()}
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    demo_path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(demo_path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-        patch.setattr(
-            fit_module, "find_effects", partial(find_effects, families=((Stribeck(0.3),),))
-        )
-        start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("held-out")])
+        families = ((Stribeck(0.3),),)
+        patch.setattr(fit_module, "find_effects", partial(find_effects, families=families))
+        logs = [Path(name) for name in tuple(runs)[:4]]
+        holdout = [Path("held-out")]
+        start = fit(logs, holdout=holdout)
         found = close_loop(start, 0)
     assert [(placed.effect.name, placed.axis) for placed in _effects(found)] == [("stribeck", 1)]
     return found
@@ -197,16 +223,22 @@ def _with_gains(fitted: Fit, factors: tuple[float, ...]) -> Calibration:
     as if they had been identified.
     """
     after = fitted.steps[-1].after
-    other = estimate_with(
-        Method.ML, after.training.system(), after.estimate.gains * np.array(factors)
-    )
+    system = after.training.system()
+    fixed_gains = after.estimate.gains * np.array(factors)
+    other = estimate_with(Method.ML, system, fixed_gains)
     other = replace(other, gains_fixed=False, covariance=after.estimate.covariance)
-    step = replace(fitted.steps[-1], after=replace(after, estimate=other))
-    return calibration_of(replace(fitted, steps=(*fitted.steps[:-1], step)), NOW)
+    last_step = fitted.steps[-1]
+    changed_after = replace(after, estimate=other)
+    step = replace(last_step, after=changed_after)
+    steps = (*fitted.steps[:-1], step)
+    changed_fitted = replace(fitted, steps=steps)
+    return calibration_of(changed_fitted, NOW)
 
 
 def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
-    context = GateContext(Request(calibration, NOW), Edit(subject="", before=b"", after=b""))
+    edit = Edit(subject="", before=b"", after=b"")
+    request = Request(calibration, NOW)
+    context = GateContext(request, edit)
     # The runs were generated and not recorded: they have no digests.
     return [(one.gate, one.subject) for one in check_gates(context) if one.gate is not Gate.SOURCES]
 
@@ -216,9 +248,11 @@ def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -
     """The nameplate is compared in the same model:
     with its own gains a calibration is no better than it is.
     """
-    nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
+    nameplate_gains = [axis.nameplate_gain for axis in with_effect.cell.axes]
+    nameplate = np.array(nameplate_gains)
     gains = with_effect.estimate.gains
-    same = _with_gains(with_effect, tuple(nameplate / gains))
+    factors = tuple(nameplate / gains)
+    same = _with_gains(with_effect, factors)
     held = same.holdout_error_percent
     compared = same.nameplate_holdout_error_percent
     assert held is not None
@@ -232,29 +266,36 @@ def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -
 
 @pytest.mark.slow
 def test_one_wrong_gain_among_good_ones_is_refused_in_spite_of_an_effect(with_effect: Fit) -> None:
-    assert _refused(calibration_of(with_effect, NOW)) == []
-    assert _refused(_with_gains(with_effect, (1.0,) * 6)) == []
+    calibration = calibration_of(with_effect, NOW)
+    assert _refused(calibration) == []
+    factors = (1.0,) * 6
+    assert _refused(_with_gains(with_effect, factors)) == []
     found = _refused(_with_gains(with_effect, (1.0, 1.0, 1.0, 0.7, 1.0, 1.0)))
     assert (Gate.HOLDOUT, "J4") in found
-    assert {gate for gate, _ in found} == {Gate.HOLDOUT}
+    gates = {gate for gate, _ in found}
+    assert gates == {Gate.HOLDOUT}
 
 
 def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(
     truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    demo_path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(demo_path)
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (truth_runs[path.name], cell))
     logs = [Path("bare-1"), Path("loaded-1")]
     now = datetime(2025, 1, 2, tzinfo=UTC)
-    assert calibration_of(fit(logs), now).nameplate_holdout_error_percent is None
-    fixed = fit(logs, holdout=[Path("held-out")], gains_fixed=True)
+    calibration = calibration_of(fit(logs), now)
+    assert calibration.nameplate_holdout_error_percent is None
+    holdout = [Path("held-out")]
+    fixed = fit(logs, holdout=holdout, gains_fixed=True)
     assert calibration_of(fixed, now).nameplate_holdout_error_percent is None
 
 
 def test_an_effect_on_all_motors_is_not_called_the_first_axis_s(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
     assert ALL_AXES not in cell.axis_names
-    assert PlacedEffect(TimeSkew(), 0).axis_name(cell.axis_names) == ALL_AXES
+    placed_effect = PlacedEffect(TimeSkew(), 0)
+    assert placed_effect.axis_name(cell.axis_names) == ALL_AXES
     assert PlacedEffect(Lag(), 0).axis_name(cell.axis_names) == "J1"
 
 
@@ -262,17 +303,21 @@ def test_an_effect_on_all_motors_is_not_called_the_first_axis_s(checkout: Path) 
 def test_a_delay_of_all_axes_is_predicted_from_the_file(with_effect: Fit) -> None:
     first = with_effect.steps[0]
     assert first.accepted is not None
-    delayed = with_effects(first.after, (PlacedEffect(TimeSkew(), 0),))
-    step = replace(
-        first, accepted=replace(first.accepted, effect=TimeSkew(), axis=0), after=delayed
-    )
-    made = calibration_of(replace(with_effect, steps=(step,)), NOW)
+    effects = (PlacedEffect(TimeSkew(), 0),)
+    delayed = with_effects(first.after, effects)
+    accepted = replace(first.accepted, effect=TimeSkew(), axis=0)
+    step = replace(first, accepted=accepted, after=delayed)
+    changed_with_effect = replace(with_effect, steps=(step,))
+    made = calibration_of(changed_with_effect, NOW)
     assert [effect.axis for effect in made.effects] == [ALL_AXES]
     read = decode_calibration(encode_calibration(made), "c.yaml")
     data = delayed.datasets[0]
     torque = decimate_rows(data, delayed.conditioning, predict_torque(read, delayed.model, data).T)
     fitted = delayed.estimate.predicted_torque(delayed.training)[:, : torque.shape[1]]
-    assert np.max(np.abs(torque - fitted)) < 1e-3 * np.max(np.abs(fitted))
+    torque_difference = np.abs(torque - fitted)
+    largest_torque_difference = np.max(torque_difference)
+    largest_absolute_fitted = np.max(np.abs(fitted))
+    assert largest_torque_difference < 1e-3 * largest_absolute_fitted
 
 
 @pytest.mark.parametrize("entered", [4.584, 4.596, 9.0, 0.1])
@@ -281,10 +326,11 @@ def test_a_mass_off_the_cell_s_is_refused_before_anything_is_asked_of_the_bus(
 ) -> None:
     rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
     declared = load_cell(rig.cell_file)
+    plan = load_plan(rig.plan, declared)
     request = RecordingRequest(
         rig.cell_file,
         declared,
-        load_plan(rig.plan, declared),
+        plan,
         rig.out,
         payload=DISC,
         operator="Ada",
@@ -312,15 +358,15 @@ def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
-    rig.cell_file.write_text(
-        rig.cell_file.read_text().replace("../controllers/demo.yaml", "controller.yaml")
-    )
+    changed_text = rig.cell_file.read_text().replace("../controllers/demo.yaml", "controller.yaml")
+    rig.cell_file.write_text(changed_text)
     (tmp_path / "controller.yaml").write_bytes(b"drives: {}\n")
     declared = load_cell(rig.cell_file)
+    plan = load_plan(rig.plan, declared)
     request = RecordingRequest(
         rig.cell_file,
         declared,
-        load_plan(rig.plan, declared),
+        plan,
         rig.out,
         payload=DISC,
         operator="Ada",
@@ -329,10 +375,12 @@ def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
         entered_kg=4.595,
         unguarded=True,  # the scripted drives have no 1016h
     )
-    record(request, clocks=Clocks(lambda: WALL_NS, rig.bus.clock))
+    clocks = Clocks(lambda: WALL_NS, rig.bus.clock)
+    record(request, clocks=clocks)
     run = read_log(rig.out).head.run
     assert run.entered_kg == 4.595
-    assert run.controller_sha256 == hashlib.sha256(b"drives: {}\n").hexdigest()
+    expected = hashlib.sha256(b"drives: {}\n").hexdigest()
+    assert run.controller_sha256 == expected
 
 
 def test_a_mass_needs_a_payload(checkout: Path) -> None:

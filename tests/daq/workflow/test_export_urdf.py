@@ -49,36 +49,36 @@ BODY = Body(
 def _calibration(
     cell: str, model: Model, limits: FloatArray, standard: FloatArray, digest: str = "c" * 64
 ) -> Calibration:
-    columns = (
-        model.regressor(random_motion(limits, 200, 9)).transpose(0, 2, 1).reshape(-1, len(standard))
-    )
-    base = base_parameters(
-        np.asarray(np.linalg.qr(columns, mode="r")), tuple(column.name for column in model.columns)
-    )
+    motion = random_motion(limits, 200, 9)
+    columns = model.regressor(motion).transpose(0, 2, 1).reshape(-1, len(standard))
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    names = tuple(column.name for column in model.columns)
+    base = base_parameters(triangle, names)
     count = model.robot.joint_count
+    parameter = Parameter("mx:flange-a", 0.3, 0.01, "kg m")
+    parameters = (
+        *(
+            Parameter(name, float(value), 0.01, "kg m²")
+            for name, value in zip(base.names, base.grouping @ standard, strict=True)
+        ),
+        parameter,
+        Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1"),
+    )
+    gains = tuple(Gain(f"J{number}", 30.0, 0.1, "Nm/A", 30.0) for number in range(1, count + 1))
+    coefficients = (Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1"),)
+    accepted_effect = AcceptedEffect(
+        "load-friction", "J3", {"speed_exponent": 0}, coefficients, 6.1, 3.4
+    )
+    effects = (accepted_effect,)
+    axes = (3.0,) * count
+    relative_error_percent = RelativeError(axes, 3.0)
     return Calibration(
         cell=cell,
         method="ml",
-        gains=tuple(Gain(f"J{number}", 30.0, 0.1, "Nm/A", 30.0) for number in range(1, count + 1)),
-        parameters=(
-            *(
-                Parameter(name, float(value), 0.01, "kg m²")
-                for name, value in zip(base.names, base.grouping @ standard, strict=True)
-            ),
-            Parameter("mx:flange-a", 0.3, 0.01, "kg m"),
-            Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1"),
-        ),
-        effects=(
-            AcceptedEffect(
-                "load-friction",
-                "J3",
-                {"speed_exponent": 0},
-                (Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1"),),
-                6.1,
-                3.4,
-            ),
-        ),
-        relative_error_percent=RelativeError((3.0,) * count, 3.0),
+        gains=gains,
+        parameters=parameters,
+        effects=effects,
+        relative_error_percent=relative_error_percent,
         holdout_error_percent=None,
         condition=800.0,
         rows=1000,
@@ -100,11 +100,14 @@ def tx40(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     rng = np.random.default_rng(4)
     for joint, link in enumerate(urdf_links(cell.urdf)):
         # Other bodies than those of the URDF: each has a further kilogram somewhere.
-        more = Body(1.0, rng.uniform(-0.1, 0.1, 3), 0.01 * np.eye(3))
+        centre_m = rng.uniform(-0.1, 0.1, 3)
+        inertia_kg_m2 = 0.01 * np.eye(3)
+        more = Body(1.0, centre_m, inertia_kg_m2)
         standard[14 * joint : 14 * joint + 14] = (*(link + more.parameters), 0.3, 1.2, 2.0, 0.1)
     standard[-3:] = (0.1, 0.3, 0.8)
     file = tmp_path_factory.mktemp("calibration") / "calibration.yaml"
-    save_calibration(_calibration("tx40", model, cell_limits(cell), standard, cell.digest), file)
+    calibration = _calibration("tx40", model, cell_limits(cell), standard, cell.digest)
+    save_calibration(calibration, file)
     return path, file, standard
 
 
@@ -139,9 +142,9 @@ def test_a_corrected_description_is_said_beside_the_bodies(
     calibration = load_calibration(file)
     offset = Parameter("zero-offset offset 2", 1e-4, 1e-5, "rad")
     zero = AcceptedEffect("zero-offset", calibration.gains[1].axis, {}, (offset,), 6.0, 3.0)
-    save_calibration(
-        replace(calibration, effects=(*calibration.effects, zero)), tmp_path / "zero.yaml"
-    )
+    effects = (*calibration.effects, zero)
+    changed_calibration = replace(calibration, effects=effects)
+    save_calibration(changed_calibration, tmp_path / "zero.yaml")
     for known, corrected in ((file, False), (tmp_path / "zero.yaml", True)):
         assert _export(cell, known, "--out", tmp_path / "out.urdf") == 0
         printed = " ".join(capsys.readouterr().out.split())
@@ -155,7 +158,9 @@ def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[s
     file = tmp_path / "c.yaml"
     out = tmp_path / "out.urdf"
     source.write_text(GANTRY.urdf)
-    model = Model(robot_from_urdf(GANTRY.urdf), DriveTrain(np.eye(5)))
+    drive_train = DriveTrain(np.eye(5))
+    robot = robot_from_urdf(GANTRY.urdf)
+    model = Model(robot, drive_train)
     standard = np.zeros(len(model.columns))
     for joint, link in enumerate(urdf_links(GANTRY.urdf)):
         standard[14 * joint : 14 * joint + 14] = (*(1.3 * link), 0.5, 3.0, 4.0, 0.2)
@@ -166,24 +171,28 @@ def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[s
     missing = AcceptedEffect(
         "ring-friction", calibration.gains[1].axis, {}, (cosine,), 6.1, 3.4, package="rings 1.2.0"
     )
-    save_calibration(replace(calibration, effects=(*calibration.effects, missing)), file)
+    effects = (*calibration.effects, missing)
+    changed_calibration = replace(calibration, effects=effects)
+    save_calibration(changed_calibration, file)
     assert _export(file, "--urdf", source, "--out", out, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["same_configuration"] is None
     rest = {entry["name"]: entry["value"] for entry in report["not_in_urdf"]}
     for number, joint in enumerate(report["joints"], start=1):
         rest |= {f"fv{number}": joint["damping"], f"fs{number}": joint["friction"]}
+    drive = np.array([rest.get(column.name, 0.0) for column in model.columns])
     _compare(
         model,
         out.read_text(),
-        np.array([rest.get(column.name, 0.0) for column in model.columns]),
+        drive,
         standard,
     )
 
 
 def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -> None:
     count = model.robot.joint_count
-    motion = random_motion(np.repeat([[0.2], [1.0], [2.0], [5.0]], count, axis=1), 30, 17)
+    limits = np.repeat([[0.2], [1.0], [2.0], [5.0]], count, axis=1)
+    motion = random_motion(limits, 30, 17)
     columns = model.regressor(motion)
     expected = np.einsum("jck,c->jk", columns, standard)
     friction = np.einsum("jck,c->jk", columns, drive)
@@ -197,7 +206,9 @@ def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -
             )
         ]
     ).T
-    assert np.linalg.norm(rigid + friction - expected) <= 2e-6 * np.linalg.norm(expected)
+    rigid_norm = np.linalg.norm(rigid + friction - expected)
+    expected_norm = np.linalg.norm(expected)
+    assert rigid_norm <= 2e-6 * expected_norm
 
 
 def test_an_impossible_calibration_is_projected_and_reported(
@@ -208,12 +219,14 @@ def test_an_impossible_calibration_is_projected_and_reported(
     broken = standard.copy()
     broken[14 * 4 + 12] = -0.3  # fs5
     file = tmp_path / "c.yaml"
-    save_calibration(_calibration("tx40", model_of(declared), cell_limits(declared), broken), file)
+    calibration = _calibration("tx40", model_of(declared), cell_limits(declared), broken)
+    save_calibration(calibration, file)
     assert _export(file, "--cell", cell, "--out", tmp_path / "r.urdf", "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert not report["exact"]
     assert not report["same_configuration"]
-    assert 0.0 < report["torque_change_percent"]["total"] < 10.0
+    total = report["torque_change_percent"]["total"]
+    assert 0.0 < total < 10.0
     assert "fs5" in {shift["name"] for shift in report["shifts"][:3]}
     assert all(joint["friction"] >= 0.0 and joint["mass_kg"] > 0.0 for joint in report["joints"])
     assert _export(file, "--cell", cell, "--out", tmp_path / "r.urdf") == 0
@@ -253,10 +266,12 @@ def test_of_a_closed_chain_the_tree_is_written_and_its_closures_are_named(
     robot = robot_of("five-bar")
     out = tmp_path / "out.urdf"
     assert _export(robot.cell_file, robot.saved(tmp_path), "--out", out) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    said = " ".join(printed.split())
     assert "exactly the identified one" in said
     assert "closure tip" in said
-    assert len(urdf_links(out.read_text())) == robot.model.robot.joint_count
+    joint_count = robot.model.robot.joint_count
+    assert len(urdf_links(out.read_text())) == joint_count
 
 
 def test_no_input_and_no_foreign_file_is_overwritten(
@@ -339,11 +354,11 @@ UPDATES = {"a": JointUpdate(BODY, 1.5, 0.25), "b": JointUpdate(BODY, 2.5, 0.5)}
 
 def test_everything_else_of_the_file_stays_byte_for_byte() -> None:
     updated = update_urdf(ODD.encode(), "odd.urdf", UPDATES, "by -- me -")
-    assert updated.links == {"a": "arm", "b": "slide"}
+    expected = {"a": "arm", "b": "slide"}
+    assert updated.links == expected
     assert updated.merged == ("tool",)
-    assert urdf_links(updated.content.decode()) == pytest.approx(
-        np.array([BODY.parameters] * 2), abs=1e-12
-    )
+    urdf = updated.content.decode()
+    assert urdf_links(urdf) == pytest.approx(np.array([BODY.parameters] * 2), abs=1e-12)
     text = updated.content.decode()
     assert '<dynamics damping="1.5" friction="0.25" spring="2"/>' in text
     assert '<dynamics damping="2.5" friction="0.5"/>' in text
@@ -426,16 +441,14 @@ def test_held_joints_are_fixed_in_the_exported_urdf(
         "</robot>", finger + 'effort="1" velocity="1"/></joint></robot>'
     )
     (tmp_path / "robot.urdf").write_text(urdf)
-    text = (
-        cell.read_text()
-        .replace("../robots/tx40.urdf", "robot.urdf")
-        .replace("axes:", "hold: {finger: 20}\naxes:", 1)
-    )
+    changed_text = cell.read_text().replace("../robots/tx40.urdf", "robot.urdf")
+    text = changed_text.replace("axes:", "hold: {finger: 20}\naxes:", 1)
     (tmp_path / "cell.yaml").write_text(text)
     out = tmp_path / "out.urdf"
     assert _export(calibration, "--cell", tmp_path / "cell.yaml", "--out", out) == 0
     exported = pin.buildModelFromXML(out.read_text())
-    assert list(exported.names)[1:] == [f"J{number}" for number in range(1, 7)]
+    expected = [f"J{number}" for number in range(1, 7)]
+    assert list(exported.names)[1:] == expected
     assert exported.existFrame("finger")
 
 
@@ -450,8 +463,9 @@ def _full_set(model: Model, standard: FloatArray) -> FullSet:
             share = 0.9
         parameter = FullParameter(column.name, value, 0.1, column.unit, basis, share, None, None)
         parameters.append(parameter)
+    urdf_sha256 = "a" * 64
     return FullSet(
-        "arm.urdf", "a" * 64, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ()
+        "arm.urdf", urdf_sha256, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ()
     )
 
 
@@ -463,15 +477,18 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     """
     monkeypatch.setattr(daq.environment, "find_spec", lambda _: None)
     robot = robot_of("kr270")
-    full = _full_set(robot.model, 1.01 * robot.standard)
-    file = robot.saved(tmp_path, replace(robot.calibration, full_parameters=full))
+    standard = 1.01 * robot.standard
+    full = _full_set(robot.model, standard)
+    calibration = replace(robot.calibration, full_parameters=full)
+    file = robot.saved(tmp_path, calibration)
     out = tmp_path / "robot.urdf"
     assert _export(robot.cell_file, file, "--out", out, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["chosen_by"] == "full_parameters of the calibration"
     assert [one["value"] for one in report["parameters"]] == [one.value for one in full.parameters]
     assert [one["name"] for one in report["parameters"] if one["basis"] == "prior"] == ["m1"]
-    assert report["torque_change_percent"]["total"] == pytest.approx(1.0, abs=1e-6)
+    total = report["torque_change_percent"]["total"]
+    assert total == pytest.approx(1.0, abs=1e-6)
     largest = max(report["shifts"], key=lambda shift: shift["standard_deviations"])
     assert report["shifts"][0] == largest
     for shift in report["shifts"]:
@@ -484,7 +501,8 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
     model = tmp_path / "robot.xml"
     words = [str(word) for word in (robot.cell_file, file, "--out", model, "--json")]
     assert main(["export", "mjcf", *words]) == 0
-    assert json.loads(capsys.readouterr().out)["parameters"] == report["parameters"]
+    document = json.loads(capsys.readouterr().out)
+    assert document["parameters"] == report["parameters"]
     assert _export(robot.cell_file, file, "--out", out) == 0
     assert "The torque of these bodies differs by 1 %" in capsys.readouterr().out
 
@@ -500,7 +518,8 @@ class _SlidingFriction(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Return one column."""
-        return np.asarray(np.sign(signals.velocity_rad_s[axis])[None])
+        velocity_sign = np.sign(signals.velocity_rad_s[axis])
+        return np.asarray(velocity_sign[None])
 
 
 def _with_friction_of_a_package(calibration: Calibration, axis: str) -> Calibration:
@@ -510,7 +529,8 @@ def _with_friction_of_a_package(calibration: Calibration, axis: str) -> Calibrat
         "sliding-friction", axis, {}, (coefficient,), 6.1, 3.4, package="slides 1.2.0"
     )
     parameters = (*calibration.parameters, coefficient)
-    return replace(calibration, parameters=parameters, effects=(*calibration.effects, effect))
+    effects = (*calibration.effects, effect)
+    return replace(calibration, parameters=parameters, effects=effects)
 
 
 def test_bodies_are_the_same_where_the_package_of_an_effect_is_not_installed(
@@ -535,7 +555,8 @@ def test_bodies_are_the_same_where_the_package_of_an_effect_is_not_installed(
         gone = [effect.accepted for effect in missing]
         return full_choice(installed, model, limits, cell.urdf, gone)
 
-    with_package = choose(replace(known, own_effects=(_SlidingFriction(),)))
+    changed_known = replace(known, own_effects=(_SlidingFriction(),))
+    with_package = choose(changed_known)
     without = choose(known)
     assert with_package.exact
     np.testing.assert_array_equal(without.standard, with_package.standard)

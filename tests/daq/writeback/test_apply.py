@@ -40,12 +40,14 @@ def controller(tmp_path: Path) -> Path:
     """A copy of the demo controller's file in a folder of its own."""
     path = tmp_path / "the controllers" / "demo.yaml"
     path.parent.mkdir()
-    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", path)
+    demo_path = CONFIGS / "controllers" / "demo.yaml"
+    shutil.copyfile(demo_path, path)
     return path
 
 
 def _propose(calibration: Calibration, controller: Path) -> Proposal[FileEdit]:
-    return propose(FileTarget(controller, KEYS), Request(calibration, NOW))
+    target = FileTarget(controller, KEYS)
+    return propose(target, Request(calibration, NOW))
 
 
 def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
@@ -57,13 +59,15 @@ def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
     assert "+    gain: -9.2100       # Nm at the joint per A\n" in proposal.edit.diff
     assert proposal.edit.diff.count("\n+ ") == proposal.edit.diff.count("\n- ") == 6
     assert controller.read_bytes() == before
-    assert list(controller.parent.iterdir()) == [controller]
+    files = list(controller.parent.iterdir())
+    assert files == [controller]
 
 
 def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -> None:
     controller.chmod(0o640)
     before = controller.read_bytes()
-    written = apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    written = apply(proposal, NOW)
     assert written is not None
     expected = before
     for old, new in (
@@ -74,17 +78,20 @@ def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -
     ):
         assert expected.count(old) == 1
         expected = expected.replace(old, new)
-    expected = expected.replace(b"32.96", b"33.900", 1).replace(b"32.96", b"32.400", 1)
+    changed_expected = expected.replace(b"32.96", b"33.900", 1)
+    expected = changed_expected.replace(b"32.96", b"32.400", 1)
     assert controller.read_bytes() == expected
     digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (before, expected))
     assert written.backup == controller.parent / f"demo.yaml.20250102T030405Z.{digests}.bak"
     assert written.backup.read_bytes() == before
-    assert sorted(controller.parent.iterdir()) == sorted([controller, written.backup])
+    sorted_files = sorted(controller.parent.iterdir())
+    assert sorted_files == sorted([controller, written.backup])
     assert {stat.S_IMODE(path.stat().st_mode) for path in (controller, written.backup)} == {0o640}
 
 
 def test_applying_twice_changes_nothing_the_second_time(controller: Path) -> None:
-    apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    apply(proposal, NOW)
     again = _propose(demo_calibration(), controller)
     assert again.edit.diff == ""
     assert apply(again, NOW) is None
@@ -95,10 +102,12 @@ def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
     fewer = replace(demo_calibration(), gains=demo_calibration().gains[:5])
     with pytest.raises(CalibrationRefused, match="J1, J2, J3, J4, J5; expected"):
         _propose(fewer, controller)
+    target = FileTarget(controller, {**KEYS, "J2": "drives.J1.gain"})
+    request = Request(demo_calibration(), NOW)
     with pytest.raises(ControllerUnfit, match=r"drives\.J1\.gain for more than one axis"):
         propose(
-            FileTarget(controller, {**KEYS, "J2": "drives.J1.gain"}),
-            Request(demo_calibration(), NOW),
+            target,
+            request,
         )
 
 
@@ -114,7 +123,8 @@ def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
 def test_a_controller_file_that_does_not_fit_is_refused(
     controller: Path, old: str, new: str, says: str | None
 ) -> None:
-    controller.write_text(controller.read_text().replace(old, new))
+    changed_text = controller.read_text().replace(old, new)
+    controller.write_text(changed_text)
     with pytest.raises(ControllerUnfit, match=says):
         _propose(demo_calibration(), controller)
 
@@ -133,7 +143,8 @@ def test_a_file_changed_since_the_diff_is_refused(controller: Path) -> None:
     with pytest.raises(ControllerChanged):
         apply(proposal, NOW)
     assert controller.read_bytes() == changed
-    assert list(controller.parent.iterdir()) == [controller]
+    files = list(controller.parent.iterdir())
+    assert files == [controller]
 
 
 def test_a_second_writer_is_refused(controller: Path) -> None:
@@ -208,21 +219,24 @@ def test_two_names_of_one_number_are_refused(
     file = tmp_path / name
     file.write_text(content)
     two = replace(demo_calibration(), gains=demo_calibration().gains[:2])
+    target = FileTarget(file, dict(zip(("J1", "J2"), keys, strict=True)))
     with pytest.raises(ControllerUnfit, match="which name the same number"):
-        propose(FileTarget(file, dict(zip(("J1", "J2"), keys, strict=True))), Request(two, NOW))
+        propose(target, Request(two, NOW))
 
 
 def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
-    written = apply(_propose(demo_calibration(), link), NOW)
+    proposal = _propose(demo_calibration(), link)
+    written = apply(proposal, NOW)
     assert written is not None
     assert written.backup is not None
     assert link.is_symlink()
     assert written.edit.subject == str(controller)
     assert written.backup.parent == controller.parent
     assert b"-9.2100" in controller.read_bytes()
-    assert rollback(FileTarget(link), NOW).edit.subject == str(controller)
+    edit = rollback(FileTarget(link), NOW).edit
+    assert edit.subject == str(controller)
     assert b"-11.52" in controller.read_bytes()
 
 
@@ -250,7 +264,8 @@ def test_whatever_step_fails_the_old_file_stays_and_nothing_is_left(
     failures = 0
     while True:
         proposal = _propose(demo_calibration(), controller)
-        failing = _Failing(getattr(os, name), failures + 1)
+        call = getattr(os, name)
+        failing = _Failing(call, failures + 1)
         with monkeypatch.context() as patch:
             patch.setattr(os, name, failing)
             try:
@@ -262,7 +277,8 @@ def test_whatever_step_fails_the_old_file_stays_and_nothing_is_left(
         failures += 1
         assert written is None
         assert controller.read_bytes() == before
-        assert list(controller.parent.iterdir()) == [controller]
+        files = list(controller.parent.iterdir())
+        assert files == [controller]
     assert written is not None
     assert failures >= {"open": 5, "fchmod": 2, "fsync": 4, "replace": 2}[name]
 
@@ -285,7 +301,8 @@ def test_a_disk_that_gives_back_something_else_is_noticed(
         apply(proposal, NOW)
     monkeypatch.undo()
     assert controller.read_bytes() == before
-    assert list(controller.parent.iterdir()) == [controller]
+    files = list(controller.parent.iterdir())
+    assert files == [controller]
 
 
 @pytest.mark.parametrize("does", ["saves it", "deletes it"])
@@ -299,7 +316,8 @@ def test_what_a_person_saves_during_the_write_is_not_lost(
 
     def meanwhile(descriptor: int) -> None:
         fsync(descriptor)
-        if Path(f"/proc/self/fd/{descriptor}").readlink().suffix == ".tmp" and backups(controller):
+        path = Path(f"/proc/self/fd/{descriptor}")
+        if path.readlink().suffix == ".tmp" and backups(controller):
             if does == "saves it":
                 controller.write_bytes(edited)
             else:
@@ -310,15 +328,18 @@ def test_what_a_person_saves_during_the_write_is_not_lost(
     with pytest.raises(ControllerChanged, match="meanwhile"):
         apply(proposal, NOW, audit=audit, who="T")
     monkeypatch.undo()
-    assert list(controller.parent.iterdir()) == ([controller] if does == "saves it" else [])
+    files = list(controller.parent.iterdir())
+    assert files == ([controller] if does == "saves it" else [])
     assert not controller.exists() or controller.read_bytes() == edited
-    assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]
+    actions = [entry.action for entry in read(audit)]
+    assert actions == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]
 
 
 def test_a_file_that_someone_makes_during_a_rollback_stays(
     controller: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    apply(proposal, NOW)
     controller.unlink()
     fsync = os.fsync
 
@@ -334,11 +355,13 @@ def test_a_file_that_someone_makes_during_a_rollback_stays(
 
 def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
     original = controller.read_bytes()
-    first = apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    first = apply(proposal, NOW)
     assert first is not None
     calibrated = controller.read_bytes()
 
-    back = rollback(FileTarget(controller), NOW + timedelta(minutes=1))
+    now = NOW + timedelta(minutes=1)
+    back = rollback(FileTarget(controller), now)
     assert controller.read_bytes() == original
     assert back.edit.source == first.backup
     assert back.backup is not None
@@ -350,9 +373,11 @@ def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
 
 
 def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path) -> None:
-    apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    apply(proposal, NOW)
     for step in (0, -3600, 0, -7200):
-        rollback(FileTarget(controller), NOW + timedelta(seconds=step))
+        now = NOW + timedelta(seconds=step)
+        rollback(FileTarget(controller), now)
     assert [(one.stamp, one.count) for one in backups(controller)] == [
         ("20250102T030405Z", k) for k in range(5)
     ]
@@ -380,15 +405,18 @@ def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> Non
     controller.with_name("demo.yaml.bak").write_text("a human's own")
     controller.unlink()
     controller.parent.joinpath("other.yaml").write_text("x: 1\n")
+    file = controller.with_name("other.yaml")
     with pytest.raises(CalibrationRefused, match="no backup beside it"):
-        rollback(FileTarget(controller.with_name("other.yaml")), NOW)
+        rollback(FileTarget(file), NOW)
 
 
 def test_a_write_that_was_killed_half_way_is_passed_over(controller: Path) -> None:
     original = controller.read_bytes()
-    apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    apply(proposal, NOW)
     _make_backup(controller, controller.read_bytes(), b"never written", "20250102T040405Z")
-    rollback(FileTarget(controller), NOW + timedelta(hours=2))
+    now = NOW + timedelta(hours=2)
+    rollback(FileTarget(controller), now)
     assert controller.read_bytes() == original
 
 
@@ -402,7 +430,8 @@ def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"drives: {}\n"])
 def test_a_backup_that_was_gutted_is_not_restored(controller: Path, content: bytes) -> None:
-    written = apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    written = apply(proposal, NOW)
     assert written is not None
     assert written.backup is not None
     written.backup.write_bytes(content)
@@ -414,18 +443,22 @@ def test_a_backup_that_was_gutted_is_not_restored(controller: Path, content: byt
             rollback(FileTarget(controller), NOW)
         assert controller.exists() is not deleted
     assert written.edit.after == calibrated
-    assert list(controller.parent.iterdir()) == [written.backup]
+    files = list(controller.parent.iterdir())
+    assert files == [written.backup]
 
 
 def test_a_deleted_file_comes_back(controller: Path, capsys: pytest.CaptureFixture[str]) -> None:
     controller.chmod(0o640)
     original = controller.read_bytes()
-    apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    apply(proposal, NOW)
     controller.unlink()
     assert main(["rollback", "--to", str(controller), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["backup"] is None
+    document = json.loads(capsys.readouterr().out)
+    assert document["backup"] is None
     assert controller.read_bytes() == original
-    assert stat.S_IMODE(controller.stat().st_mode) == 0o640
+    st_mode = controller.stat().st_mode
+    assert stat.S_IMODE(st_mode) == 0o640
     controller.unlink()
     assert main(["rollback", "--to", str(controller)]) == 0
     assert "the file was gone" in capsys.readouterr().out
@@ -434,13 +467,16 @@ def test_a_deleted_file_comes_back(controller: Path, capsys: pytest.CaptureFixtu
 def test_an_edit_since_the_write_is_not_lost(
     controller: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = controller.parent.rename(controller.parent.parent / "my controllers")
+    my_controllers_folder = controller.parent.parent / "my controllers"
+    folder = controller.parent.rename(my_controllers_folder)
     controller = folder / controller.name
-    written = apply(_propose(demo_calibration(), controller), NOW)
+    proposal = _propose(demo_calibration(), controller)
+    written = apply(proposal, NOW)
     assert written is not None
     edited = controller.read_bytes().replace(b"120.0", b"130.0")
     controller.write_bytes(edited)
     assert main(["rollback", "--to", str(controller)]) == 3
-    output = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    output = " ".join(error_output.split())
     assert f"`diff {shlex.quote(str(written.backup))} {shlex.quote(str(controller))}`" in output
     assert controller.read_bytes() == edited

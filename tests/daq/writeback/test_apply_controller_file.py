@@ -47,17 +47,19 @@ def test_of_a_file_on_the_disk_nothing_but_the_gains_changes(
         keys = dict(zip(axes, case.keys, strict=True))
         # Its own file is not under test, and to spell it would take as long as all the rest.
         now = datetime(2025, 1, 2, tzinfo=UTC)
-        proposal = propose(
-            FileTarget(file, keys), Request(calibration, now, content=b"a calibration")
-        )
+        request = Request(calibration, now, content=b"a calibration")
+        target = FileTarget(file, keys)
+        proposal = propose(target, request)
         assert proposal.refusals == ()
         written = apply(proposal, now, audit=audit, who="Ada")
-        assert file.read_bytes() == case.text(spelt).encode()
+        expected = case.text(spelt).encode()
+        assert file.read_bytes() == expected
         if spelt != case.numbers:
             assert written is not None
             assert written.backup is not None
             assert written.backup.read_bytes() == case.text(case.numbers).encode()
-            assert [entry.action for entry in read(audit)] == [
+            actions = [entry.action for entry in read(audit)]
+            assert actions == [
                 AuditAction.APPLY_BEGUN,
                 AuditAction.APPLIED,
             ]

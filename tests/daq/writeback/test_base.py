@@ -25,13 +25,17 @@ from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simu
 
 def _findings(base: str | None, before: bytes, after: bytes) -> list[GateFinding]:
     request = Request(demo_calibration(), datetime(2025, 1, 2, tzinfo=UTC), base=base)
-    return list(base_gate(GateContext(request, Edit(subject="x", before=before, after=after))))
+    edit = Edit(subject="x", before=before, after=after)
+    context = GateContext(request, edit)
+    return list(base_gate(context))
 
 
 @given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
 def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, another: bytes) -> None:
-    reviewed, _ = parse_base(f" {change_digest(before, after).upper()}\n", before)
-    assert reviewed == hashlib.sha256(before).hexdigest()
+    base = f" {change_digest(before, after).upper()}\n"
+    reviewed, _ = parse_base(base, before)
+    expected = hashlib.sha256(before).hexdigest()
+    assert reviewed == expected
     assert _findings(change_digest(before, after), before, after) == []
     assert bool(_findings(change_digest(before, after), before, another)) == (
         another not in (before, after)
@@ -62,7 +66,9 @@ def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
 @pytest.fixture
 def simulation(cell: Cell) -> Iterator[SimulatedCell]:
     """Its drives."""
-    with simulated(BusAddress("virtual", cell.buses[0].channel)) as running:
+    channel = cell.buses[0].channel
+    address = BusAddress("virtual", channel)
+    with simulated(address) as running:
         yield running
 
 
@@ -71,9 +77,12 @@ def test_the_drives_get_the_change_that_was_reviewed_and_no_other(
 ) -> None:
     calibration = demo_calibration()
     apply_in_drives(cell, calibration=calibration, base=None, yes=False)
-    base = capsys.readouterr().out.split("--base ")[1].split(maxsplit=1)[0]
-    moved = replace(calibration.gains[3], value=calibration.gains[3].value * 1.01)
-    another = replace(calibration, gains=(*calibration.gains[:3], moved, *calibration.gains[4:]))
+    printed = capsys.readouterr().out
+    base = printed.split("--base ")[1].split(maxsplit=1)[0]
+    gain = calibration.gains[3].value
+    moved = replace(calibration.gains[3], value=gain * 1.01)
+    gains = (*calibration.gains[:3], moved, *calibration.gains[4:])
+    another = replace(calibration, gains=gains)
     with pytest.raises(CalibrationRefused, match="have changed since the dry run"):
         apply_in_drives(cell, calibration=another, base=base, yes=True)
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)

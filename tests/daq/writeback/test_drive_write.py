@@ -104,7 +104,8 @@ def _apply(
     proposal: Proposal[DriveEdit], target: DriveTarget, audit: Path | None = None
 ) -> Written:
     """Write a proposal, in a network that may be another than the one it was planned in."""
-    written = apply(replace(proposal, target=target), NOW, audit=audit, who="T")
+    changed_proposal = replace(proposal, target=target)
+    written = apply(changed_proposal, NOW, audit=audit, who="T")
     assert written is not None
     return written
 
@@ -121,7 +122,8 @@ def _write(
     assert proposal.refusals == ()
     assert cell.history is not None
     with network_of(cell, address, mapping) as network:
-        return _apply(proposal, DriveTarget(cell, network, saving), cell.history.audit)
+        target = DriveTarget(cell, network, saving)
+        return _apply(proposal, target, cell.history.audit)
 
 
 def _backup(written: Written) -> Path:
@@ -152,8 +154,11 @@ def test_gains_are_written_read_back_and_saved(
         for node in simulation.nodes:
             node.command_nmt(NmtCommand.RESET_NODE, 0.0)
         assert _gains(simulation) == NEW
-        assert [node.saved.pdos for node in simulation.nodes] == [stored.pdos for stored in before]
-    assert [node for node, *_ in listener.downloads()] == [1, 2, 3, 4, 5, 6] * 2
+        pdos = [node.saved.pdos for node in simulation.nodes]
+        expected = [stored.pdos for stored in before]
+        assert pdos == expected
+    nodes = [node for node, *_ in listener.downloads()]
+    assert nodes == [1, 2, 3, 4, 5, 6] * 2
 
 
 def test_nothing_but_the_gain_and_the_save_is_ever_sent(
@@ -169,7 +174,8 @@ def test_nothing_but_the_gain_and_the_save_is_ever_sent(
         for frame in heard
         if not 0x580 < frame.arbitration_id < 0x600 and frame.arbitration_id < 0x700
     ]
-    assert {frame.arbitration_id for frame in ours} == set(range(0x601, 0x607))
+    expected = set(range(0x601, 0x607))
+    assert {frame.arbitration_id for frame in ours} == expected
     written = {
         int.from_bytes(frame.data[1:3], "little") for frame in ours if frame.data[0] >> 5 == 1
     }
@@ -183,7 +189,8 @@ def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_p
         proposal = _propose(cell, network)
     assert listener.downloads() == []
     assert list(tmp_path.iterdir()) == []
-    assert [change.current_gain for change in proposal.edit.changes] == IN_DRIVES
+    current_gains = [change.current_gain for change in proposal.edit.changes]
+    assert current_gains == IN_DRIVES
     assert [change.new for change in proposal.edit.changes] == NEW
     assert proposal.edit.changes[3].key == "J4, 2003h:01"
     assert proposal.edit.before != proposal.edit.after
@@ -192,11 +199,15 @@ def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_p
 def test_a_real_object_and_another_sign_and_unit(address: BusAddress, tmp_path: Path) -> None:
     negative = replace(REAL, factor=-0.5)
     cell = demo_cell(tmp_path, *(negative if axis == "J4" else REAL for axis in AXES))
-    with simulated(address, entered=(*NAMEPLATE[:3], 5.76, *NAMEPLATE[4:])) as simulation:
+    entered = (*NAMEPLATE[:3], 5.76, *NAMEPLATE[4:])
+    with simulated(address, entered=entered) as simulation:
         written = _write(cell, address)
-        assert entered_gain(simulation.nodes[3], REAL) == pytest.approx(4.605, rel=1e-6)
-        assert entered_gain(simulation.nodes[0], REAL) == pytest.approx(33.9, rel=1e-6)
-    assert written.parameters[0].parameter.kind is ParameterKind.F32
+        node = simulation.nodes[3]
+        assert entered_gain(node, REAL) == pytest.approx(4.605, rel=1e-6)
+        first_node = simulation.nodes[0]
+        assert entered_gain(first_node, REAL) == pytest.approx(33.9, rel=1e-6)
+    parameter = written.parameters[0].parameter
+    assert parameter.kind is ParameterKind.F32
 
 
 def test_written_to_ram_alone_is_gone_with_the_power(address: BusAddress, tmp_path: Path) -> None:
@@ -206,7 +217,8 @@ def test_written_to_ram_alone_is_gone_with_the_power(address: BusAddress, tmp_pa
         assert _gains(simulation) == NEW
         assert _saved(simulation) == IN_DRIVES
         # A value in RAM is no reason not to save it the next time.
-        assert all(change.saved for change in _write(demo_cell(tmp_path), address).parameters)
+        parameters = _write(demo_cell(tmp_path), address).parameters
+        assert all(change.saved for change in parameters)
         assert _saved(simulation) == NEW
 
 
@@ -290,9 +302,8 @@ def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
         ) as caught:
             _write(cell, address)
         restored = AXES if kind is FaultKind.REFUSES_SAVE else AXES[:3]
-        assert caught.value.__notes__ == [
-            f"kept: the previous values are restored in {', '.join(restored)}"
-        ]
+        expected = [f"kept: the previous values are restored in {', '.join(restored)}"]
+        assert caught.value.__notes__ == expected
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -342,7 +353,9 @@ def test_whichever_transfer_fails_the_old_values_stay_everywhere(
     whole = demo_cell(tmp_path)
     count = 3
     left = 0
-    cell = replace(whole, axes=whole.axes[:count], controller=Controller(objects=(WHOLE,) * count))
+    objects = (WHOLE,) * count
+    controller = Controller(objects=objects)
+    cell = replace(whole, axes=whole.axes[:count], controller=controller)
     changed = pytest.approx([*IDENTIFIED[:count], *NAMEPLATE[count:]])
 
     def failing(transfer: Callable[..., int | None]) -> Callable[..., int | None]:
@@ -360,7 +373,8 @@ def test_whichever_transfer_fails_the_old_values_stay_everywhere(
 
     with simulated(address) as simulation:
         with network_of(cell, address) as network:
-            proposal = _propose(cell, network, of_first_axes(demo_calibration(), count))
+            calibration = of_first_axes(demo_calibration(), count)
+            proposal = _propose(cell, network, calibration)
         assert proposal.refusals == ()
         monkeypatch.setattr(ObjectAccess, "read", failing(ObjectAccess.read))
         monkeypatch.setattr(ObjectAccess, "write", failing(ObjectAccess.write))
@@ -466,7 +480,8 @@ def test_what_a_killed_recording_left_is_not_saved(
         assert _saved(simulation) == IN_DRIVES
         # Categories of their own do not keep the mapping, and RAM keeps nothing.
         with network_of(cell, address, Mapping.SEPARATE) as network:
-            assert _apply(proposal, DriveTarget(cell, network)).parameters[0].saved
+            target = DriveTarget(cell, network)
+            assert _apply(proposal, target).parameters[0].saved
         assert _gains(simulation) == NEW
 
 
@@ -503,9 +518,8 @@ def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(
         ):
             _write(cell, address, mapping=Mapping.UNKNOWN)
         assert _gains(simulation) == IN_DRIVES
-        assert all(
-            change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters
-        )
+        parameters = _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters
+        assert all(change.saved for change in parameters)
         assert _saved(simulation) == NEW
 
 
@@ -515,8 +529,10 @@ def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path
         network.axes = tuple(
             replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes
         )
+        proposal = _propose(cell, network)
+        target = DriveTarget(cell, network, Saving.ANY)
         with pytest.raises(ParameterRefused, match="is not described in its profile"):
-            _apply(_propose(cell, network), DriveTarget(cell, network, Saving.ANY))
+            _apply(proposal, target)
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -525,30 +541,32 @@ def test_the_gates_are_those_of_a_file(
 ) -> None:
     cell = demo_cell(tmp_path)
     calibration = demo_calibration()
-    far = replace(
-        calibration, gains=(replace(calibration.gains[0], value=60.0), *calibration.gains[1:])
-    )
+    gains = (replace(calibration.gains[0], value=60.0), *calibration.gains[1:])
+    far = replace(calibration, gains=gains)
     with simulated(address), network_of(cell, address) as network:
-        proposal = _propose(cell, network, far, base="0" * 64)
-        assert [refusal.gate for refusal in proposal.refusals] == [
-            Gate.BASE,
-            Gate.CHANGE,
-            Gate.NAMEPLATE,
-        ]
-        reviewed = _propose(cell, network, base=_propose(cell, network).edit.base_sha256)
+        base = "0" * 64
+        proposal = _propose(cell, network, far, base=base)
+        expected = [Gate.BASE, Gate.CHANGE, Gate.NAMEPLATE]
+        gates = [refusal.gate for refusal in proposal.refusals]
+        assert gates == expected
+        base_sha256 = _propose(cell, network).edit.base_sha256
+        reviewed = _propose(cell, network, base=base_sha256)
         assert reviewed.refusals == ()
+        target = DriveTarget(cell, network)
+        audit = tmp_path / "audit"
         with pytest.raises(CalibrationRefused, match="3 failed checks"):
-            _apply(proposal, DriveTarget(cell, network), tmp_path / "audit")
-        strange = replace(
-            calibration, gains=(*calibration.gains[:5], replace(calibration.gains[5], axis="J9"))
-        )
+            _apply(proposal, target, audit)
+        changed_gain = replace(calibration.gains[5], axis="J9")
+        strange = replace(calibration, gains=(*calibration.gains[:5], changed_gain))
         with pytest.raises(CalibrationRefused, match="one for each axis of the cell"):
             _propose(cell, network, strange)
         nowhere = replace(cell, controller=None)
         with pytest.raises(ConfigurationInconsistent, match="no objects in the drives"):
             _propose(nowhere, network)
     assert listener.downloads() == []
-    assert [entry.action for entry in read(tmp_path / "audit")] == [AuditAction.REFUSED]
+    path = tmp_path / "audit"
+    actions = [entry.action for entry in read(path)]
+    assert actions == [AuditAction.REFUSED]
 
 
 @pytest.mark.parametrize(
@@ -576,7 +594,8 @@ def test_an_object_that_cannot_hold_the_gain_is_refused(
     address: BusAddress, tmp_path: Path, gain_object: GainObject, says: str
 ) -> None:
     calibration = demo_calibration()
-    gains = (replace(calibration.gains[0], value=33.7, std=0.135), *calibration.gains[1:])
+    changed_gain = replace(calibration.gains[0], value=33.7, std=0.135)
+    gains = (changed_gain, *calibration.gains[1:])
     cell = demo_cell(tmp_path, *(gain_object,) * 6)
     with (
         simulated(address),
@@ -616,15 +635,18 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
             (2, IN_DRIVES, IN_DRIVES),
         ):
             with network_of(cell, address) as network:
+                now = NOW + timedelta(minutes=minutes)
+                target = DriveTarget(cell, network)
                 rollback(
-                    DriveTarget(cell, network),
-                    NOW + timedelta(minutes=minutes),
+                    target,
+                    now,
                     audit=cell.history.audit,
                     who="T",
                 )
             assert _gains(simulation) == expected
             assert _saved(simulation) == saved
-    assert len(read_records(record_folder(cell))) == 4
+    records = read_records(record_folder(cell))
+    assert len(records) == 4
     actions = [entry.action for entry in read(cell.history.audit)]
     assert (
         actions
@@ -656,11 +678,16 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(
             ),
         ):
             rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
-        rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=NOW)
+        planned = plan_rename(ledger, "demo")
+        rename_cell(ledger, planned, who="T", at=NOW)
         with network_of(press, address) as network:
-            rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
+            target = DriveTarget(press, network)
+            rollback(target, NOW, audit=ledger.audit, who="T")
         assert _gains(simulation) == IN_DRIVES
-    assert [event.target for event in read_history(ledger).events] == [drives_of("press")] * 2
+    events = read_history(ledger).events
+    targets = [event.target for event in events]
+    expected = [drives_of("press")] * 2
+    assert targets == expected
 
 
 @pytest.mark.parametrize("renamed_after_s", [-60, 60])
@@ -676,10 +703,12 @@ def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
     acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
     with simulated(address) as simulation:
         if renamed_after_s < 0:
-            rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=renamed_at)
+            planned = plan_rename(ledger, "demo")
+            rename_cell(ledger, planned, who="T", at=renamed_at)
         _write(demo, address)
         if renamed_after_s > 0:
-            rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=renamed_at)
+            rename = plan_rename(ledger, "demo")
+            rename_cell(ledger, rename, who="T", at=renamed_at)
         written = _gains(simulation)
         owner, other = (demo, press) if renamed_after_s < 0 else (press, demo)
         with (
@@ -689,7 +718,8 @@ def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
             rollback(DriveTarget(other, network), NOW, audit=ledger.audit, who="T")
         assert _gains(simulation) == written
         with network_of(owner, address) as network:
-            rollback(DriveTarget(owner, network), NOW, audit=ledger.audit, who="T")
+            target = DriveTarget(owner, network)
+            rollback(target, NOW, audit=ledger.audit, who="T")
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -735,14 +765,13 @@ def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(
             assert _propose(cell, network).refusals == ()
         network.link.objects(5).write(entry, 18000)
         changed = _propose(cell, network)
-        assert [(one.gate, one.subject, one.found) for one in changed.refusals] == [
-            (Gate.BASE, "J5, 2003h:01", "18000")
-        ]
+        expected = [(Gate.BASE, "J5, 2003h:01", "18000")]
+        assert [(one.gate, one.subject, one.found) for one in changed.refusals] == expected
         assert "16300" in changed.refusals[0].expected
-        assert _propose(cell, network, base=changed.edit.base_sha256).refusals == ()
-        assert [
-            one.gate for one in _propose(cell, network, base=first.edit.base_sha256).refusals
-        ] == [Gate.BASE]
+        refusals = _propose(cell, network, base=changed.edit.base_sha256).refusals
+        assert refusals == ()
+        gates = [one.gate for one in _propose(cell, network, base=first.edit.base_sha256).refusals]
+        assert gates == [Gate.BASE]
         network.link.objects(5).write(entry, 16300)
         _backup(written).write_text("{}")
         unread = _propose(cell, network)
@@ -756,8 +785,11 @@ def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path
     cell = demo_cell(tmp_path)
     with simulated(address):
         _write(cell, address)
-    new = replace(cell, axes=(replace(cell.axes[0], identity=None), *cell.axes[1:]))
-    with simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 0), entered=IDENTIFIED) as simulation:
+    changed_axis = replace(cell.axes[0], identity=None)
+    axes = (changed_axis, *cell.axes[1:])
+    new = replace(cell, axes=axes)
+    fault_spec = FaultSpec(FaultKind.OTHER_SERIAL, 0)
+    with simulated(address, fault_spec, entered=IDENTIFIED) as simulation:
         with (
             network_of(new, address) as network,
             pytest.raises(ControllerChanged, match="serial number 1002"),
@@ -783,9 +815,8 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(
         changed = min(writes, 6)
         assert _gains(simulation) == pytest.approx([*IDENTIFIED[:changed], *NAMEPLATE[changed:]])
         (path,) = read_records(record_folder(cell))
-        assert [
-            note.parameter.value(note.old) / 1000.0 for note in read_record(path).drives
-        ] == IN_DRIVES
+        drives = read_record(path).drives
+        assert [note.parameter.value(note.old) / 1000.0 for note in drives] == IN_DRIVES
         (left,) = verify(cell.history.audit).open_writes
         assert left.begun.action is AuditAction.APPLY_BEGUN
         with network_of(cell, hub.address()) as network:

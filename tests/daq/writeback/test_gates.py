@@ -68,7 +68,8 @@ class Scene:
         if self.file is not None:
             self.file.write_bytes(content)
             for name in self.signed:
-                sign(self.file, self.file.parent / f"{name}.key", name, at=NOW)
+                secret_key = self.file.parent / f"{name}.key"
+                sign(self.file, secret_key, name, at=NOW)
         request = Request(
             self.calibration,
             self.now,
@@ -79,33 +80,39 @@ class Scene:
             file=self.file,
             content=content,
         )
-        return propose(FileTarget.of(self.cell, self.controller), request)
+        target = FileTarget.of(self.cell, self.controller)
+        return propose(target, request)
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Scene:
     """A calibration of the demo cell that Ada applies and Bob has signed."""
     controller = tmp_path / "demo.yaml"
-    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controller)
-    cell = load_cell(CONFIGS / "cells" / "demo.yaml")
+    demo_path = CONFIGS / "controllers" / "demo.yaml"
+    shutil.copyfile(demo_path, controller)
+    path = CONFIGS / "cells" / "demo.yaml"
+    cell = load_cell(path)
     keys = {name: generate(tmp_path, name)[1].line for name in ("Ada", "Bob")}
     calibration = with_recordings(
         demo_calibration(), controller_sha256=sha256(controller.read_bytes())
     )
+    changed_calibration = replace(
+        calibration,
+        configuration_sha256=cell.digest,
+        recording_configuration_sha256=cell.recording_digest,
+    )
+    policy = ApplyPolicy(signatures=1, signers=keys)
+    file = tmp_path / "calibration.yaml"
     return Scene(
-        calibration=replace(
-            calibration,
-            configuration_sha256=cell.digest,
-            recording_configuration_sha256=cell.recording_digest,
-        ),
+        calibration=changed_calibration,
         cell=cell,
         controller=controller,
-        policy=ApplyPolicy(signatures=1, signers=keys),
+        policy=policy,
         now=NOW,
         entered_kg={},
         base=None,
         appliers=("Ada", "root"),
-        file=tmp_path / "calibration.yaml",
+        file=file,
         signed=("Bob",),
     )
 
@@ -116,7 +123,8 @@ def _gain(axis: str, **changes: float) -> Callable[[Scene], Scene]:
             _changed(gain, changes) if gain.axis == axis else gain
             for gain in scene.calibration.gains
         )
-        return replace(scene, calibration=replace(scene.calibration, gains=gains))
+        calibration = replace(scene.calibration, gains=gains)
+        return replace(scene, calibration=calibration)
 
     return broken
 
@@ -156,7 +164,8 @@ def _payload(**changes: object) -> Callable[[Scene], Scene]:
 
     def broken(scene: Scene) -> Scene:
         payloads = (replace(one, **changes) for one in scene.cell.payloads)  # type: ignore[arg-type]
-        return replace(scene, cell=replace(scene.cell, payloads=tuple(payloads)))
+        cell = replace(scene.cell, payloads=tuple(payloads))
+        return replace(scene, cell=cell)
 
     return broken
 
@@ -178,7 +187,8 @@ def _source(index: int, **changes: object) -> Callable[[Scene], Scene]:
         if reported is not None and of_recording:
             rest["recording"] = replace(reported, **of_recording)  # type: ignore[arg-type]
         sources[index] = replace(sources[index], **rest)  # type: ignore[arg-type]
-        return replace(scene, calibration=replace(scene.calibration, sources=tuple(sources)))
+        calibration = replace(scene.calibration, sources=tuple(sources))
+        return replace(scene, calibration=calibration)
 
     return broken
 
@@ -204,7 +214,8 @@ def _corrected(effect: str, diagnosis: Diagnosis) -> Callable[[Scene], Scene]:
     """
 
     def broken(scene: Scene) -> Scene:
-        correction = replace(scene.calibration.effects[0], name=effect)
+        first_effect = scene.calibration.effects[0]
+        correction = replace(first_effect, name=effect)
         return _calibration(effects=(correction,), diagnoses=(diagnosis,))(scene)
 
     return broken
@@ -214,13 +225,15 @@ def _by_encoders(*, applied: bool) -> Callable[[Scene], Scene]:
     """Encoders of a closed chain that find the zero of J2 off."""
     correction = GeometryCorrection("zero", "J2", "", 0.0, 0.0349, 0.0002, "rad")
     misfit = EncoderMisfit(0.01, 0.0001, "rad", True, (correction,), applied)
-    return _calibration(encoder_misfit=misfit, diagnoses=(diagnosis_named("zero-off", "J2"),))
+    diagnoses = (diagnosis_named("zero-off", "J2"),)
+    return _calibration(encoder_misfit=misfit, diagnoses=diagnoses)
 
 
 def _unexplained(misfit: float, noise: float | None = 5e-6) -> Callable[[Scene], Scene]:
     """Encoders of a closed chain that miss the loops without an explanation."""
     found = EncoderMisfit(misfit, 2e-5, "rad", True, (), False, noise=noise)
-    return _calibration(encoder_misfit=found, diagnoses=(diagnosis_named("geometry-off"),))
+    diagnoses = (diagnosis_named("geometry-off"),)
+    return _calibration(encoder_misfit=found, diagnoses=diagnoses)
 
 
 def _late_encoder(scene: Scene) -> Scene:
@@ -230,9 +243,8 @@ def _late_encoder(scene: Scene) -> Scene:
     found = EncoderMisfit(
         2e-3, 5e-6, "rad", True, (), False, noise=5e-6, late_encoders="an encoder of J2"
     )
-    return _calibration(encoder_misfit=found, diagnoses=(diagnosis_named("position-late", "J2"),))(
-        scene
-    )
+    diagnoses = (diagnosis_named("position-late", "J2"),)
+    return _calibration(encoder_misfit=found, diagnoses=diagnoses)(scene)
 
 
 def _diagnosed(*diagnoses: Diagnosis) -> Callable[[Scene], Scene]:
@@ -258,7 +270,8 @@ def _scene(**changes: object) -> Callable[[Scene], Scene]:
 
 
 def _effect(scene: Scene) -> Scene:
-    worse = replace(scene.calibration.effects[0], error_after_percent=6.3)
+    first_effect = scene.calibration.effects[0]
+    worse = replace(first_effect, error_after_percent=6.3)
     return _calibration(effects=(worse,))(scene)
 
 
@@ -275,15 +288,18 @@ def _forged(scene: Scene) -> Scene:
     """Bob has signed another file of that name."""
     assert scene.file is not None
     scene.file.write_bytes(b"another calibration")
-    sign(scene.file, scene.file.parent / "Bob.key", "Bob", at=NOW)
+    secret_key = scene.file.parent / "Bob.key"
+    sign(scene.file, secret_key, "Bob", at=NOW)
     return replace(scene, signed=())
 
 
 def _another_serial_now(scene: Scene) -> Scene:
     axes = list(scene.cell.axes)
     assert axes[3].identity is not None
-    axes[3] = replace(axes[3], identity=replace(axes[3].identity, serial=4711))
-    return replace(scene, cell=replace(scene.cell, axes=tuple(axes)))
+    identity = replace(axes[3].identity, serial=4711)
+    axes[3] = replace(axes[3], identity=identity)
+    cell = replace(scene.cell, axes=tuple(axes))
+    return replace(scene, cell=cell)
 
 
 NO_SERIALS: Callable[[Scene], Scene] = lambda scene: replace(  # noqa: E731
@@ -300,11 +316,13 @@ NO_SERIALS: Callable[[Scene], Scene] = lambda scene: replace(  # noqa: E731
 
 def _wanted(scene: Scene) -> Scene:
     """The cell wants a hold-out."""
-    return replace(scene, policy=replace(scene.policy, holdout=HoldOut.REQUIRED))
+    policy = replace(scene.policy, holdout=HoldOut.REQUIRED)
+    return replace(scene, policy=policy)
 
 
 def _bounded(scene: Scene, **axes: float) -> Scene:
-    return replace(scene, policy=replace(scene.policy, max_change=axes))
+    policy = replace(scene.policy, max_change=axes)
+    return replace(scene, policy=policy)
 
 
 def _both(*steps: Callable[[Scene], Scene]) -> Callable[[Scene], Scene]:
@@ -318,7 +336,8 @@ def _both(*steps: Callable[[Scene], Scene]) -> Callable[[Scene], Scene]:
 
 def _doubled(scene: Scene) -> Scene:
     """The loaded log once more."""
-    return _calibration(sources=(*scene.calibration.sources, scene.calibration.sources[1]))(scene)
+    sources = (*scene.calibration.sources, scene.calibration.sources[1])
+    return _calibration(sources=sources)(scene)
 
 
 def _bare(scene: Scene) -> Scene:
@@ -545,7 +564,8 @@ def test_each_gate_closes_alone(
     scene = broken(scene)
     before = scene.controller.read_bytes()
     proposal = scene.propose()
-    assert {refusal.gate for refusal in proposal.refusals} == {gate}
+    gates = {refusal.gate for refusal in proposal.refusals}
+    assert gates == {gate}
     assert all(subject in refusal.subject for refusal in proposal.refusals)
     audit = tmp_path / "audit.jsonl"
     with pytest.raises(CalibrationRefused) as caught:
@@ -557,18 +577,16 @@ def test_each_gate_closes_alone(
     assert scene.controller.read_bytes() == before
     assert not list(tmp_path.glob("*.bak"))
     (entry,) = read(audit)
-    assert (entry.action, entry.who, entry.subject) == (
-        AuditAction.REFUSED,
-        "Ada",
-        str(scene.controller),
-    )
+    expected = (AuditAction.REFUSED, "Ada", str(scene.controller))
+    assert (entry.action, entry.who, entry.subject) == expected
     reported = entry.details["refusals"]
     assert isinstance(reported, list)
     assert [one["gate"] for one in reported] == [gate.value] * len(proposal.refusals)
 
 
 def test_every_gate_has_such_a_test() -> None:
-    assert {gate for gate, _, _ in CLOSED} == set(Gate)
+    gates = {gate for gate, _, _ in CLOSED}
+    assert gates == set(Gate)
 
 
 def test_the_table_lists_every_gate_once_with_its_description() -> None:
@@ -638,7 +656,8 @@ def test_a_number_just_beyond_its_bound_is_not_written_as_the_bound(
 ) -> None:
     """And a large σ is looked for in what the model lacks first, where that was not done."""
     bound = scene.policy.max_std_percent
-    std = 1.0001e-2 * bound * abs(scene.calibration.gains[0].value)
+    absolute_gain = abs(scene.calibration.gains[0].value)
+    std = 1.0001e-2 * bound * absolute_gain
     doubtful = _gain("J1", std=std)(scene)
     if not effects:
         doubtful = _calibration(effects=())(doubtful)
@@ -654,7 +673,9 @@ def test_a_reviewed_change_of_a_changed_file_may_go_on(scene: Scene) -> None:
     digest = sha256(scene.controller.read_bytes())
     # In full: this dry run, with a gate closed, ends without the line that a write would need.
     assert (refusal.gate, refusal.remedy.endswith(f"--base {digest}")) == (Gate.BASE, True)
-    assert replace(scene, base=sha256(scene.controller.read_bytes())).propose().refusals == ()
+    base = sha256(scene.controller.read_bytes())
+    changed_scene = replace(scene, base=base)
+    assert changed_scene.propose().refusals == ()
 
 
 def test_the_policy_moves_the_bounds(scene: Scene) -> None:
@@ -665,11 +686,10 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
         max_saturated_percent=1.0,
         max_age_days=0.01,
     )
-    gates = [
-        (refusal.gate, refusal.subject)
-        for refusal in replace(scene, policy=tight).propose().refusals
-    ]
-    assert [axis for gate, axis in gates if gate is Gate.CHANGE] == ["J3", "J4", "J5", "J6"]
+    refusals = replace(scene, policy=tight).propose().refusals
+    gates = [(refusal.gate, refusal.subject) for refusal in refusals]
+    expected = ["J3", "J4", "J5", "J6"]
+    assert [axis for gate, axis in gates if gate is Gate.CHANGE] == expected
     assert [axis for gate, axis in gates if gate is Gate.NAMEPLATE] == ["J4"]
     assert [axis for gate, axis in gates if gate is Gate.UNCERTAINTY] == list(AXES)
     assert len([axis for gate, axis in gates if gate is Gate.SATURATED]) == 3
@@ -688,18 +708,23 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
 def test_a_job_that_applies_by_itself_wants_a_hold_out(
     section: dict[str, str], wanted: bool
 ) -> None:
-    policy = PolicyModel.model_validate_json(json.dumps({"apply": section})).apply
-    assert (policy.requires_holdout, policy.by) == (wanted, AppliedBy(section.get("by", "person")))
+    text = json.dumps({"apply": section})
+    policy = PolicyModel.model_validate_json(text).apply
+    applied_by = AppliedBy(section.get("by", "person"))
+    expected = (wanted, applied_by)
+    assert (policy.requires_holdout, policy.by) == expected
     with pytest.raises(ValueError, match="holdout: required"):
         PolicyModel.model_validate_json('{"apply": {"by": "job", "holdout": "optional"}}')
 
 
 def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path: Path) -> None:
-    cell = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells" / "demo.yaml"
+    cells_folder = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells"
+    cell = cells_folder / "demo.yaml"
     text = cell.read_text()
     assert "policy:" not in text
     cell.write_text(text + "policy: {apply: {max_change: {J4: 2.0}}}\n")
-    assert load_cell(cell).apply.max_change == {"J4": 2.0}
+    max_change = load_cell(cell).apply.max_change
+    assert max_change == {"J4": 2.0}
     cell.write_text(text + "policy:\n  apply:\n    max_change:\n      j4: 2.0\n")
     line = len(cell.read_text().splitlines())
     with pytest.raises(
@@ -712,12 +737,14 @@ def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path:
 
 def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
     """2025-01-02 02:00 is an hour and four minutes ago."""
-    hour = replace(scene, policy=ApplyPolicy(max_age_days=1 / 24))
-    reported = {(one.found, one.expected) for one in hour.propose().refusals}
+    max_age_days = 1 / 24
+    policy = ApplyPolicy(max_age_days=max_age_days)
+    hour = replace(scene, policy=policy)
+    refusals = hour.propose().refusals
+    reported = {(one.found, one.expected) for one in refusals}
     assert reported == {("recorded 1.1 hours ago", "recorded within the last 1 hours")}
-    days = _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())(
-        replace(scene, policy=ApplyPolicy())
-    )
+    recorded_s = (NOW - 30.1 * DAY).timestamp()
+    days = _source(0, recorded_s=recorded_s)(replace(scene, policy=ApplyPolicy()))
     assert [(one.found, one.expected) for one in days.propose().refusals] == [
         ("recorded 30.1 days ago", "recorded within the last 30 days")
     ]
@@ -725,9 +752,8 @@ def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
 
 @pytest.mark.parametrize("days", [3, 730])
 def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(scene: Scene, days: int) -> None:
-    future = _source(0, recorded_s=(NOW + days * DAY).timestamp())(
-        replace(scene, policy=ApplyPolicy())
-    )
+    recorded_s = (NOW + days * DAY).timestamp()
+    future = _source(0, recorded_s=recorded_s)(replace(scene, policy=ApplyPolicy()))
     (refusal,) = future.propose().refusals
     assert refusal.gate is Gate.STALE
     assert refusal.found.endswith("from now")
@@ -739,23 +765,27 @@ def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(sc
     request = Request(
         scene.calibration, NOW, policy=ApplyPolicy(), accepts_changed_configuration=True
     )
-    proposal = propose(FileTarget.of(cell, scene.controller), request)
-    assert {(one.gate, one.found) for one in proposal.refusals} == {
-        (Gate.MASS, "fitted with 4.59 kg")
-    }
+    target = FileTarget.of(cell, scene.controller)
+    proposal = propose(target, request)
+    expected = {(Gate.MASS, "fitted with 4.59 kg")}
+    assert {(one.gate, one.found) for one in proposal.refusals} == expected
 
 
 def test_two_names_of_one_signer_are_one_person(scene: Scene, tmp_path: Path) -> None:
     again = generate(tmp_path, "ADA")[1].line
-    two = replace(scene.policy, signatures=2, signers={**scene.policy.signers, "ADA": again})
+    signers = {**scene.policy.signers, "ADA": again}
+    two = replace(scene.policy, signatures=2, signers=signers)
     twice = replace(scene, policy=two, signed=("Ada", "ADA"), appliers=("root",))
-    assert [one.gate for one in twice.propose().refusals] == [Gate.SIGNATURE]
+    refusals = twice.propose().refusals
+    gates = [one.gate for one in refusals]
+    assert gates == [Gate.SIGNATURE]
 
 
 def test_a_signer_s_key_that_is_none_is_refused_with_file_line_and_key(
     tmp_path: Path, scene: Scene
 ) -> None:
-    cell = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells" / "demo.yaml"
+    cells_folder = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells"
+    cell = cells_folder / "demo.yaml"
     text = cell.read_text()
     line = len(text.splitlines()) + 4
     head = text + "policy:\n  apply:\n    signers:\n"
@@ -776,52 +806,61 @@ def test_a_signer_s_key_that_is_none_is_refused_with_file_line_and_key(
     ):
         load_cell(cell)
     cell.write_text(f"{head}      Ada: {key}\n")
-    assert load_cell(cell).apply.signers == {"Ada": key}
+    signers = load_cell(cell).apply.signers
+    assert signers == {"Ada": key}
 
 
 def test_two_signatures_of_others_are_two(scene: Scene) -> None:
-    two = replace(scene, policy=replace(scene.policy, signatures=2))
-    assert [refusal.gate for refusal in replace(two, signed=("Ada", "Bob")).propose().refusals] == [
-        Gate.SIGNATURE
-    ]
+    policy = replace(scene.policy, signatures=2)
+    two = replace(scene, policy=policy)
+    refusals = replace(two, signed=("Ada", "Bob")).propose().refusals
+    gates = [refusal.gate for refusal in refusals]
+    assert gates == [Gate.SIGNATURE]
     assert replace(two, signed=("Ada", "Bob"), appliers=("the job",)).propose().refusals == ()
 
 
 def test_all_failed_checks_are_reported_at_once(scene: Scene) -> None:
-    other = replace(scene, policy=ApplyPolicy(max_change_percent=5.0))
+    policy = ApplyPolicy(max_change_percent=5.0)
+    other = replace(scene, policy=policy)
     error = _calibration(cell="other")(other).propose().error
-    assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [
-        True
-    ] * 5 + [False]
+    expected = [True] * 5 + [False]
+    assert [
+        axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")
+    ] == expected
 
 
 def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
-    scene.controller.write_text(scene.controller.read_text().replace("7.68", "0.0"))
-    reviewed = replace(scene, base=sha256(scene.controller.read_bytes()))
+    changed_text = scene.controller.read_text().replace("7.68", "0.0")
+    scene.controller.write_text(changed_text)
+    base = sha256(scene.controller.read_bytes())
+    reviewed = replace(scene, base=base)
     (refusal,) = reviewed.propose().refusals
     assert (refusal.gate, refusal.subject) == (Gate.SIGN, "J6")
     assert refusal.found == "gain 6.79, current gain 0, nameplate 7.68"
 
 
 def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
-    skew = replace(
-        scene.calibration.effects[0], name="time-skew", axis="all axes", error_after_percent=9.0
-    )
+    first_effect = scene.calibration.effects[0]
+    skew = replace(first_effect, name="time-skew", axis="all axes", error_after_percent=9.0)
     (refusal,) = _calibration(effects=(skew,))(scene).propose().refusals
     assert refusal.subject == "effect time-skew on all axes"
 
 
 def test_a_library_that_reports_no_gate_context_is_not_asked_for_them(scene: Scene) -> None:
-    old = replace(scene.calibration, sources=(Source("old", "a" * 64, "fit"),))
-    assert propose(FileTarget(scene.controller, KEYS), Request(old, NOW)).refusals == ()
-    assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {
-        Gate.SOURCES,
-        Gate.HOLDOUT,
-    }
+    source = Source("old", "a" * 64, "fit")
+    sources = (source,)
+    old = replace(scene.calibration, sources=sources)
+    target = FileTarget(scene.controller, KEYS)
+    request = Request(old, NOW)
+    assert propose(target, request).refusals == ()
+    refusals = replace(scene, calibration=old).propose().refusals
+    expected = {Gate.SOURCES, Gate.HOLDOUT}
+    assert {one.gate for one in refusals} == expected
 
 
 def test_the_demo_calibration_is_of_the_day_it_says() -> None:
+    sources = recorded(demo_calibration(), RECORDED + DAY).sources
     assert all(
         source.recording is not None and source.recording.recorded_s == (RECORDED + DAY).timestamp()
-        for source in recorded(demo_calibration(), RECORDED + DAY).sources
+        for source in sources
     )

@@ -40,12 +40,14 @@ def three_ends(address: BusAddress) -> Iterator[Ends]:
 class TestVirtual(BusContract):
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
-        yield from three_ends(BusAddress("virtual", request.node.nodeid))
+        address = BusAddress("virtual", request.node.nodeid)
+        yield from three_ends(address)
 
 
 @contextmanager
 def _own(_monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
-    with open_bus(BusAddress("virtual", "clock set back")) as end:
+    address = BusAddress("virtual", "clock set back")
+    with open_bus(address) as end:
         yield end
 
 
@@ -59,7 +61,8 @@ def _of_a_hub(_monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
 def _foreign(monkeypatch: pytest.MonkeyPatch) -> Iterator[can.BusABC]:
     """An interface of python-can that drivegain has no class for."""
     monkeypatch.setattr(can, "Bus", lambda **_: VirtualBus("clock set back, foreign"))
-    with open_bus(BusAddress("pcan", "PCAN_USBBUS1")) as end:
+    address = BusAddress("pcan", "PCAN_USBBUS1")
+    with open_bus(address) as end:
         yield end
 
 
@@ -74,28 +77,35 @@ def test_a_wait_does_not_become_longer_when_the_wall_clock_is_set_back(
         monkeypatch.setattr("can.bus.time", lambda: next(true_s, time.monotonic() - LONG_S))
         begun_s = time.monotonic()
         assert end.recv(timeout=0.05) is None
-        assert 0.05 <= time.monotonic() - begun_s < LONG_S / 2
+        now_difference_s = time.monotonic() - begun_s
+        assert 0.05 <= now_difference_s < LONG_S / 2
 
 
 class _Flood(SimpleQueue[can.Message]):
     """A queue that fills faster than it is read."""
 
     def get_nowait(self) -> can.Message:
-        self.put(can.Message(arbitration_id=0x7F, is_extended_id=False))
+        message = can.Message(arbitration_id=0x7F, is_extended_id=False)
+        self.put(message)
         assert self.qsize() < 1000, "a reader that never ends"
         self.put(can.Message(arbitration_id=0x7F, is_extended_id=False))
         return super().get_nowait()
 
 
 def test_a_flood_does_not_keep_a_reader() -> None:
-    with open_bus(BusAddress("virtual", "flooded")) as end:
+    address = BusAddress("virtual", "flooded")
+    with open_bus(address) as end:
         assert isinstance(end, VirtualEnd)
         end.channel.remove(end.queue)
         end.queue = cast("Queue[can.Message]", _Flood())
         end.channel.append(end.queue)
         for _ in range(3):
-            end.queue.put(can.Message(arbitration_id=0x81, is_extended_id=False))
-        assert [frame.arbitration_id for frame in (end.recv(0.0), end.recv(0.0)) if frame] == [
+            message = can.Message(arbitration_id=0x81, is_extended_id=False)
+            end.queue.put(message)
+        arbitration_ids = [
+            frame.arbitration_id for frame in (end.recv(0.0), end.recv(0.0)) if frame
+        ]
+        assert arbitration_ids == [
             0x81,
             0x81,
         ]
@@ -121,12 +131,8 @@ def test_a_frame_that_changes_after_it_was_sent_arrives_as_it_was_sent() -> None
         frame.data[0], frame.arbitration_id = 2, 0x82
         heard = far.recv(WAIT_S)
     assert heard is not None
-    assert (heard.arbitration_id, bytes(heard.data), heard.is_rx, heard.channel) == (
-        0x81,
-        b"\x01",
-        True,
-        "changed",
-    )
+    expected = (0x81, b"\x01", True, "changed")
+    assert (heard.arbitration_id, bytes(heard.data), heard.is_rx, heard.channel) == expected
     with pytest.raises(can.CanOperationError, match="closed"):
         far.recv(0.0)
     with pytest.raises(can.CanOperationError, match="closed"):
@@ -143,7 +149,8 @@ class TestHub(BusContract):
 def test_channels_of_a_hub_are_buses_of_their_own() -> None:
     with Hub(("left", "right")) as hub:
         left, other, right = (open_bus(hub.address(name)) for name in ("left", "left", "right"))
-        left.send(can.Message(arbitration_id=1, is_extended_id=False))
+        message = can.Message(arbitration_id=1, is_extended_id=False)
+        left.send(message)
         assert other.recv(WAIT_S) is not None
         assert right.recv(0.0) is None
         for end in (left, other, right):
@@ -168,8 +175,9 @@ def test_no_one_listens() -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         port = taken.getsockname()[1]
+        address = BusAddress("socketcand", "can0", port=port)
         with pytest.raises(BusError, match=str(port)):
-            open_bus(BusAddress("socketcand", "can0", port=port))
+            open_bus(address)
         taken.listen()
         with (
             pytest.raises(BusError, match=f"{port}: .*another hub runs on this port"),
@@ -343,7 +351,8 @@ def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(
     with theirs:
         with pytest.raises(can.CanOperationError, match=r"accepts nothing for 0\.02 s"):
             for _ in range(100_000):
-                end.send_burst((frame,) * 100)
+                messages = (frame,) * 100
+                end.send_burst(messages)
         # Half a frame may have gone out
         with pytest.raises(can.CanOperationError, match="accepts nothing"):
             end.send(frame)
@@ -410,6 +419,7 @@ def test_a_frame_that_no_bus_carries_is_reported(
 def test_remote_frames_are_refused_where_the_protocol_has_none() -> None:
     with Hub(("can0",)) as hub:
         end = open_bus(hub.address())
+        message = can.Message(arbitration_id=0x701, is_extended_id=False, is_remote_frame=True)
         with pytest.raises(can.CanOperationError, match="remote"):
-            end.send(can.Message(arbitration_id=0x701, is_extended_id=False, is_remote_frame=True))
+            end.send(message)
         end.shutdown()

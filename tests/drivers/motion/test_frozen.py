@@ -22,14 +22,17 @@ def alarms(
     reported = []
     for cycle, (position, current) in enumerate(zip(positions, currents, strict=True)):
         lost = 0 if missing is None else missing[cycle]
-        sample = Sample(cycle, cycle * PERIOD_NS, (position, 0), (current, 0), (0x27, 0x27), lost)
+        time_ns = cycle * PERIOD_NS
+        sample = Sample(cycle, time_ns, (position, 0), (current, 0), (0x27, 0x27), lost)
         if data.frozen(sample):
             reported.append(cycle)
     return reported
 
 
 def test_an_axis_that_shows_nothing_new_is_reported_in_its_bound() -> None:
-    assert alarms([7] * 100, [3] * 100)[0] == round(FROZEN_S * 1e9 / PERIOD_NS)
+    positions = [7] * 100
+    currents = [3] * 100
+    assert alarms(positions, currents)[0] == round(FROZEN_S * 1e9 / PERIOD_NS)
 
 
 @settings(deadline=None)
@@ -40,4 +43,7 @@ def test_one_count_in_position_or_current_is_life(beat: int, of_current: bool) -
 
 
 def test_a_repeated_value_of_a_lost_sample_proves_nothing() -> None:
-    assert alarms([7] * 500, [3] * 500, [int(cycle % 40 == 0) for cycle in range(500)]) == []
+    missing = [int(cycle % 40 == 0) for cycle in range(500)]
+    positions = [7] * 500
+    currents = [3] * 500
+    assert alarms(positions, currents, missing) == []

@@ -43,9 +43,11 @@ def moving() -> Iterator[Moving]:
     with network:
         network.prepare()
         bus.cycle = -1
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        sync_stream = SyncStream(network, pacing, events.append)
         yield (
             network,
-            SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append),
+            sync_stream,
             bus,
             events,
         )
@@ -68,13 +70,18 @@ def run(moving: Moving, *moves: Move) -> list[Sample]:
 
 def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> None:
     _, stream, bus, events = moving
-    first = synchronised_move((0, 0), (50_000, -40_000), permission().limits, dwell_cycles=7)
-    second = synchronised_move((50_000, -40_000), (0, 10_000), permission().limits, dwell_cycles=3)
+    target_counts = (50_000, -40_000)
+    first = synchronised_move((0, 0), target_counts, permission().limits, dwell_cycles=7)
+    start_counts = (50_000, -40_000)
+    second = synchronised_move(start_counts, (0, 10_000), permission().limits, dwell_cycles=3)
     samples = run(moving, first, second)
-    assert samples[-1].position_counts == (0, 10_000)
-    assert [sample.cycle for sample in samples] == list(range(len(samples)))
+    position_counts = samples[-1].position_counts
+    assert position_counts == (0, 10_000)
+    expected = list(range(len(samples)))
+    assert [sample.cycle for sample in samples] == expected
     assert bus.nodes[0].setpoint_cycles == bus.nodes[1].setpoint_cycles
-    assert len(bus.nodes[0].setpoint_cycles) == 2
+    setpoint_cycles = bus.nodes[0].setpoint_cycles
+    assert len(setpoint_cycles) == 2
     marks = [event for event in events if event.kind in MARKS]
     assert [(mark.kind, mark.code) for mark in marks] == [
         (EventKind.MOVE_START, 0),
@@ -104,25 +111,27 @@ def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Mov
 def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     _, _, bus, _ = moving
     run(moving, FAR)
-    written = [
-        tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)) for node in bus.nodes
-    ]
-    assert written == [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
+    written = []
+    for node in bus.nodes:
+        written.append(tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)))
+    expected = [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
+    assert written == expected
 
 
 def test_an_axis_with_no_way_to_go_gets_no_setpoint(moving: Moving) -> None:
     _, _, bus, _ = moving
-    samples = run(
-        moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), Move((5_000, 0), (1, 1), (1, 1), 4)
-    )
-    assert samples[-1].position_counts == (5_000, 0)
+    move = Move((5_000, 0), (1, 1), (1, 1), 4)
+    samples = run(moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), move)
+    position_counts = samples[-1].position_counts
+    assert position_counts == (5_000, 0)
     assert bus.nodes[1].setpoint_cycles == []
 
 
 def test_a_drive_that_needs_its_controlword_twice_still_moves(moving: Moving) -> None:
     _, _, bus, _ = moving
     bus.nodes[0].second_controlword = bus.nodes[1].second_controlword = True
-    assert run(moving, FAR)[-1].position_counts == (50_000, -40_000)
+    position_counts = run(moving, FAR)[-1].position_counts
+    assert position_counts == (50_000, -40_000)
 
 
 def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) -> None:
@@ -130,7 +139,8 @@ def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) ->
     for node in bus.nodes:
         node.position = 30_000.0
     bus.tamper = lambda m: () if m.arbitration_id == 0x182 and bus.cycle < 2 else (m,)
-    run(moving, Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    move = Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    run(moving, move)
     targets = [
         int.from_bytes(frame.data[:4], "little", signed=True)
         for frame in bus.sent
@@ -149,7 +159,8 @@ def test_without_permission_nothing_is_even_enabled(moving: Moving) -> None:
         list(execute(network, stream, (FAR,), permission(span=40_000), BOUNDS))
     with pytest.raises(MotionRefused, match="limits for 3 axes"):
         list(execute(network, stream, (FAR,), permission(axes=3), BOUNDS))
-    assert [node.powered_cycles for node in bus.nodes] == [0, 0]
+    powered_cycles = [node.powered_cycles for node in bus.nodes]
+    assert powered_cycles == [0, 0]
 
 
 def test_a_drive_in_fault_is_not_enabled(moving: Moving) -> None:
@@ -157,7 +168,8 @@ def test_a_drive_in_fault_is_not_enabled(moving: Moving) -> None:
     bus.nodes[1].fault()
     with pytest.raises(StateRefused, match=r"J2 \(node 2\): asked for OPERATION ENABLED.*FAULT"):
         run(moving, FAR)
-    assert [node.powered_cycles for node in bus.nodes] == [0, 0]
+    powered_cycles = [node.powered_cycles for node in bus.nodes]
+    assert powered_cycles == [0, 0]
 
 
 def break_at(bus: ScriptedBus, cycle: int, what: str) -> None:
@@ -207,7 +219,8 @@ def test_every_failure_stops_all_axes(
     with pytest.raises(error):
         run(moving, FAR)
     assert powerless(bus)
-    assert 0 < bus.nodes[0].position < 50_000
+    position = bus.nodes[0].position
+    assert 0 < position < 50_000
     assert EventKind.STOP in [event.kind for event in events]
     assert EventKind.STOP_UNCONFIRMED not in [event.kind for event in events]
 
@@ -223,7 +236,8 @@ def test_leaving_the_loop_stops_all_axes(moving: Moving, interrupt: type[BaseExc
             if sample.cycle == 60:
                 raise interrupt
     assert powerless(bus)
-    assert 0 < bus.nodes[0].position < 50_000
+    position = bus.nodes[0].position
+    assert 0 < position < 50_000
 
 
 def test_an_interrupt_inside_of_a_cycle_stops_all_axes(moving: Moving) -> None:
@@ -274,8 +288,10 @@ def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_mov
         node.holds_acknowledge = True
     back = Move((0, 0), (100_000, 80_000), (1_000_000, 800_000))
     samples = run(moving, FAR, back, FAR)
-    assert samples[-1].position_counts == (50_000, -40_000)
-    assert [len(node.setpoint_cycles) for node in bus.nodes] == [3, 3]
+    expected = (50_000, -40_000)
+    assert samples[-1].position_counts == expected
+    setpoint_cycle_counts = [len(node.setpoint_cycles) for node in bus.nodes]
+    assert setpoint_cycle_counts == [3, 3]
 
 
 def test_an_acknowledge_that_stays_for_ever_is_named_and_the_axes_lose_power(
@@ -305,7 +321,8 @@ def test_an_acknowledge_of_before_the_first_setpoint_starts_no_move(moving: Movi
         r"statusword bit 12",
     ):
         run(moving, FAR)
-    assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
+    setpoint_cycles = [node.setpoint_cycles for node in bus.nodes]
+    assert setpoint_cycles == [[], []]
     assert powerless(bus)
 
 
@@ -318,8 +335,10 @@ def test_a_drive_whose_rpdos_act_before_sync_makes_the_same_moves(moving: Moving
         node.acts_at_once = True
     back = Move((0, 0), (100_000, 80_000), (1_000_000, 800_000))
     samples = run(moving, FAR, back)
-    assert samples[-1].position_counts == (0, 0)
-    assert [len(node.setpoint_cycles) for node in bus.nodes] == [2, 2]
+    position_counts = samples[-1].position_counts
+    assert position_counts == (0, 0)
+    setpoint_cycle_counts = [len(node.setpoint_cycles) for node in bus.nodes]
+    assert setpoint_cycle_counts == [2, 2]
     assert not any(sample.missing for sample in samples)
     assert powerless(bus)
 
@@ -343,7 +362,9 @@ def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving)
 @pytest.mark.parametrize("way", [40, 1000, 2500])
 def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, way: int) -> None:
     _, _, bus, events = moving
-    out = synchronised_move((0, 0), (way, way), (AxisLimits(0, 0, 20_000, 200_000),) * 2)
+    axis_limits = AxisLimits(0, 0, 20_000, 200_000)
+    limits = (axis_limits,) * 2
+    out = synchronised_move((0, 0), (way, way), limits)
     duration_s = max(out.duration_s((0, 0)))
 
     def hold_bit(_: int) -> None:
@@ -351,10 +372,12 @@ def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, w
             node.statusword |= 0x0400
 
     bus.on_cycle = hold_bit
-    samples = run(moving, out, Move((way, way), (1, 1), (1, 1)))
+    move = Move((way, way), (1, 1), (1, 1))
+    samples = run(moving, out, move)
     start, end = (event.time_ns for event in events if event.kind in MARKS and event.code == 0)
     assert (end - start) * 1e-9 == pytest.approx(duration_s, abs=2e-3)
-    assert samples[-1].position_counts == (way, way)
+    position_counts = samples[-1].position_counts
+    assert position_counts == (way, way)
     at_end = next(sample for sample in samples if sample.time_ns >= end)
     assert at_end.position_counts == (way, way)
 
@@ -376,10 +399,12 @@ def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(
     monkeypatch.setattr(bus, "recv", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run(moving, FAR)
-    assert last_profile in [frame.arbitration_id for frame in bus.sent]
+    arbitration_ids = [frame.arbitration_id for frame in bus.sent]
+    assert last_profile in arbitration_ids
     controlwords = [frame.data[4] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
     assert not any(word & 0x10 for word in controlwords)
-    assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
+    setpoint_cycles = [node.setpoint_cycles for node in bus.nodes]
+    assert setpoint_cycles == [[], []]
     assert powerless(bus)
 
 
@@ -399,12 +424,14 @@ def stop_with(moving: Moving, drift_counts: tuple[float, ...]) -> list[int]:
     for node in bus.nodes:
         node.quick_stop_stays = True
     bus.on_cycle = drift
-    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    move = Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    run(moving, move)
     return stopping
 
 
 def test_an_encoder_that_flickers_stands_still(moving: Moving) -> None:
-    stopping = stop_with(moving, (3.0, -5.0, 2.0, 0.0))
+    drift_counts = (3.0, -5.0, 2.0, 0.0)
+    stopping = stop_with(moving, drift_counts)
     assert len(stopping) < 20
     assert powerless(moving[2])
 
@@ -470,7 +497,8 @@ def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> Non
     with pytest.raises(Exception, match="wire was cut") as error:
         list(execute(network, stream, (FAR,), permission(), BOUNDS))
     assert any("while stopping" in note for note in error.value.__notes__)
-    assert events[-1].kind is EventKind.STOP_UNCONFIRMED
+    last_event = events[-1]
+    assert last_event.kind is EventKind.STOP_UNCONFIRMED
     bus.on_cycle = lambda cycle: None
 
 
@@ -626,7 +654,8 @@ def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
         node.quick_stop_stays = True
     bus.on_cycle = deaf
     monkeypatch.setattr(network, "disable", note)
-    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    move = Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    run(moving, move)
     assert reported[0] == [0x07, 0x07]
     assert powerless(bus)
 
@@ -648,8 +677,9 @@ def test_a_bus_that_ends_the_stop_by_pdo_does_not_keep_the_others_from_being_sto
     for node in bus.nodes:
         node.quick_stop_stays = True
     bus.on_cycle = fail
+    move = Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000))
     with pytest.raises(type(error)):
-        run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+        run(moving, move)
     assert powerless(bus)
     assert EventKind.BUS_LOST in [event.kind for event in events]
     assert EventKind.STOP_UNCONFIRMED in [event.kind for event in events]

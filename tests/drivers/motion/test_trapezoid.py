@@ -30,9 +30,9 @@ limits = st.tuples(*[st.floats(1e-2, 1e3)] * AXES)
 def made(
     distance: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]
 ) -> Trapezoid:
-    return synchronised(
-        np.zeros(AXES), np.array(distance), np.array(velocity), np.array(acceleration)
-    )
+    velocity_limit = np.array(velocity)
+    acceleration_limit = np.array(acceleration)
+    return synchronised(np.zeros(AXES), np.array(distance), velocity_limit, acceleration_limit)
 
 
 @given(distances, limits, limits)
@@ -40,8 +40,10 @@ def test_limits_are_kept_and_one_is_used(
     distance: tuple[float, ...], velocity: tuple[float, ...], acceleration: tuple[float, ...]
 ) -> None:
     path = made(distance, velocity, acceleration)
-    speed_share = np.abs(path.velocity) / np.array(velocity)
-    ramp_share = np.abs(path.acceleration) / np.array(acceleration)
+    absolute_velocity = np.abs(path.velocity)
+    speed_share = absolute_velocity / np.array(velocity)
+    absolute_acceleration = np.abs(path.acceleration)
+    ramp_share = absolute_acceleration / np.array(acceleration)
     assert np.all(speed_share <= 1 + 1e-9)
     assert np.all(ramp_share <= 1 + 1e-9)
     assert np.max(ramp_share) == pytest.approx(1.0)
@@ -60,18 +62,25 @@ def test_all_axes_run_from_start_to_end_together(
     np.testing.assert_allclose(position[-1], distance, rtol=1e-9)
     # The path parameter is the same for all axes, so a coupled motor moves on a trapezoid too.
     share = position[:, np.array(distance) != 0] / np.array(distance)[np.array(distance) != 0]
-    np.testing.assert_allclose(share, np.repeat(share[:, :1], share.shape[1], axis=1), atol=1e-9)
+    expected = np.repeat(share[:, :1], share.shape[1], axis=1)
+    np.testing.assert_allclose(share, expected, atol=1e-9)
     travelled = np.sum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time_s)[:, None], axis=0)
     np.testing.assert_allclose(travelled, distance, rtol=1e-3, atol=1e-6)
 
 
 def test_no_distance_takes_no_time() -> None:
-    assert made((0.0,) * AXES, (1.0,) * AXES, (1.0,) * AXES).duration_s == 0.0
+    distance = (0.0,) * AXES
+    velocity = (1.0,) * AXES
+    acceleration = (1.0,) * AXES
+    assert made(distance, velocity, acceleration).duration_s == 0.0
 
 
 def test_a_limit_must_be_positive() -> None:
+    distance = (1.0,) * AXES
+    acceleration = (1.0,) * AXES
+    velocity = (1.0, 0.0, 1.0)
     with pytest.raises(ValueError, match="positive"):
-        made((1.0,) * AXES, (1.0, 0.0, 1.0), (1.0,) * AXES)
+        made(distance, velocity, acceleration)
 
 
 counts = st.tuples(*[st.integers(-2_000_000, 2_000_000)] * AXES)
@@ -83,7 +92,9 @@ def test_whole_numbers_keep_limits_and_end_times(
     start: tuple[int, ...], target: tuple[int, ...]
 ) -> None:
     move = synchronised_move(start, target, ROOM)
-    check_moves(start, (move,), MotionPermission("test", ROOM), ("a", "b", "c"))
+    permission = MotionPermission("test", ROOM)
+    names = ("a", "b", "c")
+    check_moves(start, (move,), permission, names)
     going = [
         (seconds, abs(b - a))
         for seconds, a, b in zip(move.duration_s(start), start, target, strict=True)
@@ -104,12 +115,16 @@ def test_rounding_never_leaves_tight_limits(
     target: tuple[int, ...], velocity: tuple[float, ...], acceleration: tuple[float, ...]
 ) -> None:
     room = tuple(AxisLimits(-500, 500, v, a) for v, a in zip(velocity, acceleration, strict=True))
-    move = synchronised_move((0,) * AXES, target, room)
-    check_moves((0,) * AXES, (move,), MotionPermission("test", room), ("a", "b", "c"))
+    start_counts = (0,) * AXES
+    move = synchronised_move(start_counts, target, room)
+    permission = MotionPermission("test", room)
+    names = ("a", "b", "c")
+    check_moves((0,) * AXES, (move,), permission, names)
 
 
 def test_refusals_name_axis_found_and_allowed() -> None:
-    room = (AxisLimits(-10, 10, 100.0, 1000.0),)
+    axis_limits = AxisLimits(-10, 10, 100.0, 1000.0)
+    room = (axis_limits,)
     granted = MotionPermission("test", room)
     for start, move, words in (
         (0, Move((11,), (50,), (500,)), ("J1", "11", "-10 to 10")),
@@ -122,5 +137,6 @@ def test_refusals_name_axis_found_and_allowed() -> None:
         with pytest.raises(MotionRefused) as refusal:
             check_moves((start,), (move,), granted, ("J1",))
         assert all(word in str(refusal.value) for word in words)
+    permission = MotionPermission(" ", room)
     with pytest.raises(MotionRefused, match="names no operator"):
-        check_moves((0,), (), MotionPermission(" ", room), ("J1",))
+        check_moves((0,), (), permission, ("J1",))

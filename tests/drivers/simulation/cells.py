@@ -44,7 +44,8 @@ class Master:
 
     def send(self, can_id: int, data: bytes) -> None:
         """One frame."""
-        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        self.bus.send(message)
 
     def receive(self) -> tuple[int, bytes]:
         """The next frame; a cell that falls silent fails the test."""
@@ -65,13 +66,16 @@ class Master:
         """Expedited download; returns the abort code, or 0."""
         data = struct.pack("<" + kind, value)
         head = struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, subindex)
-        return abort_code(self.sdo(node_id, head + data))
+        answer = self.sdo(node_id, head + data)
+        return abort_code(answer)
 
     def read(self, node_id: int, index: int, subindex: int, kind: str) -> int:
         """Expedited upload of a number."""
-        answer = self.sdo(node_id, struct.pack("<BHB", 0x40, index, subindex))
+        packed = struct.pack("<BHB", 0x40, index, subindex)
+        answer = self.sdo(node_id, packed)
         assert abort_code(answer) == 0, f"{index:04X}h:{subindex:02X} {answer.hex()}"
-        return int(struct.unpack_from("<" + kind, answer, 4)[0])
+        unpack = struct.unpack_from("<" + kind, answer, 4)
+        return int(unpack[0])
 
     def set_up(self, node_ids: range) -> None:
         """Map position, current reference and statusword into TPDO1 and the controlword into RPDO1,
@@ -121,13 +125,15 @@ class Master:
     def control(self, node_ids: range, controlword: int) -> None:
         """Controlword of all nodes by RPDO; it acts on the next SYNC."""
         for node_id in node_ids:
-            self.send(0x200 + node_id, struct.pack("<H", controlword))
+            packed = struct.pack("<H", controlword)
+            self.send(0x200 + node_id, packed)
 
 
 def abort_code(answer: bytes) -> int:
     """0 where the answer is no abort."""
     if answer[0] == 0x80:
-        return int(struct.unpack_from("<I", answer, 4)[0])
+        unpack = struct.unpack_from("<I", answer, 4)
+        return int(unpack[0])
     return 0
 
 

@@ -59,12 +59,16 @@ def _axis(node_id: int, gain: float, inertia: float) -> AxisSpec:
 
 
 def _spec(payload: Body | None = None) -> CellSpec:
+    axes = (_axis(1, 40.0, 0.5), _axis(2, 150.0, 9.0), _axis(3, 150.0, 9.0))
+    ratio = np.diag([100.0, SCREW, SCREW])
+    start_rad = np.array([0.0, 0.4, 0.5])
+    gravity_m_s2 = (0.0, 0.0, -9.81)
     return CellSpec(
         urdf=URDF,
-        gravity_m_s2=(0.0, 0.0, -9.81),
-        ratio=np.diag([100.0, SCREW, SCREW]),
-        axes=(_axis(1, 40.0, 0.5), _axis(2, 150.0, 9.0), _axis(3, 150.0, 9.0)),
-        start_rad=np.array([0.0, 0.4, 0.5]),
+        gravity_m_s2=gravity_m_s2,
+        ratio=ratio,
+        axes=axes,
+        start_rad=start_rad,
         payload=payload,
         effects=(),
         sync_period_us=1000,
@@ -75,7 +79,8 @@ def _spec(payload: Body | None = None) -> CellSpec:
 
 def _run(spec: CellSpec, current_a: FloatArray, seconds: float) -> Plant:
     plant = Plant(spec)
-    plant.set_brakes(np.zeros(3, dtype=np.bool_))
+    closed = np.zeros(3, dtype=np.bool_)
+    plant.set_brakes(closed)
     for _ in range(round(seconds * 4000)):
         plant.step(current_a)
     return plant
@@ -108,18 +113,22 @@ def test_the_loops_are_tuned_over_the_travel_of_a_prismatic_joint() -> None:
     spec = _spec()
     plant = Plant(spec)
     seen = [1.0 + 1.0 + 0.1 + BEHIND_KG * reach**2 + 0.5 for reach in (0.1, 1.1)]
-    assert plant.motor_inertia_at(np.array([0.3, 0.2, 1.1]))[0] == pytest.approx(seen[1])
+    position_rad = np.array([0.3, 0.2, 1.1])
+    assert plant.motor_inertia_at(position_rad)[0] == pytest.approx(seen[1])
     counts_per_rad = 65536 / (2 * np.pi)
     expected = np.sqrt(seen[0] * seen[1]) / (40.0 * 100.0 * counts_per_rad)
     assert tuned_inertia_a_s2(spec, plant)[0] == pytest.approx(expected)
     # Where it starts is of no account.
-    elsewhere = replace(spec, start_rad=np.array([0.0, 0.1, 1.0]))
+    start_rad = np.array([0.0, 0.1, 1.0])
+    elsewhere = replace(spec, start_rad=start_rad)
     assert tuned_inertia_a_s2(elsewhere, plant) == pytest.approx(tuned_inertia_a_s2(spec, plant))
 
 
 def test_the_loops_are_tuned_for_a_body_and_for_none() -> None:
     """A lift meets one inertia in all postures: without the body, and with it."""
-    body = Body(5.0, (0.1, 0.0, 0.0), (0.01, 0.0, 0.0, 0.01, 0.0, 0.01))
+    inertia_kg_m2 = (0.01, 0.0, 0.0, 0.01, 0.0, 0.01)
+    centre_m = (0.1, 0.0, 0.0)
+    body = Body(5.0, centre_m, inertia_kg_m2)
     bare = _spec()
     tuned = replace(bare, tuned_with=body)
     plant = Plant(tuned)

@@ -46,10 +46,11 @@ def test_jacobian_is_the_slope_of_the_residual(
         scaled = 1e-6 * rng.normal(size=len(around.free))
         step = np.zeros(6 + len(parameters))
         step[around.free] = scaled * around.scale
-        slope = (problem(step) - problem(-step)) / 2.0
-        assert_allclose(
-            -slope, around.jacobian @ scaled, rtol=0.0, atol=1e-4 * np.max(np.abs(slope))
-        )
+        difference = problem(step) - problem(-step)
+        slope = difference / 2.0
+        expected = around.jacobian @ scaled
+        largest_absolute_slope = np.max(np.abs(slope))
+        assert_allclose(-slope, expected, rtol=0.0, atol=1e-4 * largest_absolute_slope)
 
 
 def test_a_jacobian_in_parts_is_the_whole_one() -> None:
@@ -82,14 +83,16 @@ def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:
     estimate = np.linalg.lstsq(rows, whole, rcond=None)[0]
     around = residual - jacobian @ estimate
     grams = np.einsum("mri,mrj->mij", jacobian, jacobian)
-    shifts = left_out_shifts(grams, np.einsum("mri,mr->mi", jacobian, around))
+    scores = np.einsum("mri,mr->mi", jacobian, around)
+    shifts = left_out_shifts(grams, scores)
     for cluster, shift in enumerate(shifts):
         kept = np.arange(10) != cluster
         without = np.linalg.lstsq(
             jacobian[kept].reshape(-1, 4), residual[kept].ravel(), rcond=None
         )[0]
+        largest_absolute_estimate = np.abs(estimate).max()
         assert shift == pytest.approx(
-            without - estimate, rel=1e-6, abs=1e-9 * np.abs(estimate).max()
+            without - estimate, rel=1e-6, abs=1e-9 * largest_absolute_estimate
         )
 
 
@@ -108,7 +111,8 @@ def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
     for part in (rows, np.asarray(np.linalg.qr(rows, mode="r"))):
         jacobian, residual = motor_jacobian(part, 2, truth.gains, parameters, noise)
         products.append(np.column_stack((jacobian.T @ jacobian, jacobian.T @ residual)))
-    assert products[0] == pytest.approx(products[1], abs=1e-10 * np.abs(products[0]).max())
+    largest_absolute_product = np.abs(products[0]).max()
+    assert products[0] == pytest.approx(products[1], abs=1e-10 * largest_absolute_product)
 
 
 @pytest.mark.parametrize("has_instruments", [False, True])
@@ -119,7 +123,8 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
     system = recorded
     if has_instruments:  # other rows for J than for e
         tilted = [[rows * 1.01 for rows in cluster] for cluster in recorded.clusters]
-        system = replace(recorded, clusters=tuple(map(tuple, tilted)))
+        clusters = tuple(map(tuple, tilted))
+        system = replace(recorded, clusters=clusters)
     estimate = noisy.estimate
     around = (estimate.gains, estimate.parameters, estimate.axis_noise)
     grams, scores = _sums_of_motors(system, recorded, *around)
@@ -133,8 +138,10 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
             _, residual = motor_jacobian(own_rows, motor, *around)
             gram += jacobian.T @ jacobian
             score += jacobian.T @ residual
-        assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * np.abs(gram).max())
-        assert scores[index] == pytest.approx(score, rel=1e-9, abs=1e-9 * np.abs(score).max())
+        largest_absolute_gram = np.abs(gram).max()
+        assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * largest_absolute_gram)
+        largest_absolute_score = np.abs(score).max()
+        assert scores[index] == pytest.approx(score, rel=1e-9, abs=1e-9 * largest_absolute_score)
 
 
 FloatArray = NDArray[np.float64]
@@ -149,7 +156,9 @@ def _slow_line(
     rows = np.arange(6000)
     turns = rng.uniform(1e-3, 2.5e-2, 5)
     phase = rng.uniform(0.0, 6.0, 5)
-    jacobian = np.column_stack((np.ones(len(rows)), np.sin(np.outer(rows, turns) + phase)))
+    rows_outer = np.outer(rows, turns)
+    sine = np.sin(rows_outer + phase)
+    jacobian = np.column_stack((np.ones(len(rows)), sine))
     keep = np.exp(-1.0 / correlation_rows) if correlation_rows else 0.0
     noise = signal.lfilter(
         [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(len(rows) + 1000)
@@ -163,16 +172,16 @@ def _slow_line(
 def _std(grams: FloatArray, scores: FloatArray) -> FloatArray:
     shifts = left_out_shifts(grams, scores)
     blocks = len(grams)
-    return np.asarray(
-        np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
-    )
+    shift_difference = shifts - shifts.mean(axis=0)
+    return np.asarray(np.sqrt((blocks - 1) / blocks * np.sum(shift_difference**2, axis=0)))
 
 
 def test_clusters_with_independent_noise_stay_as_they_are() -> None:
     runs = np.repeat([0, 1, 2], 40)
     kept = 0
     for seed in range(20):
-        _, grams, scores = _slow_line(np.random.default_rng(seed), 0.0)
+        rng = np.random.default_rng(seed)
+        _, grams, scores = _slow_line(rng, 0.0)
         kept += len(independent_blocks(grams, scores, runs)) == len(grams)
     assert kept >= 19
 
@@ -185,7 +194,8 @@ def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -
     plain = []
     joined = []
     for seed in range(60):
-        estimate, grams, scores = _slow_line(np.random.default_rng(seed), 150.0)
+        rng = np.random.default_rng(seed)
+        estimate, grams, scores = _slow_line(rng, 150.0)
         starts = independent_blocks(grams, scores, runs)
         assert len(starts) >= MIN_MOVES_TO_LEAVE_OUT
         assert {0, 60} <= set(starts)
@@ -193,10 +203,14 @@ def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -
         joined.append(
             estimate / _std(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
         )
-    assert np.sqrt(np.mean(np.square(plain))) > 1.6
-    assert np.sqrt(np.mean(np.square(joined))) < 1.3
+    mean_squared_plain = np.mean(np.square(plain))
+    assert np.sqrt(mean_squared_plain) > 1.6
+    mean_squared_joined = np.mean(np.square(joined))
+    assert np.sqrt(mean_squared_joined) < 1.3
 
 
 def test_clusters_of_different_runs_are_never_joined() -> None:
-    _, grams, scores = _slow_line(np.random.default_rng(1), 150.0)
-    assert len(independent_blocks(grams, scores, np.arange(len(grams)))) == len(grams)
+    rng = np.random.default_rng(1)
+    _, grams, scores = _slow_line(rng, 150.0)
+    runs = np.arange(len(grams))
+    assert len(independent_blocks(grams, scores, runs)) == len(grams)

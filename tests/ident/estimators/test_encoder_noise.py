@@ -17,13 +17,15 @@ DRAWS = 30
 def _directions() -> RunDirections:
     """Two motors that hold each other, so that the misfit has one direction, which turns slowly."""
     angle = 0.3 * np.sin(TIME_S)
-    basis = np.stack((np.cos(angle), -np.sin(angle)), axis=1)[:, :, None]
+    cosine_and_sine = np.stack((np.cos(angle), -np.sin(angle)), axis=1)
+    basis = cosine_and_sine[:, :, None]
     return RunDirections(TIME_S, basis)
 
 
 def _noise(rng: np.random.Generator, correlation_s: float) -> FloatArray:
     """Noise of both motors with σ = 1 in that direction, half of its variance white, shape (k,)."""
-    decay = np.exp(-np.abs(TIME_S[:, None] - TIME_S[None, :]) / correlation_s)
+    time_difference_s = TIME_S[:, None] - TIME_S[None, :]
+    decay = np.exp(-np.abs(time_difference_s) / correlation_s)
     root = np.linalg.cholesky(decay + 1e-12 * np.eye(SAMPLES))
     slow = root @ rng.standard_normal((SAMPLES, 2))
     white = rng.standard_normal((SAMPLES, 2))
@@ -41,13 +43,18 @@ def test_an_estimate_with_white_rows_has_its_own_deviation(correlation_s: float)
     scaled: list[FloatArray] = []
     for _ in range(DRAWS):
         right = np.concatenate((_noise(rng, correlation_s), _noise(rng, correlation_s)))
-        noise = estimate_noise([_directions(), _directions()], jacobian, right)
-        white = noise.white(np.column_stack((jacobian, right)))
+        directions = [_directions(), _directions()]
+        noise = estimate_noise(directions, jacobian, right)
+        rows = np.column_stack((jacobian, right))
+        white = noise.white(rows)
         change, square, _, _ = np.linalg.lstsq(white[:, :3], white[:, 3], rcond=None)
         variance = square[0] / (2 * SAMPLES - 3)
-        covariance = variance * np.linalg.inv(white[:, :3].T @ white[:, :3])
-        scaled.append(change / np.sqrt(np.diag(covariance)))
-    assert 0.8 < np.sqrt(np.mean(np.square(scaled))) < 1.2
+        inverse = np.linalg.inv(white[:, :3].T @ white[:, :3])
+        covariance = variance * inverse
+        covariance_diagonal_root = np.sqrt(np.diag(covariance))
+        scaled.append(change / covariance_diagonal_root)
+    mean_squared_scaled = np.mean(np.square(scaled))
+    assert 0.8 < np.sqrt(mean_squared_scaled) < 1.2
 
 
 def test_slow_noise_counts_as_fewer_numbers() -> None:

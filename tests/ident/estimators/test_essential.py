@@ -43,7 +43,8 @@ def test_the_spread_of_what_stays_is_below_the_ratio(
     payload = [column.name for column in found.system.unknowns if ":" in column.name]
     assert len(payload) == 9
     names = {column.name for column in found.system.columns} | {step.name for step in found.removed}
-    assert names == {column.name for column in system.columns}
+    expected = {column.name for column in system.columns}
+    assert names == expected
 
 
 def test_each_step_takes_the_worst_of_a_new_estimate(system: System) -> None:
@@ -95,10 +96,10 @@ def test_parameters_held_where_they_were_found_change_nothing(
     gains = rng.normal(size=6)
     rest = system.holding({index: float(values[index]) for index in held})
     left = np.delete(values, held)
-    assert [c.name for c in rest.unknowns] == [
-        c.name for i, c in enumerate(system.unknowns) if i not in held
-    ]
-    one = system.joints.square_sum(np.concatenate((gains, values, [1.0])))
+    expected = [c.name for i, c in enumerate(system.unknowns) if i not in held]
+    assert [c.name for c in rest.unknowns] == expected
+    stacked_gains = np.concatenate((gains, values, [1.0]))
+    one = system.joints.square_sum(stacked_gains)
     assert rest.joints.square_sum(np.concatenate((gains, left, [1.0]))) == pytest.approx(
         one, rel=1e-8
     )
@@ -119,8 +120,6 @@ def test_a_ratio_that_leaves_nothing_is_refused(system: System) -> None:
 
 
 def test_a_parameter_of_zero_is_infinitely_uncertain() -> None:
-    assert relative_std_percent(np.array([0.0, 2.0, -2.0]), np.array([1.0, 1.0, 1.0])).tolist() == [
-        np.inf,
-        50.0,
-        50.0,
-    ]
+    std = np.array([1.0, 1.0, 1.0])
+    expected = [np.inf, 50.0, 50.0]
+    assert relative_std_percent(np.array([0.0, 2.0, -2.0]), std).tolist() == expected

@@ -64,7 +64,8 @@ def test_ml_and_the_papers_tls_beat_wls(noisy_found: Identification) -> None:
 def test_gains_scale_with_the_payload_mass(
     truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification
 ) -> None:
-    heavier = Payload("disc", "a", {"m": 4.59 * 1.05})
+    known = {"m": 4.59 * 1.05}
+    heavier = Payload("disc", "a", known)
     runs = tuple(replace(run, payload=heavier) if run.payload else run for run in noisy_runs)
     assert _fit(truth, runs).gains == pytest.approx(1.05 * noisy_found.estimate.gains, rel=1e-6)
 
@@ -76,7 +77,8 @@ def test_a_change_of_current_unit_scales_exactly_that_gain(
     scale = np.ones(6)
     scale[3] = factor
     before = noisy_found.estimate
-    after = _fit(truth, tuple(replace(run, current_a=run.current_a * scale) for run in noisy_runs))
+    runs = tuple(replace(run, current_a=run.current_a * scale) for run in noisy_runs)
+    after = _fit(truth, runs)
     assert after.gains == pytest.approx(before.gains / scale, rel=1e-6)
     assert after.parameters == pytest.approx(before.parameters, rel=1e-5, abs=1e-8)
     assert after.gains_std == pytest.approx(before.gains_std / np.abs(scale), rel=1e-4)
@@ -93,9 +95,11 @@ def test_the_order_of_runs_does_not_matter(
 
 def test_permuting_the_motors_permutes_the_gains(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     order = np.array([0, 2, 1, 3, 5, 4])
-    model = Model(truth.model.robot, DriveTrain(truth.model.drive_train.ratio[order]))
+    drive_train = DriveTrain(truth.model.drive_train.ratio[order])
+    model = Model(truth.model.robot, drive_train)
     runs = tuple(replace(run, current_a=run.current_a[:, order]) for run in noisy_runs)
-    conditioning = replace(CONDITIONING, standstill_rad_s=(0.0,) * 6)
+    standstill_rad_s = (0.0,) * 6
+    conditioning = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
     before = identify(truth.model, noisy_runs, conditioning).estimate
     after = identify(model, runs, conditioning).estimate
     assert after.gains == pytest.approx(before.gains[order], rel=1e-9)
@@ -104,7 +108,8 @@ def test_permuting_the_motors_permutes_the_gains(truth: Truth, noisy_runs: tuple
 
 def test_the_covariance_covers_the_error(noisy_found: Identification) -> None:
     estimate = noisy_found.estimate
-    scores = (estimate.gains - GAINS) / estimate.gains_std
+    gain_difference = estimate.gains - GAINS
+    scores = gain_difference / estimate.gains_std
     assert np.all(np.abs(scores) < 4.0)
     assert np.all(estimate.gains_std / np.abs(GAINS) < 0.02)
 
@@ -119,15 +124,18 @@ def test_ml_solves_the_instrumental_variable_equations(noisy_found: Identificati
     for factor, g, sigma in zip(system.motors.factors, gamma, estimate.axis_noise, strict=True):
         predicted = g * (factor[:, 1:-1] @ estimate.parameters + factor[:, -1])
         error = factor[:, 0] - predicted
-        assert abs(predicted @ error) < 1e-6 * np.linalg.norm(predicted) * np.linalg.norm(error)
+        predicted_norm = np.linalg.norm(predicted)
+        assert abs(predicted @ error) < 1e-6 * predicted_norm * np.linalg.norm(error)
         columns += g / sigma**2 * (factor[:, 1:-1].T @ error)
-        size += abs(g) / sigma**2 * np.linalg.norm(factor[:, 1:-1], axis=0) * np.linalg.norm(error)
+        error_norm = np.linalg.norm(error)
+        size += abs(g) / sigma**2 * np.linalg.norm(factor[:, 1:-1], axis=0) * error_norm
     assert np.all(np.abs(columns) < 1e-6 * size)
 
 
 @pytest.mark.parametrize("scaling", Scaling)
 def test_tls_scalings_agree_without_noise(clean_found: Identification, scaling: Scaling) -> None:
-    assert tls(clean_found.system, scaling).gains == pytest.approx(GAINS, rel=2e-4)
+    gains = tls(clean_found.system, scaling).gains
+    assert gains == pytest.approx(GAINS, rel=2e-4)
 
 
 def test_without_a_known_payload_there_is_no_scale(
@@ -166,7 +174,8 @@ def test_tls_has_nothing_to_do_with_fixed_gains(clean_found: Identification) -> 
 def test_more_runs_of_one_mounting_share_its_unknowns(noisy_found: Identification) -> None:
     system = noisy_found.system
     assert len(system.unknowns) == 61 + 9
-    assert noisy_found.estimate.rows == int(system.motors.rows.sum())
+    expected = int(system.motors.rows.sum())
+    assert noisy_found.estimate.rows == expected
 
 
 def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(
@@ -176,16 +185,14 @@ def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(
     dry friction.
     """
     system = clean_found.system
+    factors = tuple(
+        f if m < 4 else np.zeros((0, f.shape[1])) for m, f in enumerate(system.motors.factors)
+    )
+    rows = np.where(np.arange(6) < 4, system.motors.rows, 0)
+    motors = replace(system.motors, factors=factors, rows=rows)
     apart = replace(
         system,
-        motors=replace(
-            system.motors,
-            factors=tuple(
-                f if m < 4 else np.zeros((0, f.shape[1]))
-                for m, f in enumerate(system.motors.factors)
-            ),
-            rows=np.where(np.arange(6) < 4, system.motors.rows, 0),
-        ),
+        motors=motors,
     )
     require_distinct(apart, gains=True)
     assert wls(apart).gains == pytest.approx(wls(system).gains)

@@ -67,16 +67,19 @@ def runs(truth: Truth) -> tuple[Run, ...]:
 
 @pytest.fixture(scope="module")
 def found(truth: Truth, runs: tuple[Run, ...]) -> Identification:
-    return identify(replace(truth.model, friction_by_payload=True), runs, CONDITIONING)
+    model = replace(truth.model, friction_by_payload=True)
+    return identify(model, runs, CONDITIONING)
 
 
 @pytest.fixture(scope="module")
 def calibration(truth: Truth, found: Identification) -> Calibration:
-    return calibration_of(found, ("J1", "J2", "J3"), truth.gains)
+    axes = ("J1", "J2", "J3")
+    return calibration_of(found, axes, truth.gains)
 
 
 def _sigmas_off(found: Identification, truth: Truth) -> FloatArray:
-    return np.abs(found.estimate.gains - truth.gains) / found.estimate.gains_std
+    gain_difference = found.estimate.gains - truth.gains
+    return np.abs(gain_difference) / found.estimate.gains_std
 
 
 def test_friction_that_falls_before_the_payload_is_mounted_does_not_become_gain(
@@ -96,10 +99,8 @@ def test_what_the_payload_adds_to_friction_is_that_of_the_truth(
         name = f"{truth.model.columns[place].name}_loaded"
         index = names.index(name)
         added = (WARMER - 1.0) * truth.parameters[place]
-        assert (
-            abs(found.estimate.parameters[index] - added)
-            < 4.0 * found.estimate.parameters_std[index]
-        )
+        parameter_difference = abs(found.estimate.parameters[index] - added)
+        assert parameter_difference < 4.0 * found.estimate.parameters_std[index]
 
 
 def test_it_costs_little_where_friction_stays(truth: Truth) -> None:
@@ -109,7 +110,8 @@ def test_it_costs_little_where_friction_stays(truth: Truth) -> None:
         for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
     ]
     shared = identify(truth.model, runs, CONDITIONING)
-    by_payload = identify(replace(truth.model, friction_by_payload=True), runs, CONDITIONING)
+    model = replace(truth.model, friction_by_payload=True)
+    by_payload = identify(model, runs, CONDITIONING)
     assert np.all(_sigmas_off(by_payload, truth) < 3.5)
     assert np.all(by_payload.estimate.gains_std < 1.3 * shared.estimate.gains_std)
 
@@ -120,9 +122,8 @@ def test_a_calibration_predicts_with_the_friction_of_what_is_mounted(
 ) -> None:
     mounted = MOUNTED if payload is not None else None
     arm = truth if mounted is None else _warmer(truth)
-    run = record(
-        arm, "new", np.random.default_rng(9), mounted, seconds=6.0, rate_hz=500.0, averaged=2
-    )
+    rng = np.random.default_rng(9)
+    run = record(arm, "new", rng, mounted, seconds=6.0, rate_hz=500.0, averaged=2)
     data = differentiate(run, truth.model.drive_train, CONDITIONING)
     if mounted is None:
         body = None
@@ -180,8 +181,9 @@ def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
         by_columns = np.einsum("mck,c->mk", regressor, parameters)
         if mounted is not None:
             by_columns += np.einsum("mck,c->mk", regressor[:, model.flange], body)
+        standard = model.with_payload(parameters, mounted)
         np.testing.assert_allclose(
-            model.torques(motion, model.with_payload(parameters, mounted))[2],
+            model.torques(motion, standard)[2],
             by_columns,
             rtol=1e-9,
             atol=1e-9,
@@ -191,7 +193,8 @@ def test_the_columns_of_friction_are_there_once_more_while_a_payload_is_mounted(
 def test_where_every_run_is_loaded_there_is_one_friction(truth: Truth) -> None:
     rng = np.random.default_rng(10)
     disc = Payload("disc", "a", dict(PAYLOAD_TRUTH))
-    plate = Payload("plate", "b", {name: 0.5 * value for name, value in PAYLOAD_TRUTH.items()})
+    known = {name: 0.5 * value for name, value in PAYLOAD_TRUTH.items()}
+    plate = Payload("plate", "b", known)
     runs = [
         record(truth, f"run{number}", rng, payload, noise_a=NOISE_A, rate_hz=500.0, averaged=2)
         for number, payload in enumerate((disc, plate))
@@ -224,6 +227,7 @@ def test_a_body_is_weighed_beside_bare_runs_of_another_friction(
     mass = list(LINK_PARAMETERS).index("m")
     weighed = weigh(calibration, model, (loaded,), CONDITIONING, bare=(bare,))
     one_friction = weigh(calibration, truth.model, (loaded,), CONDITIONING, bare=(bare,))
-    error_kg = abs(weighed.values[mass] - PAYLOAD_TRUTH["m"])
+    weighed_difference = weighed.values[mass] - PAYLOAD_TRUTH["m"]
+    error_kg = abs(weighed_difference)
     assert error_kg < 3.0 * weighed.std[mass]
     assert weighed.std[mass] < 0.3 * one_friction.std[mass]

@@ -42,7 +42,8 @@ def pieces(small_truth: Truth) -> tuple[Run, ...]:
 @pytest.fixture(scope="module")
 def at_once(small_truth: Truth, pieces: tuple[Run, ...]) -> QuickGains:
     """The gains of all rows in one reduction."""
-    return quick_gains(reduce_runs(small_truth.model, pieces, SMALL))
+    standard = reduce_runs(small_truth.model, pieces, SMALL)
+    return quick_gains(standard)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +110,8 @@ def _is_unknown(found: QuickGains, reason: Unknown, axes: tuple[int, ...] = ()) 
 def test_pieces_in_any_order_give_the_gains_of_all_rows_at_once(
     small_truth: Truth, pieces: tuple[Run, ...], at_once: QuickGains, order: list[int]
 ) -> None:
-    found = _grown(small_truth, tuple(pieces[index] for index in order)).gains()
+    runs = tuple(pieces[index] for index in order)
+    found = _grown(small_truth, runs).gains()
     assert _gains(found) == pytest.approx(_gains(at_once), rel=1e-9)
     # Blocks of correlated neighbours depend on the order of the runs.
     assert _std(found) == pytest.approx(_std(at_once), rel=0.3)
@@ -130,8 +132,11 @@ def test_runs_that_were_folded_in_while_they_grew_are_the_whole_runs(
         fit = fit.with_run(run)
     assert fit.standard is not None
     assert whole.standard is not None
-    assert [run.rows for run in fit.runs] == [run.rows for run in whole.runs]
-    assert fit.standard.joints.rows.tolist() == whole.standard.joints.rows.tolist()
+    expected = [run.rows for run in whole.runs]
+    assert [run.rows for run in fit.runs] == expected
+    rows = fit.standard.joints.rows.tolist()
+    rows_expected = whole.standard.joints.rows.tolist()
+    assert rows == rows_expected
     assert _gains(fit.gains()) == pytest.approx(_gains(whole.gains()), rel=1e-8)
     # Long motion is cut into stretches of two seconds, elsewhere for each look.
     assert _std(fit.gains()) == pytest.approx(_std(whole.gains()), rel=0.3)
@@ -162,7 +167,8 @@ def test_rows_near_the_border_wait_and_are_then_those_of_the_whole_run(
     assert so_far.standard is not None
     assert whole.standard is not None
     waiting = whole.runs[0].rows - so_far.runs[0].rows
-    assert waiting == round(0.2 / 0.02)
+    expected = round(0.2 / 0.02)
+    assert waiting == expected
     ended = so_far.with_run(run)
     assert ended.runs[0].rows == whole.runs[0].rows
     assert ended.standard is not None
@@ -189,8 +195,10 @@ def test_clusters_of_very_many_moves_are_joined_and_say_the_same(
 def test_the_grown_equations_serve_maximum_likelihood(
     small_truth: Truth, pieces: tuple[Run, ...]
 ) -> None:
-    grown = ml(_grown(small_truth, pieces).system())
-    whole = ml(regrouped(reduce_runs(small_truth.model, pieces, SMALL)))
+    system = _grown(small_truth, pieces).system()
+    grown = ml(system)
+    standard = reduce_runs(small_truth.model, pieces, SMALL)
+    whole = ml(regrouped(standard))
     assert grown.gains == pytest.approx(whole.gains, rel=1e-9)
     assert grown.gains_std == pytest.approx(whole.gains_std, rel=1e-6)
 
@@ -215,7 +223,8 @@ def test_a_redundant_robot_grows_too() -> None:
 def test_without_a_payload_the_gains_are_unknown_however_much_is_recorded(
     small_truth: Truth, pieces: tuple[Run, ...], chosen: set[int]
 ) -> None:
-    found = _grown(small_truth, tuple(pieces[index] for index in chosen)).gains()
+    runs = tuple(pieces[index] for index in chosen)
+    found = _grown(small_truth, runs).gains()
     assert _is_unknown(found, Unknown.NO_PAYLOAD)
     assert found.std_percent is None
 
@@ -244,11 +253,13 @@ def test_a_dead_current_is_named(small_truth: Truth, pieces: tuple[Run, ...]) ->
         current = run.current_a.copy()
         current[:, 2] = 0.0
         dead.append(replace(run, current_a=current))
-    assert _is_unknown(_grown(small_truth, tuple(dead)).gains(), Unknown.NO_CURRENT, (2,))
+    gains = _grown(small_truth, tuple(dead)).gains()
+    assert _is_unknown(gains, Unknown.NO_CURRENT, (2,))
 
 
 def test_a_few_moves_are_too_few_for_an_error_bar(small_truth: Truth) -> None:
-    fit = _grown(small_truth, noisy_pieces(small_truth, 5, count=2, seconds=2.5))
+    runs = noisy_pieces(small_truth, 5, count=2, seconds=2.5)
+    fit = _grown(small_truth, runs)
     assert fit.move_count < 8
     assert _is_unknown(fit.gains(), Unknown.FEW_MOVES)
 
@@ -260,7 +271,8 @@ def test_a_payload_that_was_not_mounted_does_not_show(
     said_to_be_loaded = tuple(
         replace(run, name=f"{run.name}, again", payload=MOUNTED) for run in bare[:2]
     )
-    found = _grown(small_truth, (*bare[2:], *said_to_be_loaded)).gains()
+    runs = (*bare[2:], *said_to_be_loaded)
+    found = _grown(small_truth, runs).gains()
     assert _is_unknown(found, Unknown.PAYLOAD_UNSEEN)
 
 
@@ -278,7 +290,8 @@ def test_a_run_is_in_the_fit_once(small_truth: Truth, pieces: tuple[Run, ...]) -
 def test_a_payload_that_was_not_announced_is_refused(
     small_truth: Truth, pieces: tuple[Run, ...]
 ) -> None:
-    other = replace(pieces[1], payload=Payload("plate", "b", {"m": 2.0}))
+    payload = Payload("plate", "b", {"m": 2.0})
+    other = replace(pieces[1], payload=payload)
     with pytest.raises(DataUnfit, match="name all payloads"):
         _empty(small_truth).with_run(other)
 
@@ -291,7 +304,8 @@ def test_a_run_that_is_too_short_waits_and_is_refused_when_it_ends(
     with pytest.raises(DataUnfit):
         _empty(small_truth).with_run(short)
     if samples > 2:
-        assert _empty(small_truth).with_run_so_far(short).standard is None
+        standard = _empty(small_truth).with_run_so_far(short).standard
+        assert standard is None
 
 
 def test_systems_of_other_payloads_are_not_joined(

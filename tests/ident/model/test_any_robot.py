@@ -117,14 +117,16 @@ def _truth(urdf: str, gravity: Gravity) -> tuple[Model, FloatArray, FloatArray]:
     frame.
     """
     kind = next(kind for kind in (*KINDS, *HEAVY) if kind.urdf == urdf)
-    model = Model(
-        robot_from_urdf((CONFIGS / "robots" / urdf).read_text(), gravity), DriveTrain(kind.ratio)
-    )
+    text = (CONFIGS / "robots" / urdf).read_text()
+    robot = robot_from_urdf(text, gravity)
+    drive_train = DriveTrain(kind.ratio)
+    model = Model(robot, drive_train)
     rng = np.random.default_rng(len(urdf))
     parameters = np.zeros(len(model.columns))
     for joint in range(model.robot.joint_count):
         first = 14 * joint
-        parameters[first : first + 10] = _body(rng, rng.uniform(1.0, 8.0))
+        mass = rng.uniform(1.0, 8.0)
+        parameters[first : first + 10] = _body(rng, mass)
         parameters[first + 10 : first + 14] = (
             rng.uniform(0.05, 0.3),
             *rng.uniform(0.5, 5.0, 2),
@@ -137,7 +139,8 @@ def _truth(urdf: str, gravity: Gravity) -> tuple[Model, FloatArray, FloatArray]:
 
 def _body(rng: np.random.Generator, mass: float) -> FloatArray:
     centre = rng.uniform(-0.1, 0.1, 3)
-    inertia = mass * (np.eye(3) * (0.06**2 + centre @ centre) - np.outer(centre, centre))
+    centre_outer = np.outer(centre, centre)
+    inertia = mass * (np.eye(3) * (0.06**2 + centre @ centre) - centre_outer)
     return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
 
 
@@ -159,11 +162,13 @@ def _runs(urdf: str, gravity: Gravity) -> tuple[Run, Run]:
     made = []
     for mounted in (None, Payload("body", "a", {"m": 5.0})):
         q = positions(rng, 22.0, RATE_HZ, kind.reach)
+        time_s = np.arange(len(q)) / RATE_HZ
+        current_a = np.zeros_like(q)
         bare = Run(
             "loaded" if mounted else "bare",
-            np.arange(len(q)) / RATE_HZ,
+            time_s,
             q,
-            np.zeros_like(q),
+            current_a,
             mounted,
         )
         data = differentiate(bare, model.drive_train, _conditioning(model))
@@ -173,7 +178,8 @@ def _runs(urdf: str, gravity: Gravity) -> tuple[Run, Run]:
         torque = np.einsum("jck,c->jk", model.regressor(data.motion()), total)
         current = np.zeros_like(q)
         current[1:-1] = ((model.drive_train.to_motor @ torque) / kind.gains[:, None]).T
-        made.append(Run(bare.name, bare.time_s, q, current, mounted))
+        run = Run(bare.name, bare.time_s, q, current, mounted)
+        made.append(run)
     return made[0], made[1]
 
 
@@ -187,7 +193,8 @@ def _fit(model: Model, runs: tuple[Run, ...], still: tuple[float, ...] | None = 
 @pytest.mark.parametrize(("kind", "gravity"), CASES, ids=_name)
 def test_without_noise_the_gains_are_exact(kind: Kind, gravity: Gravity) -> None:
     model, _, payload = _truth(kind.urdf, gravity)
-    estimate = _fit(model, _runs(kind.urdf, gravity))
+    runs = _runs(kind.urdf, gravity)
+    estimate = _fit(model, runs)
     assert estimate.gains == pytest.approx(kind.gains, rel=1e-6)
     names = [column.name for column in estimate.unknowns]
     for name in ("mx", "my", "mz"):
@@ -222,7 +229,8 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(
     after = _fit(Model(model.robot, train), shuffled, still)
     per_motor = before.gains / model.drive_train.reduction
     assert after.gains / train.reduction == pytest.approx(per_motor[order], rel=1e-6)
-    spread = before.gains_std / np.abs(model.drive_train.reduction)
+    absolute_reduction = np.abs(model.drive_train.reduction)
+    spread = before.gains_std / absolute_reduction
     assert after.gains_std / np.abs(train.reduction) == pytest.approx(spread[order], rel=1e-4)
     known = dict(zip((c.name for c in before.unknowns), before.parameters, strict=True))
     found = dict(zip((c.name for c in after.unknowns), after.parameters, strict=True))
@@ -257,7 +265,8 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
 def test_prismatic_joints_have_newton_for_their_friction() -> None:
     model, _, _ = _truth("gantry.urdf", UPRIGHT)
     units = {column.name: column.unit for column in model.columns}
-    assert (units["Ia1"], units["fv1"], units["fs1"], units["off1"]) == ("kg", "N/(m/s)", "N", "N")
+    expected = ("kg", "N/(m/s)", "N", "N")
+    assert (units["Ia1"], units["fv1"], units["fs1"], units["off1"]) == expected
     assert (units["Ia4"], units["fv4"], units["fs4"], units["off4"]) == (
         "kg m²",
         "Nm/(rad/s)",

@@ -49,7 +49,9 @@ def test_a_payload_that_no_body_is_is_refused(known: dict[str, Any], words: str)
 
 
 def test_a_point_mass_and_a_rounded_drawing_are_bodies() -> None:
-    point = Body(2.0, np.array([0.1, 0.2, 0.3]), np.zeros((3, 3))).parameters
+    centre_m = np.array([0.1, 0.2, 0.3])
+    inertia_kg_m2 = np.zeros((3, 3))
+    point = Body(2.0, centre_m, inertia_kg_m2).parameters
     ident.Payload("point", "flange", dict(zip(LINK_PARAMETERS, point.tolist(), strict=True)))
     plate = {"Ixx": 0.0500, "Ixy": 0.0, "Ixz": 0.0, "Iyy": 0.0500, "Iyz": 0.0, "Izz": 0.1001}
     ident.Payload("plate", "flange", {"m": 4.0, **plate})

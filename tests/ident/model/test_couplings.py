@@ -91,9 +91,12 @@ def _pinocchio_torque(
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, multiplier, 0.0], [0.0, 0.0, 1.0]]
     )
     offset = np.array([0.0, 0.0, OFFSET_RAD, 0.0])
-    position = np.asarray(motion.position_rad) @ to_joints.T + offset
-    velocity = np.asarray(motion.velocity_rad_s) @ to_joints.T
-    acceleration = np.asarray(motion.acceleration_rad_s2) @ to_joints.T
+    position_rad = np.asarray(motion.position_rad)
+    position = position_rad @ to_joints.T + offset
+    velocity_rad_s = np.asarray(motion.velocity_rad_s)
+    velocity = velocity_rad_s @ to_joints.T
+    acceleration_rad_s2 = np.asarray(motion.acceleration_rad_s2)
+    acceleration = acceleration_rad_s2 @ to_joints.T
     states = zip(position, velocity, acceleration, strict=True)
     torque = np.array([pin.rnea(model, data, q, v, a) for q, v, a in states])
     return np.asarray(torque @ to_joints)
@@ -113,7 +116,8 @@ def _standard(model: Model, urdf: str) -> FloatArray:
 
 
 def _model(robot: Robot) -> Model:
-    return Model(robot, DriveTrain(np.diag([40.0, 50.0, -45.0])))
+    ratio = np.diag([40.0, 50.0, -45.0])
+    return Model(robot, DriveTrain(ratio))
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
@@ -129,11 +133,15 @@ def test_the_torque_is_that_of_pinocchios_tree_projected_to_the_axes(kind: str) 
     load, _, _ = model.torques(motion, standard)
     np.testing.assert_allclose(load.T, expected, atol=1e-9)
     # The mass matrix: the torque of an acceleration of one axis, less that at rest.
-    mass = model.inertia(np.asarray(motion.position_rad), standard)
+    position_rad = np.asarray(motion.position_rad)
+    mass = model.inertia(position_rad, standard)
     still = np.zeros((40, 3))
     at_rest = _pinocchio_torque(urdf, MULTIPLIER, Motion(motion.position_rad, still, still))
     for axis, one in enumerate(np.eye(3)):
-        moved = _pinocchio_torque(urdf, MULTIPLIER, Motion(motion.position_rad, still, still + one))
+        acceleration_rad_s2 = still + one
+        moved = _pinocchio_torque(
+            urdf, MULTIPLIER, Motion(motion.position_rad, still, acceleration_rad_s2)
+        )
         np.testing.assert_allclose(mass[:, axis].T, moved - at_rest, atol=1e-9)
 
 
@@ -151,10 +159,14 @@ def test_a_rack_with_many_radians_to_the_metre_is_followed() -> None:
         "</robot>",
     ]
     robot = robot_from_urdf("".join(parts))
-    position_m = np.linspace(-0.6, 0.9, 50)[:, None]
+    grid = np.linspace(-0.6, 0.9, 50)
+    position_m = grid[:, None]
     rate = np.ones_like(position_m)
-    found = follow(robot, assemble(robot), Motion(position_m, rate, 3.0 * rate)).joints
-    np.testing.assert_allclose(found.position_rad[:, 1], 200.0 * position_m[:, 0] - 8.0, atol=1e-9)
+    acceleration_rad_s2 = 3.0 * rate
+    axes = Motion(position_m, rate, acceleration_rad_s2)
+    found = follow(robot, assemble(robot), axes).joints
+    expected = 200.0 * position_m[:, 0] - 8.0
+    np.testing.assert_allclose(found.position_rad[:, 1], expected, atol=1e-9)
     np.testing.assert_allclose(found.velocity_rad_s[:, 1], 200.0, atol=1e-9)
     np.testing.assert_allclose(found.acceleration_rad_s2[:, 1], 600.0, atol=1e-9)
 
@@ -166,13 +178,18 @@ def _recordings() -> tuple[Run, ...]:
     urdf = _arm()
     train = _model(robot_from_urdf(urdf)).drive_train
     body = np.array([PAYLOAD_TRUTH[name] for name in PINOCCHIO_ORDER])
-    payload = Payload("disc", "a", {"m": PAYLOAD_TRUTH["m"]})
+    known = {"m": PAYLOAD_TRUTH["m"]}
+    payload = Payload("disc", "a", known)
     rng = np.random.default_rng(7)
     runs = []
     for name, carried in (("bare", None), ("loaded", payload)):
-        q = positions(rng, 24.0, RATE_HZ, np.array([2.5, 1.2, 2.0]))
-        run = Run(name, np.arange(len(q)) / RATE_HZ, q, np.zeros_like(q), carried)
-        motion = differentiate(run, train, Conditioning(position_cutoff_hz=0.3 * RATE_HZ)).motion()
+        limits = np.array([2.5, 1.2, 2.0])
+        q = positions(rng, 24.0, RATE_HZ, limits)
+        time_s = np.arange(len(q)) / RATE_HZ
+        run = Run(name, time_s, q, np.zeros_like(q), carried)
+        position_cutoff_hz = 0.3 * RATE_HZ
+        conditioning = Conditioning(position_cutoff_hz=position_cutoff_hz)
+        motion = differentiate(run, train, conditioning).motion()
         torque = _pinocchio_torque(urdf, MULTIPLIER, motion, None if carried is None else body)
         viscous, dry = np.array(FRICTION).T
         velocity = np.asarray(motion.velocity_rad_s)
@@ -180,7 +197,8 @@ def _recordings() -> tuple[Run, ...]:
         current = np.zeros_like(q)
         current[1:-1] = torque / GAINS
         noise = 0.02 * rng.standard_normal(current.shape)
-        runs.append(replace(run, current_a=current + noise))
+        current_a = current + noise
+        runs.append(replace(run, current_a=current_a))
     return tuple(runs)
 
 
@@ -190,8 +208,10 @@ def recordings() -> tuple[Run, ...]:
 
 
 def _gains(recordings: tuple[Run, ...], multiplier: float) -> FloatArray:
-    model = _model(robot_from_urdf(_arm(multiplier)))
-    return np.asarray(identify(model, recordings, Conditioning()).estimate.gains)
+    robot = robot_from_urdf(_arm(multiplier))
+    model = _model(robot)
+    estimate = identify(model, recordings, Conditioning()).estimate
+    return np.asarray(estimate.gains)
 
 
 def test_the_gains_of_an_arm_with_a_follower_are_found(recordings: tuple[Run, ...]) -> None:
@@ -217,7 +237,8 @@ def test_a_follower_is_no_place_of_an_effect() -> None:
     motion = Motion(*(np.full((4, 3), 0.1) for _ in range(3)))
     followed = model.follow(motion)
     assert model.leverage(followed).shape == (0, 3, 4)
-    assert np.asarray(model.at_places(followed).position_rad).shape == (4, 3)
+    position_rad = np.asarray(model.at_places(followed).position_rad)
+    assert position_rad.shape == (4, 3)
 
 
 def test_a_spring_on_a_follower_is_found_as_one_of_its_axis(recordings: tuple[Run, ...]) -> None:
@@ -225,13 +246,17 @@ def test_a_spring_on_a_follower_is_found_as_one_of_its_axis(recordings: tuple[Ru
     stiffness_nm_rad = 30.0
     sprung = []
     for run in recordings:
-        position = np.asarray(run.position_rad)[:, 1]
+        position_rad = np.asarray(run.position_rad)
+        position = position_rad[:, 1]
         torque = MULTIPLIER * stiffness_nm_rad * (MULTIPLIER * position + OFFSET_RAD)
         current = np.asarray(run.current_a).copy()
         current[:, 1] += torque / GAINS[1]
         sprung.append(replace(run, current_a=current))
-    found = identify(_model(robot_from_urdf(_arm())), sprung, Conditioning())
-    first = find_effects(gather(found, sprung), np.random.default_rng(0))[0]
+    model = _model(robot_from_urdf(_arm()))
+    found = identify(model, sprung, Conditioning())
+    rng = np.random.default_rng(0)
+    effects = find_effects(gather(found, sprung), rng)
+    first = effects[0]
     # The best of its axes
     spring = next(one for one in first.findings if one.effect.name == "spring")
     assert spring.axis == 1
@@ -242,19 +267,22 @@ def test_a_spring_on_a_follower_is_found_as_one_of_its_axis(recordings: tuple[Ru
 def test_columns_of_a_follower_are_its_links_alone() -> None:
     model = _model(robot_from_urdf(_arm()))
     rng = np.random.default_rng(4)
-    columns = model.regressor(Motion(*(rng.uniform(-1.0, 1.0, (30, 3)) for _ in range(3))))
+    motion = Motion(*(rng.uniform(-1.0, 1.0, (30, 3)) for _ in range(3)))
+    columns = model.regressor(motion)
     rod = 14 * 2
-    assert np.abs(columns[1, rod : rod + len(LINK_PARAMETERS)]).max() > 1e-3
+    absolute_column = np.abs(columns[1, rod : rod + len(LINK_PARAMETERS)])
+    assert absolute_column.max() > 1e-3
     assert not columns[:, rod + len(LINK_PARAMETERS) : rod + 14].any()
 
 
 def test_a_motor_on_a_follower_and_a_follower_in_a_closed_chain_are_refused() -> None:
+    robot = robot_from_urdf(_arm(), motors=("turn", "rod", "wrist"))
     with pytest.raises(
         ModelError,
         match=r"joint 'rod' follows 'shoulder' and has a motor; "
         r"expected one or the other",
     ):
-        _model(robot_from_urdf(_arm(), motors=("turn", "rod", "wrist")))
+        _model(robot)
     loop = LinkPair("loop", "table", "hand", ("ry",))
     with pytest.raises(
         ModelError,
